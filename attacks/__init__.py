@@ -1,0 +1,1 @@
+"""Attacks on what a victim sees, one file an attack."""

@@ -1,0 +1,184 @@
+"""What an attacker may know and change, and the oracle that enforces it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from bench.contracts import Access, Features, Policy
+from bench.errors import UserError
+
+Norm = Literal["relative", "linf"]
+
+FLOORS = {"x": 0.5, "y": 0.2, "vx": 0.3, "vy": 0.2}
+"""Smallest deviation of the `relative` set at a budget of 0.1, in m and m/s: a sensor's own resolution."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThreatModel:
+    """The perturbation set, the access and the query budget of an attacker. Enforced, never trusted.
+
+    Args:
+        norm: `relative`: each measured value of a present row may be off by `budget` times its actual value, or by the
+            feature's floor (scaled with the budget) where that is larger (thesis 4.3.1). `linf`: by `budget` on the [-1, 1]
+            scale (thesis 4.4.3, read as a range; a stress test).
+        budget: size of the set, in [0, 2].
+        access: the most an attack may use; attacks that need more are refused.
+        queries: most policy evaluations an episode may spend in one step.
+
+    `presence` cannot be forged and absent rows cannot be filled. What leaves [-1, 1], the range of every sensor, is clipped.
+    """
+
+    norm: Norm = "relative"
+    budget: float = 0.1
+    access: Access = "gradients"
+    queries: int = 1000
+
+    def __post_init__(self) -> None:
+        if self.norm not in get_args(Norm):
+            raise ValueError(f"threat.norm must be one of {', '.join(get_args(Norm))}, got {self.norm!r}")
+        if not 0 <= self.budget <= 2:
+            raise ValueError(f"threat.budget must be between 0 and 2, got {self.budget}")
+        if self.access not in get_args(Access):
+            raise ValueError(f"threat.access must be one of {', '.join(get_args(Access))}, got {self.access!r}")
+        if self.queries < 0:
+            raise ValueError(f"threat.queries must be at least 0, got {self.queries}")
+
+    def allows(self, access: Access) -> bool:
+        """Whether an attack that needs `access` fits this threat model."""
+        return get_args(Access).index(access) <= get_args(Access).index(self.access)
+
+    def radius(self, observation: Tensor, features: Features, scale: float = 1.0) -> Tensor:
+        """[..., V, F] the largest deviation of each entry, on the normalised scale; 0 for presence and absent rows.
+
+        Args:
+            observation: the true observation [..., V, F].
+            features: names and ranges of the measured features.
+            scale: multiplies the budget (adversarial training ramps it).
+        """
+        measured = observation[..., 1:]
+        budget = self.budget * scale
+        if self.norm == "linf":
+            bound = torch.full_like(measured, budget)
+        else:
+            half_range = features.half_range().to(measured)
+            centre = (torch.tensor(features.low) + torch.tensor(features.high)).to(measured) / 2
+            floor = torch.tensor([FLOORS.get(name, 0.0) for name in features.names]).to(measured) * (budget / 0.1)
+            physical = measured * half_range + centre
+            bound = torch.maximum(budget * physical.abs(), floor) / half_range
+        bound = bound * (observation[..., :1] > 0)
+        return torch.cat((torch.zeros_like(observation[..., :1]), bound), -1)
+
+
+def project(perturbed: Tensor, observation: Tensor, radius: Tensor) -> Tensor:
+    """The nearest point of the perturbation set: within `radius` of `observation` and within the sensors' [-1, 1].
+
+    NaN counts as no perturbation.
+    """
+    offset = torch.nan_to_num(perturbed - observation, nan=0.0, posinf=2.0, neginf=-2.0)
+    within = observation + torch.maximum(torch.minimum(offset, radius), -radius)
+    return within.clamp(-1.0, 1.0)
+
+
+class QueryBudgetExceeded(UserError):
+    """An attack asked for more queries than its threat model allows."""
+
+
+class Oracle:
+    """The only door to the victim. It refuses what the access level forbids, counts every query, and stops at the budget.
+
+    A batch of queries has shape [..., B, V, F], B the running episodes (or those of `rows`); one evaluation of one episode's
+    observation is one query, a gradient is one query too.
+
+    Args:
+        policy: the victim.
+        threat: the threat model.
+        access: what the attack declared it needs; more than that is refused.
+        features: of the observation.
+        generator: the run's random generator, for attacks that draw.
+    """
+
+    def __init__(
+        self, policy: Policy, threat: ThreatModel, access: Access, features: Features, generator: torch.Generator
+    ) -> None:
+        if not threat.allows(access):
+            raise UserError(f"the attack needs access {access!r}, the threat model allows {threat.access!r} at most")
+        self._policy = policy
+        self._levels = get_args(Access).index(access)
+        self.threat = threat
+        self.features = features
+        self.generator = generator
+        self.action_type = policy.action_type
+        self.observation = torch.empty(0)
+        self.radius = torch.empty(0)
+        self.spent = torch.empty(0, dtype=torch.int64)
+
+    def begin_step(self, observation: Tensor, scale: float = 1.0) -> None:
+        """Open a step on the true observations [B, V, F]: the perturbation set follows them, the query counters start at 0."""
+        self.observation = observation
+        self.radius = self.threat.radius(observation, self.features, scale)
+        self.spent = torch.zeros(observation.shape[0], dtype=torch.int64)
+
+    @property
+    def remaining(self) -> Tensor:
+        """[B] queries each episode has left in this step."""
+        return self.threat.queries - self.spent
+
+    def project(self, perturbed: Tensor, rows: Tensor | None = None) -> Tensor:
+        """`perturbed` [..., B, V, F], or of the episodes `rows`, brought into the perturbation set. Costs no query."""
+        if rows is None:
+            return project(perturbed, self.observation, self.radius)
+        return project(perturbed, self.observation[rows], self.radius[rows])
+
+    def decide(self, observation: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The victim's actions; needs access `decisions`."""
+        self._spend(observation, rows, "decisions")
+        with torch.no_grad():
+            return self._policy.decide(observation)
+
+    def scores(self, observation: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The victim's Q-values [..., B, A] or its continuous action [..., B, 2]; needs access `scores`."""
+        self._spend(observation, rows, "scores")
+        with torch.no_grad():
+            return self._policy.scores(observation)
+
+    def gradient(
+        self, observation: Tensor, loss: Callable[[Tensor], Tensor], rows: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The loss [..., B] of the victim's scores and its gradient [..., B, V, F] in the observation; needs `gradients`."""
+        self._spend(observation, rows, "gradients")
+        leaf = observation.detach().requires_grad_(True)
+        with torch.enable_grad():
+            value = loss(self._policy.scores(leaf))
+            (gradient,) = torch.autograd.grad(value.sum(), leaf)
+        return value.detach(), gradient
+
+    def value(self, observation: Tensor, action: Tensor) -> Tensor:
+        """The victim's own critic Q(observation, action) [..., B], differentiable in the action; needs access `gradients`.
+
+        White-box knowledge of the weights, evaluated by the attacker, so it costs no query.
+        """
+        self._require("gradients")
+        return self._policy.value(observation, action)
+
+    def _require(self, access: Access) -> None:
+        if get_args(Access).index(access) > self._levels:
+            allowed = get_args(Access)[self._levels]
+            raise UserError(f"the attack asked for {access!r}, but declares that it needs {allowed!r} only")
+
+    def _spend(self, observation: Tensor, rows: Tensor | None, access: Access) -> None:
+        self._require(access)
+        each = observation.shape[:-3].numel()
+        if rows is None:
+            self.spent += each
+        else:
+            self.spent.index_add_(0, rows, torch.full_like(rows, each))
+        worst = int(self.spent.max()) if self.spent.numel() else 0
+        if worst > self.threat.queries:
+            raise QueryBudgetExceeded(
+                f"the attack asked for {worst} queries in a step, the threat model allows {self.threat.queries}"
+            )

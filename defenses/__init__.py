@@ -1,0 +1,1 @@
+"""Defences of a victim, one file a defence."""

@@ -1,0 +1,1 @@
+"""Worlds: the environments that victims drive in."""

@@ -1,0 +1,1 @@
+"""The driving world: highway-env, exactly, batched."""
