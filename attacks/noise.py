@@ -1,0 +1,56 @@
+"""Random noise: the control every attack has to beat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+
+import torch
+from torch import Tensor
+
+from bench.contracts import Access, Attack
+
+if TYPE_CHECKING:
+    from bench.threat import Oracle
+
+Distribution = Literal["uniform", "gaussian"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise(Attack):
+    """Random noise within the budget; asks the victim nothing.
+
+    Distance: whatever set the threat model defines; `scale` is a share of its radius, feature by feature.
+
+    Args:
+        distribution: `uniform` over the whole set, or `gaussian` with a standard deviation of `scale` times the radius,
+            cut off at the radius (default uniform).
+        scale: width of the noise as a share of the radius, in (0, 1] (default 1).
+
+    Shapes: observation [B, V, F] in, the same out.
+
+    Example:
+        >>> from attacks.noise import Noise
+        >>> Noise(distribution="gaussian", scale=0.5).scale
+        0.5
+    """
+
+    access: ClassVar[Access] = "oblivious"
+
+    distribution: Distribution = "uniform"
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.distribution not in get_args(Distribution):
+            raise ValueError(
+                f"noise.distribution must be one of {', '.join(get_args(Distribution))}, got {self.distribution!r}"
+            )
+        if not 0 < self.scale <= 1:
+            raise ValueError(f"noise.scale must be in (0, 1], got {self.scale}")
+
+    def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
+        if self.distribution == "uniform":
+            share = torch.rand(observation.shape, generator=oracle.generator) * 2 - 1
+        else:
+            share = torch.randn(observation.shape, generator=oracle.generator)
+        return oracle.project(observation + self.scale * share * oracle.radius)

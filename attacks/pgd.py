@@ -1,0 +1,129 @@
+"""Projected gradient descent: the white-box yardstick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, get_args
+
+import torch
+from torch import Tensor
+
+from attacks.objectives import Loss, Objective
+from bench.contracts import Access, Attack
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from bench.threat import Oracle
+
+
+@dataclass(frozen=True, kw_only=True)
+class PGD(Attack):
+    """Projected gradient descent (Madry et al. 2018, "Towards Deep Learning Models Resistant to Adversarial Attacks").
+
+    Sign steps on the victim's own gradient, projected after each; the best iterate of all restarts is shown. With `steps=1
+    step_size=1 random_start=false restarts=1` it is FGSM (Goodfellow et al. 2015). White box: access `gradients`.
+
+    Distance: L-inf in shares of the threat model's radius, feature by feature.
+
+    Args:
+        steps: gradient steps a restart, at least 1 (default 10).
+        step_size: length of a step as a share of the radius, in (0, 2] (default 0.25).
+        restarts: independent starts, at least 1, all in one batch (default 1).
+        random_start: begin at a random point of the set instead of the true observation (default true).
+        momentum: decay of the accumulated gradient (MI-FGSM, Dong et al. 2018), in [0, 1); 0 is plain PGD (default 0).
+        objective: what is minimised (default `expected`): `expected` the clean Q expected under the attacked policy (for a
+            continuous victim its critic's Q(x, mu(x'))); `margin` the lead of the clean action (minus the distance from it);
+            `target` the lead over the target action (the distance to it).
+        temperature: of `expected`, as a share of the spread of the clean Q-values, above 0 (default 0.2).
+        target_action: discrete target, at least 0 (default 3, FASTER).
+        target_acceleration: continuous target, in [-1, 1] (default 1).
+        target_steering: continuous target, in [-1, 1] (default 0.5).
+
+    Shapes: observation [B, V, F] in, the same out. Queries a step: 1 + restarts * (steps + 1); fewer restarts, then fewer
+    steps, where the threat model allows less.
+
+    Example:
+        >>> from attacks.pgd import PGD
+        >>> fgsm = PGD(steps=1, step_size=1.0, random_start=False)
+    """
+
+    access: ClassVar[Access] = "gradients"
+
+    steps: int = 10
+    step_size: float = 0.25
+    restarts: int = 1
+    random_start: bool = True
+    momentum: float = 0.0
+    objective: Objective = "expected"
+    temperature: float = 0.2
+    target_action: int = 3
+    target_acceleration: float = 1.0
+    target_steering: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise ValueError(f"pgd.steps must be at least 1, got {self.steps}")
+        if not 0 < self.step_size <= 2:
+            raise ValueError(f"pgd.step_size must be in (0, 2], got {self.step_size}")
+        if self.restarts < 1:
+            raise ValueError(f"pgd.restarts must be at least 1, got {self.restarts}")
+        if not 0 <= self.momentum < 1:
+            raise ValueError(f"pgd.momentum must be in [0, 1), got {self.momentum}")
+        if self.objective not in get_args(Objective):
+            raise ValueError(f"pgd.objective must be one of {', '.join(get_args(Objective))}, got {self.objective!r}")
+        if not self.temperature > 0:
+            raise ValueError(f"pgd.temperature must be above 0, got {self.temperature}")
+        if self.target_action < 0:
+            raise ValueError(f"pgd.target_action must be at least 0, got {self.target_action}")
+        for name in ("target_acceleration", "target_steering"):
+            if not -1 <= getattr(self, name) <= 1:
+                raise ValueError(f"pgd.{name} must be in [-1, 1], got {getattr(self, name)}")
+
+    def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
+        remaining = int(oracle.remaining.min())
+        restarts = min(self.restarts, (remaining - 1) // 2)
+        if restarts < 1:
+            return observation
+        steps = min(self.steps, (remaining - 1) // restarts - 1)
+        loss = self._loss(observation, oracle)
+        x = observation.expand(restarts, *observation.shape)
+        if self.random_start:
+            share = torch.rand(x.shape, generator=oracle.generator) * 2 - 1
+            x = oracle.project(x + share * oracle.radius)
+        accumulated = torch.zeros_like(x)
+        best, lowest = x, torch.full(x.shape[:2], torch.inf)
+        for step in range(steps):
+            value, gradient = oracle.gradient(x, loss)
+            if step > 0:
+                best, lowest = _better(best, lowest, x, value)
+            accumulated = self.momentum * accumulated + _unit(gradient)
+            x = oracle.project(x - self.step_size * oracle.radius * accumulated.sign())
+        best, lowest = _better(best, lowest, x, loss(oracle.scores(x)))
+        return best[lowest.argmin(0), torch.arange(observation.shape[0])]
+
+    def _loss(self, observation: Tensor, oracle: Oracle) -> Callable[[Tensor], Tensor]:
+        """The loss [..., B] of the victim's scores, to be minimised."""
+        continuous = oracle.action_type == "continuous"
+        clean = oracle.scores(observation)
+        if continuous and self.objective == "expected":
+            return lambda action: oracle.value(observation.expand(*action.shape[:-1], *observation.shape[1:]), action)
+        return Loss(
+            objective=self.objective,
+            action_type=oracle.action_type,
+            clean=clean,
+            temperature=self.temperature,
+            target=(self.target_acceleration, self.target_steering) if continuous else self.target_action,
+        )
+
+
+def _unit(gradient: Tensor) -> Tensor:
+    """`gradient` [R, B, V, F] scaled to a mean magnitude of 1 an episode, so that momentum weighs directions, not lengths."""
+    scale = gradient.abs().mean((-2, -1), keepdim=True)
+    return gradient / scale.clamp(min=torch.finfo(gradient.dtype).tiny)
+
+
+def _better(best: Tensor, lowest: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    """Keep the iterate with the lower loss, restart by restart and episode by episode."""
+    improved = value < lowest
+    return torch.where(improved[..., None, None], x, best), torch.where(improved, value, lowest)
