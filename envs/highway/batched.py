@@ -1,0 +1,31 @@
+"""The default environment: our own compiled engine, equal to highway-env and several hundred times faster."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.highway.config import HighwayConfig
+from envs.highway.engine import HighwayEngine
+from envs.highway.environment import HighwayEnv
+
+
+class BatchedHighway(HighwayEnv):
+    """`HighwayEnv` on `HighwayEngine`.
+
+    >>> env = BatchedHighway(HighwayConfig(cells=(Cell(lanes=3, density=1.0),) * 64))
+    >>> env.rollout(450, break_when_all_done=True)
+    """
+
+    def __init__(self, config: HighwayConfig) -> None:
+        super().__init__(config)
+        self.engine = HighwayEngine(config)
+
+    def _start(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
+        self.engine.reset(chosen, seeds)
+
+    def _drive(self, action: NDArray[np.int64] | NDArray[np.float32]) -> None:
+        self.engine.step(action)
+
+    def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+        return self.engine.observation, self.engine.numbers, self.engine.flags

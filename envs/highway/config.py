@@ -1,0 +1,157 @@
+"""What the driving world can be told, checked in one place. Both environments read this and nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from bench.contracts import ActionType, Driver, Features
+from bench.scenario import Cell
+
+Preset = Literal["standard", "thesis"]
+
+ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
+"""Discrete actions by number, as in highway-env's DiscreteMetaAction (envs/common/action.py)."""
+
+UNITS = ("m", "m", "m/s", "m/s")
+STANDARD_FEATURES = Features(
+    names=("x", "y", "vx", "vy"), low=(-100.0, -20.0, -40.0, -20.0), high=(100.0, 20.0, 40.0, 20.0), units=UNITS
+)
+THESIS_FEATURES = Features(
+    names=("x", "y", "vx", "vy"), low=(-100.0, -100.0, 0.0, 0.0), high=(100.0, 100.0, 20.0, 20.0), units=UNITS
+)
+STANDARD_TARGET_SPEEDS = (10.0, 15.0, 20.0, 25.0, 30.0)
+THESIS_TARGET_SPEEDS = (20.0, 25.0, 30.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HighwayConfig:
+    """highway-env's `highway-v0` on a straight road, as this project uses it.
+
+    Args:
+        cells: lanes, density and weather of each episode of the batch (at least one).
+        vehicles: traffic vehicles beside the ego, at least 1.
+        ego_spacing: highway-env's spacing factor in front of the ego at the start.
+        simulation_frequency: physics frames a second.
+        policy_frequency: decisions a second; must divide `simulation_frequency`.
+        max_steps: decisions until an episode is truncated.
+        action_type: `discrete` lane-changing actions (`ACTIONS`), or `continuous` [acceleration, steering] in [-1, 1],
+            which stand for -5 to 5 m/s2 and -45 to 45 degrees.
+        driver: `agent` obeys the actions; `idm` puts highway-env's IDMVehicle in the ego's place and ignores them.
+        action_repeat: decisions an action is held: lane changes are sent once and then IDLE, the rest is repeated.
+        target_speeds: increasing speeds in m/s among which FASTER and SLOWER choose (highway-env takes them as uniform).
+        features: observed features and the fixed ranges that map to [-1, 1].
+        observed_vehicles: rows of an observation, the ego's own included; at least 2.
+        collision_reward, right_lane_reward, high_speed_reward: weights of highway-env's reward.
+        reward_speed_range: speeds in m/s at which the speed reward begins and is full.
+        normalize_reward: map the reward to [0, 1] as highway-env does.
+        offroad_terminal: whether leaving the road ends the episode.
+
+    Raises:
+        ValueError: with one line that says what is wrong and what is allowed.
+    """
+
+    cells: tuple[Cell, ...] = (Cell(lanes=3, density=1.0),)
+    vehicles: int = 20
+    ego_spacing: float = 2.0
+    simulation_frequency: int = 15
+    policy_frequency: int = 15
+    max_steps: int = 450
+    action_type: ActionType = "discrete"
+    driver: Driver = "agent"
+    action_repeat: int = 1
+    target_speeds: tuple[float, ...] = STANDARD_TARGET_SPEEDS
+    features: Features = STANDARD_FEATURES
+    observed_vehicles: int = 10
+    collision_reward: float = -1.0
+    right_lane_reward: float = 0.1
+    high_speed_reward: float = 0.4
+    reward_speed_range: tuple[float, float] = (20.0, 30.0)
+    normalize_reward: bool = True
+    offroad_terminal: bool = True
+
+    def __post_init__(self) -> None:
+        _check_counts(self)
+        _check_frequencies(self)
+        if self.action_type not in get_args(ActionType):
+            raise ValueError(f"action_type must be one of {', '.join(get_args(ActionType))}, got {self.action_type!r}")
+        if self.driver not in get_args(Driver):
+            raise ValueError(f"driver must be one of {', '.join(get_args(Driver))}, got {self.driver!r}")
+        check_target_speeds(self.target_speeds)
+        _check_features(self.features)
+        _check_reward(self)
+
+    @property
+    def batch(self) -> int:
+        """Number of episodes."""
+        return len(self.cells)
+
+    @property
+    def substeps(self) -> int:
+        """Physics frames a decision."""
+        return self.simulation_frequency // self.policy_frequency
+
+    @classmethod
+    def thesis(cls, **changes: object) -> HighwayConfig:
+        """The thesis' observation (x, y in +-100 m, velocities in 0 to 20 m/s, 5 rows) and target speeds (20, 25, 30)."""
+        defaults: dict[str, object] = {
+            "features": THESIS_FEATURES,
+            "observed_vehicles": 5,
+            "target_speeds": THESIS_TARGET_SPEEDS,
+        }
+        return cls(**(defaults | changes))  # type: ignore[arg-type]
+
+
+def check_target_speeds(speeds: Sequence[float]) -> None:
+    """Raise ValueError unless the table has at least two increasing speeds within what a vehicle can drive."""
+    increasing = all(a < b for a, b in zip(speeds, speeds[1:], strict=False))
+    if len(speeds) < 2 or not increasing or not (speeds[0] >= 0 and speeds[-1] <= 40):
+        listed = ", ".join(f"{speed:g}" for speed in speeds)
+        raise ValueError(f"target_speeds must be at least two increasing speeds from 0 to 40 m/s, got ({listed})")
+
+
+def _check_counts(config: HighwayConfig) -> None:
+    if not config.cells:
+        raise ValueError("cells must name at least one cell")
+    if not 1 <= config.vehicles <= 1000:
+        raise ValueError(f"vehicles must be between 1 and 1000, got {config.vehicles}")
+    if not 0 < config.ego_spacing < math.inf:
+        raise ValueError(f"ego_spacing must be positive, got {config.ego_spacing}")
+    if not 2 <= config.observed_vehicles <= 1001:
+        raise ValueError(
+            f"observed_vehicles must be between 2 and 1001 (it counts the ego), got {config.observed_vehicles}"
+        )
+    if config.max_steps < 1:
+        raise ValueError(f"max_steps must be at least 1, got {config.max_steps}")
+    if config.action_repeat < 1:
+        raise ValueError(f"action_repeat must be at least 1, got {config.action_repeat}")
+
+
+def _check_frequencies(config: HighwayConfig) -> None:
+    simulation, policy = config.simulation_frequency, config.policy_frequency
+    for name, value in (("simulation_frequency", simulation), ("policy_frequency", policy)):
+        if value != int(value) or value < 1:
+            raise ValueError(f"{name} must be a whole number of at least 1 Hz, got {value}")
+    if simulation % policy:
+        raise ValueError(f"policy_frequency must divide simulation_frequency ({simulation}), got {policy}")
+
+
+def _check_features(features: Features) -> None:
+    if features.names != STANDARD_FEATURES.names:
+        raise ValueError(f"features must be x, y, vx, vy, got {', '.join(features.names)}")
+    for name, low, high in zip(features.names, features.low, features.high, strict=True):
+        if not -math.inf < low < high < math.inf:
+            raise ValueError(f"the range of {name} must be finite and increasing, got [{low:g}, {high:g}]")
+
+
+def _check_reward(config: HighwayConfig) -> None:
+    low, high = config.reward_speed_range
+    if not -math.inf < low < high < math.inf:
+        raise ValueError(f"reward_speed_range must be finite and increasing, got [{low:g}, {high:g}]")
+    weights = (config.collision_reward, config.right_lane_reward, config.high_speed_reward)
+    if not all(math.isfinite(weight) for weight in weights):
+        raise ValueError(f"reward weights must be finite, got {weights}")
+    if config.normalize_reward and weights[0] == weights[1] + weights[2]:
+        raise ValueError("normalize_reward needs a collision_reward different from the sum of the other two weights")

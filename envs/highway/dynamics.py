@@ -1,0 +1,153 @@
+"""How a vehicle moves and where it is: highway-env's road/lane.py, vehicle/kinematics.py and vehicle/controller.py.
+
+The order of every floating-point operation is highway-env's own: the results are equal to the last bit. Shortcuts are
+taken only where they provably give the same bits (a vehicle that drives exactly along the road needs no trigonometry).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from envs.highway.state import EgoKind
+
+DISCRETE, CONTINUOUS, IDM = int(EgoKind.DISCRETE), int(EgoKind.CONTINUOUS), int(EgoKind.IDM)
+
+LANE_WIDTH = 4.0
+ROAD_LENGTH = 10_000.0
+SPEED_LIMIT = 30.0
+VEHICLE_LENGTH = 5.0
+VEHICLE_WIDTH = 2.0
+MAX_SPEED = 40.0
+
+GAIN_SPEED = 1 / 0.6
+GAIN_HEADING = 1 / 0.2
+GAIN_LATERAL = 1 / 0.6
+MAX_STEERING = np.pi / 3
+MAX_LANE_CHANGE_HEADING = np.pi / 4
+TWO_PI = 2 * np.pi
+
+
+@njit
+def clip(value, low, high):  # type: ignore[no-untyped-def]
+    """`value` limited to [low, high]."""
+    return min(max(value, low), high)
+
+
+@njit
+def linear_map(value, from_low, from_high, to_low, to_high):  # type: ignore[no-untyped-def]
+    """highway_env.utils.lmap: `value` of [from_low, from_high] on [to_low, to_high], not clipped."""
+    return to_low + (value - from_low) * (to_high - to_low) / (from_high - from_low)
+
+
+@njit
+def not_zero(value):  # type: ignore[no-untyped-def]
+    """highway_env.utils.not_zero: `value`, but at least 0.01 away from 0."""
+    if abs(value) > 1e-2:
+        return value
+    return 1e-2 if value >= 0 else -1e-2
+
+
+@njit
+def wrap_to_pi(angle):  # type: ignore[no-untyped-def]
+    """highway_env.utils.wrap_to_pi: `angle` in [-pi, pi)."""
+    shifted = angle + np.pi
+    if not 0.0 <= shifted < TWO_PI:
+        shifted = shifted % TWO_PI
+    return shifted - np.pi
+
+
+@njit
+def closest_lane(x, y, heading, lanes):  # type: ignore[no-untyped-def]
+    """RoadNetwork.get_closest_lane_index: only the two lanes around `y` can be closest; ties go to the lower one."""
+    angle = abs(wrap_to_pi(heading))
+    before, beyond = max(x - ROAD_LENGTH, 0.0), max(0.0 - x, 0.0)
+    below = int(clip(math.floor(y / LANE_WIDTH), 0.0, lanes - 1.0))
+    above = int(clip(math.floor(y / LANE_WIDTH) + 1.0, 0.0, lanes - 1.0))
+    distance_below = abs(y - LANE_WIDTH * below) + before + beyond + angle
+    distance_above = abs(y - LANE_WIDTH * above) + before + beyond + angle
+    return above if distance_above < distance_below else below
+
+
+@njit
+def is_on_lane(vehicle, lane, margin):  # type: ignore[no-untyped-def]
+    """AbstractLane.on_lane: whether the vehicle's centre is on the lane, widened by `margin` m on both sides."""
+    near = abs(vehicle.y - LANE_WIDTH * lane) <= LANE_WIDTH / 2 + margin
+    return near and -VEHICLE_LENGTH <= vehicle.x < ROAD_LENGTH + VEHICLE_LENGTH
+
+
+@njit
+def is_reachable(vehicle, lane):  # type: ignore[no-untyped-def]
+    """AbstractLane.is_reachable_from: whether a lane change to `lane` may begin here."""
+    near = abs(vehicle.y - LANE_WIDTH * lane) <= 2 * LANE_WIDTH
+    return near and 0 <= vehicle.x < ROAD_LENGTH + VEHICLE_LENGTH
+
+
+@njit
+def update_direction(vehicle):  # type: ignore[no-untyped-def]
+    """Keep the cosine and sine of the heading beside it."""
+    if vehicle.heading == 0.0:
+        vehicle.cos_heading = 1.0
+        vehicle.sin_heading = 0.0
+    else:
+        vehicle.cos_heading = math.cos(vehicle.heading)
+        vehicle.sin_heading = math.sin(vehicle.heading)
+
+
+@njit
+def steering_control(vehicle, lane):  # type: ignore[no-untyped-def]
+    """ControlledVehicle.steering_control: the steering angle in rad that leads to the centre of `lane`."""
+    lateral = vehicle.y - LANE_WIDTH * lane
+    if lateral == 0.0 and vehicle.heading == 0.0:
+        return 0.0
+    speed = not_zero(vehicle.speed)
+    heading_command = math.asin(clip(-GAIN_LATERAL * lateral / speed, -1.0, 1.0))
+    heading_reference = clip(heading_command, -MAX_LANE_CHANGE_HEADING, MAX_LANE_CHANGE_HEADING)
+    heading_rate = GAIN_HEADING * wrap_to_pi(heading_reference - vehicle.heading)
+    slip_angle = math.asin(clip(VEHICLE_LENGTH / 2 / speed * heading_rate, -1.0, 1.0))
+    return clip(math.atan(2 * math.tan(slip_angle)), -MAX_STEERING, MAX_STEERING)
+
+
+@njit
+def speed_control(vehicle):  # type: ignore[no-untyped-def]
+    """ControlledVehicle.speed_control: the acceleration in m/s2 towards the target speed."""
+    return GAIN_SPEED * (vehicle.target_speed - vehicle.speed)
+
+
+@njit
+def clip_actions(vehicle):  # type: ignore[no-untyped-def]
+    """Vehicle.clip_actions: a wreck brakes to a stop, and no one drives faster than 40 m/s."""
+    if vehicle.crashed:
+        vehicle.steering = 0.0
+        vehicle.acceleration = -1.0 * vehicle.speed
+    if vehicle.speed > MAX_SPEED:
+        vehicle.acceleration = min(vehicle.acceleration, 1.0 * (MAX_SPEED - vehicle.speed))
+    elif vehicle.speed < -MAX_SPEED:
+        vehicle.acceleration = max(vehicle.acceleration, 1.0 * (-MAX_SPEED - vehicle.speed))
+
+
+@njit
+def move(vehicle, lanes, dt):  # type: ignore[no-untyped-def]
+    """Vehicle.step and IDMVehicle.step: one frame of the kinematic bicycle model, then the lane the vehicle is in."""
+    vehicle.timer += dt
+    clip_actions(vehicle)
+    speed = vehicle.speed
+    straight = vehicle.steering == 0.0 and vehicle.heading == 0.0
+    if straight:
+        vehicle.x += speed * dt
+    else:
+        slip = math.atan(0.5 * math.tan(vehicle.steering))
+        vehicle.x += speed * math.cos(vehicle.heading + slip) * dt
+        vehicle.y += speed * math.sin(vehicle.heading + slip) * dt
+        vehicle.heading += speed * math.sin(slip) / (VEHICLE_LENGTH / 2) * dt
+    if vehicle.impact_pair >= 0:
+        vehicle.x += vehicle.impact_x
+        vehicle.y += vehicle.impact_y
+        vehicle.crashed = True
+        vehicle.impact_pair = -1
+    vehicle.speed += vehicle.acceleration * dt
+    if not straight:
+        update_direction(vehicle)
+    vehicle.lane = closest_lane(vehicle.x, vehicle.y, vehicle.heading, lanes)

@@ -1,0 +1,120 @@
+"""What the ego does with an action, and what it earns: highway-env's MDPVehicle and HighwayEnv._reward."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from envs.highway.dynamics import (
+    DISCRETE,
+    IDM,
+    VEHICLE_LENGTH,
+    clip,
+    is_on_lane,
+    is_reachable,
+    linear_map,
+)
+from envs.highway.traffic import front_vehicle
+
+LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
+PROGRESS_LANE, PROGRESS_SPEED = 0.1, 0.4
+"""Eq. 4.1's weights. `progress` keeps them even where the reward is told other ones: it is a measure, not an incentive."""
+
+
+@njit
+def nearest_target_speed(speed, target_speeds):  # type: ignore[no-untyped-def]
+    """MDPVehicle.speed_to_index: the entry of the (uniform) table closest to a speed."""
+    last = target_speeds.size - 1
+    share = (speed - target_speeds[0]) / (target_speeds[last] - target_speeds[0])
+    return int(clip(np.rint(share * last), 0.0, float(last)))
+
+
+@njit
+def apply_meta_action(ego, action, lanes, target_speeds):  # type: ignore[no-untyped-def]
+    """MDPVehicle.act: change the target speed or the target lane."""
+    if action == FASTER or action == SLOWER:  # noqa: PLR1714
+        change = 1 if action == FASTER else -1
+        index = nearest_target_speed(ego.speed, target_speeds) + change
+        ego.target_speed = target_speeds[min(max(index, 0), target_speeds.size - 1)]
+    elif action == LANE_LEFT or action == LANE_RIGHT:  # noqa: PLR1714
+        change = 1 if action == LANE_RIGHT else -1
+        lane = min(max(ego.target_lane + change, 0), lanes - 1)
+        if is_reachable(ego, lane):
+            ego.target_lane = lane
+
+
+@njit
+def apply_action(ego, action, control, first, lanes, parameters):  # type: ignore[no-untyped-def]
+    """Hand the decision to the ego; of a decision that is held, a lane change counts only the `first` time.
+
+    Args:
+        action: number of a discrete action.
+        control: [2] acceleration in m/s2 and steering in rad of a continuous one.
+    """
+    if parameters.ego == IDM:
+        return
+    if parameters.ego == DISCRETE:
+        if first or action == FASTER or action == SLOWER:  # noqa: PLR1714
+            apply_meta_action(ego, action, lanes, parameters.target_speeds)
+    else:
+        ego.acceleration = control[0]
+        ego.steering = control[1]
+
+
+@njit
+def speed_share(ego, parameters):  # type: ignore[no-untyped-def]
+    """Forward speed within the rewarded range, in [0, 1]."""
+    forward = ego.speed * ego.cos_heading
+    low, high = parameters.reward_speed_low, parameters.reward_speed_high
+    return clip(linear_map(forward, low, high, 0.0, 1.0), 0.0, 1.0)
+
+
+@njit
+def lane_share(ego, lanes, parameters):  # type: ignore[no-untyped-def]
+    """How far right, in [0, 1]: the target lane of a vehicle that has one, the current lane of a continuous ego."""
+    lane = ego.target_lane if parameters.ego in (DISCRETE, IDM) else ego.lane
+    return lane / max(lanes - 1, 1)
+
+
+@njit
+def reward(ego, on_road, lane, speed, parameters):  # type: ignore[no-untyped-def]
+    """HighwayEnv._reward from the shares `lane` and `speed`."""
+    value = parameters.collision_reward * (1.0 if ego.crashed else 0.0)
+    value += parameters.right_lane_reward * lane
+    value += parameters.high_speed_reward * speed
+    if parameters.normalize_reward:
+        best = parameters.high_speed_reward + parameters.right_lane_reward
+        value = linear_map(value, parameters.collision_reward, best, 0.0, 1.0)
+    return value if on_road else value * 0.0
+
+
+@njit
+def time_to_collision(vehicles, order):  # type: ignore[no-untyped-def]
+    """Seconds until the ego's bumper meets that of the car ahead in its lane at the present speeds; inf if it never does."""
+    place = 0
+    while order[place] != 0:
+        place += 1
+    ego = vehicles[0]
+    leader = front_vehicle(vehicles, order, place, ego.lane)
+    if leader < 0:
+        return np.inf
+    other = vehicles[leader]
+    closing = ego.speed * ego.cos_heading - other.speed * other.cos_heading
+    if closing <= 0:
+        return np.inf
+    return max(other.x - ego.x - VEHICLE_LENGTH, 0.0) / closing
+
+
+@njit
+def score(vehicles, episode, parameters):  # type: ignore[no-untyped-def]
+    """Write what one decision brought into the episode's record; reward and progress are added up."""
+    ego = vehicles[0]
+    on_road = is_on_lane(ego, ego.lane, 0.0)
+    lane, speed = lane_share(ego, episode.lanes, parameters), speed_share(ego, parameters)
+    episode.reward += reward(ego, on_road, lane, speed, parameters)
+    episode.crashed = ego.crashed
+    episode.offroad = not on_road
+    if on_road and not ego.crashed:
+        episode.progress += (PROGRESS_LANE * lane + PROGRESS_SPEED * speed) / (PROGRESS_LANE + PROGRESS_SPEED)
+    episode.terminated = ego.crashed or (parameters.offroad_terminal and not on_road)
+    episode.truncated = episode.steps >= parameters.max_steps

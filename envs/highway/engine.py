@@ -1,0 +1,221 @@
+"""The batched engine: highway-env's `highway-v0` for B episodes at once, step by step equal to it.
+
+Episodes share nothing. A finished episode is left alone until it is started again, and costs nothing.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from bench.scenario import WEATHERS
+from envs.highway.collision import find_collisions
+from envs.highway.compiled import entry_point
+from envs.highway.config import ACTIONS, HighwayConfig
+from envs.highway.dynamics import move
+from envs.highway.ego import apply_action, score, time_to_collision
+from envs.highway.observation import observe
+from envs.highway.sensor import noise_sigma, sensor_range_m
+from envs.highway.spawn import draw_words, lane_spacing, spawn_batch
+from envs.highway.state import EPISODE, VEHICLE, EgoKind, parameters
+from envs.highway.traffic import act, sort_by_position
+
+
+class Number(IntEnum):
+    """Rows of `HighwayEngine.step`'s float32 output."""
+
+    REWARD = 0
+    PROGRESS = 1
+    SPEED = 2
+    X = 3
+    TTC = 4
+
+
+class Flag(IntEnum):
+    """Rows of `HighwayEngine.step`'s boolean output."""
+
+    DONE = 0
+    TERMINATED = 1
+    TRUNCATED = 2
+    CRASHED = 3
+    OFFROAD = 4
+
+
+REWARD, PROGRESS, SPEED, X, TTC = (int(number) for number in Number)
+DONE, TERMINATED, TRUNCATED, CRASHED, OFFROAD = (int(flag) for flag in Flag)
+
+
+@njit
+def advance(vehicles, order, places, corners, lanes, parameters):  # type: ignore[no-untyped-def]
+    """AbstractEnv._simulate: the physics frames of one decision."""
+    for _ in range(parameters.substeps):
+        act(vehicles, order, places, lanes, parameters.ego)
+        for number in range(vehicles.size):
+            move(vehicles[number], lanes, parameters.dt)
+        sort_by_position(vehicles, order)
+        find_collisions(vehicles, order, parameters.dt, corners)
+
+
+@njit
+def drive(vehicles, order, episode, action, control, parameters, places, corners):  # type: ignore[no-untyped-def]
+    """One action of one episode: up to `action_repeat` decisions, fewer if the episode ends."""
+    episode.reward = 0.0
+    episode.progress = 0.0
+    for held in range(parameters.action_repeat):
+        apply_action(vehicles[0], action, control, held == 0, episode.lanes, parameters)
+        advance(vehicles, order, places, corners, episode.lanes, parameters)
+        episode.steps += 1
+        score(vehicles, episode, parameters)
+        if episode.terminated or episode.truncated:
+            break
+    episode.ttc = time_to_collision(vehicles, order)
+
+
+@njit
+def report(ego, episode, numbers, flags, number):  # type: ignore[no-untyped-def]
+    """Copy an episode's record into column `number` of the outputs."""
+    numbers[REWARD, number] = episode.reward
+    numbers[PROGRESS, number] = episode.progress
+    numbers[SPEED, number] = ego.speed
+    numbers[X, number] = ego.x
+    numbers[TTC, number] = episode.ttc
+    flags[DONE, number] = episode.terminated or episode.truncated
+    flags[TERMINATED, number] = episode.terminated
+    flags[TRUNCATED, number] = episode.truncated
+    flags[CRASHED, number] = episode.crashed
+    flags[OFFROAD, number] = episode.offroad
+
+
+@entry_point
+def step_batch(vehicles, order, episodes, actions, controls, parameters, observation, numbers, flags):  # type: ignore[no-untyped-def]
+    """One action of every unfinished episode. See `HighwayEngine.step`."""
+    places = np.empty(vehicles.shape[1], np.int64)
+    corners = np.empty((2, 5, 2))
+    rows = np.empty(observation.shape[1] - 1, np.int64)
+    measured = np.empty(4)
+    for number in range(episodes.size):
+        episode, cars, sequence = episodes[number], vehicles[number], order[number]
+        if episode.terminated or episode.truncated:
+            numbers[REWARD, number] = 0.0
+            numbers[PROGRESS, number] = 0.0
+            continue
+        drive(cars, sequence, episode, actions[number], controls[number], parameters, places, corners)
+        observe(cars, sequence, episode, parameters.low, parameters.high, rows, measured, observation[number])
+        report(cars[0], episode, numbers, flags, number)
+
+
+@entry_point
+def observe_batch(vehicles, order, episodes, chosen, parameters, observation, numbers, flags):  # type: ignore[no-untyped-def]
+    """The observation and record of the episodes `chosen` [R] as they are, without a step."""
+    rows = np.empty(observation.shape[1] - 1, np.int64)
+    measured = np.empty(4)
+    for number in chosen:
+        episode, cars, sequence = episodes[number], vehicles[number], order[number]
+        episode.ttc = time_to_collision(cars, sequence)
+        observe(cars, sequence, episode, parameters.low, parameters.high, rows, measured, observation[number])
+        report(cars[0], episode, numbers, flags, number)
+
+
+class HighwayEngine:
+    """B episodes of `config`, in numpy. The outputs belong to the engine and are overwritten by the next call.
+
+    Attributes:
+        observation: float32 [B, V, 5].
+        numbers: float32 [5, B]; rows as in `Number`.
+        flags: bool [5, B]; rows as in `Flag`.
+        vehicles: [B, vehicles + 1] records `VEHICLE`, in highway-env's order.
+        episodes: [B] records `EPISODE`.
+    """
+
+    def __init__(self, config: HighwayConfig) -> None:
+        batch, size = config.batch, config.vehicles + 1
+        self.config = config
+        self.parameters = parameters(config)
+        self.vehicles = np.zeros((batch, size), dtype=VEHICLE)
+        self.order = np.tile(np.arange(size, dtype=np.int64), (batch, 1))
+        self.episodes = np.zeros(batch, dtype=EPISODE)
+        self.observation = np.zeros((batch, config.observed_vehicles, 5), dtype=np.float32)
+        self.numbers = np.zeros((len(Number), batch), dtype=np.float32)
+        self.flags = np.zeros((len(Flag), batch), dtype=np.bool_)
+        weathers = [WEATHERS[cell.weather] for cell in config.cells]
+        self.episodes["lanes"] = [cell.lanes for cell in config.cells]
+        self.episodes["sensor_range"] = [sensor_range_m(weather) for weather in weathers]
+        self.episodes["noise_sigma"] = [noise_sigma(weather) for weather in weathers]
+        # Nothing drives before it was started.
+        self.episodes["truncated"] = True
+        self._traffic_spacing = np.array([1 / cell.density for cell in config.cells])
+        self._lane_factor = lane_spacing(self.episodes["lanes"])
+        self._no_actions = np.ones(batch, dtype=np.int64)
+        self._no_controls = np.zeros((batch, 2))
+
+    def reset(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
+        """Start the episodes `chosen` [R] (row numbers) from the scenario seeds [R].
+
+        Raises:
+            ValueError: if a seed is negative.
+        """
+        if (seeds < 0).any():
+            raise ValueError(f"scenario seeds must be at least 0, got {seeds.min()}")
+        for name in ("steps", "reward", "progress", "crashed", "offroad", "terminated", "truncated"):
+            self.episodes[name][chosen] = 0
+        self.episodes["seed"][chosen] = seeds
+        spawn_batch(
+            self.vehicles,
+            self.order,
+            self.episodes,
+            chosen,
+            draw_words(seeds, self.config.vehicles),
+            float(self.config.ego_spacing),
+            self._traffic_spacing[chosen],
+            self._lane_factor[chosen],
+            self.parameters,
+        )
+        observe_batch(
+            self.vehicles,
+            self.order,
+            self.episodes,
+            chosen,
+            self.parameters,
+            self.observation,
+            self.numbers,
+            self.flags,
+        )
+
+    def step(self, action: NDArray[np.int64] | NDArray[np.float32]) -> None:
+        """Carry out one action an episode; finished episodes stay as they are and earn 0.
+
+        Args:
+            action: int64 [B] numbers of `ACTIONS`, or float32 [B, 2] acceleration and steering in [-1, 1] (clipped).
+
+        Raises:
+            ValueError: if a discrete action has no such number.
+        """
+        actions, controls = self._no_actions, self._no_controls
+        if self.parameters.ego == EgoKind.DISCRETE:
+            actions = np.asarray(action, dtype=np.int64)
+            if actions.min() < 0 or actions.max() >= len(ACTIONS):
+                raise ValueError(f"actions must be between 0 and {len(ACTIONS) - 1}, got {actions.tolist()}")
+        elif self.parameters.ego == EgoKind.CONTINUOUS:
+            controls = physical_controls(np.asarray(action))
+        step_batch(
+            self.vehicles,
+            self.order,
+            self.episodes,
+            actions,
+            controls,
+            self.parameters,
+            self.observation,
+            self.numbers,
+            self.flags,
+        )
+
+
+def physical_controls(action: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[B, 2] m/s2 and rad: ContinuousAction.get_action, in the action's own precision, as highway-env computes it."""
+    clipped = np.clip(action, -1, 1)
+    acceleration = -5 + (clipped[:, 0] + 1) * (5.0 - -5) / 2
+    steering = -np.pi / 4 + (clipped[:, 1] + 1) * (np.pi / 4 - -np.pi / 4) / 2
+    return np.stack([acceleration, steering], axis=1).astype(np.float64)

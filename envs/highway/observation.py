@@ -1,0 +1,86 @@
+"""What the ego sees: highway-env's KinematicObservation (envs/common/observation.py), through the weather's sensor."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from envs.highway.dynamics import VEHICLE_LENGTH, clip, linear_map
+from envs.highway.sensor import FEATURES, add_noise
+
+
+@njit
+def is_seen(ego, other, sensor_range):  # type: ignore[no-untyped-def]
+    """Road.close_objects_to: within the sensor's range and not more than two lengths behind."""
+    x, y = other.x - ego.x, other.y - ego.y
+    return -2 * VEHICLE_LENGTH < x and math.sqrt(x * x + y * y) < sensor_range
+
+
+@njit
+def nearest_vehicles(vehicles, order, sensor_range, rows):  # type: ignore[no-untyped-def]
+    """Fill `rows` [V - 1] with the vehicles seen, nearest along the road first (ties: by number); returns how many."""
+    ego = vehicles[0]
+    found = 0
+    for place in range(order.size):
+        number = order[place]
+        distance = vehicles[number].x - ego.x
+        if distance >= sensor_range:
+            break
+        if number == 0 or not is_seen(ego, vehicles[number], sensor_range):
+            continue
+        distance = abs(distance)
+        slot = found
+        while slot > 0:
+            before = rows[slot - 1]
+            gap = abs(vehicles[before].x - ego.x)
+            if gap < distance or (gap == distance and before < number):
+                break
+            if slot < rows.size:
+                rows[slot] = before
+            slot -= 1
+        if slot < rows.size:
+            rows[slot] = number
+            found = min(found + 1, rows.size)
+    return found
+
+
+@njit
+def measure(ego, other, relative, measured):  # type: ignore[no-untyped-def]
+    """Vehicle.to_dict: x, y, vx, vy of `other` into `measured` [4], less the ego's own if `relative`."""
+    measured[0] = other.x
+    measured[1] = other.y
+    measured[2] = other.speed * other.cos_heading
+    measured[3] = other.speed * other.sin_heading
+    if relative:
+        measured[0] -= ego.x
+        measured[1] -= ego.y
+        measured[2] -= ego.speed * ego.cos_heading
+        measured[3] -= ego.speed * ego.sin_heading
+
+
+@njit
+def write_row(measured, low, high, row):  # type: ignore[no-untyped-def]
+    """KinematicObservation.normalize_obs: one row [1 + 4], presence first, mapped to [-1, 1] and clipped."""
+    row[0] = 1.0
+    for feature in range(FEATURES):
+        scaled = linear_map(measured[feature], low[feature], high[feature], -1.0, 1.0)
+        row[1 + feature] = clip(scaled, -1.0, 1.0)
+
+
+@njit
+def observe(vehicles, order, episode, low, high, rows, measured, observation):  # type: ignore[no-untyped-def]
+    """Fill `observation` [V, 5]: the ego absolute, then the others relative to it, then empty rows.
+
+    `rows` [V - 1] and `measured` [4] are scratch.
+    """
+    ego = vehicles[0]
+    observation[:] = 0.0
+    measure(ego, ego, False, measured)
+    write_row(measured, low, high, observation[0])
+    found = nearest_vehicles(vehicles, order, episode.sensor_range, rows)
+    for row in range(found):
+        number = rows[row]
+        measure(ego, vehicles[number], True, measured)
+        add_noise(measured, episode.noise_sigma, episode.seed, episode.steps, number)
+        write_row(measured, low, high, observation[1 + row])

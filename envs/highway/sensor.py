@@ -1,0 +1,78 @@
+"""Weather as a sensor: how far the ego sees, and how noisy it measures. Both environments use these functions.
+
+Range: an active sensor's return from distance R falls as exp(-2 beta R) / R^2 (monostatic equation), so the range at which
+the return is as weak as in clean air at 200 m (highway-env's own limit) solves R exp(beta R) = 200 m.
+Noise: zero-mean Gaussian on x, y (m) and vx, vy (m/s) of the other vehicles. Its size is our modelling choice.
+The draws are a hash of (scenario seed, step, vehicle, feature): no generator, no order, no dependence on the batch.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from bench.scenario import Weather
+
+CLEAR_RANGE_M = 200.0
+"""AbstractEnv.PERCEPTION_DISTANCE: 5 x the greatest speed."""
+SIGMA_PER_MM_H = 0.008
+SIGMA_PER_EXTINCTION = 4.0
+
+FEATURES = 4
+TWO_PI = 2 * np.pi
+
+
+def sensor_range_m(weather: Weather) -> float:
+    """Distance in m beyond which vehicles are not seen: the root R of R exp(beta R) = 200, by Newton on its logarithm."""
+    extinction = weather.extinction_per_m
+    if extinction == 0:
+        return CLEAR_RANGE_M
+    distance = CLEAR_RANGE_M / (1 + extinction * CLEAR_RANGE_M)
+    for _ in range(50):
+        excess = math.log(distance / CLEAR_RANGE_M) + extinction * distance
+        distance -= excess / (1 / distance + extinction)
+    return distance
+
+
+def noise_sigma(weather: Weather) -> float:
+    """Standard deviation of the measurements, in m (positions) and m/s (velocities)."""
+    return SIGMA_PER_MM_H * weather.precipitation_mm_h + SIGMA_PER_EXTINCTION * weather.extinction_per_m
+
+
+@njit
+def mix(value):  # type: ignore[no-untyped-def]
+    """Finaliser of splitmix64 (Steele, Lea and Flood 2014): a bijection on 64 bits that scatters counters."""
+    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return value ^ (value >> np.uint64(31))
+
+
+@njit
+def counter_hash(seed, step, vehicle, draw):  # type: ignore[no-untyped-def]
+    """64 uniform bits for one counter; each part is mixed in on its own, so that neighbouring counters share nothing."""
+    step_size = np.uint64(0x9E3779B97F4A7C15)
+    value = mix(np.uint64(seed) + step_size)
+    value = mix((value ^ np.uint64(step)) + step_size)
+    value = mix((value ^ np.uint64(vehicle)) + step_size)
+    return mix((value ^ np.uint64(draw)) + step_size)
+
+
+@njit
+def standard_normal(seed, step, vehicle, feature):  # type: ignore[no-untyped-def]
+    """One standard normal number by Box and Muller's transform of two hashed uniforms."""
+    scale = 1.0 / 9007199254740992.0
+    radius_bits = counter_hash(seed, step, vehicle, 2 * feature) >> np.uint64(11)
+    angle_bits = counter_hash(seed, step, vehicle, 2 * feature + 1) >> np.uint64(11)
+    # (bits + 1) keeps the logarithm finite.
+    radius = math.sqrt(-2.0 * math.log((np.float64(radius_bits) + 1.0) * scale))
+    return radius * math.cos(TWO_PI * np.float64(angle_bits) * scale)
+
+
+@njit
+def add_noise(measured, sigma, seed, step, vehicle):  # type: ignore[no-untyped-def]
+    """Disturb one vehicle's measured x, y, vx, vy [4], in place and in physical units; sigma 0 leaves every bit."""
+    if sigma > 0.0:
+        for feature in range(FEATURES):
+            measured[feature] += sigma * standard_normal(seed, step, vehicle, feature)

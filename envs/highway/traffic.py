@@ -1,0 +1,209 @@
+"""How the other drivers decide: highway-env's IDM and MOBIL (vehicle/behavior.py) and its neighbours (road/road.py).
+
+`order` lists the vehicles by position (ties: by number), so that a neighbour is found by looking outwards.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from envs.highway.dynamics import (
+    CONTINUOUS,
+    DISCRETE,
+    IDM,
+    SPEED_LIMIT,
+    clip,
+    is_on_lane,
+    is_reachable,
+    not_zero,
+    speed_control,
+    steering_control,
+)
+
+MAX_ACCELERATION = 6.0
+COMFORT_ACCELERATION = 3.0
+COMFORT_BRAKING = -5.0
+JAM_DISTANCE = 10.0
+TIME_GAP = 1.5
+GAP_SCALE = 2 * math.sqrt(-COMFORT_ACCELERATION * COMFORT_BRAKING)
+LANE_CHANGE_DELAY = 1.0
+LANE_CHANGE_MIN_GAIN = 0.2
+LANE_CHANGE_MAX_BRAKING_IMPOSED = 2.0
+NEIGHBOUR_MARGIN = 1.0
+NO_ONE = -1
+
+
+@njit
+def sort_by_position(vehicles, order):  # type: ignore[no-untyped-def]
+    """Bring `order` [N] up to date, in place: insertion sort, for it is nearly sorted from the frame before."""
+    for place in range(1, order.size):
+        moved = order[place]
+        x = vehicles[moved].x
+        slot = place - 1
+        while slot >= 0 and (vehicles[order[slot]].x > x or (vehicles[order[slot]].x == x and order[slot] > moved)):
+            order[slot + 1] = order[slot]
+            slot -= 1
+        order[slot + 1] = moved
+
+
+@njit
+def front_vehicle(vehicles, order, place, lane):  # type: ignore[no-untyped-def]
+    """Road.neighbour_vehicles: the nearest vehicle on `lane` at or ahead of the vehicle at `place` of `order`, or NO_ONE.
+
+    Among vehicles at the very same position the last in highway-env's order wins.
+    """
+    x = vehicles[order[place]].x
+    first = place
+    while first > 0 and vehicles[order[first - 1]].x == x:
+        first -= 1
+    found = NO_ONE
+    for candidate in range(first, order.size):
+        other = order[candidate]
+        if found >= 0 and vehicles[other].x > vehicles[found].x:
+            break
+        if candidate != place and is_on_lane(vehicles[other], lane, NEIGHBOUR_MARGIN):
+            found = other
+    return found
+
+
+@njit
+def rear_vehicle(vehicles, order, place, lane):  # type: ignore[no-untyped-def]
+    """Road.neighbour_vehicles: the nearest vehicle on `lane` behind the vehicle at `place` of `order`, or NO_ONE.
+
+    Among vehicles at the very same position the first in highway-env's order wins.
+    """
+    x = vehicles[order[place]].x
+    found = NO_ONE
+    for candidate in range(place - 1, -1, -1):
+        other = order[candidate]
+        if found >= 0 and vehicles[other].x < vehicles[found].x:
+            break
+        if vehicles[other].x < x and is_on_lane(vehicles[other], lane, NEIGHBOUR_MARGIN):
+            found = other
+    return found
+
+
+@njit
+def desired_gap(vehicle, leader):  # type: ignore[no-untyped-def]
+    """IDMVehicle.desired_gap in m; the difference of velocities is taken along the vehicle's own direction."""
+    cos, sin = vehicle.cos_heading, vehicle.sin_heading
+    along = vehicle.speed * cos - leader.speed * leader.cos_heading
+    across = vehicle.speed * sin - leader.speed * leader.sin_heading
+    closing = along * cos + across * sin
+    return JAM_DISTANCE + vehicle.speed * TIME_GAP + vehicle.speed * closing / GAP_SCALE
+
+
+@njit
+def free_acceleration(vehicle, target_speed, delta):  # type: ignore[no-untyped-def]
+    """IDMVehicle.acceleration on an empty road, in m/s2."""
+    wanted = abs(not_zero(clip(target_speed, 0.0, SPEED_LIMIT)))
+    return COMFORT_ACCELERATION * (1 - math.pow(max(vehicle.speed, 0.0) / wanted, delta))
+
+
+@njit
+def interaction(vehicle, leader):  # type: ignore[no-untyped-def]
+    """What IDMVehicle.acceleration subtracts for the vehicle ahead, in m/s2."""
+    ratio = desired_gap(vehicle, leader) / not_zero(leader.x - vehicle.x)
+    return COMFORT_ACCELERATION * (ratio * ratio)
+
+
+@njit
+def following_acceleration(vehicles, number, leader, free):  # type: ignore[no-untyped-def]
+    """IDMVehicle.acceleration behind `leader` (or NO_ONE), in m/s2, given its value `free` on an empty road."""
+    if leader < 0:
+        return free
+    return free - interaction(vehicles[number], vehicles[leader])
+
+
+@njit
+def wants_lane(vehicles, order, place, lane, free, own_leader, ego):  # type: ignore[no-untyped-def]
+    """IDMVehicle.mobil: whether changing to `lane` pays and imposes no hard braking on the new follower.
+
+    The two conditions are independent; the cheap one is looked at first. Politeness is 0 in highway-env. Accelerations of
+    others are evaluated with the deciding vehicle's own IDM exponent, and a continuous ego, which has no target speed,
+    with a target of 0.
+    """
+    number = order[place]
+    new_leader = front_vehicle(vehicles, order, place, lane)
+    gain = following_acceleration(vehicles, number, new_leader, free) - following_acceleration(
+        vehicles, number, own_leader, free
+    )
+    if gain < LANE_CHANGE_MIN_GAIN:
+        return False
+    follower = rear_vehicle(vehicles, order, place, lane)
+    if follower < 0:
+        return True
+    target_speed = 0.0 if follower == 0 and ego == CONTINUOUS else vehicles[follower].target_speed
+    imposed = free_acceleration(vehicles[follower], target_speed, vehicles[number].delta)
+    return not imposed - interaction(vehicles[follower], vehicles[number]) < -LANE_CHANGE_MAX_BRAKING_IMPOSED
+
+
+@njit
+def must_abort(vehicles, number, ego):  # type: ignore[no-untyped-def]
+    """Whether someone just ahead is already changing to the same lane (IDMVehicle.change_lane_policy)."""
+    vehicle = vehicles[number]
+    for other in range(1 if ego == CONTINUOUS else 0, vehicles.size):
+        rival = vehicles[other]
+        if rival.target_lane != vehicle.target_lane or rival.lane == vehicle.target_lane or other == number:
+            continue
+        distance = rival.x - vehicle.x
+        if 0 < distance < desired_gap(vehicle, rival):
+            return True
+    return False
+
+
+@njit
+def choose_lane(vehicles, order, place, lanes, free, leader, ego):  # type: ignore[no-untyped-def]
+    """IDMVehicle.change_lane_policy, its second half: look left, then right; right overwrites left."""
+    vehicle = vehicles[order[place]]
+    vehicle.timer = 0.0
+    if abs(vehicle.speed) < 1:
+        return
+    for lane in (vehicle.lane - 1, vehicle.lane + 1):
+        if (
+            0 <= lane < lanes
+            and is_reachable(vehicle, lane)
+            and wants_lane(vehicles, order, place, lane, free, leader, ego)
+        ):
+            vehicle.target_lane = lane
+
+
+@njit
+def drive_idm(vehicles, order, place, lanes, ego):  # type: ignore[no-untyped-def]
+    """IDMVehicle.act: MOBIL for the lane, IDM for the acceleration (over both lanes during a change)."""
+    number = order[place]
+    vehicle = vehicles[number]
+    if vehicle.crashed:
+        return
+    free = free_acceleration(vehicle, vehicle.target_speed, vehicle.delta)
+    leader = front_vehicle(vehicles, order, place, vehicle.lane)
+    if vehicle.lane != vehicle.target_lane:
+        if must_abort(vehicles, number, ego):
+            vehicle.target_lane = vehicle.lane
+    elif vehicle.timer > LANE_CHANGE_DELAY:
+        choose_lane(vehicles, order, place, lanes, free, leader, ego)
+    vehicle.steering = steering_control(vehicle, vehicle.target_lane)
+    acceleration = following_acceleration(vehicles, number, leader, free)
+    if vehicle.lane != vehicle.target_lane:
+        leader = front_vehicle(vehicles, order, place, vehicle.target_lane)
+        acceleration = min(acceleration, following_acceleration(vehicles, number, leader, free))
+    vehicle.acceleration = clip(acceleration, -MAX_ACCELERATION, MAX_ACCELERATION)
+
+
+@njit
+def act(vehicles, order, places, lanes, ego):  # type: ignore[no-untyped-def]
+    """Road.act: every vehicle decides, in highway-env's order, for each sees the target lanes chosen before it.
+
+    `places` [N] is scratch: the place of each vehicle in `order`.
+    """
+    for place in range(order.size):
+        places[order[place]] = place
+    if ego == DISCRETE:
+        vehicles[0].steering = steering_control(vehicles[0], vehicles[0].target_lane)
+        vehicles[0].acceleration = speed_control(vehicles[0])
+    elif ego == IDM:
+        drive_idm(vehicles, order, places[0], lanes, ego)
+    for number in range(1, vehicles.size):
+        drive_idm(vehicles, order, places[number], lanes, ego)

@@ -1,0 +1,111 @@
+"""The highway world: what `world=highway world.vehicles=50` on the command line sets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+
+from bench.contracts import ActionType, Driver, Features, World
+from bench.scenario import Cell
+from envs.highway.config import (
+    STANDARD_FEATURES,
+    STANDARD_TARGET_SPEEDS,
+    THESIS_FEATURES,
+    THESIS_TARGET_SPEEDS,
+    HighwayConfig,
+    Preset,
+)
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+Backend = Literal["batched", "reference"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HighwayWorld(World):
+    """A straight highway with IDM/MOBIL traffic: highway-env 1.12.1's `highway-v0`, 15 Hz, 30 seconds.
+
+    Args:
+        preset: `standard` (x +-100 m, y +-20 m, vx +-40 m/s, vy +-20 m/s, 10 rows, target speeds 10 to 30 by 5) or
+            `thesis` (x, y +-100 m, velocities 0 to 20 m/s, 5 rows, target speeds 20, 25, 30).
+        vehicles: traffic vehicles beside the ego.
+        observed_vehicles: rows of an observation with the ego's own; None takes the preset's.
+        target_speeds: speeds in m/s that FASTER and SLOWER choose from; None takes the preset's.
+        simulation_frequency, policy_frequency: physics frames and decisions a second.
+        max_steps: decisions until an episode is truncated.
+        offroad_terminal: whether leaving the road ends the episode.
+        backend: `batched`, our engine, or `reference`, the real highway-env (equal, and several hundred times slower).
+
+    Raises:
+        ValueError: with one line, for what neither environment can do.
+    """
+
+    features: ClassVar[Features] = STANDARD_FEATURES
+
+    preset: Preset = "standard"
+    vehicles: int = 20
+    observed_vehicles: int | None = None
+    target_speeds: tuple[float, ...] | None = None
+    simulation_frequency: int = 15
+    policy_frequency: int = 15
+    max_steps: int = 450
+    offroad_terminal: bool = True
+    backend: Backend = "batched"
+
+    def __post_init__(self) -> None:
+        if self.preset not in get_args(Preset):
+            raise ValueError(f"preset must be one of {', '.join(get_args(Preset))}, got {self.preset!r}")
+        if self.backend not in get_args(Backend):
+            raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, got {self.backend!r}")
+        if self.preset == "thesis":
+            # The class says the standard's ranges; this object's own are others.
+            object.__setattr__(self, "features", THESIS_FEATURES)
+        self.config((Cell(lanes=3, density=1.0),))
+
+    def config(
+        self,
+        cells: Sequence[Cell],
+        *,
+        action_type: ActionType = "discrete",
+        driver: Driver = "agent",
+        action_repeat: int = 1,
+    ) -> HighwayConfig:
+        """The environment's full configuration; arguments as in `World.make`."""
+        thesis = self.preset == "thesis"
+        rows = self.observed_vehicles if self.observed_vehicles is not None else (5 if thesis else 10)
+        preset_speeds = THESIS_TARGET_SPEEDS if thesis else STANDARD_TARGET_SPEEDS
+        return HighwayConfig(
+            cells=tuple(cells),
+            vehicles=self.vehicles,
+            simulation_frequency=self.simulation_frequency,
+            policy_frequency=self.policy_frequency,
+            max_steps=self.max_steps,
+            action_type=action_type,
+            driver=driver,
+            action_repeat=action_repeat,
+            target_speeds=tuple(self.target_speeds) if self.target_speeds is not None else preset_speeds,
+            features=self.features,
+            observed_vehicles=rows,
+            offroad_terminal=self.offroad_terminal,
+        )
+
+    def make(
+        self,
+        cells: Sequence[Cell],
+        *,
+        action_type: ActionType = "discrete",
+        driver: Driver = "agent",
+        action_repeat: int = 1,
+    ) -> EnvBase:
+        """See `bench.contracts.World.make`."""
+        config = self.config(cells, action_type=action_type, driver=driver, action_repeat=action_repeat)
+        # Imported here: both load torchrl and numba or pygame, which listing components must not.
+        if self.backend == "batched":
+            from envs.highway.batched import BatchedHighway
+
+            return BatchedHighway(config)
+        from envs.highway.reference import ReferenceHighway
+
+        return ReferenceHighway(config)
