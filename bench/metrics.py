@@ -1,0 +1,271 @@
+"""What a set of episode records says: driving metrics and attack metrics, a cell or a grid at a time, with intervals.
+
+Records come as a `pyarrow.Table`, one row an episode (columns: `bench.results.SCHEMA`). `Episodes.arrange` puts the
+rows of one pair in order, training seeds x cells x scenario seeds; `summarise` measures them; `difference` compares
+two sets scenario by scenario. The statistics are those of `bench.statistics`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyarrow as pa
+
+from bench.scenario import WEATHERS, Cell
+from bench.statistics import Array, Interval, interval, wilson
+
+MAX_RETURN = 450.0
+"""Largest `return`: highway-env's normalised reward, 1 a step, over 450 steps (the thesis' scale)."""
+CONTROL_PERIOD_MS = 1000 / 15
+"""The time between two decisions at 15 Hz: an attack that takes longer cannot run on the road."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The episodes of one pair: every run has every cell, every cell every scenario seed.
+
+    Args:
+        table: the records, sorted by run, cell, scenario seed; [R * C * E] rows.
+        runs: training seeds [R].
+        cells: [C], by weather (in the order of `WEATHERS`), lanes, density.
+        seeds: scenario seeds [E], rising.
+        left_out: records given to `arrange` that were not used, because their cell or seed is missing from another run.
+    """
+
+    table: pa.Table
+    runs: tuple[int, ...]
+    cells: tuple[Cell, ...]
+    seeds: tuple[int, ...]
+    left_out: int = 0
+
+    @classmethod
+    def arrange(cls, records: pa.Table) -> Episodes:
+        """Sort the records of one pair; keep the cells that every run has and the seeds that all those cells have.
+
+        Raises:
+            ValueError: if there is no record, if a scenario is there twice, or if nothing is common to all runs.
+        """
+        if not records.num_rows:
+            raise ValueError("no records to measure")
+        keys = _keys(records)
+        if len(set(keys)) < len(keys):
+            raise ValueError("a scenario is there twice: these are the records of more than one pair")
+        by_run: dict[int, set[Cell]] = {}
+        by_square: dict[tuple[int, Cell], set[int]] = {}
+        for run, cell, seed in keys:
+            by_run.setdefault(run, set()).add(cell)
+            by_square.setdefault((run, cell), set()).add(seed)
+        cells = set.intersection(*by_run.values())
+        if not cells:
+            raise ValueError("the training seeds have no cell in common")
+        seeds = set.intersection(*(found for (_, cell), found in by_square.items() if cell in cells))
+        if not seeds:
+            raise ValueError("the cells have no scenario seed in common")
+        return _arranged(records, keys, set(by_run), cells, seeds)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """R runs, C cells, E episodes a run and cell."""
+        return len(self.runs), len(self.cells), len(self.seeds)
+
+    def column(self, name: str) -> Array:
+        """[R, C, E] a measurement as float64."""
+        values = self.table[name].to_numpy(zero_copy_only=False)
+        return np.asarray(values, dtype=np.float64).reshape(self.shape)
+
+    def only(
+        self,
+        *,
+        runs: Collection[int] | None = None,
+        cells: Collection[Cell] | None = None,
+        seeds: Collection[int] | None = None,
+    ) -> Episodes:
+        """The part with these runs, cells and scenario seeds; None keeps all.
+
+        Raises:
+            ValueError: if nothing is left.
+        """
+        parts = (
+            set(self.runs if runs is None else runs) & set(self.runs),
+            set(self.cells if cells is None else cells) & set(self.cells),
+            set(self.seeds if seeds is None else seeds) & set(self.seeds),
+        )
+        if not all(parts):
+            raise ValueError("no episode is left")
+        return _arranged(self.table, _keys(self.table), *parts)
+
+    def standing_for(self, runs: Sequence[int], cells: Sequence[Cell]) -> Episodes:
+        """The episodes of a driver that neither learns nor sees, under the names of other runs and weathers.
+
+        Args:
+            runs: training seeds, each given the episodes of the first run.
+            cells: those that were driven, and those that were driven in clear weather, which stands for all weathers.
+
+        Raises:
+            ValueError: if a cell was driven in neither its own nor in clear weather.
+        """
+        driven = {cell: cell if cell in self.cells else replace(cell, weather="clear") for cell in cells}
+        missing = [str(cell) for cell, stand_in in driven.items() if stand_in not in self.cells]
+        if missing:
+            raise ValueError(f"never driven: {'; '.join(missing)}")
+        parts = []
+        for run in runs:
+            for cell, stand_in in driven.items():
+                rows = self.only(runs=self.runs[:1], cells=[stand_in]).table
+                labels = {"training_seed": run, "weather": cell.weather}
+                for name, label in labels.items():
+                    field = rows.schema.field(name)
+                    rows = rows.set_column(
+                        rows.column_names.index(name), field, pa.array([label] * len(rows), field.type)
+                    )
+                parts.append(rows)
+        return Episodes.arrange(pa.concat_tables(parts))
+
+
+def _keys(records: pa.Table) -> list[tuple[int, Cell, int]]:
+    """Run, cell and scenario seed of each record."""
+    columns = ("training_seed", "lanes", "density", "weather", "seed")
+    known: dict[tuple[int, float, str], Cell] = {}
+    keys = []
+    for run, lanes, density, weather, seed in zip(*(records[name].to_pylist() for name in columns), strict=True):
+        square = (lanes, density, weather)
+        if square not in known:
+            known[square] = Cell(lanes=lanes, density=density, weather=weather)
+        keys.append((run, known[square], seed))
+    return keys
+
+
+def _arranged(
+    records: pa.Table, keys: Sequence[tuple[int, Cell, int]], runs: set[int], cells: set[Cell], seeds: set[int]
+) -> Episodes:
+    order = list(WEATHERS)
+    ordered_cells = sorted(cells, key=lambda cell: (order.index(cell.weather), cell.lanes, cell.density))
+    place = {key: row for row, key in enumerate(keys)}
+    rows = [place[run, cell, seed] for run in sorted(runs) for cell in ordered_cells for seed in sorted(seeds)]
+    return Episodes(
+        table=records.take(pa.array(rows, pa.int64())),
+        runs=tuple(sorted(runs)),
+        cells=tuple(ordered_cells),
+        seeds=tuple(sorted(seeds)),
+        left_out=records.num_rows - len(rows),
+    )
+
+
+def shared(first: Episodes, second: Episodes) -> tuple[Episodes, Episodes]:
+    """Both, reduced to the runs, cells and scenario seeds that both have.
+
+    Raises:
+        ValueError: if they have nothing in common.
+    """
+    runs, cells, seeds = (set(getattr(first, name)) & set(getattr(second, name)) for name in ("runs", "cells", "seeds"))
+    return first.only(runs=runs, cells=cells, seeds=seeds), second.only(runs=runs, cells=cells, seeds=seeds)
+
+
+def difference(treated: Episodes, control: Episodes, name: str) -> Interval:
+    """Interquartile mean of `treated` - `control`, paired: same training seed, cell and scenario seed.
+
+    Raises:
+        ValueError: if runs, cells or scenario seeds differ: that would mix the traffic into the effect.
+    """
+    if (treated.runs, treated.cells, treated.seeds) != (control.runs, control.cells, control.seeds):
+        raise ValueError("not paired: the two sides differ in training seeds, cells or scenario seeds (see `shared`)")
+    return interval(treated.column(name) - control.column(name))
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The measurements of a set of episodes.
+
+    Args:
+        safe_progress: in [0, 1], the ranking metric: 0 where the episode crashes or leaves the road.
+        episode_return: in [0, 450], highway-env's normalised reward summed over the episode.
+        crash_rate: share of episodes that end in a crash, all runs pooled.
+        offroad_rate: share of episodes that leave the road, all runs pooled.
+        attack_success: share of steps in [0, 1] whose decision the attack changed.
+        queries_mean: victim evaluations a step, mean over steps.
+        queries_median: victim evaluations a step, median over episodes of the episode's median.
+        queries_max: most victim evaluations in one step.
+        attack_ms: the attack's wall time a step and episode, milliseconds.
+        min_ttc_s: smallest time to collision of an episode in seconds, median over episodes; inf: never a car ahead.
+        mean_speed: metres a second.
+        action_entropy: of discrete actions, in [0, 1] (1: all equally often, 0: always one); NaN for continuous ones.
+        runs: training seeds.
+        cells: cells of the grid.
+        episodes: a run and cell.
+    """
+
+    safe_progress: Interval
+    episode_return: Interval
+    crash_rate: Interval
+    offroad_rate: Interval
+    attack_success: float
+    queries_mean: float
+    queries_median: float
+    queries_max: float
+    attack_ms: float
+    min_ttc_s: float
+    mean_speed: float
+    action_entropy: float
+    runs: int
+    cells: int
+    episodes: int
+
+
+def summarise(episodes: Episodes) -> Summary:
+    """Measure a set of episodes: a whole grid, or one cell of it (`episodes.only(cells=[cell])`)."""
+    runs, cells, count = episodes.shape
+    return Summary(
+        safe_progress=unit_interval(episodes.column("safe_progress")),
+        episode_return=interval(episodes.column("return")),
+        crash_rate=rate(episodes, "crashed"),
+        offroad_rate=rate(episodes, "offroad"),
+        attack_success=step_mean(episodes, "changed"),
+        queries_mean=step_mean(episodes, "queries"),
+        queries_median=float(np.median(episodes.column("queries_median"))),
+        queries_max=float(episodes.column("queries_max").max()),
+        attack_ms=step_mean(episodes, "attack_ms"),
+        min_ttc_s=float(np.median(episodes.column("min_ttc_s"))),
+        mean_speed=step_mean(episodes, "mean_speed"),
+        action_entropy=action_entropy(episodes.table),
+        runs=runs,
+        cells=cells,
+        episodes=count,
+    )
+
+
+def unit_interval(scores: Array) -> Interval:
+    """`interval` for scores [R, C, E] in [0, 1].
+
+    Where every score is 0, or every score is 1, a bootstrap has nothing to vary; there the interval is Wilson's,
+    which is conservative for any variable in [0, 1].
+    """
+    estimate = interval(scores)
+    if np.all(scores == scores.flat[0]) and scores.flat[0] in (0.0, 1.0):
+        return wilson(float(scores.sum()), scores.size)
+    return estimate
+
+
+def rate(episodes: Episodes, name: str) -> Interval:
+    """The share of episodes, all runs and cells pooled, for which a boolean column is set, with its Wilson interval."""
+    values = episodes.column(name)
+    return wilson(float(values.sum()), values.size)
+
+
+def step_mean(episodes: Episodes, name: str) -> float:
+    """Mean over all driven steps of a column that holds a mean a step."""
+    steps = episodes.column("steps")
+    return float((episodes.column(name) * steps).sum() / max(float(steps.sum()), 1.0))
+
+
+def action_entropy(records: pa.Table) -> float:
+    """Shannon entropy of the actions taken, over its largest value log(A); NaN where no action is discrete."""
+    counts = [row for row in records["action_counts"].to_pylist() if row]
+    if not counts:
+        return float("nan")
+    totals = np.zeros(max(map(len, counts)))
+    for row in counts:
+        totals[: len(row)] += row
+    share = totals[totals > 0] / totals.sum()
+    return float(-(share * np.log(share)).sum() / np.log(len(totals)))

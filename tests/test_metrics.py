@@ -1,0 +1,218 @@
+"""Statistics and driving metrics: known values, and what must hold for any records."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from rliable import metrics as rliable_metrics
+from scipy.stats import binomtest
+
+from bench.metrics import Episodes, action_entropy, difference, shared, summarise, unit_interval
+from bench.scenario import Cell
+from bench.statistics import interval, iqm, wilson
+
+quick = settings(max_examples=40, deadline=None)
+shapes = st.tuples(st.integers(1, 5), st.integers(1, 6), st.integers(1, 8))
+scores = shapes.flatmap(lambda shape: arrays(np.float64, shape, elements=st.floats(0, 1, width=32)))
+
+
+def episodes(values: np.ndarray, first_seed: int = 100, shift: float = 0.0) -> pa.Table:
+    """Records whose `safe_progress` is values [R, C, E]."""
+    runs, cells, count = values.shape
+    run, cell, seed = (index.ravel() for index in np.indices(values.shape))
+    rows = runs * cells * count
+    return pa.table(
+        {
+            "training_seed": run,
+            "lanes": 3 + cell % 3,
+            "density": 1.0 + cell // 3 % 2,
+            "weather": np.array(["clear", "rain", "fog"])[cell // 6],
+            "seed": first_seed + seed,
+            "safe_progress": values.ravel() + shift,
+            "return": 450 * values.ravel(),
+            "crashed": values.ravel() < 0.2,
+            "offroad": np.zeros(rows, bool),
+            "steps": np.full(rows, 450),
+            "changed": values.ravel() / 2,
+            "queries": np.full(rows, 7.0),
+            "queries_median": np.full(rows, 7.0),
+            "queries_max": np.full(rows, 9.0),
+            "attack_ms": np.full(rows, 1.5),
+            "min_ttc_s": np.where(values.ravel() > 0.5, np.inf, values.ravel()),
+            "mean_speed": np.full(rows, 25.0),
+            "action_counts": pa.array([[450, 0, 0, 0, 0]] * rows, pa.list_(pa.int32())),
+        }
+    )
+
+
+@given(scores)
+@quick
+def test_an_interval_holds_its_estimate(values: np.ndarray) -> None:
+    result = interval(values, replicates=200)
+    assert np.isnan(result.low) or result.low <= result.estimate <= result.high
+    assert values.min() - 1e-9 <= result.estimate <= values.max() + 1e-9
+
+
+def test_one_number_has_no_interval() -> None:
+    result = interval(np.full((1, 3, 1), 0.5))
+    assert result.estimate == 0.5
+    assert np.isnan(result.low)
+    assert np.isnan(result.high)
+
+
+@given(scores)
+@quick
+def test_the_interquartile_mean_is_rliables(values: np.ndarray) -> None:
+    runs_by_tasks = values.mean(2)
+    assert iqm(runs_by_tasks) == pytest.approx(rliable_metrics.aggregate_iqm(runs_by_tasks))
+
+
+def test_the_bootstrap_over_runs_is_rliables() -> None:
+    # rliable 1.2.0 with pandas 2: StratifiedBootstrap(x).conf_int(aggregate_iqm, reps=2000, method="percentile").
+    x = np.random.default_rng(0).random((5, 18, 1))
+    result = interval(x, replicates=20000)
+    assert (result.low, result.high) == pytest.approx((0.4652, 0.6093), abs=0.003)
+
+
+def test_the_bootstrap_covers_the_truth_as_often_as_it_says() -> None:
+    generator = np.random.default_rng(1)
+    draws = generator.normal(0.5, 0.1, size=(300, 1, 1, 100))
+    hits = sum(0.5 in interval(x, seed=i, replicates=300) for i, x in enumerate(draws))
+    assert 0.90 < hits / 300 < 0.99
+
+
+def test_the_bootstrap_is_its_own_generators() -> None:
+    x = np.random.default_rng(0).random((4, 3, 2))
+    np.random.seed(0)  # noqa: NPY002 the global generator must not matter
+    first = interval(x)
+    np.random.seed(1)  # noqa: NPY002
+    assert interval(x) == first
+
+
+@pytest.mark.parametrize("bad", [np.zeros((2, 3)), np.zeros((0, 3, 2)), np.full((1, 1, 1), np.nan)])
+def test_scores_that_mean_nothing_are_refused(bad: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="scores must be"):
+        interval(bad)
+
+
+@given(st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+@quick
+def test_wilson_is_scipys_and_stays_in_the_unit_interval(counts: tuple[int, int]) -> None:
+    successes, trials = counts
+    result = wilson(successes, trials)
+    expected = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
+    assert (result.low, result.high) == pytest.approx((expected.low, expected.high), abs=1e-9)
+    assert 0 <= result.low <= result.estimate <= result.high <= 1
+    assert result.high - result.low > 0
+
+
+def test_wilson_refuses_more_successes_than_trials() -> None:
+    with pytest.raises(ValueError, match="successes"):
+        wilson(3, 2)
+
+
+@given(scores, st.randoms(use_true_random=False))
+@quick
+def test_the_order_of_the_records_does_not_matter(values: np.ndarray, random: object) -> None:
+    table = episodes(values)
+    rows = list(range(table.num_rows))
+    random.shuffle(rows)  # type: ignore[attr-defined]
+    ordered, mixed = Episodes.arrange(table), Episodes.arrange(table.take(rows))
+    assert ordered.table.equals(mixed.table)
+    assert repr(summarise(ordered)) == repr(summarise(mixed))
+
+
+@given(scores)
+@quick
+def test_columns_come_back_as_runs_cells_episodes(values: np.ndarray) -> None:
+    arranged = Episodes.arrange(episodes(values))
+    assert arranged.shape == values.shape
+    cells = list(arranged.cells)
+    for c in range(values.shape[1]):
+        cell = Cell(lanes=3 + c % 3, density=1.0 + c // 3, weather="clear")
+        np.testing.assert_array_equal(arranged.column("safe_progress")[:, cells.index(cell)], values[:, c])
+
+
+def test_what_a_run_lacks_is_left_out_of_all_runs() -> None:
+    table = episodes(np.random.default_rng(0).random((2, 3, 4)))
+    run, lanes = table["training_seed"].to_numpy(), table["lanes"].to_numpy()
+    broken_off = table.filter(pa.array(~((run == 1) & (lanes == 5))))
+    arranged = Episodes.arrange(broken_off)
+    assert [cell.lanes for cell in arranged.cells] == [3, 4]
+    assert arranged.left_out == 4
+
+
+def test_records_of_two_pairs_are_refused() -> None:
+    table = episodes(np.ones((1, 1, 2)))
+    with pytest.raises(ValueError, match="twice"):
+        Episodes.arrange(pa.concat_tables([table, table]))
+
+
+@given(scores, st.floats(-0.5, 0.5))
+@quick
+def test_a_constant_effect_is_found_exactly_in_pairs(values: np.ndarray, effect: float) -> None:
+    control, treated = Episodes.arrange(episodes(values)), Episodes.arrange(episodes(values, shift=effect))
+    result = difference(treated, control, "safe_progress")
+    assert result.estimate == pytest.approx(effect, abs=1e-6)
+    if not np.isnan(result.low):
+        assert result.high - result.low == pytest.approx(0, abs=1e-6)
+
+
+def test_pairing_refuses_other_scenarios() -> None:
+    values = np.random.default_rng(0).random((2, 2, 4))
+    first, second = Episodes.arrange(episodes(values)), Episodes.arrange(episodes(values, first_seed=101))
+    with pytest.raises(ValueError, match="not paired"):
+        difference(first, second, "safe_progress")
+    first, second = shared(first, second)
+    assert first.seeds == second.seeds == (101, 102, 103)
+    difference(first, second, "safe_progress")
+
+
+def test_pairing_refuses_other_training_seeds() -> None:
+    three = Episodes.arrange(episodes(np.random.default_rng(0).random((3, 2, 4))))
+    with pytest.raises(ValueError, match="not paired"):
+        difference(three, three.only(runs=[0, 1]), "safe_progress")
+
+
+def test_a_blind_driver_stands_for_every_run_and_weather() -> None:
+    values = np.random.default_rng(0).random((3, 12, 4))
+    learner, blind = Episodes.arrange(episodes(values)), Episodes.arrange(episodes(values[:1, :6]))
+    stand_in = blind.standing_for(learner.runs, learner.cells)
+    assert (stand_in.runs, stand_in.cells, stand_in.seeds) == (learner.runs, learner.cells, learner.seeds)
+    difference(learner, stand_in, "safe_progress")
+    np.testing.assert_array_equal(
+        stand_in.only(runs=[2]).column("safe_progress")[0, 6:], blind.column("safe_progress")[0]
+    )
+    with pytest.raises(ValueError, match="never driven: 3 lanes, density 4, clear"):
+        blind.standing_for([0], [Cell(lanes=3, density=4.0)])
+
+
+def test_rates_near_zero_keep_an_interval() -> None:
+    never = Episodes.arrange(episodes(np.full((1, 1, 100), 0.6)))
+    assert summarise(never).crash_rate.high == pytest.approx(0.037, abs=0.001)
+    assert unit_interval(np.zeros((1, 1, 100))).high == pytest.approx(0.037, abs=0.001)
+    always = summarise(Episodes.arrange(episodes(np.zeros((2, 1, 50)))))
+    assert always.crash_rate.low == pytest.approx(0.963, abs=0.001)
+
+
+def test_a_summary_counts_steps_not_episodes() -> None:
+    table = episodes(np.array([[[0.0, 1.0]]]))
+    table = table.set_column(table.column_names.index("steps"), "steps", pa.array([100, 300]))
+    summary = summarise(Episodes.arrange(table))
+    assert summary.attack_success == pytest.approx(0.5 * 300 / 400)
+    assert summary.queries_mean == 7.0
+    assert summary.queries_max == 9.0
+    assert (summary.runs, summary.cells, summary.episodes) == (1, 1, 2)
+
+
+def test_action_entropy_is_zero_for_one_action_and_one_for_all() -> None:
+    def of(counts: list[list[int]]) -> float:
+        return action_entropy(pa.table({"action_counts": pa.array(counts, pa.list_(pa.int32()))}))
+
+    assert of([[9, 0, 0, 0, 0]]) == 0.0
+    assert of([[3, 3, 0, 0, 0], [0, 0, 3, 3, 3]]) == pytest.approx(1.0)
+    assert np.isnan(of([[], []]))
