@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from envs.highway.dynamics import VEHICLE_LENGTH, VEHICLE_WIDTH
+from envs.highway.state import Floats, Integers, Vehicle, Vehicles
 
 DIAGONAL = math.sqrt(VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2)
 SURELY = 1e-6
@@ -15,13 +16,13 @@ SURELY = 1e-6
 
 
 @njit
-def interval_distance(low_a, high_a, low_b, high_b):  # type: ignore[no-untyped-def]
+def interval_distance(low_a: float, high_a: float, low_b: float, high_b: float) -> float:
     """utils.interval_distance: gap between two intervals, negative where they overlap."""
     return low_b - high_a if low_a < low_b else low_a - high_b
 
 
 @njit
-def fill_corners(vehicle, corners):  # type: ignore[no-untyped-def]
+def fill_corners(vehicle: Vehicle, corners: Floats) -> None:
     """RoadObject.polygon: write the rectangle's corners [5, 2], the first one again at the end."""
     cos, sin = vehicle.cos_heading, vehicle.sin_heading
     for corner in range(5):
@@ -32,7 +33,7 @@ def fill_corners(vehicle, corners):  # type: ignore[no-untyped-def]
 
 
 @njit
-def project(corners, normal_x, normal_y):  # type: ignore[no-untyped-def]
+def project(corners: Floats, normal_x: float, normal_y: float) -> tuple[float, float]:
     """utils.project_polygon: least and greatest coordinate of the corners along a normal."""
     low, high = np.inf, -np.inf
     for corner in range(5):
@@ -42,14 +43,20 @@ def project(corners, normal_x, normal_y):  # type: ignore[no-untyped-def]
 
 
 @njit
-def centre(corners, axis):  # type: ignore[no-untyped-def]
+def centre(corners: Floats, axis: int) -> float:
     """Mean of the four corners along an axis, summed in numpy's order."""
     return (corners[0, axis] + corners[1, axis] + corners[2, axis] + corners[3, axis]) / 4
 
 
 @njit
-def polygons_intersect(corners_a, corners_b, displacement_x, displacement_y):  # type: ignore[no-untyped-def]
-    """utils.are_polygons_intersecting: overlap now, overlap within the frame, and the push that parts them (x, y in m)."""
+def polygons_intersect(
+    corners_a: Floats, corners_b: Floats, displacement_x: float, displacement_y: float
+) -> tuple[bool, bool, float, float]:
+    """utils.are_polygons_intersecting.
+
+    Returns:
+        Whether they overlap now, whether they will within the frame, and the push that parts them (x and y in m).
+    """
     intersecting = will_intersect = True
     nearest, push_x, push_y = np.inf, 0.0, 0.0
     centre_x = centre(corners_a, 0) - centre(corners_b, 0)
@@ -83,8 +90,11 @@ def polygons_intersect(corners_a, corners_b, displacement_x, displacement_y):  #
 
 
 @njit
-def pass_side_by_side(first, second, displacement_x, displacement_y):  # type: ignore[no-untyped-def]
-    """Whether the first vehicle's long side surely parts the two, now and within the frame: neither overlap nor impact."""
+def pass_side_by_side(first: Vehicle, second: Vehicle, displacement_x: float, displacement_y: float) -> bool:
+    """Whether the first vehicle's long side surely parts the two, now and within the frame.
+
+    One parting line is enough for `polygons_intersect` to find neither overlap nor impact, and this one is cheap.
+    """
     normal_x, normal_y = -first.sin_heading, first.cos_heading
     apart = abs(normal_x * (second.x - first.x) + normal_y * (second.y - first.y))
     length_share = abs(normal_x * second.cos_heading + normal_y * second.sin_heading)
@@ -94,7 +104,7 @@ def pass_side_by_side(first, second, displacement_x, displacement_y):  # type: i
 
 
 @njit
-def set_impact(vehicle, pair, push_x, push_y):  # type: ignore[no-untyped-def]
+def set_impact(vehicle: Vehicle, pair: int, push_x: float, push_y: float) -> None:
     """In highway-env the last pair of a frame decides the impact; pairs come in any order here, so they are ranked."""
     if pair > vehicle.impact_pair:
         vehicle.impact_x = push_x
@@ -103,7 +113,9 @@ def set_impact(vehicle, pair, push_x, push_y):  # type: ignore[no-untyped-def]
 
 
 @njit
-def collide(vehicles, first_number, second_number, dt, corners_a, corners_b):  # type: ignore[no-untyped-def]
+def collide(
+    vehicles: Vehicles, first_number: int, second_number: int, dt: float, corners_a: Floats, corners_b: Floats
+) -> None:
     """RoadObject.handle_collisions for one pair, `first_number` < `second_number`.
 
     The circle that is looked at first grows with the speed of the first vehicle only, as in highway-env.
@@ -129,7 +141,7 @@ def collide(vehicles, first_number, second_number, dt, corners_a, corners_b):  #
 
 
 @njit
-def find_collisions(vehicles, order, dt, corners):  # type: ignore[no-untyped-def]
+def find_collisions(vehicles: Vehicles, order: Integers, dt: float, corners: Floats) -> None:
     """The second half of Road.step: every pair, but only those close enough along the road are looked at.
 
     `corners` [2, 5, 2] is scratch.

@@ -15,7 +15,7 @@ from numba.core.caching import FunctionCache
 
 
 def _fingerprint() -> str:
-    """Hash of this folder's sources: numba itself only looks at the file of the cached function, not at what it calls."""
+    """Hash of this folder's sources: numba only looks at the file of the cached function, not at what it calls."""
     digest = hashlib.sha256()
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
@@ -26,7 +26,7 @@ FINGERPRINT = _fingerprint()
 
 
 class _SourcesCache(FunctionCache):
-    """numba's on-disk cache, with this folder's sources in the key; a disk that cannot be written costs time, not the run."""
+    """numba's cache on disk with this folder's sources in the key; a disk that cannot be written costs time only."""
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         return (*super()._index_key(sig, codegen), FINGERPRINT)
@@ -39,7 +39,7 @@ class _SourcesCache(FunctionCache):
 
 
 def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function that Python calls: `njit` without the GIL, cached in `__pycache__` or the user's cache folder."""
+    """Compile a function that Python calls: without the GIL, cached in `__pycache__` or the user's cache folder."""
     dispatcher = njit(nogil=True)(function)
     try:
         dispatcher._cache = _SourcesCache(function)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal, get_args
 
 from bench.contracts import ActionType, Driver, Features
@@ -41,7 +42,7 @@ class HighwayConfig:
             which stand for -5 to 5 m/s2 and -45 to 45 degrees.
         driver: `agent` obeys the actions; `idm` puts highway-env's IDMVehicle in the ego's place and ignores them.
         action_repeat: decisions an action is held: lane changes are sent once and then IDLE, the rest is repeated.
-        target_speeds: increasing speeds in m/s among which FASTER and SLOWER choose (highway-env takes them as uniform).
+        target_speeds: increasing speeds in m/s among which FASTER and SLOWER choose; highway-env takes them as uniform.
         features: observed features and the fixed ranges that map to [-1, 1].
         observed_vehicles: rows of an observation, the ego's own included; at least 2.
         collision_reward, right_lane_reward, high_speed_reward: weights of highway-env's reward.
@@ -95,7 +96,7 @@ class HighwayConfig:
 
     @classmethod
     def thesis(cls, **changes: object) -> HighwayConfig:
-        """The thesis' observation (x, y in +-100 m, velocities in 0 to 20 m/s, 5 rows) and target speeds (20, 25, 30)."""
+        """The thesis' observation (x, y +-100 m, velocities 0 to 20 m/s, 5 rows) and target speeds (20, 25, 30)."""
         defaults: dict[str, object] = {
             "features": THESIS_FEATURES,
             "observed_vehicles": 5,
@@ -106,7 +107,7 @@ class HighwayConfig:
 
 def check_target_speeds(speeds: Sequence[float]) -> None:
     """Raise ValueError unless the table has at least two increasing speeds within what a vehicle can drive."""
-    increasing = all(a < b for a, b in zip(speeds, speeds[1:], strict=False))
+    increasing = all(slower < faster for slower, faster in pairwise(speeds))
     if len(speeds) < 2 or not increasing or not (speeds[0] >= 0 and speeds[-1] <= 40):
         listed = ", ".join(f"{speed:g}" for speed in speeds)
         raise ValueError(f"target_speeds must be at least two increasing speeds from 0 to 40 m/s, got ({listed})")

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from envs.highway.state import EgoKind
+from envs.highway.state import EgoKind, Vehicle
 
 DISCRETE, CONTINUOUS, IDM = int(EgoKind.DISCRETE), int(EgoKind.CONTINUOUS), int(EgoKind.IDM)
 
@@ -31,19 +31,19 @@ TWO_PI = 2 * np.pi
 
 
 @njit
-def clip(value, low, high):  # type: ignore[no-untyped-def]
+def clip(value: float, low: float, high: float) -> float:
     """`value` limited to [low, high]."""
     return min(max(value, low), high)
 
 
 @njit
-def linear_map(value, from_low, from_high, to_low, to_high):  # type: ignore[no-untyped-def]
+def linear_map(value: float, from_low: float, from_high: float, to_low: float, to_high: float) -> float:
     """highway_env.utils.lmap: `value` of [from_low, from_high] on [to_low, to_high], not clipped."""
     return to_low + (value - from_low) * (to_high - to_low) / (from_high - from_low)
 
 
 @njit
-def not_zero(value):  # type: ignore[no-untyped-def]
+def not_zero(value: float) -> float:
     """highway_env.utils.not_zero: `value`, but at least 0.01 away from 0."""
     if abs(value) > 1e-2:
         return value
@@ -51,7 +51,7 @@ def not_zero(value):  # type: ignore[no-untyped-def]
 
 
 @njit
-def wrap_to_pi(angle):  # type: ignore[no-untyped-def]
+def wrap_to_pi(angle: float) -> float:
     """highway_env.utils.wrap_to_pi: `angle` in [-pi, pi)."""
     shifted = angle + np.pi
     if not 0.0 <= shifted < TWO_PI:
@@ -60,7 +60,7 @@ def wrap_to_pi(angle):  # type: ignore[no-untyped-def]
 
 
 @njit
-def closest_lane(x, y, heading, lanes):  # type: ignore[no-untyped-def]
+def closest_lane(x: float, y: float, heading: float, lanes: int) -> int:
     """RoadNetwork.get_closest_lane_index: only the two lanes around `y` can be closest; ties go to the lower one."""
     angle = abs(wrap_to_pi(heading))
     before, beyond = max(x - ROAD_LENGTH, 0.0), max(0.0 - x, 0.0)
@@ -72,21 +72,21 @@ def closest_lane(x, y, heading, lanes):  # type: ignore[no-untyped-def]
 
 
 @njit
-def is_on_lane(vehicle, lane, margin):  # type: ignore[no-untyped-def]
+def is_on_lane(vehicle: Vehicle, lane: int, margin: float) -> bool:
     """AbstractLane.on_lane: whether the vehicle's centre is on the lane, widened by `margin` m on both sides."""
     near = abs(vehicle.y - LANE_WIDTH * lane) <= LANE_WIDTH / 2 + margin
     return near and -VEHICLE_LENGTH <= vehicle.x < ROAD_LENGTH + VEHICLE_LENGTH
 
 
 @njit
-def is_reachable(vehicle, lane):  # type: ignore[no-untyped-def]
+def is_reachable(vehicle: Vehicle, lane: int) -> bool:
     """AbstractLane.is_reachable_from: whether a lane change to `lane` may begin here."""
     near = abs(vehicle.y - LANE_WIDTH * lane) <= 2 * LANE_WIDTH
     return near and 0 <= vehicle.x < ROAD_LENGTH + VEHICLE_LENGTH
 
 
 @njit
-def update_direction(vehicle):  # type: ignore[no-untyped-def]
+def update_direction(vehicle: Vehicle) -> None:
     """Keep the cosine and sine of the heading beside it."""
     if vehicle.heading == 0.0:
         vehicle.cos_heading = 1.0
@@ -97,7 +97,7 @@ def update_direction(vehicle):  # type: ignore[no-untyped-def]
 
 
 @njit
-def steering_control(vehicle, lane):  # type: ignore[no-untyped-def]
+def steering_control(vehicle: Vehicle, lane: int) -> float:
     """ControlledVehicle.steering_control: the steering angle in rad that leads to the centre of `lane`."""
     lateral = vehicle.y - LANE_WIDTH * lane
     if lateral == 0.0 and vehicle.heading == 0.0:
@@ -111,13 +111,13 @@ def steering_control(vehicle, lane):  # type: ignore[no-untyped-def]
 
 
 @njit
-def speed_control(vehicle):  # type: ignore[no-untyped-def]
+def speed_control(vehicle: Vehicle) -> float:
     """ControlledVehicle.speed_control: the acceleration in m/s2 towards the target speed."""
     return GAIN_SPEED * (vehicle.target_speed - vehicle.speed)
 
 
 @njit
-def clip_actions(vehicle):  # type: ignore[no-untyped-def]
+def clip_actions(vehicle: Vehicle) -> None:
     """Vehicle.clip_actions: a wreck brakes to a stop, and no one drives faster than 40 m/s."""
     if vehicle.crashed:
         vehicle.steering = 0.0
@@ -129,7 +129,7 @@ def clip_actions(vehicle):  # type: ignore[no-untyped-def]
 
 
 @njit
-def move(vehicle, lanes, dt):  # type: ignore[no-untyped-def]
+def move(vehicle: Vehicle, lanes: int, dt: float) -> None:
     """Vehicle.step and IDMVehicle.step: one frame of the kinematic bicycle model, then the lane the vehicle is in."""
     vehicle.timer += dt
     clip_actions(vehicle)

@@ -14,15 +14,16 @@ from envs.highway.dynamics import (
     is_reachable,
     linear_map,
 )
+from envs.highway.state import Episode, Floats, Integers, Parameters, Vehicle, Vehicles
 from envs.highway.traffic import front_vehicle
 
 LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
 PROGRESS_LANE, PROGRESS_SPEED = 0.1, 0.4
-"""Eq. 4.1's weights. `progress` keeps them even where the reward is told other ones: it is a measure, not an incentive."""
+"""Eq. 4.1's weights. `progress` keeps them where the reward is told others: it is a measure, not an incentive."""
 
 
 @njit
-def nearest_target_speed(speed, target_speeds):  # type: ignore[no-untyped-def]
+def nearest_target_speed(speed: float, target_speeds: Floats) -> int:
     """MDPVehicle.speed_to_index: the entry of the (uniform) table closest to a speed."""
     last = target_speeds.size - 1
     share = (speed - target_speeds[0]) / (target_speeds[last] - target_speeds[0])
@@ -30,13 +31,13 @@ def nearest_target_speed(speed, target_speeds):  # type: ignore[no-untyped-def]
 
 
 @njit
-def apply_meta_action(ego, action, lanes, target_speeds):  # type: ignore[no-untyped-def]
+def apply_meta_action(ego: Vehicle, action: int, lanes: int, target_speeds: Floats) -> None:
     """MDPVehicle.act: change the target speed or the target lane."""
-    if action == FASTER or action == SLOWER:  # noqa: PLR1714
+    if action in (FASTER, SLOWER):
         change = 1 if action == FASTER else -1
         index = nearest_target_speed(ego.speed, target_speeds) + change
         ego.target_speed = target_speeds[min(max(index, 0), target_speeds.size - 1)]
-    elif action == LANE_LEFT or action == LANE_RIGHT:  # noqa: PLR1714
+    elif action in (LANE_LEFT, LANE_RIGHT):
         change = 1 if action == LANE_RIGHT else -1
         lane = min(max(ego.target_lane + change, 0), lanes - 1)
         if is_reachable(ego, lane):
@@ -44,7 +45,7 @@ def apply_meta_action(ego, action, lanes, target_speeds):  # type: ignore[no-unt
 
 
 @njit
-def apply_action(ego, action, control, first, lanes, parameters):  # type: ignore[no-untyped-def]
+def apply_action(ego: Vehicle, action: int, control: Floats, first: bool, lanes: int, parameters: Parameters) -> None:
     """Hand the decision to the ego; of a decision that is held, a lane change counts only the `first` time.
 
     Args:
@@ -54,7 +55,7 @@ def apply_action(ego, action, control, first, lanes, parameters):  # type: ignor
     if parameters.ego == IDM:
         return
     if parameters.ego == DISCRETE:
-        if first or action == FASTER or action == SLOWER:  # noqa: PLR1714
+        if first or action in (FASTER, SLOWER):
             apply_meta_action(ego, action, lanes, parameters.target_speeds)
     else:
         ego.acceleration = control[0]
@@ -62,7 +63,7 @@ def apply_action(ego, action, control, first, lanes, parameters):  # type: ignor
 
 
 @njit
-def speed_share(ego, parameters):  # type: ignore[no-untyped-def]
+def speed_share(ego: Vehicle, parameters: Parameters) -> float:
     """Forward speed within the rewarded range, in [0, 1]."""
     forward = ego.speed * ego.cos_heading
     low, high = parameters.reward_speed_low, parameters.reward_speed_high
@@ -70,14 +71,14 @@ def speed_share(ego, parameters):  # type: ignore[no-untyped-def]
 
 
 @njit
-def lane_share(ego, lanes, parameters):  # type: ignore[no-untyped-def]
+def lane_share(ego: Vehicle, lanes: int, parameters: Parameters) -> float:
     """How far right, in [0, 1]: the target lane of a vehicle that has one, the current lane of a continuous ego."""
     lane = ego.target_lane if parameters.ego in (DISCRETE, IDM) else ego.lane
     return lane / max(lanes - 1, 1)
 
 
 @njit
-def reward(ego, on_road, lane, speed, parameters):  # type: ignore[no-untyped-def]
+def reward(ego: Vehicle, on_road: bool, lane: float, speed: float, parameters: Parameters) -> float:
     """HighwayEnv._reward from the shares `lane` and `speed`."""
     value = parameters.collision_reward * (1.0 if ego.crashed else 0.0)
     value += parameters.right_lane_reward * lane
@@ -89,8 +90,8 @@ def reward(ego, on_road, lane, speed, parameters):  # type: ignore[no-untyped-de
 
 
 @njit
-def time_to_collision(vehicles, order):  # type: ignore[no-untyped-def]
-    """Seconds until the ego's bumper meets that of the car ahead in its lane at the present speeds; inf if it never does."""
+def time_to_collision(vehicles: Vehicles, order: Integers) -> float:
+    """Seconds until the ego's bumper meets that of the car ahead in its lane at their present speeds; inf if never."""
     place = 0
     while order[place] != 0:
         place += 1
@@ -106,7 +107,7 @@ def time_to_collision(vehicles, order):  # type: ignore[no-untyped-def]
 
 
 @njit
-def score(vehicles, episode, parameters):  # type: ignore[no-untyped-def]
+def score(vehicles: Vehicles, episode: Episode, parameters: Parameters) -> None:
     """Write what one decision brought into the episode's record; reward and progress are added up."""
     ego = vehicles[0]
     on_road = is_on_lane(ego, ego.lane, 0.0)

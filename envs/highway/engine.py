@@ -20,7 +20,18 @@ from envs.highway.ego import apply_action, score, time_to_collision
 from envs.highway.observation import observe
 from envs.highway.sensor import noise_sigma, sensor_range_m
 from envs.highway.spawn import draw_words, lane_spacing, spawn_batch
-from envs.highway.state import EPISODE, VEHICLE, EgoKind, parameters
+from envs.highway.state import (
+    EPISODE,
+    VEHICLE,
+    EgoKind,
+    Episode,
+    Floats,
+    Integers,
+    Parameters,
+    Vehicle,
+    Vehicles,
+    parameters,
+)
 from envs.highway.traffic import act, sort_by_position
 
 
@@ -49,7 +60,9 @@ DONE, TERMINATED, TRUNCATED, CRASHED, OFFROAD = (int(flag) for flag in Flag)
 
 
 @njit
-def advance(vehicles, order, places, corners, lanes, parameters):  # type: ignore[no-untyped-def]
+def advance(
+    vehicles: Vehicles, order: Integers, places: Integers, corners: Floats, lanes: int, parameters: Parameters
+) -> None:
     """AbstractEnv._simulate: the physics frames of one decision."""
     for _ in range(parameters.substeps):
         act(vehicles, order, places, lanes, parameters.ego)
@@ -60,7 +73,16 @@ def advance(vehicles, order, places, corners, lanes, parameters):  # type: ignor
 
 
 @njit
-def drive(vehicles, order, episode, action, control, parameters, places, corners):  # type: ignore[no-untyped-def]
+def drive(
+    vehicles: Vehicles,
+    order: Integers,
+    episode: Episode,
+    action: int,
+    control: Floats,
+    parameters: Parameters,
+    places: Integers,
+    corners: Floats,
+) -> None:
     """One action of one episode: up to `action_repeat` decisions, fewer if the episode ends."""
     episode.reward = 0.0
     episode.progress = 0.0
@@ -75,7 +97,7 @@ def drive(vehicles, order, episode, action, control, parameters, places, corners
 
 
 @njit
-def report(ego, episode, numbers, flags, number):  # type: ignore[no-untyped-def]
+def report(ego: Vehicle, episode: Episode, numbers: NDArray[np.float32], flags: NDArray[np.bool_], number: int) -> None:
     """Copy an episode's record into column `number` of the outputs."""
     numbers[REWARD, number] = episode.reward
     numbers[PROGRESS, number] = episode.progress
@@ -90,7 +112,17 @@ def report(ego, episode, numbers, flags, number):  # type: ignore[no-untyped-def
 
 
 @entry_point
-def step_batch(vehicles, order, episodes, actions, controls, parameters, observation, numbers, flags):  # type: ignore[no-untyped-def]
+def step_batch(
+    vehicles: NDArray[np.void],
+    order: Integers,
+    episodes: NDArray[np.void],
+    actions: Integers,
+    controls: Floats,
+    parameters: Parameters,
+    observation: NDArray[np.float32],
+    numbers: NDArray[np.float32],
+    flags: NDArray[np.bool_],
+) -> None:
     """One action of every unfinished episode. See `HighwayEngine.step`."""
     places = np.empty(vehicles.shape[1], np.int64)
     corners = np.empty((2, 5, 2))
@@ -108,7 +140,16 @@ def step_batch(vehicles, order, episodes, actions, controls, parameters, observa
 
 
 @entry_point
-def observe_batch(vehicles, order, episodes, chosen, parameters, observation, numbers, flags):  # type: ignore[no-untyped-def]
+def observe_batch(
+    vehicles: NDArray[np.void],
+    order: Integers,
+    episodes: NDArray[np.void],
+    chosen: Integers,
+    parameters: Parameters,
+    observation: NDArray[np.float32],
+    numbers: NDArray[np.float32],
+    flags: NDArray[np.bool_],
+) -> None:
     """The observation and record of the episodes `chosen` [R] as they are, without a step."""
     rows = np.empty(observation.shape[1] - 1, np.int64)
     measured = np.empty(4)

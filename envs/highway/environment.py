@@ -119,6 +119,7 @@ class HighwayEnv(EnvBase):
                 "offroad": flag[Flag.OFFROAD],
             },
             batch_size=self.batch_size,
+            device=self.device,
         )
         content = {
             "observation": torch.from_numpy(observation.copy()),
@@ -129,4 +130,4 @@ class HighwayEnv(EnvBase):
         }
         if with_reward:
             content["reward"] = number[Number.REWARD]
-        return TensorDict(content, batch_size=self.batch_size)
+        return TensorDict(content, batch_size=self.batch_size, device=self.device)

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from envs.highway.dynamics import VEHICLE_LENGTH, clip, linear_map
 from envs.highway.sensor import FEATURES, add_noise
+from envs.highway.state import Episode, Floats, Integers, Vehicle, Vehicles
 
 
 @njit
-def is_seen(ego, other, sensor_range):  # type: ignore[no-untyped-def]
+def is_seen(ego: Vehicle, other: Vehicle, sensor_range: float) -> bool:
     """Road.close_objects_to: within the sensor's range and not more than two lengths behind."""
     x, y = other.x - ego.x, other.y - ego.y
-    return -2 * VEHICLE_LENGTH < x and math.sqrt(x * x + y * y) < sensor_range
+    return x > -2 * VEHICLE_LENGTH and math.sqrt(x * x + y * y) < sensor_range
 
 
 @njit
-def nearest_vehicles(vehicles, order, sensor_range, rows):  # type: ignore[no-untyped-def]
+def nearest_vehicles(vehicles: Vehicles, order: Integers, sensor_range: float, rows: Integers) -> int:
     """Fill `rows` [V - 1] with the vehicles seen, nearest along the road first (ties: by number); returns how many."""
     ego = vehicles[0]
     found = 0
@@ -46,7 +49,7 @@ def nearest_vehicles(vehicles, order, sensor_range, rows):  # type: ignore[no-un
 
 
 @njit
-def measure(ego, other, relative, measured):  # type: ignore[no-untyped-def]
+def measure(ego: Vehicle, other: Vehicle, relative: bool, measured: Floats) -> None:
     """Vehicle.to_dict: x, y, vx, vy of `other` into `measured` [4], less the ego's own if `relative`."""
     measured[0] = other.x
     measured[1] = other.y
@@ -60,7 +63,7 @@ def measure(ego, other, relative, measured):  # type: ignore[no-untyped-def]
 
 
 @njit
-def write_row(measured, low, high, row):  # type: ignore[no-untyped-def]
+def write_row(measured: Floats, low: Floats, high: Floats, row: NDArray[np.float32]) -> None:
     """KinematicObservation.normalize_obs: one row [1 + 4], presence first, mapped to [-1, 1] and clipped."""
     row[0] = 1.0
     for feature in range(FEATURES):
@@ -69,7 +72,16 @@ def write_row(measured, low, high, row):  # type: ignore[no-untyped-def]
 
 
 @njit
-def observe(vehicles, order, episode, low, high, rows, measured, observation):  # type: ignore[no-untyped-def]
+def observe(
+    vehicles: Vehicles,
+    order: Integers,
+    episode: Episode,
+    low: Floats,
+    high: Floats,
+    rows: Integers,
+    measured: Floats,
+    observation: NDArray[np.float32],
+) -> None:
     """Fill `observation` [V, 5]: the ego absolute, then the others relative to it, then empty rows.
 
     `rows` [V - 1] and `measured` [4] are scratch.

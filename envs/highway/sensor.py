@@ -1,7 +1,7 @@
 """Weather as a sensor: how far the ego sees, and how noisy it measures. Both environments use these functions.
 
-Range: an active sensor's return from distance R falls as exp(-2 beta R) / R^2 (monostatic equation), so the range at which
-the return is as weak as in clean air at 200 m (highway-env's own limit) solves R exp(beta R) = 200 m.
+Range: an active sensor's return from distance R falls as exp(-2 beta R) / R^2 (monostatic equation), so the range at
+which it is as weak as in clean air at 200 m (highway-env's own limit) solves R exp(beta R) = 200 m.
 Noise: zero-mean Gaussian on x, y (m) and vx, vy (m/s) of the other vehicles. Its size is our modelling choice.
 The draws are a hash of (scenario seed, step, vehicle, feature): no generator, no order, no dependence on the batch.
 """
@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from bench.scenario import Weather
 
@@ -22,10 +23,11 @@ SIGMA_PER_EXTINCTION = 4.0
 
 FEATURES = 4
 TWO_PI = 2 * np.pi
+UNIT_PER_BIT = 1.0 / 2**53
 
 
 def sensor_range_m(weather: Weather) -> float:
-    """Distance in m beyond which vehicles are not seen: the root R of R exp(beta R) = 200, by Newton on its logarithm."""
+    """Distance in m beyond which nothing is seen: the root R of R exp(beta R) = 200, by Newton on its logarithm."""
     extinction = weather.extinction_per_m
     if extinction == 0:
         return CLEAR_RANGE_M
@@ -42,7 +44,7 @@ def noise_sigma(weather: Weather) -> float:
 
 
 @njit
-def mix(value):  # type: ignore[no-untyped-def]
+def mix(value: np.uint64) -> np.uint64:
     """Finaliser of splitmix64 (Steele, Lea and Flood 2014): a bijection on 64 bits that scatters counters."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -50,8 +52,8 @@ def mix(value):  # type: ignore[no-untyped-def]
 
 
 @njit
-def counter_hash(seed, step, vehicle, draw):  # type: ignore[no-untyped-def]
-    """64 uniform bits for one counter; each part is mixed in on its own, so that neighbouring counters share nothing."""
+def counter_hash(seed: int, step: int, vehicle: int, draw: int) -> np.uint64:
+    """64 uniform bits for one counter; each part is mixed in on its own: neighbouring counters share nothing."""
     step_size = np.uint64(0x9E3779B97F4A7C15)
     value = mix(np.uint64(seed) + step_size)
     value = mix((value ^ np.uint64(step)) + step_size)
@@ -60,18 +62,17 @@ def counter_hash(seed, step, vehicle, draw):  # type: ignore[no-untyped-def]
 
 
 @njit
-def standard_normal(seed, step, vehicle, feature):  # type: ignore[no-untyped-def]
+def standard_normal(seed: int, step: int, vehicle: int, feature: int) -> float:
     """One standard normal number by Box and Muller's transform of two hashed uniforms."""
-    scale = 1.0 / 9007199254740992.0
     radius_bits = counter_hash(seed, step, vehicle, 2 * feature) >> np.uint64(11)
     angle_bits = counter_hash(seed, step, vehicle, 2 * feature + 1) >> np.uint64(11)
     # (bits + 1) keeps the logarithm finite.
-    radius = math.sqrt(-2.0 * math.log((np.float64(radius_bits) + 1.0) * scale))
-    return radius * math.cos(TWO_PI * np.float64(angle_bits) * scale)
+    radius = math.sqrt(-2.0 * math.log((np.float64(radius_bits) + 1.0) * UNIT_PER_BIT))
+    return radius * math.cos(TWO_PI * np.float64(angle_bits) * UNIT_PER_BIT)
 
 
 @njit
-def add_noise(measured, sigma, seed, step, vehicle):  # type: ignore[no-untyped-def]
+def add_noise(measured: NDArray[np.float64], sigma: float, seed: int, step: int, vehicle: int) -> None:
     """Disturb one vehicle's measured x, y, vx, vy [4], in place and in physical units; sigma 0 leaves every bit."""
     if sigma > 0.0:
         for feature in range(FEATURES):

@@ -13,12 +13,18 @@ from numpy.typing import NDArray
 from envs.highway.compiled import entry_point
 from envs.highway.dynamics import CONTINUOUS, IDM, LANE_WIDTH, SPEED_LIMIT, closest_lane, update_direction
 from envs.highway.ego import nearest_target_speed
+from envs.highway.state import Floats, Integers, Parameters, Vehicle, Vehicles
+
+Words = NDArray[np.uint64]
 
 EGO_SPEED = 25.0
 TRAFFIC_SPEED_LOW, TRAFFIC_SPEED_HIGH = 0.7 * SPEED_LIMIT, 0.8 * SPEED_LIMIT
 SPACING_LOW, SPACING_HIGH = 0.9, 1.1
 DELTA_LOW, DELTA_HIGH = 3.5, 4.5
 DEFAULT_DELTA = 4.0
+
+LOW_HALF = np.uint64(2**32 - 1)
+UNIT_PER_BIT = 1.0 / 2**53
 
 
 def draw_words(seeds: NDArray[np.int64], vehicles: int) -> NDArray[np.uint64]:
@@ -36,45 +42,45 @@ def lane_spacing(lanes: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 @njit
-def next_double(words, cursor):  # type: ignore[no-untyped-def]
+def next_double(words: Words, cursor: Integers) -> float:
     """Generator.random: 53 bits of the next word. `cursor` holds [next word, stored half word or -1]."""
     word = words[cursor[0]]
     cursor[0] += 1
-    return np.float64(word >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+    return np.float64(word >> np.uint64(11)) * UNIT_PER_BIT
 
 
 @njit
-def next_half_word(words, cursor):  # type: ignore[no-untyped-def]
+def next_half_word(words: Words, cursor: Integers) -> np.uint64:
     """PCG64's 32-bit output: the low half of a word now, its high half the next time."""
     if cursor[1] >= 0:
-        half = cursor[1]
+        half = np.uint64(cursor[1])
         cursor[1] = -1
-        return np.uint64(half)
+        return half
     word = words[cursor[0]]
     cursor[0] += 1
     cursor[1] = np.int64(word >> np.uint64(32))
-    return word & np.uint64(0xFFFFFFFF)
+    return word & LOW_HALF
 
 
 @njit
-def next_below(words, cursor, bound):  # type: ignore[no-untyped-def]
+def next_below(words: Words, cursor: Integers, bound: int) -> np.int64:
     """Generator.integers(bound), and so Generator.choice(bound): Lemire's method on 32 bits."""
-    bound = np.uint64(bound)
-    product = next_half_word(words, cursor) * bound
-    threshold = (np.uint64(0x100000000) - bound) % bound
-    while (product & np.uint64(0xFFFFFFFF)) < threshold:
-        product = next_half_word(words, cursor) * bound
+    limit = np.uint64(bound)
+    product = next_half_word(words, cursor) * limit
+    threshold = (np.uint64(2**32) - limit) % limit
+    while (product & LOW_HALF) < threshold:
+        product = next_half_word(words, cursor) * limit
     return np.int64(product >> np.uint64(32))
 
 
 @njit
-def next_uniform(words, cursor, low, high):  # type: ignore[no-untyped-def]
+def next_uniform(words: Words, cursor: Integers, low: float, high: float) -> float:
     """Generator.uniform(low, high)."""
     return low + (high - low) * next_double(words, cursor)
 
 
 @njit
-def place_vehicle(vehicle, x, lane, lanes, speed):  # type: ignore[no-untyped-def]
+def place_vehicle(vehicle: Vehicle, x: float, lane: int | np.int64, lanes: int, speed: float) -> None:
     """Put a vehicle on the centre of a lane, driving along it."""
     vehicle.x = x
     vehicle.y = LANE_WIDTH * lane
@@ -93,7 +99,16 @@ def place_vehicle(vehicle, x, lane, lanes, speed):  # type: ignore[no-untyped-de
 
 
 @njit
-def spawn_episode(vehicles, words, lanes, ego_spacing, traffic_spacing, lane_factor, ego, target_speeds):  # type: ignore[no-untyped-def]
+def spawn_episode(
+    vehicles: Vehicles,
+    words: Words,
+    lanes: int,
+    ego_spacing: float,
+    traffic_spacing: float,
+    lane_factor: float,
+    ego: int,
+    target_speeds: Floats,
+) -> None:
     """Fill `vehicles` [N], the ego first; each starts ahead of all before it (Vehicle.create_random)."""
     cursor = np.array([0, -1], dtype=np.int64)
     furthest = 0.0
@@ -116,7 +131,17 @@ def spawn_episode(vehicles, words, lanes, ego_spacing, traffic_spacing, lane_fac
 
 
 @entry_point
-def spawn_batch(vehicles, order, episodes, chosen, words, ego_spacing, traffic_spacing, lane_factors, parameters):  # type: ignore[no-untyped-def]
+def spawn_batch(
+    vehicles: NDArray[np.void],
+    order: Integers,
+    episodes: NDArray[np.void],
+    chosen: Integers,
+    words: Words,
+    ego_spacing: float,
+    traffic_spacing: Floats,
+    lane_factors: Floats,
+    parameters: Parameters,
+) -> None:
     """Start the episodes `chosen` [R] of `vehicles` [B, N] anew.
 
     Args:

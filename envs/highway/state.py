@@ -6,53 +6,69 @@ Vehicles are kept in highway-env's order (the ego is 0), on which several of its
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.highway.config import HighwayConfig
 
-VEHICLE = np.dtype(
-    [
-        ("x", np.float64),  # m along the road
-        ("y", np.float64),  # m across it; lane i has its centre at 4 i
-        ("heading", np.float64),  # rad
-        ("speed", np.float64),  # m/s, signed
-        ("cos_heading", np.float64),
-        ("sin_heading", np.float64),
-        ("target_speed", np.float64),  # m/s
-        ("timer", np.float64),  # s since the last time a lane change was considered
-        ("delta", np.float64),  # IDM exponent
-        ("steering", np.float64),  # rad
-        ("acceleration", np.float64),  # m/s2
-        ("impact_x", np.float64),  # m, the push of a collision, applied in the next frame
-        ("impact_y", np.float64),
-        ("impact_pair", np.int64),  # the pair of vehicles that set the impact, -1 if none is pending
-        ("lane", np.int64),
-        ("target_lane", np.int64),
-        ("crashed", np.bool_),
-    ],
-    align=True,
-)
 
-EPISODE = np.dtype(
-    [
-        ("lanes", np.int64),
-        ("seed", np.int64),
-        ("steps", np.int64),  # decisions so far
-        ("sensor_range", np.float64),  # m
-        ("noise_sigma", np.float64),  # m and m/s
-        ("reward", np.float64),  # of the last step
-        ("progress", np.float64),  # of the last step, in [0, 1] a decision
-        ("ttc", np.float64),  # s
-        ("crashed", np.bool_),
-        ("offroad", np.bool_),
-        ("terminated", np.bool_),
-        ("truncated", np.bool_),
-    ],
-    align=True,
-)
+class Vehicle:
+    """One vehicle."""
+
+    x: float  # m along the road
+    y: float  # m across it; lane i has its centre at 4 i
+    heading: float  # rad
+    speed: float  # m/s, signed
+    cos_heading: float
+    sin_heading: float
+    target_speed: float  # m/s
+    timer: float  # s since a lane change was last considered
+    delta: float  # IDM exponent
+    steering: float  # rad
+    acceleration: float  # m/s2
+    impact_x: float  # m, the push of a collision, applied in the next frame
+    impact_y: float  # m
+    impact_pair: int  # the pair of vehicles that set the impact, -1 if none is pending
+    lane: int
+    target_lane: int
+    crashed: bool
+
+
+class Episode:
+    """One episode."""
+
+    lanes: int
+    seed: int  # the scenario's
+    steps: int  # decisions so far
+    sensor_range: float  # m
+    noise_sigma: float  # m and m/s
+    reward: float  # of the last action
+    progress: float  # of the last action, in [0, 1] a decision
+    ttc: float  # s, time to collision
+    crashed: bool
+    offroad: bool
+    terminated: bool
+    truncated: bool
+
+
+def record_type(kind: type) -> np.dtype[np.void]:
+    """The numpy record with the fields that a class declares."""
+    fields = {"float": np.float64, "int": np.int64, "bool": np.bool_}
+    return np.dtype([(name, fields[annotation]) for name, annotation in kind.__annotations__.items()], align=True)
+
+
+VEHICLE = record_type(Vehicle)
+EPISODE = record_type(Episode)
+
+
+class Vehicles(Protocol):
+    """The vehicles [N] of an episode, a numpy array of `VEHICLE`, as compiled code sees it."""
+
+    size: int
+
+    def __getitem__(self, number: int) -> Vehicle: ...
 
 
 class EgoKind(IntEnum):
@@ -81,6 +97,10 @@ class Parameters(NamedTuple):
     reward_speed_high: float
     normalize_reward: bool
     offroad_terminal: bool
+
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
 
 
 def ego_kind(config: HighwayConfig) -> EgoKind:

@@ -21,6 +21,7 @@ from envs.highway.dynamics import (
     speed_control,
     steering_control,
 )
+from envs.highway.state import Integers, Vehicle, Vehicles
 
 MAX_ACCELERATION = 6.0
 COMFORT_ACCELERATION = 3.0
@@ -36,7 +37,7 @@ NO_ONE = -1
 
 
 @njit
-def sort_by_position(vehicles, order):  # type: ignore[no-untyped-def]
+def sort_by_position(vehicles: Vehicles, order: Integers) -> None:
     """Bring `order` [N] up to date, in place: insertion sort, for it is nearly sorted from the frame before."""
     for place in range(1, order.size):
         moved = order[place]
@@ -49,10 +50,10 @@ def sort_by_position(vehicles, order):  # type: ignore[no-untyped-def]
 
 
 @njit
-def front_vehicle(vehicles, order, place, lane):  # type: ignore[no-untyped-def]
-    """Road.neighbour_vehicles: the nearest vehicle on `lane` at or ahead of the vehicle at `place` of `order`, or NO_ONE.
+def front_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> int:
+    """Road.neighbour_vehicles: the nearest on `lane`, level with or ahead of the vehicle at `place` of `order`.
 
-    Among vehicles at the very same position the last in highway-env's order wins.
+    Its number, or NO_ONE. Among vehicles at the very same position the last in highway-env's order wins.
     """
     x = vehicles[order[place]].x
     first = place
@@ -69,10 +70,10 @@ def front_vehicle(vehicles, order, place, lane):  # type: ignore[no-untyped-def]
 
 
 @njit
-def rear_vehicle(vehicles, order, place, lane):  # type: ignore[no-untyped-def]
-    """Road.neighbour_vehicles: the nearest vehicle on `lane` behind the vehicle at `place` of `order`, or NO_ONE.
+def rear_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> int:
+    """Road.neighbour_vehicles: the nearest on `lane` behind the vehicle at `place` of `order`.
 
-    Among vehicles at the very same position the first in highway-env's order wins.
+    Its number, or NO_ONE. Among vehicles at the very same position the first in highway-env's order wins.
     """
     x = vehicles[order[place]].x
     found = NO_ONE
@@ -86,7 +87,7 @@ def rear_vehicle(vehicles, order, place, lane):  # type: ignore[no-untyped-def]
 
 
 @njit
-def desired_gap(vehicle, leader):  # type: ignore[no-untyped-def]
+def desired_gap(vehicle: Vehicle, leader: Vehicle) -> float:
     """IDMVehicle.desired_gap in m; the difference of velocities is taken along the vehicle's own direction."""
     cos, sin = vehicle.cos_heading, vehicle.sin_heading
     along = vehicle.speed * cos - leader.speed * leader.cos_heading
@@ -96,21 +97,21 @@ def desired_gap(vehicle, leader):  # type: ignore[no-untyped-def]
 
 
 @njit
-def free_acceleration(vehicle, target_speed, delta):  # type: ignore[no-untyped-def]
+def free_acceleration(vehicle: Vehicle, target_speed: float, delta: float) -> float:
     """IDMVehicle.acceleration on an empty road, in m/s2."""
     wanted = abs(not_zero(clip(target_speed, 0.0, SPEED_LIMIT)))
     return COMFORT_ACCELERATION * (1 - math.pow(max(vehicle.speed, 0.0) / wanted, delta))
 
 
 @njit
-def interaction(vehicle, leader):  # type: ignore[no-untyped-def]
+def interaction(vehicle: Vehicle, leader: Vehicle) -> float:
     """What IDMVehicle.acceleration subtracts for the vehicle ahead, in m/s2."""
     ratio = desired_gap(vehicle, leader) / not_zero(leader.x - vehicle.x)
     return COMFORT_ACCELERATION * (ratio * ratio)
 
 
 @njit
-def following_acceleration(vehicles, number, leader, free):  # type: ignore[no-untyped-def]
+def following_acceleration(vehicles: Vehicles, number: int, leader: int, free: float) -> float:
     """IDMVehicle.acceleration behind `leader` (or NO_ONE), in m/s2, given its value `free` on an empty road."""
     if leader < 0:
         return free
@@ -118,12 +119,14 @@ def following_acceleration(vehicles, number, leader, free):  # type: ignore[no-u
 
 
 @njit
-def wants_lane(vehicles, order, place, lane, free, own_leader, ego):  # type: ignore[no-untyped-def]
+def wants_lane(
+    vehicles: Vehicles, order: Integers, place: int, lane: int, free: float, own_leader: int, ego: int
+) -> bool:
     """IDMVehicle.mobil: whether changing to `lane` pays and imposes no hard braking on the new follower.
 
-    The two conditions are independent; the cheap one is looked at first. Politeness is 0 in highway-env. Accelerations of
-    others are evaluated with the deciding vehicle's own IDM exponent, and a continuous ego, which has no target speed,
-    with a target of 0.
+    The two conditions are independent; the cheap one is looked at first. Politeness is 0 in highway-env. The follower's
+    acceleration is evaluated with the deciding vehicle's own IDM exponent, and a continuous ego, which has no target
+    speed, with a target of 0.
     """
     number = order[place]
     new_leader = front_vehicle(vehicles, order, place, lane)
@@ -141,7 +144,7 @@ def wants_lane(vehicles, order, place, lane, free, own_leader, ego):  # type: ig
 
 
 @njit
-def must_abort(vehicles, number, ego):  # type: ignore[no-untyped-def]
+def must_abort(vehicles: Vehicles, number: int, ego: int) -> bool:
     """Whether someone just ahead is already changing to the same lane (IDMVehicle.change_lane_policy)."""
     vehicle = vehicles[number]
     for other in range(1 if ego == CONTINUOUS else 0, vehicles.size):
@@ -155,7 +158,9 @@ def must_abort(vehicles, number, ego):  # type: ignore[no-untyped-def]
 
 
 @njit
-def choose_lane(vehicles, order, place, lanes, free, leader, ego):  # type: ignore[no-untyped-def]
+def choose_lane(
+    vehicles: Vehicles, order: Integers, place: int, lanes: int, free: float, leader: int, ego: int
+) -> None:
     """IDMVehicle.change_lane_policy, its second half: look left, then right; right overwrites left."""
     vehicle = vehicles[order[place]]
     vehicle.timer = 0.0
@@ -171,7 +176,7 @@ def choose_lane(vehicles, order, place, lanes, free, leader, ego):  # type: igno
 
 
 @njit
-def drive_idm(vehicles, order, place, lanes, ego):  # type: ignore[no-untyped-def]
+def drive_idm(vehicles: Vehicles, order: Integers, place: int, lanes: int, ego: int) -> None:
     """IDMVehicle.act: MOBIL for the lane, IDM for the acceleration (over both lanes during a change)."""
     number = order[place]
     vehicle = vehicles[number]
@@ -193,7 +198,7 @@ def drive_idm(vehicles, order, place, lanes, ego):  # type: ignore[no-untyped-de
 
 
 @njit
-def act(vehicles, order, places, lanes, ego):  # type: ignore[no-untyped-def]
+def act(vehicles: Vehicles, order: Integers, places: Integers, lanes: int, ego: int) -> None:
     """Road.act: every vehicle decides, in highway-env's order, for each sees the target lanes chosen before it.
 
     `places` [N] is scratch: the place of each vehicle in `order`.
