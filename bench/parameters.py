@@ -1,0 +1,101 @@
+"""A component's parameters: its dataclass fields, with their types, choices, and the meaning its docstring gives them."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import types
+import typing
+from dataclasses import MISSING, Field, dataclass, fields
+from typing import Any, Literal, Union, get_args, get_origin
+
+from bench.errors import UserError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """One parameter of a component.
+
+    Args:
+        name: of the dataclass field.
+        hint: its type.
+        default: None where `required`.
+        required: whether it must be given.
+        meaning: what the class docstring's Args say of it; empty if nothing.
+    """
+
+    name: str
+    hint: Any
+    default: Any
+    required: bool
+    meaning: str
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """What is allowed, where the type is a Literal; empty otherwise."""
+        hints = (self.hint, *get_args(self.hint)) if get_origin(self.hint) in (Union, types.UnionType) else (self.hint,)
+        return tuple(choice for hint in hints if get_origin(hint) is Literal for choice in get_args(hint))
+
+    @property
+    def type_name(self) -> str:
+        """The type as an author writes it."""
+        if self.choices:
+            return type(self.choices[0]).__name__
+        return self.hint.__name__ if isinstance(self.hint, type) and not get_args(self.hint) else str(self.hint)
+
+
+def parameters(component: type) -> dict[str, Parameter]:
+    """The parameters of a component class, in order.
+
+    Raises:
+        UserError: if a type annotation cannot be read at run time.
+    """
+    try:
+        hints = typing.get_type_hints(component)
+    except NameError as error:
+        raise UserError(f"the parameters of {component.__qualname__} cannot be read: {error}") from error
+    meanings = _meanings(component)
+    return {
+        field.name: Parameter(
+            name=field.name,
+            hint=hints[field.name],
+            default=_default(field),
+            required=field.default is MISSING and field.default_factory is MISSING,
+            meaning=meanings.get(field.name, ""),
+        )
+        for field in fields(component)
+        if field.init
+    }
+
+
+def description(component: type) -> str:
+    """The class docstring without its Args; empty if it has none of its own."""
+    return re.sub(r"\n*Args:\n(?:[ \t]+.*\n?|\n(?=[ \t]))*", "\n", _docstring(component)).strip()
+
+
+def _default(field: Field[Any]) -> Any:
+    if field.default_factory is not MISSING:
+        return field.default_factory()
+    return None if field.default is MISSING else field.default
+
+
+def _docstring(component: type) -> str:
+    own = component.__dict__.get("__doc__") or ""
+    # dataclass() writes the signature where an author wrote nothing.
+    return "" if own.startswith(f"{component.__name__}(") else inspect.cleandoc(own)
+
+
+def _meanings(component: type) -> dict[str, str]:
+    """The Args section of a Google-style docstring: `name: meaning` or `name, name: meaning`, continued by deeper lines."""
+    _, _, section = _docstring(component).partition("Args:\n")
+    found: dict[str, str] = {}
+    current: list[str] = []
+    for line in section.splitlines():
+        if line and not line.startswith(" "):
+            break
+        if match := re.match(r" {1,4}(\w+(?:, \w+)*): (.*)", line):
+            current = match[1].split(", ")
+            found |= dict.fromkeys(current, match[2])
+        elif line.strip():
+            found |= {name: f"{found[name]} {line.strip()}" for name in current}
+    return found

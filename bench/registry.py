@@ -1,0 +1,142 @@
+"""Names to components, through Python entry points only: a third party's plug-in is found exactly as a built-in is.
+
+Reading names imports no component, so `bench list` is quick; a component's module is imported when it is loaded.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from importlib import metadata
+from typing import Any, Literal, get_args
+
+from bench.errors import UserError
+
+Kind = Literal["attack", "defense", "victim", "world"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+GROUPS: dict[Kind, str] = {
+    "attack": "cavbench.attacks",
+    "defense": "cavbench.defenses",
+    "victim": "cavbench.victims",
+    "world": "cavbench.worlds",
+}
+REPORTS = "cavbench.reports"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One name in a group of entry points.
+
+    Args:
+        name: what the command line calls it.
+        target: `module:attribute`.
+        distribution: name of the pip package that ships it.
+        version: of that package.
+    """
+
+    name: str
+    target: str
+    distribution: str
+    version: str
+
+    @property
+    def shipped_by(self) -> str:
+        """Distribution and version, as records name them."""
+        return f"{self.distribution} {self.version}"
+
+
+@cache
+def entries(group: str) -> dict[str, tuple[Entry, ...]]:
+    """Every name of an entry-point group, sorted, with all that claim it: more than one is a clash."""
+    found: dict[str, set[Entry]] = {}
+    for point in metadata.entry_points(group=group):
+        distribution, version = (point.dist.name, point.dist.version) if point.dist else ("unknown", "unknown")
+        entry = Entry(name=point.name, target=point.value, distribution=distribution, version=version)
+        found.setdefault(point.name, set()).add(entry)
+    return {name: tuple(sorted(found[name], key=lambda entry: entry.shipped_by)) for name in sorted(found)}
+
+
+def names(kind: Kind) -> list[str]:
+    """The names of all components of a kind, without importing any."""
+    return list(entries(GROUPS[kind]))
+
+
+def problem(claims: tuple[Entry, ...]) -> str:
+    """What is wrong with a name as far as can be said without importing it; empty if nothing."""
+    if len(claims) == 1:
+        return ""
+    return f"shipped by {' and by '.join(entry.shipped_by for entry in claims)}; uninstall one"
+
+
+def find(group: str, name: str, noun: str) -> Entry:
+    """The entry of a name.
+
+    Args:
+        group: entry-point group.
+        name: of the entry.
+        noun: what the error message calls it, for instance `attack`.
+
+    Raises:
+        UserError: if there is none, or more than one.
+    """
+    known = entries(group)
+    if name not in known:
+        raise UserError(unknown(f"{noun} {name!r}", name, known))
+    if complaint := problem(known[name]):
+        raise UserError(f"{noun} {name!r} is {complaint}")
+    return known[name][0]
+
+
+def resolve(group: str, name: str, noun: str) -> Any:
+    """The object an entry point names, imported.
+
+    Raises:
+        UserError: if there is no such name, or if importing it fails, naming the package that ships it.
+    """
+    entry = find(group, name, noun)
+    point = metadata.EntryPoint(name=name, value=entry.target, group=group)
+    try:
+        return point.load()
+    # A plug-in may fail in any way while it is imported, and must not take the others with it.
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise UserError(
+            f"{noun} {name!r} ({entry.target} of {entry.shipped_by}) cannot be imported: {reason}"
+        ) from error
+
+
+def load(kind: Kind, name: str) -> type[Any]:
+    """The class of a component.
+
+    Raises:
+        UserError: if the name is unknown or taken twice, or if the plug-in is broken: it cannot be imported, or it is not a
+            frozen dataclass derived from the base class of its kind.
+    """
+    from bench import contracts
+
+    component = resolve(GROUPS[kind], name, kind)
+    entry = find(GROUPS[kind], name, kind)
+    base = getattr(contracts, kind.capitalize())
+    where = f"{kind} {name!r} ({entry.target} of {entry.shipped_by})"
+    if not (inspect.isclass(component) and issubclass(component, base)):
+        raise UserError(f"{where} is not a subclass of bench.contracts.{base.__name__}")
+    if missing := sorted(component.__abstractmethods__):
+        raise UserError(f"{where} does not implement {', '.join(missing)}")
+    if not (is_dataclass(component) and component.__dataclass_params__.frozen):  # type: ignore[attr-defined]
+        raise UserError(f"{where} is not a frozen dataclass: write @dataclass(frozen=True, kw_only=True) above it")
+    if positional := [field.name for field in fields(component) if field.init and not field.kw_only]:
+        raise UserError(
+            f"{where} takes {', '.join(positional)} by position: write @dataclass(frozen=True, kw_only=True)"
+        )
+    return component
+
+
+def unknown(what: str, word: str, known: Iterable[str]) -> str:
+    """One line for a word that is not known: what it was, the nearest that is, and all that are."""
+    known = list(known)
+    near = difflib.get_close_matches(word, known, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return f"unknown {what}; {hint}known: {', '.join(known) or 'none'}"
