@@ -16,6 +16,9 @@ from bench.contracts import ActionType
 
 Objective = Literal["expected", "margin", "target"]
 
+TIE_BREAK = 1e-3
+"""Weight of the soft loss beside the greedy action's clean Q when points are compared."""
+
 
 def expected(scores: Tensor, clean: Tensor, temperature: float) -> Tensor:
     """The clean Q expected under the attacked policy: softmax(Q(x') / tau) . Q(x).
@@ -82,6 +85,16 @@ class Loss:
             return margin(scores, self.clean.argmax(-1))
         return -margin(scores, torch.full(scores.shape[-2:-1], int(self.target)))  # type: ignore[arg-type]
 
+    def key(self, scores: Tensor) -> Tensor:
+        """What the best of several asked points is chosen by, [..., B], lower is better.
+
+        The victim takes its greedy action, so for `expected` the clean Q of that action comes first, and the loss decides
+        between points with the same one. Elsewhere it is the loss.
+        """
+        if self.action_type == "continuous" or self.objective != "expected":
+            return self(scores)
+        return self._given(scores) + TIE_BREAK * self(scores)
+
     def met(self, scores: Tensor) -> Tensor:
         """Whether the victim already does what the attacker wants, bool [..., B]."""
         if self.action_type == "continuous":
@@ -90,10 +103,12 @@ class Loss:
             return torch.zeros(scores.shape[:-1], dtype=torch.bool)
         if self.objective != "expected":
             return self(scores) < 0
-        greedy = scores.argmax(-1, keepdim=True)
         best, worst = self.clean.amax(-1), self.clean.amin(-1)
-        given = self.clean.expand(scores.shape).gather(-1, greedy).squeeze(-1)
-        return best - given >= self.enough * (best - worst)
+        return best - self._given(scores) >= self.enough * (best - worst)
+
+    def _given(self, scores: Tensor) -> Tensor:
+        """Clean Q of the greedy action, [..., B]."""
+        return self.clean.expand(scores.shape).gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
 
     def of(self, rows: Tensor) -> Loss:
         """The same for some of the episodes."""

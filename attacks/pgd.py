@@ -28,14 +28,14 @@ class PGD(Attack):
 
     Args:
         steps: gradient steps a restart, at least 1 (default 10).
-        step_size: length of a step as a share of the radius, in (0, 2] (default 0.25).
-        restarts: independent starts, at least 1, all in one batch (default 1).
+        step_size: length of a step as a share of the radius, in (0, 2] (default 0.5).
+        restarts: independent starts, at least 1, all in one batch (default 4).
         random_start: begin at a random point of the set instead of the true observation (default true).
         momentum: decay of the accumulated gradient (MI-FGSM, Dong et al. 2018), in [0, 1); 0 is plain PGD (default 0).
         objective: what is minimised (default `expected`): `expected` the clean Q expected under the attacked policy (for a
             continuous victim its critic's Q(x, mu(x'))); `margin` the lead of the clean action (minus the distance from it);
             `target` the lead over the target action (the distance to it).
-        temperature: of `expected`, as a share of the spread of the clean Q-values, above 0 (default 0.2).
+        temperature: of `expected`, as a share of the spread of the clean Q-values, above 0 (default 0.5).
         target_action: discrete target, at least 0 (default 3, FASTER).
         target_acceleration: continuous target, in [-1, 1] (default 1).
         target_steering: continuous target, in [-1, 1] (default 0.5).
@@ -51,12 +51,12 @@ class PGD(Attack):
     access: ClassVar[Access] = "gradients"
 
     steps: int = 10
-    step_size: float = 0.25
-    restarts: int = 1
+    step_size: float = 0.5
+    restarts: int = 4
     random_start: bool = True
     momentum: float = 0.0
     objective: Objective = "expected"
-    temperature: float = 0.2
+    temperature: float = 0.5
     target_action: int = 3
     target_acceleration: float = 1.0
     target_steering: float = 0.5
@@ -94,13 +94,24 @@ class PGD(Attack):
         accumulated = torch.zeros_like(x)
         best, lowest = x, torch.full(x.shape[:2], torch.inf)
         for step in range(steps):
-            value, gradient = oracle.gradient(x, loss)
+            key, gradient = self._ask(x, loss, oracle)
             if step > 0:
-                best, lowest = _better(best, lowest, x, value)
+                best, lowest = _better(best, lowest, x, key)
             accumulated = self.momentum * accumulated + _unit(gradient)
             x = oracle.project(x - self.step_size * oracle.radius * accumulated.sign())
-        best, lowest = _better(best, lowest, x, loss(oracle.scores(x)))
+        best, lowest = _better(best, lowest, x, _key(loss, oracle.scores(x)))
         return best[lowest.argmin(0), torch.arange(observation.shape[0])]
+
+    def _ask(self, x: Tensor, loss: Callable[[Tensor], Tensor], oracle: Oracle) -> tuple[Tensor, Tensor]:
+        """What iterates are compared by [R, B] and the loss's gradient [R, B, V, F], from one query."""
+        keys: list[Tensor] = []
+
+        def asked(scores: Tensor) -> Tensor:
+            keys.append(_key(loss, scores.detach()))
+            return loss(scores)
+
+        _, gradient = oracle.gradient(x, asked)
+        return keys[0], gradient
 
     def _loss(self, observation: Tensor, oracle: Oracle) -> Callable[[Tensor], Tensor]:
         """The loss [..., B] of the victim's scores, to be minimised."""
@@ -115,6 +126,11 @@ class PGD(Attack):
             temperature=self.temperature,
             target=(self.target_acceleration, self.target_steering) if continuous else self.target_action,
         )
+
+
+def _key(loss: Callable[[Tensor], Tensor], scores: Tensor) -> Tensor:
+    """What iterates are compared by, [R, B]."""
+    return loss.key(scores) if isinstance(loss, Loss) else loss(scores).detach()
 
 
 def _unit(gradient: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 import torch
@@ -57,12 +58,12 @@ class ZOSignSGD(Attack):
 
     access: ClassVar[Access] = "scores"
 
-    steps: int = 10
+    steps: int = 5
     directions: int = 20
-    smoothing: float = 0.5
-    step_size: float = 0.5
+    smoothing: float = 1.0
+    step_size: float = 1.0
     objective: ZOObjective = "expected"
-    temperature: float = 0.2
+    temperature: float = 0.5
     target_action: int = 3
     target_acceleration: float = 1.0
     target_steering: float = 0.5
@@ -112,12 +113,12 @@ class ZOSignSGD(Attack):
             points = torch.cat((x.unsqueeze(0), probes))
             scores = oracle.scores(points, rows)
             loss = self._loss(scores[0], oracle) if loss is None else loss
-            value = self._value(loss, scores, points, oracle.observation[rows])
-            found, at = value.min(0)
+            value, key = self._value(loss, scores, points, oracle.observation[rows])
+            found, at = key.min(0)
             improved = found < lowest[rows]
             lowest[rows] = torch.where(improved, found, lowest[rows])
             best[rows[improved]] = points[at, torch.arange(len(rows))][improved]
-            estimate = torch.einsum("qb,qvf->bvf", value[1:] - value[0], directions.squeeze(1))
+            estimate = torch.einsum("qb,qvf->bvf", value[1:] - value[1:].mean(0), directions.squeeze(1))
             x = oracle.project(x - self.step_size * oracle.radius[rows] * estimate.sign(), rows)
             if self.early_stop:
                 running = ~loss.met(scores).any(0)
@@ -138,12 +139,12 @@ class ZOSignSGD(Attack):
             enough=self.enough,
         )
 
-    def _value(self, loss: Loss, scores: Tensor, points: Tensor, observation: Tensor) -> Tensor:
-        """The loss [q + 1, B] of every point asked; Eq. 4.10 for `thesis`."""
-        value = loss(scores)
-        if self.objective == "thesis":
-            return value.clamp(min=0) + self.distortion_weight * distortion(points, observation)
-        return value
+    def _value(self, loss: Loss, scores: Tensor, points: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """The loss of every point asked, and what the best is chosen by, both [q + 1, B]; Eq. 4.10 for `thesis`."""
+        if self.objective != "thesis":
+            return loss(scores), loss.key(scores)
+        value = loss(scores).clamp(min=0) + self.distortion_weight * distortion(points, observation)
+        return value, value
 
 
 def _generator(oracle: Oracle) -> torch.Generator:
@@ -152,6 +153,25 @@ def _generator(oracle: Oracle) -> torch.Generator:
     return torch.Generator().manual_seed(int(seed))
 
 
+@cache
+def _hadamard(order: int) -> Tensor:
+    """[order, order] Sylvester's matrix of signs with orthogonal rows; `order` is a power of two."""
+    matrix = torch.ones(1, 1)
+    while len(matrix) < order:
+        matrix = torch.cat((torch.cat((matrix, matrix), 1), torch.cat((matrix, -matrix), 1)))
+    return matrix
+
+
 def _directions(count: int, shape: torch.Size, generator: torch.Generator) -> Tensor:
-    """[q, V, F] random directions of root mean square length 1: random signs."""
-    return torch.randint(0, 2, (count, *shape), generator=generator) * 2.0 - 1.0
+    """[q, V, F] random signs, nearly orthogonal to each other: rows and columns drawn from a Hadamard matrix.
+
+    Orthogonal directions estimate a gradient with less variance than independent ones (Choromanski et al. 2018, "Structured
+    Evolution with Compact Architectures"). `presence` gets 0: no budget moves it.
+    """
+    vehicles, features = shape[0], shape[1] - 1
+    order = 1 << (max(count, vehicles * features) - 1).bit_length()
+    rows = torch.randperm(order, generator=generator)[:count]
+    columns = torch.randperm(order, generator=generator)[: vehicles * features]
+    flips = torch.randint(0, 2, (vehicles * features,), generator=generator) * 2.0 - 1.0
+    signs = (_hadamard(order)[rows][:, columns] * flips).reshape(count, vehicles, features)
+    return torch.cat((torch.zeros(count, vehicles, 1), signs), -1)
