@@ -36,7 +36,7 @@ BESIDE_THE_RESULT = (
 
 
 def canonical(value: Any) -> str:
-    """The one JSON text of a value: sorted keys, no spaces; dataclasses by their fields, other objects by their str()."""
+    """The one JSON text of a value: sorted keys, no spaces; dataclasses by their fields, other objects by str()."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     return json.dumps(value, sort_keys=True, separators=(",", ":"), default=str)
@@ -49,7 +49,7 @@ def digest(value: Any) -> str:
 
 @cache
 def source_digest(package: str) -> str:
-    """sha256 over the names and contents of a top-level package's Python files (of `bench`: those that make the result)."""
+    """sha256 over names and contents of a top-level package's Python files; of `bench`, those that make results."""
     spec = importlib.util.find_spec(package)
     roots = [Path(root) for root in (spec.submodule_search_locations or ())] if spec else []
     files = {str(path.relative_to(root)): path for root in roots for path in root.rglob("*.py")}

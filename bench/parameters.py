@@ -1,4 +1,4 @@
-"""A component's parameters: its dataclass fields, with their types, choices, and the meaning its docstring gives them."""
+"""A component's parameters: its dataclass fields with their types, choices, and the meaning in its docstring."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _docstring(component: type) -> str:
 
 
 def _meanings(component: type) -> dict[str, str]:
-    """The Args section of a Google-style docstring: `name: meaning` or `name, name: meaning`, continued by deeper lines."""
+    """The Args of a Google-style docstring: `name: meaning` or `name, name: meaning`, continued by deeper lines."""
     _, _, section = _docstring(component).partition("Args:\n")
     found: dict[str, str] = {}
     current: list[str] = []

@@ -103,17 +103,16 @@ def resolve(group: str, name: str, noun: str) -> Any:
     # A plug-in may fail in any way while it is imported, and must not take the others with it.
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise UserError(
-            f"{noun} {name!r} ({entry.target} of {entry.shipped_by}) cannot be imported: {reason}"
-        ) from error
+        where = f"{noun} {name!r} ({entry.target} of {entry.shipped_by})"
+        raise UserError(f"{where} cannot be imported: {reason}") from error
 
 
 def load(kind: Kind, name: str) -> type[Any]:
     """The class of a component.
 
     Raises:
-        UserError: if the name is unknown or taken twice, or if the plug-in is broken: it cannot be imported, or it is not a
-            frozen dataclass derived from the base class of its kind.
+        UserError: if the name is unknown or taken twice, or if the plug-in is broken: it cannot be imported, or is
+            not a frozen dataclass derived from the base class of its kind.
     """
     from bench import contracts
 
@@ -123,14 +122,13 @@ def load(kind: Kind, name: str) -> type[Any]:
     where = f"{kind} {name!r} ({entry.target} of {entry.shipped_by})"
     if not (inspect.isclass(component) and issubclass(component, base)):
         raise UserError(f"{where} is not a subclass of bench.contracts.{base.__name__}")
-    if missing := sorted(component.__abstractmethods__):
+    if missing := sorted(getattr(component, "__abstractmethods__", ())):
         raise UserError(f"{where} does not implement {', '.join(missing)}")
     if not (is_dataclass(component) and component.__dataclass_params__.frozen):  # type: ignore[attr-defined]
         raise UserError(f"{where} is not a frozen dataclass: write @dataclass(frozen=True, kw_only=True) above it")
     if positional := [field.name for field in fields(component) if field.init and not field.kw_only]:
-        raise UserError(
-            f"{where} takes {', '.join(positional)} by position: write @dataclass(frozen=True, kw_only=True)"
-        )
+        taken = ", ".join(positional)
+        raise UserError(f"{where} takes {taken} by position: write @dataclass(frozen=True, kw_only=True)")
     return component
 
 
@@ -139,4 +137,4 @@ def unknown(what: str, word: str, known: Iterable[str]) -> str:
     known = list(known)
     near = difflib.get_close_matches(word, known, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
-    return f"unknown {what}; {hint}known: {', '.join(known) or 'none'}"
+    return f"unknown {what}; {hint}known: {', '.join(known) or 'there are none'}"

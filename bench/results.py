@@ -1,6 +1,6 @@
 """Episode records: an append-only Parquet data set, one file a finished unit of work, one row an episode.
 
-A file appears whole or not at all (written aside, synced, renamed), so a run that is killed leaves only finished units behind.
+A file appears whole or not at all (written aside, synced, renamed), so a killed run leaves only finished units behind.
 """
 
 from __future__ import annotations
@@ -43,13 +43,9 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
     _field("l2", _float, "L2 norm of a step's deviation, mean over the steps", "normalised"),
     _field("linf_m", _float, "largest deviation of a position in a step, mean over the steps", "m"),
     _field("linf_mps", _float, "largest deviation of a velocity in a step, mean over the steps", "m/s"),
-    _field(
-        "excess_max", _float, "farthest the attack's own answer was outside its set, before projection", "normalised"
-    ),
+    _field("excess_max", _float, "farthest the attack's answer was outside its set, before projection", "normalised"),
     _field("attack_ms", _float, "the attack's wall time a step and episode (its batch's time shared out)", "ms"),
-    _field(
-        "action_counts", pa.list_(pa.int32()), "how often each discrete action was taken; empty for continuous ones"
-    ),
+    _field("action_counts", pa.list_(pa.int32()), "times each discrete action was taken; empty for continuous ones"),
 )
 """What `bench.rollout.rollout` measures of an episode, with `seed`."""
 
@@ -65,9 +61,7 @@ IDENTITY: tuple[pa.Field, ...] = (
     _field("world", _text, "name"),
     _field("world_params", _text, "canonical JSON"),
     _field("action_type", _text, "the victim's: discrete or continuous"),
-    _field(
-        "sees", pa.bool_(), "false for reference drivers that ignore the observation; their weather is always clear"
-    ),
+    _field("sees", pa.bool_(), "false for drivers that ignore the observation; their weather is always clear"),
     _field("training_seed", _int, "of the policy; 0 for victims that do not learn"),
     _field("threat_norm", _text, "perturbation set; a clean run has budget 0"),
     _field("threat_budget", _float, "size of the perturbation set", "share or normalised, by the norm"),
@@ -110,9 +104,8 @@ def prepare(out: Path) -> None:
         with tempfile.TemporaryFile(dir=out / FOLDER):
             pass
     except OSError as error:
-        raise UserError(
-            f"the results folder {out} cannot be written: {error.strerror}; choose another with out="
-        ) from None
+        reason = error.strerror or str(error)
+        raise UserError(f"the results folder {out} cannot be written: {reason}; choose another with out=") from None
 
 
 def path_of(out: Path, unit: str) -> Path:
@@ -154,8 +147,8 @@ def read(out: Path, units: Collection[str] | None = None) -> pa.Table:
 
     Args:
         out: results folder.
-        units: fingerprints of the units to read. None reads the newest result of everything that is there: of each pair and
-            training seed only what the newest code and weights made, and of a scenario driven twice the last one.
+        units: fingerprints of the units to read. None reads the newest result of everything that is there: of each pair
+            and training seed only what the newest code and weights made, and of a scenario driven twice the last one.
 
     Raises:
         UserError: if there are no records, or if a file is truncated or foreign.

@@ -1,0 +1,283 @@
+"""`attack=zo,noise attack.steps=50 lanes=3,4` -> a typed configuration, by hydra's compose API.
+
+Comma lists of lanes, density, weather and seeds select; every other comma list sweeps. A component's parameter is given
+to those of the chosen components that have it.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import types
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
+from enum import Enum
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+from hydra import compose, initialize
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from bench import registry
+from bench.config import Chosen, Pair, RunConfig, TrainConfig, choose, cores
+from bench.errors import UserError
+from bench.parameters import Parameter, parameters
+from bench.registry import KINDS, Kind
+from bench.scenario import GRIDS, WEATHERS, Grid
+from bench.threat import ThreatModel
+
+DEFAULTS: dict[Kind, str] = {"attack": "none", "defense": "none", "victim": "dqn", "world": "highway"}
+
+
+@dataclass
+class RunWords:
+    """The words of `bench run` that choose no component, with their types and defaults."""
+
+    grid: str = "standard-v1"
+    lanes: list[int] | None = None
+    density: list[float] | None = None
+    weather: list[str] | None = None
+    episodes: int | None = None
+    seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
+    workers: int = field(default_factory=cores)
+    out: str = "results"
+    record: int | None = None
+    reference: bool = True
+
+
+@dataclass
+class TrainWords:
+    """The words of `bench train` that choose no component."""
+
+    seeds: list[int] = field(default_factory=lambda: [0])
+    out: str | None = None
+
+
+def run_config(words: Sequence[str]) -> RunConfig:
+    """The configuration of `bench run WORDS`.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    given = _Given(words, kinds=KINDS, settings=RunWords)
+    settings = given.settings()
+    axes = {key: tuple(settings[key]) for key in ("lanes", "density", "weather") if settings[key] is not None}
+    if settings["episodes"] is not None:
+        axes["episodes"] = settings["episodes"]
+    if settings["grid"] not in GRIDS:
+        raise UserError(registry.unknown(f"grid {settings['grid']!r}", settings["grid"], GRIDS))
+    for weather in axes.get("weather", ()):
+        if weather not in WEATHERS:
+            raise UserError(registry.unknown(f"weather {weather!r}", weather, WEATHERS))
+    with _one_line():
+        grid: Grid = GRIDS[settings["grid"]].with_(**axes)
+        choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS]
+        pairs = [
+            Pair(attack=attack, defense=defense, victim=victim, world=world, threat=threat)
+            for attack, defense, victim, world, threat in itertools.product(*choices, given.threats())
+        ]
+        pairs = [pair.clean() if pair.is_clean else pair for pair in pairs]
+        return RunConfig(
+            pairs=tuple({pair.id: pair for pair in pairs}.values()),
+            grid=grid,
+            seeds=tuple(settings["seeds"]),
+            workers=settings["workers"],
+            out=Path(settings["out"]).expanduser(),
+            record=settings["record"],
+            reference=settings["reference"],
+        )
+
+
+def train_config(words: Sequence[str]) -> TrainConfig:
+    """The configuration of `bench train WORDS`; `seed` is another word for `seeds`.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    words = [f"seeds={word.removeprefix('seed=')}" if word.startswith("seed=") else word for word in words]
+    given = _Given(words, kinds=("defense", "victim", "world"), settings=TrainWords)
+    settings = given.settings()
+    one: dict[Kind, Chosen[Any]] = {}
+    for kind in given.kinds:
+        found = given.chosen(kind)
+        if len(found) > 1:
+            raise UserError(
+                f"bench train trains one policy a seed, not {len(found)}: give one {kind} and one set of parameters"
+            )
+        one[kind] = found[0]
+    with _one_line():
+        return TrainConfig(
+            victim=one["victim"],
+            defense=one["defense"],
+            world=one["world"],
+            seeds=tuple(settings["seeds"]),
+            out=Path(settings["out"]).expanduser() if settings["out"] else None,
+        )
+
+
+class _Given:
+    """The words as given: the values of each key, in hydra's override grammar.
+
+    Args:
+        words: `key=value` each.
+        kinds: of components that may be chosen.
+        settings: dataclass of the other keys.
+    """
+
+    def __init__(self, words: Sequence[str], *, kinds: Sequence[Kind], settings: type[Any]) -> None:
+        self.kinds = tuple(kinds)
+        self.schema = settings
+        # A path is taken as it is: hydra's grammar gives meaning to many of the characters one may hold.
+        self.out = [word.partition("=")[2] for word in words if word.startswith("out=")]
+        self.values: dict[str, tuple[str, ...]] = {}
+        for override in _parsed([word for word in words if not word.startswith("out=")]):
+            key = override.key_or_group
+            if key in self.values or len(self.out) > 1:
+                raise UserError(f"{key} is given twice; write its values with commas: {key}=a,b")
+            self._check_key(key)
+            self.values[key] = _elements(override)
+
+    def _check_key(self, key: str) -> None:
+        head, _, parameter = key.partition(".")
+        threats = [f"threat.{item.name}" for item in fields(ThreatModel)] if "attack" in self.kinds else []
+        known = [*self.kinds, *(item.name for item in fields(self.schema)), *threats]
+        if key not in known and not (head in self.kinds and parameter):
+            raise UserError(registry.unknown(f"key {key!r}", key, known))
+
+    def settings(self) -> dict[str, Any]:
+        """The values of the keys that choose no component."""
+        store = ConfigStore.instance()
+        store.store(name="settings", node=self.schema)
+        lists = {item.name for item in fields(self.schema) if "list" in str(item.type)}
+        overrides = []
+        for key, values in self.values.items():
+            if key.partition(".")[0] in (*self.kinds, "threat"):
+                continue
+            if key not in lists and len(values) > 1:
+                raise UserError(f"{key} takes one value, got {','.join(values)}")
+            whole = values[0] if len(values) == 1 and values[0].startswith("[") else f"[{','.join(values)}]"
+            overrides.append(f"{key}={whole if key in lists else values[0]}")
+        found = OmegaConf.to_container(_composed(overrides, config_name="settings"))
+        assert isinstance(found, dict)
+        return {str(key): value for key, value in found.items()} | ({"out": self.out[0]} if self.out else {})
+
+    def chosen(self, kind: Kind) -> list[Chosen[Any]]:
+        """Every component of a kind that is asked for, with every combination of its parameters' values."""
+        names = self.values.get(kind, (DEFAULTS[kind],))
+        known = {name: parameters(registry.load(kind, name)) for name in names}
+        swept = {key.partition(".")[2]: v for key, v in self.values.items() if key.startswith(f"{kind}.")}
+        for key in swept:
+            if not any(key.partition(".")[0] in owned for owned in known.values()):
+                what = f"parameter {kind}.{key} of {', '.join(names)}"
+                raise UserError(
+                    registry.unknown(what, key, dict.fromkeys(p for owned in known.values() for p in owned))
+                )
+        found: dict[str, Chosen[Any]] = {}
+        for name, owned in known.items():
+            ConfigStore.instance().store(group=kind, name=name, node=_schema(kind, name, owned))
+            keys = [key for key in swept if key.partition(".")[0] in owned]
+            for values in itertools.product(*(swept[key] for key in keys)):
+                words = [f"{kind}.{key}={value}" for key, value in zip(keys, values, strict=True)]
+                composed = _composed([f"+{kind}={name}", *words])[kind]
+                one = choose(kind, name, **_arguments(kind, name, owned, composed))
+                found[f"{name} {one.params}"] = one
+        return list(found.values())
+
+    def threats(self) -> list[ThreatModel]:
+        """Every combination of the threat model's values."""
+        owned = parameters(ThreatModel)
+        ConfigStore.instance().store(group="threat", name="model", node=_schema("threat", "model", owned))
+        keys = [key for key in self.values if key.startswith("threat.")]
+        found = []
+        for values in itertools.product(*(self.values[key] for key in keys)):
+            words = [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
+            composed = _composed(["+threat=model", *words])["threat"]
+            found.append(ThreatModel(**_arguments("threat", "", owned, composed)))
+        return found
+
+
+def _parsed(words: Sequence[str]) -> list[Override]:
+    parser = OverridesParser.create()
+    overrides = []
+    for word in words:
+        try:
+            (override,) = parser.parse_overrides([word])
+        except HydraException:
+            override = None
+        if override is None or override.type is not OverrideType.CHANGE or not override.key_or_group:
+            raise UserError(f"cannot read {word!r}: write key=value, for instance attack=zo or lanes=3,4")
+        overrides.append(override)
+    return overrides
+
+
+def _elements(override: Override) -> tuple[str, ...]:
+    swept = override.is_sweep_override()
+    values = list(override.sweep_string_iterator()) if swept else [override.get_value_element_as_str()]
+    if "" in values:
+        raise UserError(f"{override.key_or_group} has no value; write {override.key_or_group}=value")
+    return tuple(dict.fromkeys(values))
+
+
+def _composed(overrides: list[str], config_name: str | None = None) -> DictConfig:
+    try:
+        with initialize(version_base="1.3", config_path=None):
+            return compose(config_name, overrides=overrides)
+    except (HydraException, OmegaConfBaseException) as error:
+        cause = error if error.__cause__ is None else error.__cause__
+        key = str(getattr(cause, "full_key", "") or "").partition("[")[0]
+        word = next((word for word in overrides if key and word.startswith(f"{key}=")), " ".join(overrides))
+        reason = str(cause).splitlines()[0]
+        raise UserError(f"cannot read {word}: {reason[:1].lower()}{reason[1:]}") from error
+
+
+def _schema(kind: str, name: str, owned: dict[str, Parameter]) -> type[Any]:
+    """A structured config of a component's parameters, with types that OmegaConf knows."""
+    made: list[tuple[str, Any, Any]] = []
+    for parameter in owned.values():
+        value = parameter.default
+        default = field() if parameter.required else field(default_factory=partial(copy.copy, value))
+        made.append((parameter.name, _omegaconf_type(parameter.hint), default))
+    return make_dataclass(f"{kind}_{name}", made, kw_only=True)
+
+
+def _omegaconf_type(hint: Any) -> Any:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return type(arguments[0])
+    if origin in (Union, types.UnionType):
+        return Union[tuple(_omegaconf_type(argument) for argument in arguments)]  # noqa: UP007
+    if origin in (tuple, list):
+        return list[_omegaconf_type(arguments[0])]  # type: ignore[misc]
+    plain = isinstance(hint, type) and issubclass(hint, (bool, int, float, str, Path, Enum, types.NoneType))
+    return hint if plain or is_dataclass(hint) else Any
+
+
+def _arguments(kind: str, name: str, owned: dict[str, Parameter], composed: DictConfig) -> dict[str, Any]:
+    """The composed values as constructor arguments: checked against choices, tuples for lists."""
+    what = f"{kind} {name}".strip()
+    if missing := sorted(str(key) for key in OmegaConf.missing_keys(composed)):
+        raise UserError(f"{what} needs {', '.join(f'{kind}.{key}=…' for key in missing)}")
+    arguments = OmegaConf.to_object(composed)
+    values = {item: getattr(arguments, item) for item in owned}
+    for key, value in values.items():
+        choices = owned[key].choices
+        if choices and value is not None and value not in choices:
+            raise UserError(registry.unknown(f"{kind}.{key} {value!r}", str(value), map(str, choices)))
+        if isinstance(value, list):
+            values[key] = tuple(value)
+    return values
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(str(error).splitlines()[0]) from error
