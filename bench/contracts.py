@@ -85,6 +85,8 @@ class Policy(nn.Module, ABC):
 
     action_type: ActionType
     driver: Driver = "agent"
+    weights_sha256: str = ""
+    """Hash of the weights file it was loaded from; empty where there is none."""
 
     @abstractmethod
     def scores(self, observation: Tensor) -> Tensor:
@@ -117,10 +119,20 @@ class Policy(nn.Module, ABC):
 class Victim(ABC):
     """A kind of driver: how to load it from the zoo and, if it learns, how to train it. Fields are its hyper-parameters."""
 
-    action_type: ActionType | str
     learns: ClassVar[bool] = False
     sees: ClassVar[bool] = True
     """False for drivers that ignore the observation: attacks and weather cannot touch them."""
+    policy_type: ClassVar[type[Policy] | None] = None
+    """The class of its trained policies, which the zoo builds from a card."""
+
+    @property
+    @abstractmethod
+    def action_type(self) -> ActionType:
+        """Whether it takes discrete lane-changing decisions or steers itself."""
+
+    def zoo_name(self) -> str:
+        """The name of this victim's entries in the zoo; only victims that learn have one."""
+        raise NotImplementedError(f"{type(self).__name__} does not learn")
 
     @abstractmethod
     def load(self, seed: int) -> Policy:
@@ -151,13 +163,15 @@ class AttackInLoop:
 
     Args:
         attack: called with (observation [B, V, F], policy, budget scale in (0, 1]) -> perturbed observation.
-        skip: probability in [0, 1] with which an episode's decision is left unattacked.
+        skip: probability in [0, 1] with which a decision is left unattacked.
+        replay: attack the observations drawn from the replay buffer as well (afresh, against the victim as it is now).
         ramp: the shares of the training between which the budget grows from 0 to 1.
         start: weights to go on from; None trains from scratch.
     """
 
     attack: Callable[[Tensor, Policy, float], Tensor]
     skip: float
+    replay: bool = True
     ramp: tuple[float, float] = (0.2, 0.5)
     start: Policy | None = None
 
@@ -186,6 +200,10 @@ class Defense(ABC):
     def train(self, victim: Victim, world: World, *, seed: int, progress: Progress) -> TrainedPolicy | None:
         """Train the hardened policy of training seed `seed`; None where there is nothing to train."""
         return None
+
+    def zoo_name(self, victim: Victim) -> str:
+        """The name of the zoo entries that hold what `train` made of `victim`."""
+        raise NotImplementedError(f"{type(self).__name__} trains nothing")
 
     @abstractmethod
     def load(self, victim: Victim, seed: int) -> Policy:

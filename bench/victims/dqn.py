@@ -1,0 +1,95 @@
+"""The DQN driver: TorchRL's double Q-learning with n-step returns and soft target updates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torchrl.data import Categorical
+from torchrl.envs import EnvBase
+from torchrl.modules import EGreedyModule, QValueActor
+from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
+
+from bench.contracts import ActionType, Policy
+from bench.victims.networks import QPolicy
+from bench.victims.training import CHUNK, Learner, LearningDriver, Phase, target_state
+
+ACTIONS = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class DQN(LearningDriver):
+    """A deep Q-network (Mnih et al. 2015) that chooses lane changes and target speeds.
+
+    TorchRL's DQNLoss with double Q-learning (van Hasselt et al. 2016), n-step returns, a smooth L1 loss and a Polyak-averaged
+    target network, whose weights are also what drives in the end.
+
+    Args:
+        final_epsilon: random share of actions from 30 % of the training on, falling linearly from 1 until then.
+    """
+
+    policy_type = QPolicy
+
+    final_epsilon: float = 0.02
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.final_epsilon <= 1:
+            raise ValueError(f"final_epsilon must be between 0 and 1, got {self.final_epsilon}")
+
+    @property
+    def action_type(self) -> ActionType:
+        return "discrete"
+
+    def zoo_name(self) -> str:
+        return "dqn"
+
+    def learner(self, env: EnvBase, start: Policy | None) -> Learner:
+        return _QLearner(self, env, start)
+
+
+class _QLearner(Learner):
+    def __init__(self, recipe: DQN, env: EnvBase, start: Policy | None) -> None:
+        self.recipe = recipe
+        batch, _, features = env.observation_spec["observation"].shape
+        self.policy: QPolicy = QPolicy(features, ACTIONS, recipe.hidden)
+        self.mean = QPolicy(features, ACTIONS, recipe.hidden)
+        if start is not None:
+            self.policy.load_state_dict(start.state_dict())
+        actor = QValueActor(
+            self.policy.network, in_keys=["observation"], spec=Categorical(ACTIONS), action_space="categorical"
+        )
+        self.greedy = EGreedyModule(
+            Categorical(ACTIONS, shape=(batch,)),
+            eps_init=1.0 if start is None else recipe.final_epsilon,
+            eps_end=recipe.final_epsilon,
+            annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
+        )
+        self.explore = TensorDictSequential(actor, self.greedy)
+        self.loss = DQNLoss(actor, loss_function="smooth_l1", double_dqn=True, delay_value=True)
+        self.target = SoftUpdate(self.loss, tau=recipe.tau)
+        self.adam = torch.optim.Adam(self.policy.parameters(), recipe.learning_rate)
+
+    def enter(self, phase: Phase) -> None:
+        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
+        if phase.exploration < 1:
+            self.greedy.eps_end.fill_(self.recipe.final_epsilon * phase.exploration)
+            self.greedy.eps.fill_(self.recipe.final_epsilon * phase.exploration)
+
+    def update(self, sample: TensorDictBase, learning_rate: float) -> None:
+        self.adam.param_groups[0]["lr"] = learning_rate
+        self.adam.zero_grad()
+        self.loss(sample)["loss"].backward()
+        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
+        self.adam.step()
+        self.target.step()
+
+    def anneal(self) -> None:
+        self.greedy.step()
+
+    def averaged(self) -> Policy:
+        self.mean.network.load_state_dict(target_state(self.loss.target_value_network_params, self.mean.network))
+        return self.mean

@@ -1,0 +1,98 @@
+"""Adversarial training with a skip probability (thesis, Algorithm 5 and section 4.4.4)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from bench.config import component
+from bench.contracts import AttackInLoop, Defense, Policy, Progress, TrainedPolicy, Victim, World
+from bench.errors import UserError
+from bench.threat import Norm, Oracle, ThreatModel
+from bench.victims import zoo
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdversarialTraining(Defense):
+    """The victim learns while it is attacked (thesis Algorithm 5; Madry et al. 2018 for the principle).
+
+    Each decision of the training is attacked, except that with probability `skip` the victim sees the truth. `skip=1` is the
+    control: the same training without an attack.
+
+    Args:
+        skip: probability that a decision is not attacked, in [0, 1].
+        attack: any registered attack.
+        attack_params: its parameters, as on the command line but separated by spaces.
+        norm: perturbation set of the attack in the loop, `relative` or `linf`.
+        budget: size of that set once the ramp is over.
+        start: `scratch`, or `trained` to go on from the victim of the same training seed.
+        replay: attack the observations drawn from the replay buffer, afresh against the policy as it is now, as well as the
+            ones it acts on; without it the buffer keeps the attacked observations of the past, as in the thesis.
+        ramp_from: share of the training after which the budget begins to grow from 0.
+        ramp_to: share of the training at which it is whole.
+    """
+
+    skip: float = 0.3
+    attack: str = "pgd"
+    attack_params: str = "steps=3 step_size=0.7"
+    norm: Norm = "relative"
+    budget: float = 0.1
+    start: Literal["scratch", "trained"] = "scratch"
+    replay: bool = True
+    ramp_from: float = 0.2
+    ramp_to: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.skip <= 1:
+            raise ValueError(f"skip must be between 0 and 1, got {self.skip}")
+        if not 0 <= self.ramp_from <= self.ramp_to <= 1:
+            raise ValueError(
+                f"ramp_from and ramp_to must be in order between 0 and 1, got {self.ramp_from} and {self.ramp_to}"
+            )
+        ThreatModel(norm=self.norm, budget=self.budget)
+
+    def zoo_name(self, victim: Victim) -> str:
+        return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"
+
+    def load(self, victim: Victim, seed: int) -> Policy:
+        if victim.policy_type is None:
+            raise UserError("adversarial training needs a victim that learns")
+        made_by = {"victim": asdict(victim), "defense": asdict(self)}  # type: ignore[call-overload]
+        return zoo.load(self.zoo_name(victim), seed, victim.policy_type, made_by=made_by)
+
+    def train(self, victim: Victim, world: World, *, seed: int, progress: Progress) -> TrainedPolicy:
+        """Train the hardened policy of training seed `seed`: the victim's own training with the attack in its loop.
+
+        Raises:
+            UserError: if the attack does not fit the victim, or `start=trained` and the zoo has no such victim.
+        """
+        attack = component("attack", self.attack, dict(_word(word) for word in self.attack_params.split()))
+        if victim.action_type not in attack.action_types:
+            raise UserError(f"attack {self.attack!r} does not fit a victim with {victim.action_type} actions")
+        threat = ThreatModel(norm=self.norm, budget=self.budget)
+        generator = torch.Generator().manual_seed(seed)
+
+        def perturb(observation: Tensor, policy: Policy, scale: float) -> Tensor:
+            oracle = Oracle(policy, threat, attack.access, world.features, generator)
+            oracle.begin_step(observation, scale)
+            return oracle.project(attack.perturb(observation, oracle)).detach()
+
+        loop = AttackInLoop(
+            attack=perturb,
+            skip=self.skip,
+            replay=self.replay,
+            ramp=(self.ramp_from, self.ramp_to),
+            start=victim.load(seed) if self.start == "trained" else None,
+        )
+        trained = victim.train(world, seed=seed, attack=loop, progress=progress)
+        return TrainedPolicy(trained.policy, {**trained.card, "defense": asdict(self)})
+
+
+def _word(word: str) -> tuple[str, str]:
+    name, equals, value = word.partition("=")
+    if not equals:
+        raise UserError(f"attack_params takes words like steps=3, got {word!r}")
+    return name, value
