@@ -14,6 +14,9 @@ from bench.errors import UserError
 
 Norm = Literal["relative", "linf"]
 
+CHUNK = 1024
+"""Queries answered at once: larger batches leave the processor's cache and take twice as long each."""
+
 FLOORS = {"x": 0.5, "y": 0.2, "vx": 0.3, "vy": 0.2}
 """Smallest deviation of the `relative` set at a budget of 0.1, in m and m/s: a sensor's own resolution."""
 
@@ -137,14 +140,12 @@ class Oracle:
     def decide(self, observation: Tensor, rows: Tensor | None = None) -> Tensor:
         """The victim's actions; needs access `decisions`."""
         self._spend(observation, rows, "decisions")
-        with torch.no_grad():
-            return self._policy.decide(observation)
+        return self._in_chunks(self._policy.decide, observation)
 
     def scores(self, observation: Tensor, rows: Tensor | None = None) -> Tensor:
         """The victim's Q-values [..., B, A] or its continuous action [..., B, 2]; needs access `scores`."""
         self._spend(observation, rows, "scores")
-        with torch.no_grad():
-            return self._policy.scores(observation)
+        return self._in_chunks(self._policy.scores, observation)
 
     def gradient(
         self, observation: Tensor, loss: Callable[[Tensor], Tensor], rows: Tensor | None = None
@@ -164,6 +165,13 @@ class Oracle:
         """
         self._require("gradients")
         return self._policy.value(observation, action)
+
+    @torch.no_grad()
+    def _in_chunks(self, ask: Callable[[Tensor], Tensor], observation: Tensor) -> Tensor:
+        """One query after the other would be slow, and all at once leaves the processor's cache: a thousand at a time."""
+        flat = observation.flatten(0, -3)
+        answer = torch.cat([ask(part) for part in flat.split(CHUNK)]) if len(flat) else ask(flat)
+        return answer.unflatten(0, observation.shape[:-2])
 
     def _require(self, access: Access) -> None:
         if get_args(Access).index(access) > self._levels:
