@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import duckdb
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from bench.errors import UserError
 
@@ -136,8 +138,10 @@ def write(out: Path, records: pa.Table) -> Path:
             os.fsync(file.fileno())
         os.chmod(aside, 0o644)
         os.replace(aside, path)
-    except BaseException:
+    except BaseException as error:
         Path(aside).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise UserError(f"the record {path} cannot be written: {error.strerror}") from error
         raise
     return path
 
@@ -189,3 +193,18 @@ def _check(path: Path, *, thoroughly: bool = False) -> None:
         raise UserError(f"the record {path} is {reason}; delete it and run again to make it anew") from None
     if not schema.equals(SCHEMA):
         raise UserError(f"the record {path} has other columns than this version writes; use another folder with out=")
+
+
+def table(constants: Mapping[str, object], measured: Mapping[str, NDArray[np.generic]]) -> pa.Table:
+    """The records of a unit, one row an episode.
+
+    Args:
+        constants: what every row says (`bench.plan.Unit.constants`).
+        measured: a column [B] a measurement (`bench.rollout.rollout`); `action_counts` is [B, A].
+    """
+    rows = len(measured["seed"])
+    columns = []
+    for column in SCHEMA:
+        values = [constants[column.name]] * rows if column.name in constants else measured[column.name].tolist()
+        columns.append(pa.array(values, column.type))
+    return pa.Table.from_arrays(columns, schema=SCHEMA)
