@@ -4,7 +4,8 @@
 
 One run, interleaved: every round drives highway-env, the engine and the TorchRL environment through the same stretch of
 episodes, so that whatever else the machine does meets all three. 3 lanes, density 1, 15 Hz; highway-env's own IDM
-driver steers the ego in all three, which keeps it in the traffic (a braking ego would soon be alone, a random one crash).
+driver steers the ego in all three, which keeps it in the traffic: a braking ego would soon be alone, a random one
+would crash.
 Compilation is not counted. A TorchRL step is `step_and_maybe_reset`, which also prepares the next step's tensordict and
 restarts finished episodes, as a collector does.
 """

@@ -24,8 +24,8 @@ class BatchedHighway(HighwayEnv):
     def _start(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
         self.engine.reset(chosen, seeds)
 
-    def _drive(self, action: NDArray[np.int64] | NDArray[np.float32]) -> None:
-        self.engine.step(action)
+    def _drive(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None) -> None:
+        self.engine.step(action, paused)
 
     def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         return self.engine.observation, self.engine.numbers, self.engine.flags

@@ -118,6 +118,7 @@ def step_batch(
     episodes: NDArray[np.void],
     actions: Integers,
     controls: Floats,
+    paused: NDArray[np.bool_],
     parameters: Parameters,
     observation: NDArray[np.float32],
     numbers: NDArray[np.float32],
@@ -130,7 +131,7 @@ def step_batch(
     measured = np.empty(4)
     for number in range(episodes.size):
         episode, cars, sequence = episodes[number], vehicles[number], order[number]
-        if episode.terminated or episode.truncated:
+        if paused[number] or episode.terminated or episode.truncated:
             numbers[REWARD, number] = 0.0
             numbers[PROGRESS, number] = 0.0
             continue
@@ -191,6 +192,7 @@ class HighwayEngine:
         self._lane_factor = lane_spacing(self.episodes["lanes"])
         self._no_actions = np.ones(batch, dtype=np.int64)
         self._no_controls = np.zeros((batch, 2))
+        self._no_pause = np.zeros(batch, dtype=np.bool_)
 
     def reset(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
         """Start the episodes `chosen` [R] (row numbers) from the scenario seeds [R].
@@ -198,8 +200,7 @@ class HighwayEngine:
         Raises:
             ValueError: if a seed is negative.
         """
-        if (seeds < 0).any():
-            raise ValueError(f"scenario seeds must be at least 0, got {seeds.min()}")
+        check_seeds(seeds)
         for name in ("steps", "reward", "progress", "crashed", "offroad", "terminated", "truncated"):
             self.episodes[name][chosen] = 0
         self.episodes["seed"][chosen] = seeds
@@ -225,18 +226,20 @@ class HighwayEngine:
             self.flags,
         )
 
-    def step(self, action: NDArray[np.int64] | NDArray[np.float32]) -> None:
-        """Carry out one action an episode; finished episodes stay as they are and earn 0.
+    def step(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None = None) -> None:
+        """Carry out one action an episode; finished and paused episodes stay as they are and earn 0.
 
         Args:
             action: int64 [B] numbers of `ACTIONS`, or float32 [B, 2] acceleration and steering in [-1, 1] (clipped).
+            paused: bool [B], episodes to leave alone beside the finished ones.
 
         Raises:
             ValueError: if a discrete action has no such number.
         """
         actions, controls = self._no_actions, self._no_controls
         if self.parameters.ego == EgoKind.DISCRETE:
-            actions = np.asarray(action, dtype=np.int64)
+            # One memory layout, for each other one would be compiled anew.
+            actions = np.ascontiguousarray(action, dtype=np.int64)
             if actions.min() < 0 or actions.max() >= len(ACTIONS):
                 raise ValueError(f"actions must be between 0 and {len(ACTIONS) - 1}, got {actions.tolist()}")
         elif self.parameters.ego == EgoKind.CONTINUOUS:
@@ -247,11 +250,18 @@ class HighwayEngine:
             self.episodes,
             actions,
             controls,
+            self._no_pause if paused is None else paused,
             self.parameters,
             self.observation,
             self.numbers,
             self.flags,
         )
+
+
+def check_seeds(seeds: Integers) -> None:
+    """Raise ValueError for seeds that numpy's generators refuse."""
+    if (seeds < 0).any():
+        raise ValueError(f"scenario seeds must be at least 0, got {seeds.min()}")
 
 
 def physical_controls(action: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -26,11 +26,11 @@ def drawn_seed(environment_seed: int, episode: int, reset: int) -> int:
 
     A hash, not a stream: it does not depend on when the other rows ended. Always in the training block of seeds.
     """
-    value = environment_seed & MASK_64
-    for part in (episode, reset):
-        value = (value ^ part) + GOLDEN_GAMMA & MASK_64
-        value = (value ^ value >> 30) * 0xBF58476D1CE4E5B9 & MASK_64
-        value = (value ^ value >> 27) * 0x94D049BB133111EB & MASK_64
+    value = 0
+    for part in (environment_seed, episode, reset):
+        value = ((value ^ part) + GOLDEN_GAMMA) & MASK_64
+        value = (value ^ (value >> 30)) * 0xBF58476D1CE4E5B9 & MASK_64
+        value = (value ^ (value >> 27)) * 0x94D049BB133111EB & MASK_64
         value ^= value >> 31
     return SeedBlock.TRAIN + value % DRAWN_SEEDS
 
@@ -56,8 +56,8 @@ class HighwayEnv(EnvBase):
         """Start the episodes `chosen` [R] from the scenario seeds [R]."""
 
     @abstractmethod
-    def _drive(self, action: NDArray[np.int64] | NDArray[np.float32]) -> None:
-        """Carry out one action [B] or [B, 2] in every unfinished episode."""
+    def _drive(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None) -> None:
+        """Carry out one action [B] or [B, 2] in every unfinished episode that is not `paused` [B]."""
 
     @abstractmethod
     def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
@@ -101,7 +101,9 @@ class HighwayEnv(EnvBase):
         return self._tensordict(with_reward=False)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._drive(tensordict.get("action").numpy())
+        running = tensordict.get("_step", None)
+        paused = None if running is None else ~running.reshape(-1).numpy()
+        self._drive(tensordict.get("action").numpy(), paused)
         return self._tensordict(with_reward=True)
 
     def _tensordict(self, *, with_reward: bool) -> TensorDictBase:

@@ -18,7 +18,7 @@ from bench.scenario import WEATHERS, Cell
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.dynamics import VEHICLE_LENGTH
 from envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED
-from envs.highway.engine import Flag, Number
+from envs.highway.engine import Flag, Number, check_seeds
 from envs.highway.environment import HighwayEnv
 from envs.highway.sensor import FEATURES, add_noise, noise_sigma, sensor_range_m
 
@@ -67,12 +67,10 @@ class SensedKinematics(KinematicObservation):
     def normalize_obs(self, df: Any) -> Any:
         """Disturb the rows of the other vehicles, then normalise and clip as highway-env does."""
         if self.env.noise_sigma > 0:
-            df = df.astype(np.float64)
-            columns = list(self.env.feature_names)
+            measured = df[list(self.env.feature_names)].to_numpy(dtype=np.float64, copy=True)
             for row, number in enumerate(self._seen(), start=1):
-                measured = np.array(df.loc[row, columns], dtype=np.float64)
-                add_noise(measured, self.env.noise_sigma, self.env.scenario_seed, self.env.decisions, number)
-                df.loc[row, columns] = measured
+                add_noise(measured[row], self.env.noise_sigma, self.env.scenario_seed, self.env.decisions, number)
+            df = df.assign(**dict(zip(self.env.feature_names, measured.T, strict=True)))
         return super().normalize_obs(df)
 
     def _seen(self) -> list[int]:
@@ -162,15 +160,14 @@ class ReferenceHighway(HighwayEnv):
         self._flags = np.zeros((len(Flag), config.batch), dtype=np.bool_)
 
     def _start(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
+        check_seeds(seeds)
         for number, seed in zip(chosen.tolist(), seeds.tolist(), strict=True):
-            if seed < 0:
-                raise ValueError(f"scenario seeds must be at least 0, got {seed}")
             self._observation[number] = self.simulators[number].start(seed)
             self._report(number, 0.0, 0.0, terminated=False)
 
-    def _drive(self, action: NDArray[np.int64] | NDArray[np.float32]) -> None:
+    def _drive(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None) -> None:
         for number in range(self.config.batch):
-            if self._flags[Flag.DONE, number]:
+            if self._flags[Flag.DONE, number] or (paused is not None and paused[number]):
                 self._numbers[[Number.REWARD, Number.PROGRESS], number] = 0.0
             else:
                 self._drive_one(number, action[number])

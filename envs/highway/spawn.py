@@ -33,7 +33,10 @@ def draw_words(seeds: NDArray[np.int64], vehicles: int) -> NDArray[np.uint64]:
     A vehicle takes at most 3.5 words; the rest is room for Lemire's rejections, one in a thousand million draws.
     """
     words = 4 * (vehicles + 1) + 16
-    return np.array([np.random.PCG64(int(seed)).random_raw(words) for seed in seeds], dtype=np.uint64)
+    drawn = np.empty((len(seeds), words), dtype=np.uint64)
+    for row, seed in enumerate(seeds):
+        drawn[row] = np.random.PCG64(int(seed)).random_raw(words)
+    return drawn
 
 
 def lane_spacing(lanes: NDArray[np.int64]) -> NDArray[np.float64]:

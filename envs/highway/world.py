@@ -59,6 +59,9 @@ class HighwayWorld(World):
             raise ValueError(f"preset must be one of {', '.join(get_args(Preset))}, got {self.preset!r}")
         if self.backend not in get_args(Backend):
             raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, got {self.backend!r}")
+        if self.target_speeds is not None:
+            # A list from a configuration file would make the world unhashable.
+            object.__setattr__(self, "target_speeds", tuple(float(speed) for speed in self.target_speeds))
         if self.preset == "thesis":
             # The class says the standard's ranges; this object's own are others.
             object.__setattr__(self, "features", THESIS_FEATURES)
@@ -85,7 +88,7 @@ class HighwayWorld(World):
             action_type=action_type,
             driver=driver,
             action_repeat=action_repeat,
-            target_speeds=tuple(self.target_speeds) if self.target_speeds is not None else preset_speeds,
+            target_speeds=self.target_speeds if self.target_speeds is not None else preset_speeds,
             features=self.features,
             observed_vehicles=rows,
             offroad_terminal=self.offroad_terminal,
