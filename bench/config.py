@@ -1,116 +1,22 @@
-"""What a run is, in frozen and typed configurations; `bench.words` makes them from `key=value` words."""
+"""What a run is, in frozen and typed configurations, made from `key=value` words."""
 
 from __future__ import annotations
 
+import itertools
 import os
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from bench import registry
-from bench.contracts import Attack, Defense, Victim, World
+from bench.contracts import Defense, Victim, World
 from bench.errors import UserError
-from bench.fingerprint import canonical, digest
-from bench.parameters import parameters
-from bench.registry import Kind
-from bench.scenario import GRIDS, Grid
-from bench.threat import ThreatModel
-
-C = TypeVar("C", Attack, Defense, Victim, World)
-
-UNATTACKED = ThreatModel(budget=0.0, access="oblivious", queries=0)
-"""The threat model of every clean run, so that runs with different threats share it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Chosen(Generic[C]):
-    """A component with the name it was registered by.
-
-    Args:
-        kind: attack, defense, victim or world.
-        name: of the entry point.
-        component: the instance; its fields are its parameters.
-    """
-
-    kind: Kind
-    name: str
-    component: C
-
-    @property
-    def params(self) -> str:
-        """Its parameters as canonical JSON."""
-        return canonical(self.component)
-
-    def __str__(self) -> str:
-        """The name, with the parameters that are not the default: `pgd(steps=20)`."""
-        own = {p.name: (getattr(self.component, p.name), p) for p in parameters(type(self.component)).values()}
-        changed = [f"{name}={value}" for name, (value, p) in own.items() if p.required or value != p.default]
-        return f"{self.name}({', '.join(changed)})" if changed else self.name
-
-
-def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
-    """A component by name, with these parameters and the defaults of the others.
-
-    Raises:
-        UserError: if the name is unknown, the plug-in broken or a value not allowed.
-    """
-    component = registry.load(kind, name)
-    try:
-        return Chosen(kind=kind, name=name, component=component(**params))
-    except (ValueError, TypeError) as error:
-        raise UserError(f"{kind} {name!r}: {str(error).splitlines()[0]}") from error
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pair:
-    """An attack on a defended victim in a world, under a threat model: what a grid is driven with.
-
-    Raises:
-        UserError: if the attack does not fit the victim or needs more than the threat model allows.
-    """
-
-    attack: Chosen[Attack]
-    defense: Chosen[Defense]
-    victim: Chosen[Victim]
-    world: Chosen[World]
-    threat: ThreatModel
-
-    def __post_init__(self) -> None:
-        attack, victim = self.attack.component, self.victim.component
-        if victim.action_type not in attack.action_types:
-            raise UserError(
-                f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}: "
-                f"it needs {' or '.join(attack.action_types)} actions, the victim's are {victim.action_type}"
-            )
-        if not self.threat.allows(attack.access):
-            raise UserError(
-                f"attack {self.attack.name!r} needs access {attack.access!r}, the threat model allows "
-                f"{self.threat.access!r} at most; say threat.access={attack.access} to allow it"
-            )
-
-    @property
-    def is_clean(self) -> bool:
-        """Whether nothing stands between the world and the victim."""
-        return self.attack.name == "none"
-
-    @property
-    def identity(self) -> dict[str, str]:
-        """Names and parameters of everything in the pair."""
-        parts: tuple[Chosen[Any], ...] = (self.attack, self.defense, self.victim, self.world)
-        named = {part.kind: part.name for part in parts}
-        return named | {f"{part.kind}_params": part.params for part in parts} | {"threat": canonical(self.threat)}
-
-    @property
-    def id(self) -> str:
-        """A short name for files and tables: the names and eight digits of the hash of the identity."""
-        return f"{self.attack.name}-{self.defense.name}-{self.victim.name}-{digest(self.identity)[:8]}"
-
-    def clean(self) -> Pair:
-        """The same victim and defence without the attack: the control of every attacked pair."""
-        return replace(self, attack=choose("attack", "none"), threat=UNATTACKED)
-
-    def __str__(self) -> str:
-        return f"{self.attack} + {self.defense} + {self.victim}"
+from bench.pair import Chosen, Pair
+from bench.registry import KINDS, Kind
+from bench.scenario import GRIDS, WEATHERS, Grid
+from bench.words import Words, configured
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,3 +83,106 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
 def cores() -> int:
     """Cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass
+class RunWords:
+    """The words of `bench run` that choose no component, with their types and defaults."""
+
+    grid: str = "standard-v1"
+    lanes: list[int] | None = None
+    density: list[float] | None = None
+    weather: list[str] | None = None
+    episodes: int | None = None
+    seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
+    workers: int = field(default_factory=cores)
+    out: str = "results"
+    record: int | None = None
+    reference: bool = True
+
+
+@dataclass
+class TrainWords:
+    """The words of `bench train` that choose no component."""
+
+    seeds: list[int] = field(default_factory=lambda: [0])
+    out: str | None = None
+
+
+def run_config(words: Sequence[str]) -> RunConfig:
+    """The configuration of `bench run WORDS`.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    given = Words(words, kinds=KINDS, settings=RunWords)
+    settings = given.settings()
+    axes = {key: tuple(settings[key]) for key in ("lanes", "density", "weather") if settings[key] is not None}
+    if settings["episodes"] is not None:
+        axes["episodes"] = settings["episodes"]
+    if settings["grid"] not in GRIDS:
+        raise UserError(registry.unknown(f"grid {settings['grid']!r}", settings["grid"], GRIDS))
+    for weather in axes.get("weather", ()):
+        if weather not in WEATHERS:
+            raise UserError(registry.unknown(f"weather {weather!r}", weather, WEATHERS))
+    with _one_line():
+        grid: Grid = GRIDS[settings["grid"]].with_(**axes)
+        choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS]
+        pairs = [
+            Pair(attack=attack, defense=defense, victim=victim, world=world, threat=threat)
+            for attack, defense, victim, world, threat in itertools.product(*choices, given.threats())
+        ]
+        pairs = [pair.clean() if pair.is_clean else pair for pair in pairs]
+        return RunConfig(
+            pairs=tuple({pair.id: pair for pair in pairs}.values()),
+            grid=grid,
+            seeds=tuple(settings["seeds"]),
+            workers=settings["workers"],
+            out=Path(settings["out"]).expanduser(),
+            record=settings["record"],
+            reference=settings["reference"],
+        )
+
+
+def train_config(words: Sequence[str]) -> TrainConfig:
+    """The configuration of `bench train WORDS`; `seed` is another word for `seeds`.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    words = [f"seeds={word.removeprefix('seed=')}" if word.startswith("seed=") else word for word in words]
+    given = Words(words, kinds=("defense", "victim", "world"), settings=TrainWords)
+    settings = given.settings()
+    one: dict[Kind, Chosen[Any]] = {}
+    for kind in given.kinds:
+        found = given.chosen(kind)
+        if len(found) > 1:
+            raise UserError(
+                f"bench train trains one policy a seed, not {len(found)}: give one {kind} and one set of parameters"
+            )
+        one[kind] = found[0]
+    with _one_line():
+        return TrainConfig(
+            victim=one["victim"],
+            defense=one["defense"],
+            world=one["world"],
+            seeds=tuple(settings["seeds"]),
+            out=Path(settings["out"]).expanduser() if settings["out"] else None,
+        )
+
+
+def component(kind: Kind, name: str, values: Mapping[str, str]) -> Any:
+    """A component by name, its parameters read as on the command line: `component("attack", "pgd", {"steps": "3"})`.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    return configured(kind, name, values).component
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(str(error).splitlines()[0]) from error

@@ -8,9 +8,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from bench import registry
-from bench.config import UNATTACKED, Pair, RunConfig, choose
+from bench.config import RunConfig
 from bench.contracts import Policy
 from bench.fingerprint import canonical
+from bench.pair import UNATTACKED, Pair, choose
 from bench.parameters import parameters
 from bench.scenario import Cell
 from bench.unit import Unit

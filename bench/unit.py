@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from bench import registry
-from bench.config import Chosen, Pair
 from bench.fingerprint import canonical, code_digest, digest, libraries, machine
+from bench.pair import Chosen, Pair
 from bench.rollout import Columns, Trace, rollout
 from bench.scenario import GRIDS, Cell
 

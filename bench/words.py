@@ -1,4 +1,4 @@
-"""`attack=zo,noise attack.steps=50 lanes=3,4` -> a typed configuration, by hydra's compose API.
+"""Words like `attack=zo,noise attack.steps=50 lanes=3,4`, read and type-checked by hydra's compose API.
 
 Comma lists of lanes, density, weather and seeds select; every other comma list sweeps. A component's parameter is given
 to those of the chosen components that have it.
@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import copy
 import itertools
+import re
 import types
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import field, fields, is_dataclass, make_dataclass
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -20,109 +20,22 @@ from typing import Any, Literal, Union, get_args, get_origin
 from hydra import compose, initialize
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench import registry
-from bench.config import Chosen, Pair, RunConfig, TrainConfig, choose, cores
 from bench.errors import UserError
+from bench.pair import Chosen, choose
 from bench.parameters import Parameter, parameters
-from bench.registry import KINDS, Kind
-from bench.scenario import GRIDS, WEATHERS, Grid
+from bench.registry import Kind
 from bench.threat import ThreatModel
 
 DEFAULTS: dict[Kind, str] = {"attack": "none", "defense": "none", "victim": "dqn", "world": "highway"}
 
 
-@dataclass
-class RunWords:
-    """The words of `bench run` that choose no component, with their types and defaults."""
-
-    grid: str = "standard-v1"
-    lanes: list[int] | None = None
-    density: list[float] | None = None
-    weather: list[str] | None = None
-    episodes: int | None = None
-    seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
-    workers: int = field(default_factory=cores)
-    out: str = "results"
-    record: int | None = None
-    reference: bool = True
-
-
-@dataclass
-class TrainWords:
-    """The words of `bench train` that choose no component."""
-
-    seeds: list[int] = field(default_factory=lambda: [0])
-    out: str | None = None
-
-
-def run_config(words: Sequence[str]) -> RunConfig:
-    """The configuration of `bench run WORDS`.
-
-    Raises:
-        UserError: for anything that cannot be read or is not allowed, in one line.
-    """
-    given = _Given(words, kinds=KINDS, settings=RunWords)
-    settings = given.settings()
-    axes = {key: tuple(settings[key]) for key in ("lanes", "density", "weather") if settings[key] is not None}
-    if settings["episodes"] is not None:
-        axes["episodes"] = settings["episodes"]
-    if settings["grid"] not in GRIDS:
-        raise UserError(registry.unknown(f"grid {settings['grid']!r}", settings["grid"], GRIDS))
-    for weather in axes.get("weather", ()):
-        if weather not in WEATHERS:
-            raise UserError(registry.unknown(f"weather {weather!r}", weather, WEATHERS))
-    with _one_line():
-        grid: Grid = GRIDS[settings["grid"]].with_(**axes)
-        choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS]
-        pairs = [
-            Pair(attack=attack, defense=defense, victim=victim, world=world, threat=threat)
-            for attack, defense, victim, world, threat in itertools.product(*choices, given.threats())
-        ]
-        pairs = [pair.clean() if pair.is_clean else pair for pair in pairs]
-        return RunConfig(
-            pairs=tuple({pair.id: pair for pair in pairs}.values()),
-            grid=grid,
-            seeds=tuple(settings["seeds"]),
-            workers=settings["workers"],
-            out=Path(settings["out"]).expanduser(),
-            record=settings["record"],
-            reference=settings["reference"],
-        )
-
-
-def train_config(words: Sequence[str]) -> TrainConfig:
-    """The configuration of `bench train WORDS`; `seed` is another word for `seeds`.
-
-    Raises:
-        UserError: for anything that cannot be read or is not allowed, in one line.
-    """
-    words = [f"seeds={word.removeprefix('seed=')}" if word.startswith("seed=") else word for word in words]
-    given = _Given(words, kinds=("defense", "victim", "world"), settings=TrainWords)
-    settings = given.settings()
-    one: dict[Kind, Chosen[Any]] = {}
-    for kind in given.kinds:
-        found = given.chosen(kind)
-        if len(found) > 1:
-            raise UserError(
-                f"bench train trains one policy a seed, not {len(found)}: give one {kind} and one set of parameters"
-            )
-        one[kind] = found[0]
-    with _one_line():
-        return TrainConfig(
-            victim=one["victim"],
-            defense=one["defense"],
-            world=one["world"],
-            seeds=tuple(settings["seeds"]),
-            out=Path(settings["out"]).expanduser() if settings["out"] else None,
-        )
-
-
-class _Given:
+class Words:
     """The words as given: the values of each key, in hydra's override grammar.
 
     Args:
@@ -181,38 +94,53 @@ class _Given:
                 )
         found: dict[str, Chosen[Any]] = {}
         for name, owned in known.items():
-            ConfigStore.instance().store(group=kind, name=name, node=_schema(kind, name, owned))
             keys = [key for key in swept if key.partition(".")[0] in owned]
             for values in itertools.product(*(swept[key] for key in keys)):
-                words = [f"{kind}.{key}={value}" for key, value in zip(keys, values, strict=True)]
-                composed = _composed([f"+{kind}={name}", *words])[kind]
-                one = choose(kind, name, **_arguments(kind, name, owned, composed))
+                one = configured(kind, name, dict(zip(keys, values, strict=True)))
                 found[f"{name} {one.params}"] = one
         return list(found.values())
 
     def threats(self) -> list[ThreatModel]:
         """Every combination of the threat model's values."""
         owned = parameters(ThreatModel)
-        ConfigStore.instance().store(group="threat", name="model", node=_schema("threat", "model", owned))
         keys = [key for key in self.values if key.startswith("threat.")]
+        names = [key.removeprefix("threat.") for key in keys]
         found = []
         for values in itertools.product(*(self.values[key] for key in keys)):
-            words = [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
-            composed = _composed(["+threat=model", *words])["threat"]
-            found.append(ThreatModel(**_arguments("threat", "", owned, composed)))
+            arguments = _arguments("threat", "model", owned, dict(zip(names, values, strict=True)))
+            try:
+                found.append(ThreatModel(**arguments))
+            except ValueError as error:
+                raise UserError(str(error)) from error
         return found
+
+
+def configured(kind: Kind, name: str, values: Mapping[str, str]) -> Chosen[Any]:
+    """A component by name, its parameters read as on the command line.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    owned = parameters(registry.load(kind, name))
+    for key in values:
+        if key.partition(".")[0] not in owned:
+            raise UserError(registry.unknown(f"parameter {kind}.{key} of {name}", key, owned))
+    return choose(kind, name, **_arguments(kind, name, owned, values))
 
 
 def _parsed(words: Sequence[str]) -> list[Override]:
     parser = OverridesParser.create()
     overrides = []
     for word in words:
+        key, equals, value = word.partition("=")
+        if not (equals and re.fullmatch(r"\w+(\.\w+)*", key)):
+            raise UserError(f"cannot read {word!r}: write key=value, for instance attack=zo or lanes=3,4")
         try:
             (override,) = parser.parse_overrides([word])
         except HydraException:
-            override = None
-        if override is None or override.type is not OverrideType.CHANGE or not override.key_or_group:
-            raise UserError(f"cannot read {word!r}: write key=value, for instance attack=zo or lanes=3,4")
+            # Not a value of hydra's grammar, so a plain text.
+            escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+            (override,) = parser.parse_overrides([f'{key}="{escaped}"'])
         overrides.append(override)
     return overrides
 
@@ -237,14 +165,14 @@ def _composed(overrides: list[str], config_name: str | None = None) -> DictConfi
         raise UserError(f"cannot read {word}: {reason[:1].lower()}{reason[1:]}") from error
 
 
-def _schema(kind: str, name: str, owned: dict[str, Parameter]) -> type[Any]:
+def _schema(owned: dict[str, Parameter]) -> type[Any]:
     """A structured config of a component's parameters, with types that OmegaConf knows."""
     made: list[tuple[str, Any, Any]] = []
     for parameter in owned.values():
         value = parameter.default
         default = field() if parameter.required else field(default_factory=partial(copy.copy, value))
         made.append((parameter.name, _omegaconf_type(parameter.hint), default))
-    return make_dataclass(f"{kind}_{name}", made, kw_only=True)
+    return make_dataclass("Parameters", made, kw_only=True)
 
 
 def _omegaconf_type(hint: Any) -> Any:
@@ -259,11 +187,12 @@ def _omegaconf_type(hint: Any) -> Any:
     return hint if plain or is_dataclass(hint) else Any
 
 
-def _arguments(kind: str, name: str, owned: dict[str, Parameter], composed: DictConfig) -> dict[str, Any]:
-    """The composed values as constructor arguments: checked against choices, tuples for lists."""
-    what = f"{kind} {name}".strip()
+def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping[str, str]) -> dict[str, Any]:
+    """Values in hydra's grammar as constructor arguments: typed, checked against the choices, tuples for lists."""
+    ConfigStore.instance().store(group=kind, name=name, node=_schema(owned))
+    composed = _composed([f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())])[kind]
     if missing := sorted(str(key) for key in OmegaConf.missing_keys(composed)):
-        raise UserError(f"{what} needs {', '.join(f'{kind}.{key}=…' for key in missing)}")
+        raise UserError(f"{kind} {name!r} needs {', '.join(f'{kind}.{key}=…' for key in missing)}")
     arguments = OmegaConf.to_object(composed)
     values = {item: getattr(arguments, item) for item in owned}
     for key, value in values.items():
@@ -273,11 +202,3 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], composed: Dict
         if isinstance(value, list):
             values[key] = tuple(value)
     return values
-
-
-@contextmanager
-def _one_line() -> Iterator[None]:
-    try:
-        yield
-    except ValueError as error:
-        raise UserError(str(error).splitlines()[0]) from error

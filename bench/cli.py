@@ -1,0 +1,176 @@
+"""The command line: `bench run | train | list | show | view | report`.
+
+Commands import what they need when they are called, so that `bench list` and `--help` do not wait for torch.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from bench.errors import UserError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import pyarrow as pa
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+
+Words = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="KEY=VALUE...",
+        help="Comma lists sweep: attack=zo,noise defense=advtrain victim=dqn attack.steps=50 threat.budget=0.1,0.2. "
+        "lanes, density, weather and seeds choose from the grid: lanes=3,4 density=1 weather=clear,rain episodes=20.",
+    ),
+]
+
+
+@app.callback()
+def bench() -> None:
+    """How much does this attack hurt this defence of an automated vehicle?
+
+    With --debug anywhere on the line, or BENCH_DEBUG=1, an error shows its traceback.
+    """
+
+
+@app.command("list")
+def list_components(
+    name: Annotated[str, typer.Argument(help="One component: what it does and its parameters.")] = "",
+) -> None:
+    """List the attacks, defences, victims and worlds that are installed."""
+    from bench import cli_list
+
+    cli_list.print_component(name, Console()) if name else cli_list.print_names(Console())
+
+
+@app.command()
+def run(words: Words = None) -> None:
+    """Score attacks on defended victims over the standard grid; goes on where a run was broken off.
+
+    For instance: bench run attack=zo defense=advtrain
+    """
+    from bench import results, runner
+    from bench.config import run_config
+    from bench.console import RunProgress
+
+    config = run_config(words or [])
+    with RunProgress(Console(stderr=True)) as progress:
+        try:
+            units = runner.run(config, progress)
+        except KeyboardInterrupt:
+            kept = f"{progress.done} of {progress.total} episodes are kept"
+            raise UserError(f"interrupted; {kept}, and the same command goes on from there") from None
+    _print_report("run", results.read(config.out, units))
+    Console().print(f"Records in {config.out}: `bench show {config.out}` says what made them.", highlight=False)
+
+
+@app.command()
+def train(words: Words = None) -> None:
+    """Train a victim, or harden it with a defence, and save it to the zoo.
+
+    For instance: bench train victim=dqn seeds=0,1,2, or bench train defense=advtrain defense.skip=0.3 victim=dqn
+    """
+    from bench.config import train_config
+    from bench.console import TrainingProgress
+    from bench.victims import zoo
+
+    config = train_config(words or [])
+    victim, defense, world = config.victim.component, config.defense.component, config.world.component
+    hardens = config.defense.name != "none"
+    try:
+        name = defense.zoo_name(victim) if hardens else victim.zoo_name()
+    except NotImplementedError as error:
+        raise UserError(f"there is nothing to train: {error}") from error
+    for seed in config.seeds:
+        start = time.perf_counter()
+        with TrainingProgress(Console(stderr=True), f"{name}, seed {seed}") as progress:
+            if hardens:
+                trained = defense.train(victim, world, seed=seed, progress=progress)
+            else:
+                trained = victim.train(world, seed=seed, progress=progress)
+        if trained is None:
+            raise UserError(f"there is nothing to train: defense {config.defense.name!r} works at run time only")
+        path = zoo.save(trained.policy, trained.card, name=name, seed=seed, root=config.out)
+        seconds = time.perf_counter() - start
+        Console().print(f"{name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}", soft_wrap=True)
+
+
+@app.command()
+def show(
+    run: Annotated[str, typer.Argument(help="A results folder, or the name of a pair in it.")] = "results",
+    out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
+) -> None:
+    """Show a run: its configuration, what produced it, its table and its recordings."""
+    from bench import cli_show
+
+    cli_show.print_run(run, out, Console(), _print_report)
+
+
+@app.command()
+def view(
+    run: Annotated[str, typer.Argument(help="A recording (.rrd), a results folder, or the name of a pair in it.")],
+    out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
+) -> None:
+    """Open a recording in the rerun viewer."""
+    from bench import cli_show
+
+    cli_show.open_recording(run, out, Console())
+
+
+@app.command()
+def report(words: Words = None) -> None:
+    """Print a report on all records of a results folder: bench report [NAME] [out=results], for instance thesis."""
+    from bench import results
+
+    folders = [word.removeprefix("out=") for word in words or [] if word.startswith("out=")]
+    names = [word for word in words or [] if not word.startswith("out=")]
+    if len(names) > 1 or len(folders) > 1:
+        raise UserError(
+            "bench report takes one report and one out=folder, for instance: bench report thesis out=results"
+        )
+    name = names[0] if names else "run"
+    function = _report(name)
+    function(results.read(Path(folders[0] if folders else "results").expanduser()), Console())
+
+
+def _report(name: str) -> Callable[[pa.Table, Console], None]:
+    from bench import registry
+
+    return registry.resolve(registry.REPORTS, name, "report")
+
+
+def _print_report(name: str, records: pa.Table) -> None:
+    _report(name)(records, Console())
+
+
+def main() -> None:
+    """Run the command line. Bad input ends in one line on standard error and exit code 2."""
+    debug = "--debug" in sys.argv or bool(os.environ.get("BENCH_DEBUG"))
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    try:
+        status = app(arguments, standalone_mode=False)
+    except (UserError, typer.TyperException) as error:
+        if debug:
+            raise
+        reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
+        sys.exit(_complain(reason))
+    sys.exit(status or 0)
+
+
+def _complain(reason: str) -> int:
+    line = " ".join(reason.split())
+    Console(stderr=True).print(f"[bold red]error:[/] {escape(line)}", soft_wrap=True, highlight=False)
+    return 2
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""`bench list`: the names of all components, and the page of one."""
+
+from __future__ import annotations
+
+import re
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bench import registry
+from bench.errors import UserError
+from bench.registry import GROUPS, KINDS, Kind
+
+
+def print_names(console: Console) -> None:
+    """Every component by kind, with the package that ships it. Imports none of them."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for column in ("kind", "name", "shipped by"):
+        table.add_column(column)
+    for kind in KINDS:
+        for number, (name, claims) in enumerate(registry.entries(GROUPS[kind]).items()):
+            complaint = registry.problem(claims)
+            shipped_by = Text(complaint, style="red") if complaint else Text(claims[0].shipped_by)
+            table.add_row(kind if number == 0 else "", Text(name, style="bold"), shipped_by)
+    console.print(table)
+    console.print("\n`bench list NAME` says what one does and what its parameters are.", style="dim", highlight=False)
+
+
+def print_component(name: str, console: Console) -> None:
+    """What every component of this name does, what it needs, its parameters, and the package that ships it.
+
+    Raises:
+        UserError: if no component has the name, or if its plug-in is broken.
+    """
+    kinds = [kind for kind in KINDS if name in registry.names(kind)]
+    if not kinds:
+        every = sorted({known for kind in KINDS for known in registry.names(kind)})
+        raise UserError(registry.unknown(f"component {name!r}", name, every))
+    for number, kind in enumerate(kinds):
+        if number:
+            console.rule(style="dim")
+        _print_page(kind, name, console)
+
+
+def _print_page(kind: Kind, name: str, console: Console) -> None:
+    from bench.parameters import description, parameters
+
+    component = registry.load(kind, name)
+    entry = registry.find(GROUPS[kind], name, kind)
+    console.print(Text.assemble((f"{kind} ", "dim"), (name, "bold"), (f"   {entry.target}, {entry.shipped_by}", "dim")))
+    console.print()
+    for paragraph in _paragraphs(description(component)):
+        console.print(_with_code(paragraph), highlight=False)
+        console.print()
+    if needs := _needs(kind, component):
+        console.print(needs, highlight=False)
+        console.print()
+    known = parameters(component)
+    if not known:
+        console.print("It has no parameters.")
+        return
+    table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
+    for column in ("parameter", "type", "default"):
+        table.add_column(column, no_wrap=True)
+    table.add_column("meaning", ratio=1)
+    for parameter in known.values():
+        choices = f"one of {', '.join(map(str, parameter.choices))}" if parameter.choices else ""
+        meaning = Text("\n").join(filter(None, [_with_code(parameter.meaning), Text(choices, style="dim")]))
+        default = "required" if parameter.required else _shown(parameter.default)
+        table.add_row(Text(f"{kind}.{parameter.name}", style="bold"), parameter.type_name, default, meaning)
+    console.print(table)
+
+
+def _needs(kind: Kind, component: type) -> str:
+    """What of an attack decides where it fits."""
+    if kind != "attack":
+        return ""
+    return f"Needs access {component.access} and {' or '.join(component.action_types)} actions."  # type: ignore[attr-defined]
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(value)
+
+
+def _paragraphs(text: str) -> list[str]:
+    """The paragraphs of a docstring, each on one line unless it is indented (an example)."""
+    found = []
+    for paragraph in text.split("\n\n"):
+        indented = any(line.startswith(" ") for line in paragraph.splitlines())
+        found.append(paragraph if indented else " ".join(paragraph.split()))
+    return [paragraph for paragraph in found if paragraph.strip()]
+
+
+def _with_code(text: str) -> Text:
+    """Text with what stands in `backticks` set apart."""
+    rendered = Text()
+    for number, piece in enumerate(re.split(r"`([^`]+)`", text)):
+        rendered.append(piece, style="cyan" if number % 2 else "")
+    return rendered

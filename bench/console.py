@@ -1,0 +1,122 @@
+"""What the terminal shows while work goes on, and of a component: bars and tables on rich consoles."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from bench.unit import Unit
+
+
+class RunProgress:
+    """The progress of a run (`bench.runner.Watcher`): a bar on a terminal, a line a finished unit elsewhere.
+
+    Args:
+        console: where it is drawn; standard error, so that tables can be piped.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.bar = _bar(console, MofNCompleteColumn(), TextColumn("episodes"))
+        self.task: TaskID | None = None
+        self.total = self.done = self.kept = 0
+        self.current: Sequence[Unit] = ()
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self.bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.bar.stop()
+
+    def begin(self, *, episodes: int, finished: int) -> None:
+        self.total, self.done = episodes, finished
+        self.task = self.bar.add_task("", total=episodes, completed=finished)
+        if finished:
+            self.console.print(f"{finished} of {episodes} episodes were there already", style="dim", highlight=False)
+
+    def working(self, units: Sequence[Unit]) -> None:
+        self.current = units
+        if self.task is not None and units:
+            self.bar.update(self.task, description=_on_one_line(units))
+
+    def finished(self, unit: Unit, wall_s: float) -> None:
+        self.done += len(unit.seeds)
+        self.kept += 1
+        if self.task is not None:
+            self.bar.update(self.task, completed=self.done)
+        if not self.console.is_terminal:
+            line = f"{self.done}/{self.total} episodes | {unit} | {wall_s:.1f} s"
+            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def warn(self, line: str) -> None:
+        self.console.print(Text(f"warning: {line}", style="yellow"), soft_wrap=True)
+
+
+class TrainingProgress:
+    """The progress of one training (`bench.contracts.Progress`): a bar on a terminal, a line every tenth elsewhere."""
+
+    def __init__(self, console: Console, label: str) -> None:
+        self.console = console
+        self.label = label
+        self.started = time.perf_counter()
+        self.tenths = 0
+        self.bar = _bar(console, TextColumn("{task.percentage:>3.0f}%"))
+        self.task = self.bar.add_task(label, total=1.0)
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self.bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.bar.stop()
+
+    def __call__(self, share: float, text: str) -> None:
+        self.bar.update(self.task, completed=share, description=f"{self.label}  {text}")
+        if not self.console.is_terminal and int(share * 10) > self.tenths:
+            self.tenths = int(share * 10)
+            seconds = time.perf_counter() - self.started
+            line = f"{self.label} | {share:.0%} | {seconds:.0f} s | {text}"
+            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _bar(console: Console, *counts: ProgressColumn) -> Progress:
+    return Progress(
+        SpinnerColumn(),
+        BarColumn(bar_width=24),
+        *counts,
+        TimeElapsedColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False),
+        console=console,
+        transient=True,
+    )
+
+
+def _on_one_line(units: Sequence[Unit]) -> str:
+    more = f" (+{len(units) - 1})" if len(units) > 1 else ""
+    return f"{units[0]}{more}"
