@@ -87,14 +87,17 @@ class Episodes:
         Raises:
             ValueError: if nothing is left.
         """
-        parts = (
-            set(self.runs if runs is None else runs) & set(self.runs),
-            set(self.cells if cells is None else cells) & set(self.cells),
-            set(self.seeds if seeds is None else seeds) & set(self.seeds),
-        )
-        if not all(parts):
+        axes = (_places(self.runs, runs), _places(self.cells, cells), _places(self.seeds, seeds))
+        if not all(axes):
             raise ValueError("no episode is left")
-        return _arranged(self.table, _keys(self.table), *parts)
+        rows = np.arange(self.table.num_rows).reshape(self.shape)[np.ix_(*axes)].ravel()
+        return Episodes(
+            table=self.table.take(pa.array(rows)),
+            runs=tuple(self.runs[i] for i in axes[0]),
+            cells=tuple(self.cells[i] for i in axes[1]),
+            seeds=tuple(self.seeds[i] for i in axes[2]),
+            left_out=self.left_out,
+        )
 
     def standing_for(self, runs: Sequence[int], cells: Sequence[Cell]) -> Episodes:
         """The episodes of a driver that neither learns nor sees, under the names of other runs and weathers.
@@ -106,22 +109,27 @@ class Episodes:
         Raises:
             ValueError: if a cell was driven in neither its own nor in clear weather.
         """
-        driven = {cell: cell if cell in self.cells else replace(cell, weather="clear") for cell in cells}
-        missing = [str(cell) for cell, stand_in in driven.items() if stand_in not in self.cells]
+        stand_ins = [cell if cell in self.cells else replace(cell, weather="clear") for cell in cells]
+        missing = [str(cell) for cell, stand_in in zip(cells, stand_ins, strict=True) if stand_in not in self.cells]
         if missing:
             raise ValueError(f"never driven: {'; '.join(missing)}")
-        parts = []
-        for run in runs:
-            for cell, stand_in in driven.items():
-                rows = self.only(runs=self.runs[:1], cells=[stand_in]).table
-                labels = {"training_seed": run, "weather": cell.weather}
-                for name, label in labels.items():
-                    field = rows.schema.field(name)
-                    rows = rows.set_column(
-                        rows.column_names.index(name), field, pa.array([label] * len(rows), field.type)
-                    )
-                parts.append(rows)
-        return Episodes.arrange(pa.concat_tables(parts))
+        each = len(self.seeds)
+        first_run = np.arange(self.table.num_rows).reshape(self.shape)[0]
+        rows = np.concatenate([first_run[self.cells.index(stand_in)] for stand_in in stand_ins])
+        table = self.table.take(pa.array(np.tile(rows, len(runs))))
+        labels = {
+            "training_seed": np.repeat(runs, len(cells) * each),
+            "weather": np.tile(np.repeat([cell.weather for cell in cells], each), len(runs)),
+        }
+        for name, values in labels.items():
+            field = table.schema.field(name)
+            table = table.set_column(table.schema.get_field_index(name), field, pa.array(values, field.type))
+        return Episodes.arrange(table)
+
+
+def _places(own: Sequence[object], wanted: Collection[object] | None) -> list[int]:
+    kept = None if wanted is None else set(wanted)
+    return [place for place, value in enumerate(own) if kept is None or value in kept]
 
 
 def _keys(records: pa.Table) -> list[tuple[int, Cell, int]]:

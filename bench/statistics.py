@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, trim_mean
+from scipy.special import ndtri
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,10 @@ def iqm(scores: Array, axis: int | None = None) -> Array:
 
     The definition of `rliable.metrics.aggregate_iqm`; with fewer than four values it is the mean.
     """
-    return np.asarray(trim_mean(scores, proportiontocut=0.25, axis=axis))
+    ordered = np.sort(scores, axis=axis)
+    last = 0 if axis is None else axis
+    count = ordered.shape[last]
+    return np.asarray(np.take(ordered, range(count // 4, count - count // 4), axis=last).mean(last))
 
 
 def interval(scores: Array, *, seed: int = 0, replicates: int = REPLICATES) -> Interval:
@@ -101,7 +104,7 @@ def wilson(successes: float, trials: int) -> Interval:
         raise ValueError(f"successes must be between 0 and the {trials} trials, got {successes}")
     if trials == 0:
         return Interval(np.nan, 0.0, 1.0)
-    z2 = float(norm.ppf((1 + CONFIDENCE) / 2)) ** 2
+    z2 = float(ndtri((1 + CONFIDENCE) / 2)) ** 2
     rate = successes / trials
     centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
     half = np.sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (1 + z2 / trials)

@@ -1,0 +1,73 @@
+"""The look of every table: columns of headings and how to fill them; what a terminal has no room for is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Literal, TypeVar
+
+from rich import box
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+Subject = TypeVar("Subject")
+STRIP = 25
+"""Characters of a strip chart."""
+
+
+@dataclass(frozen=True)
+class Column(Generic[Subject]):
+    """A column of a table.
+
+    Args:
+        heading: at most two lines.
+        value: what it shows of a row's subject.
+        justify: numbers to the right, text to the left.
+        spare: columns are left out of a narrow terminal from the highest number down; 0 stays.
+    """
+
+    heading: str
+    value: Callable[[Subject], Text | str]
+    justify: Literal["left", "right"] = "right"
+    spare: int = 0
+
+
+@dataclass(frozen=True)
+class Section(Generic[Subject]):
+    """Rows that belong together, under a title of their own where there is one."""
+
+    subjects: Sequence[Subject]
+    title: Text | None = None
+
+
+def fitted(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], console: Console) -> Table:
+    """The table with as many of the columns as the console has room for, and air between them where there is room."""
+    room = console.width - 2
+    spare = max(column.spare for column in columns)
+    for limit in range(spare, -1, -1):
+        kept = [column for column in columns if column.spare <= limit]
+        for gap in (1, 0):
+            made = _table(kept, sections, gap)
+            if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= room:
+                return made
+    return made
+
+
+def _table(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], gap: int) -> Table:
+    made = Table(box=box.SIMPLE_HEAD, header_style="dim", padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
+    for column in columns:
+        made.add_column(column.heading, justify=column.justify, no_wrap=True, vertical="bottom")
+    for section in sections:
+        if section.title is not None:
+            made.add_row(section.title)
+        for subject in section.subjects:
+            made.add_row(*(column.value(subject) for column in columns))
+        made.add_section()
+    return made
+
+
+def axis() -> str:
+    """The heading of a strip chart: 0 at its left end, 1 at its right."""
+    return "safe progress\n0" + "0.5".center(STRIP - 2) + "1"

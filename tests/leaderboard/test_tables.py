@@ -1,0 +1,163 @@
+"""What a run's report says, read off the terminal."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+from rich.console import Console
+from synthetic import CLEAR, drive, reference_drivers
+
+from bench.results import SCHEMA
+from bench.scenario import GRIDS, Cell
+from bench.statistics import Interval
+from leaderboard.pairs import BEST_BLIND, read_pairs
+from leaderboard.tables import remarks, run_report
+from leaderboard.text import CLEAN, estimate, strip, threat
+
+ZO = {"objective": "expected", "steps": 50}
+
+
+def printed(records: pa.Table, width: int = 120) -> str:
+    out = io.StringIO()
+    run_report(records, Console(file=out, width=width))
+    return out.getvalue()
+
+
+def one_pair(**changes: object) -> pa.Table:
+    attacked = {"attack": "zo", "attack_params": ZO, "skill": 0.25, "queries": 1050.0, **changes}
+    return pa.concat_tables([drive(), drive(**attacked), reference_drivers()])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("width", [80, 100, 120, 140])
+def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut_off(width: int) -> None:
+    text = printed(one_pair(), width)
+    assert max(map(len, text.splitlines())) <= width
+    assert "…" not in re.sub(r"[−+]\S*…[−+]\S*", "", text)
+
+
+def test_every_cell_has_a_row_grouped_by_weather() -> None:
+    rows = [line.strip() for line in printed(one_pair()).splitlines()]
+    for weather in ("clear", "rain", "fog"):
+        place = next(i for i, row in enumerate(rows) if row.startswith(weather))
+        assert [row[:5] for row in rows[place + 1 : place + 7]] == [
+            "3 × 1",
+            "3 × 2",
+            "4 × 1",
+            "4 × 2",
+            "5 × 1",
+            "5 × 2",
+        ]
+
+
+def test_the_threat_model_and_the_attacks_parameters_are_stated() -> None:
+    text = " ".join(printed(one_pair()).split())
+    assert "zo objective=expected steps=50" in text
+    assert "relative 0.1: each measured value may be off by 10 % of itself" in text
+    assert "at most 1000 queries a step" in text
+
+
+def test_a_linf_threat_model_is_stated_on_the_normalised_scale() -> None:
+    (pair,) = read_pairs(one_pair(threat=("linf", 0.2)))
+    assert threat(pair).startswith("linf 0.2: each measured value may be off by 0.2 on the [-1, 1] scale")
+
+
+def test_a_victim_no_better_than_a_blind_policy_is_marked() -> None:
+    text = printed(one_pair(skill=0.0))
+    assert "no better than the best blind policy in 18 of 18 cells" in text
+    assert "no better" not in printed(one_pair(skill=0.6))
+
+
+def test_the_blind_policy_is_the_best_of_each_cell_and_stands_for_every_weather() -> None:
+    (pair,) = read_pairs(one_pair())
+    blind = pair.references[BEST_BLIND]
+    assert blind.cells == pair.cells
+    records = reference_drivers()
+    for cell in (Cell(lanes=3, density=1.0, weather="fog"), Cell(lanes=5, density=2.0, weather="clear")):
+        best = 0.0
+        for policy in set(records["victim_params"].to_pylist()) - {"{}"}:
+            mask = [
+                (row["lanes"], row["density"], row["victim_params"]) == (cell.lanes, cell.density, policy)
+                for row in records.to_pylist()
+            ]
+            best = max(best, float(np.mean(records.filter(pa.array(mask))["safe_progress"].to_numpy())))
+        assert blind.only(cells=[cell]).column("safe_progress").mean() == pytest.approx(best)
+
+
+def test_reference_drivers_of_other_actions_are_no_reference() -> None:
+    continuous = drive("blind", victim_params={"policy": "brake"}, cells=CLEAR, runs=(0,), sees=False, skill=0.9,
+                       action_type="continuous")  # fmt: skip
+    with_it, without = (read_pairs(table)[0] for table in (pa.concat_tables([one_pair(), continuous]), one_pair()))
+    assert with_it.reference_scores == without.reference_scores
+
+
+def test_a_sweep_has_one_row_a_pair_the_strongest_attack_first() -> None:
+    records = pa.concat_tables(
+        [
+            one_pair(),
+            drive(attack="zo", attack_params={**ZO, "steps": 10}, skill=0.4),
+            drive(attack="noise", skill=0.55),
+            drive(defense="advtrain", skill=0.5),
+            drive(attack="zo", attack_params=ZO, defense="advtrain", skill=0.45),
+        ]
+    )
+    pairs = read_pairs(records)
+    assert [(pair.identity["defense"], pair.identity["attack"]) for pair in pairs] == [
+        ("none", "zo"), ("none", "zo"), ("none", "noise"), ("advtrain", "zo"),
+    ]  # fmt: skip
+    overview = printed(records).split("victim ")[0]
+    assert overview.index("zo steps=50") < overview.index("zo steps=10") < overview.index("noise")
+    assert overview.index("noise") < overview.index("dqn + advtrain")
+    assert "objective" not in overview
+
+
+def test_attacked_and_clean_are_measured_on_the_same_scenarios() -> None:
+    records = pa.concat_tables([drive(episodes=20), drive(attack="zo", skill=0.2, cells=CLEAR[:2], episodes=10)])
+    (pair,) = read_pairs(records)
+    assert pair.clean is not None
+    assert pair.attacked is not None
+    assert (pair.clean.cells, pair.clean.seeds) == (pair.attacked.cells, pair.attacked.seeds)
+    assert len(pair.cells) == 2
+
+
+def test_a_run_that_broke_off_says_what_is_left_out() -> None:
+    whole = drive(attack="zo", skill=0.2)
+    late = pa.array([run == 2 and weather == "fog" for run, weather in
+                     zip(whole["training_seed"].to_pylist(), whole["weather"].to_pylist(), strict=True)])  # fmt: skip
+    (pair,) = read_pairs(pa.concat_tables([drive(), whole.filter(pc.invert(late))]))
+    assert {cell.weather for cell in pair.cells} == {"clear", "rain"}
+    assert any("left out" in remark for remark in remarks(pair))
+
+
+def test_the_newest_record_of_a_scenario_counts() -> None:
+    old, new = drive(cells=CLEAR[:1], runs=(0,)), drive(cells=CLEAR[:1], runs=(0,), skill=0.9)
+    later = pa.array(
+        [stamp.replace(year=2027) for stamp in new["created_at"].to_pylist()], SCHEMA.field("created_at").type
+    )
+    new = new.set_column(SCHEMA.get_field_index("created_at"), SCHEMA.field("created_at"), later)
+    for records in (pa.concat_tables([old, new]), pa.concat_tables([new, old])):
+        (pair,) = read_pairs(records)
+        assert pair.driven.column("safe_progress").mean() == pytest.approx(np.mean(new["safe_progress"].to_numpy()))
+
+
+def test_clean_runs_and_reference_drivers_alone_can_be_reported() -> None:
+    assert "queries" not in printed(pa.concat_tables([drive(), reference_drivers()])).split("safe progress: 0")[0]
+    assert "idm" in printed(drive("idm", runs=(0,), cells=CLEAR, sees=False))
+    assert printed(SCHEMA.empty_table()) == "No records to report.\n"
+
+
+def test_one_cell_one_episode_has_no_interval_but_a_number() -> None:
+    cells = GRIDS["standard-v1"].cells()[:1]
+    one = {"cells": cells, "runs": (0,), "episodes": 1}
+    assert "nan" not in printed(pa.concat_tables([drive(**one), drive(attack="zo", **one)]))  # type: ignore[arg-type]
+
+
+def test_numbers_are_written_short_and_strips_to_scale() -> None:
+    assert estimate(Interval(0.5, 0.25, 1.0)).plain == "0.50 .25–1.00"
+    assert estimate(Interval(0.5, np.nan, np.nan)).plain == "0.50"
+    assert strip({CLEAN: Interval(0.5, 0.3, 0.7)}, 10).plain == "···──○──··"
+    assert strip({CLEAN: Interval(1.0, 1.0, 1.0)}, 4).plain == "···○"
