@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from bench.errors import UserError
 
@@ -70,7 +70,7 @@ def run(words: Words = None) -> None:
             kept = f"{progress.done} of {progress.total} episodes are kept"
             raise UserError(f"interrupted; {kept}, and the same command goes on from there") from None
     _print_report("run", results.read(config.out, units))
-    Console().print(f"Records in {config.out}: `bench show {config.out}` says what made them.", highlight=False)
+    Console().print(Text(f"Records in {config.out}: `bench show {config.out}` says what made them."), soft_wrap=True)
 
 
 @app.command()
@@ -101,7 +101,7 @@ def train(words: Words = None) -> None:
             raise UserError(f"there is nothing to train: defense {config.defense.name!r} works at run time only")
         path = zoo.save(trained.policy, trained.card, name=name, seed=seed, root=config.out)
         seconds = time.perf_counter() - start
-        Console().print(f"{name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}", soft_wrap=True)
+        Console().print(Text(f"{name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"), soft_wrap=True)
 
 
 @app.command()
@@ -168,7 +168,7 @@ def main() -> None:
 
 def _complain(reason: str) -> int:
     line = " ".join(reason.split())
-    Console(stderr=True).print(f"[bold red]error:[/] {escape(line)}", soft_wrap=True, highlight=False)
+    Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
     return 2
 
 

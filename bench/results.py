@@ -168,7 +168,7 @@ def read(out: Path, units: Collection[str] | None = None) -> pa.Table:
     query = "from read_parquet(?)" + (_NEWEST if units is None else "") + _ORDER
     try:
         with duckdb.connect() as connection:
-            return connection.execute(query, [[str(path) for path in paths]]).to_arrow_table().cast(SCHEMA)
+            return connection.sql(query, params=[[str(path) for path in paths]]).to_arrow_table().cast(SCHEMA)
     except duckdb.Error as error:
         for path in paths:
             _check(path, thoroughly=True)

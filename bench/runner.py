@@ -18,12 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import torch
-
 from bench import results
 from bench.config import RunConfig
 from bench.errors import UserError
 from bench.plan import plan
+from bench.process import settle
 from bench.rollout import Columns, Trace
 from bench.unit import Unit, drive
 
@@ -110,14 +109,10 @@ def _longest_first(tasks: Iterable[Task]) -> list[Task]:
 def _spread(tasks: Sequence[Task], workers: int, watcher: Watcher) -> Generator[tuple[Task, Outcome], None, None]:
     """Carry out the tasks in this process or in several, and yield each as it is finished."""
     if min(workers, len(tasks)) <= 1:
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            for task in tasks:
-                watcher.working([task.unit])
-                yield task, _perform(task)
-        finally:
-            torch.set_num_threads(threads)
+        settle()
+        for task in tasks:
+            watcher.working([task.unit])
+            yield task, _perform(task)
         return
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(
@@ -156,7 +151,7 @@ def _pooled(
 
 def _begin_work() -> None:
     """Set up a worker process: one thread, deaf to Ctrl-C (the parent ends it), and gone when the parent is gone."""
-    torch.set_num_threads(1)
+    settle()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
