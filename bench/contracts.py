@@ -166,7 +166,8 @@ class AttackInLoop:
         skip: probability in [0, 1] with which a decision is left unattacked.
         replay: attack the observations drawn from the replay buffer as well (afresh, against the victim as it is now).
         ramp: the shares of the training between which the budget grows from 0 to 1.
-        start: weights to go on from; None trains from scratch.
+        start: weights to go on from, frame by frame; None trains from scratch.
+        decisions: of the further training, where there is a `start`.
     """
 
     attack: Callable[[Tensor, Policy, float], Tensor]
@@ -174,6 +175,7 @@ class AttackInLoop:
     replay: bool = True
     ramp: tuple[float, float] = (0.2, 0.5)
     start: Policy | None = None
+    decisions: int = 0
 
 
 class Attack(ABC):

@@ -24,7 +24,7 @@ Columns = dict[str, NDArray[np.generic]]
 
 @dataclass
 class Trace:
-    """Every step of a few episodes of the batch, for recordings and replays: `steps[name][t]` is an array [len(episodes), ...]."""
+    """Every step of a few episodes of the batch, for recordings: `steps[name][t]` is an array [len(episodes), ...]."""
 
     episodes: Sequence[int]
     steps: dict[str, list[NDArray[np.generic]]] = field(default_factory=dict)

@@ -87,7 +87,7 @@ def project(perturbed: Tensor, observation: Tensor, radius: Tensor) -> Tensor:
     return within.clamp(-1.0, 1.0)
 
 
-class QueryBudgetExceeded(UserError):
+class QueryBudgetError(UserError):
     """An attack asked for more queries than its threat model allows."""
 
 
@@ -187,6 +187,6 @@ class Oracle:
             self.spent.index_add_(0, rows, torch.full_like(rows, each))
         worst = int(self.spent.max()) if self.spent.numel() else 0
         if worst > self.threat.queries:
-            raise QueryBudgetExceeded(
+            raise QueryBudgetError(
                 f"the attack asked for {worst} queries in a step, the threat model allows {self.threat.queries}"
             )

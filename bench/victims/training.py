@@ -6,7 +6,7 @@ import copy
 import itertools
 import time
 from abc import ABC, abstractmethod
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import ClassVar
 
 import torch
@@ -129,14 +129,16 @@ class LearningDriver(Victim):
     def load(self, seed: int) -> Policy:
         return zoo.load(self.zoo_name(), seed, self.policy_type, made_by={"victim": asdict(self)})
 
-    def phases(self) -> tuple[Phase, Phase]:
-        """Held decisions first, then frame by frame; both in whole chunks."""
-        fine = max(1, round(self.decisions * self.fine / CHUNK)) * CHUNK
-        held = max(1, round(self.decisions * (1 - self.fine) / CHUNK)) * CHUNK
-        return (
-            Phase(self.repeat, held, self.gamma, self.n_step),
+    def phases(self, attack: AttackInLoop | None) -> list[Phase]:
+        """Held decisions first, then frame by frame; a policy that drives already goes on frame by frame. Whole chunks."""
+        started = attack is not None and attack.start is not None
+        fine = attack.decisions if attack and started else round(self.decisions * self.fine)
+        phases = [
+            Phase(self.repeat, self.decisions - fine, self.gamma, self.n_step),
             Phase(1, fine, self.gamma ** (1 / self.repeat), self.n_step * self.repeat, 1 / self.repeat),
-        )
+        ]
+        whole = [replace(phase, decisions=max(1, round(phase.decisions / CHUNK)) * CHUNK) for phase in phases]
+        return whole[1:] if started else whole
 
     @abstractmethod
     def learner(self, env: EnvBase, start: Policy | None) -> Learner:
@@ -150,8 +152,9 @@ class LearningDriver(Victim):
         started = time.process_time()
         generator = torch.Generator().manual_seed(seed)
         best, learner, done, attacked = Best(world, episodes=60), None, 0, 0
-        total = sum(phase.decisions for phase in self.phases())
-        for number, phase in enumerate(self.phases()):
+        phases = self.phases(attack)
+        total = sum(phase.decisions for phase in phases)
+        for number, phase in enumerate(phases):
             env = world.make(roads(self.copies), action_type=self.action_type, action_repeat=phase.repeat)
             env.set_seed(SeedBlock.TRAIN * (seed + 1) + number * SeedBlock.REPORT)
             learner = learner or self.learner(env, attack.start if attack else None)
