@@ -54,7 +54,9 @@ def parameters(component: type) -> dict[str, Parameter]:
         hints = typing.get_type_hints(component)
     except NameError as error:
         raise UserError(f"the parameters of {component.__qualname__} cannot be read: {error}") from error
-    meanings = _meanings(component)
+    meanings: dict[str, str] = {}
+    for base in reversed(component.__mro__):
+        meanings |= _meanings(base)
     return {
         field.name: Parameter(
             name=field.name,
