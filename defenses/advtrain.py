@@ -8,11 +8,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bench.config import component
 from bench.contracts import AttackInLoop, Defense, Policy, Progress, TrainedPolicy, Victim, World
 from bench.errors import UserError
 from bench.threat import Norm, Oracle, ThreatModel
 from bench.victims import zoo
+from bench.words import configured
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,8 @@ class AdversarialTraining(Defense):
         attack_params: its parameters, as on the command line but separated by spaces.
         norm: perturbation set of the attack in the loop, `relative` or `linf`.
         budget: size of that set once the ramp is over.
-        start: `scratch`, or `trained` to go on from the victim of the same training seed.
+        start: `trained` goes on from the victim of the same training seed, `scratch` trains a new one.
+        decisions: of the further training, on every road at once; with `scratch` it is the victim's own.
         replay: attack the observations drawn from the replay buffer, afresh against the policy as it is now, as well as the
             ones it acts on; without it the buffer keeps the attacked observations of the past, as in the thesis.
         ramp_from: share of the training after which the budget begins to grow from 0.
@@ -37,17 +38,20 @@ class AdversarialTraining(Defense):
 
     skip: float = 0.3
     attack: str = "pgd"
-    attack_params: str = "steps=3 step_size=0.7"
+    attack_params: str = "steps=2 step_size=1"
     norm: Norm = "relative"
     budget: float = 0.1
-    start: Literal["scratch", "trained"] = "scratch"
+    start: Literal["trained", "scratch"] = "trained"
+    decisions: int = 12_000
     replay: bool = True
-    ramp_from: float = 0.2
-    ramp_to: float = 0.5
+    ramp_from: float = 0.0
+    ramp_to: float = 0.4
 
     def __post_init__(self) -> None:
         if not 0 <= self.skip <= 1:
             raise ValueError(f"skip must be between 0 and 1, got {self.skip}")
+        if self.decisions < 1:
+            raise ValueError(f"decisions must be at least 1, got {self.decisions}")
         if not 0 <= self.ramp_from <= self.ramp_to <= 1:
             raise ValueError(
                 f"ramp_from and ramp_to must be in order between 0 and 1, got {self.ramp_from} and {self.ramp_to}"
@@ -69,7 +73,7 @@ class AdversarialTraining(Defense):
         Raises:
             UserError: if the attack does not fit the victim, or `start=trained` and the zoo has no such victim.
         """
-        attack = component("attack", self.attack, dict(_word(word) for word in self.attack_params.split()))
+        attack = configured("attack", self.attack, dict(_word(word) for word in self.attack_params.split())).component
         if victim.action_type not in attack.action_types:
             raise UserError(f"attack {self.attack!r} does not fit a victim with {victim.action_type} actions")
         threat = ThreatModel(norm=self.norm, budget=self.budget)
@@ -86,6 +90,7 @@ class AdversarialTraining(Defense):
             replay=self.replay,
             ramp=(self.ramp_from, self.ramp_to),
             start=victim.load(seed) if self.start == "trained" else None,
+            decisions=self.decisions,
         )
         trained = victim.train(world, seed=seed, attack=loop, progress=progress)
         return TrainedPolicy(trained.policy, {**trained.card, "defense": asdict(self)})
