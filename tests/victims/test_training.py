@@ -1,0 +1,93 @@
+"""Training, for real but short: what is learned from, what is attacked, and that a seed decides it all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench import registry
+from bench.contracts import AttackInLoop, World
+from bench.victims import zoo
+from bench.victims.ddpg import DDPG
+from bench.victims.dqn import DQN
+from bench.victims.training import LearningDriver, Practice, roads
+from defenses.advtrain import AdversarialTraining
+
+SHORT = {"decisions": 160, "copies": 1, "hidden": 8, "batch": 16, "memory": 2000, "checkpoints": 1}
+VICTIMS = [DQN(**SHORT), DDPG(**SHORT)]
+
+
+def silent(share: float, text: str) -> None:
+    """A progress bar that nobody looks at."""
+    assert 0 <= share <= 1
+
+
+@pytest.fixture
+def world() -> World:
+    return registry.load("world", "highway")()
+
+
+@pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
+def test_a_training_depends_on_its_seed_alone(victim: LearningDriver, world: World) -> None:
+    first, again, other = (victim.train(world, seed=seed, progress=silent).policy.state_dict() for seed in (1, 1, 2))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not all(torch.equal(first[name], other[name]) for name in first)
+
+
+def test_the_card_says_what_was_trained_and_on_what_it_was_chosen(world: World) -> None:
+    card = VICTIMS[0].train(world, seed=0, progress=silent).card
+    assert card["victim"]["decisions"] == 160
+    assert set(card["selection"]["safe_progress"]) == {"mean", *(f"{n} lanes, density {d}" for n in (3, 4, 5) for d in (1, 2))}
+
+
+def test_returns_end_where_the_episode_ends(world: World) -> None:
+    victim = DQN(**SHORT | {"copies": 4, "crash_penalty": 1000.0})
+    phase = victim.phases(None)[0]
+    env = world.make(roads(4), action_type="discrete", action_repeat=phase.repeat)
+    env.set_seed(0)
+    learner = victim.learner(env, None)
+    learner.enter(phase)
+    practice = Practice(env, learner, victim, phase, None, torch.Generator())
+    practice.drive(120, 0.0)
+    seen = practice.buffer[:]
+    short = seen["steps_to_next_obs"].squeeze(-1) < phase.n_step
+    over = seen["next", "done"].squeeze(-1)
+    crashed = seen["next", "terminated"].squeeze(-1)
+    assert crashed.any()
+    assert bool((over | ~short).all())
+    assert bool((seen["next", "reward"].squeeze(-1)[crashed] < -1).all())
+    assert bool((seen["next", "reward"].squeeze(-1)[~crashed] >= 0).all())
+
+
+@pytest.mark.parametrize("skip", [0.0, 0.5, 1.0])
+def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, world: World) -> None:
+    calls: list[int] = []
+
+    def attack(observation: torch.Tensor, policy: torch.nn.Module, scale: float) -> torch.Tensor:
+        calls.append(len(observation))
+        return observation
+
+    loop = AttackInLoop(attack=attack, skip=skip, replay=False, ramp=(0.0, 0.0))
+    card = VICTIMS[0].train(world, seed=0, attack=loop, progress=silent).card
+    assert card["attacked_decisions"] == sum(calls)
+    assert sum(calls) / (160 * 6) == pytest.approx(1 - skip, abs=0.06)
+
+
+@pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
+@pytest.mark.parametrize("start", ["trained", "scratch"])
+def test_adversarial_training_trains_saves_and_loads(
+    victim: LearningDriver, start: str, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
+    trained = victim.train(world, seed=0, progress=silent)
+    zoo.save(trained.policy, trained.card, name=victim.zoo_name(), seed=0)
+    defense = AdversarialTraining(start=start, decisions=160, attack="zo", attack_params="steps=1 directions=2")
+    hardened = defense.train(victim, world, seed=0, progress=silent)
+    assert hardened.card["attacked_decisions"] > 0
+    zoo.save(hardened.policy, hardened.card, name=defense.zoo_name(victim), seed=0)
+    loaded = defense.load(victim, 0)
+    x = torch.rand(4, 10, 5)
+    torch.testing.assert_close(loaded.scores(x), hardened.policy.scores(x))
+    assert not torch.equal(loaded.scores(x), victim.load(0).scores(x))
