@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import operator
 import os
 import subprocess
 import sys
@@ -36,15 +38,11 @@ def print_run(run: str, out: Path, console: Console, report: Report) -> None:
     """
     folder, pair = _located(run, out)
     records = results.read(folder)
-    pairs = records.filter(pc.field("sees"))
-    if pair:
-        pairs = records.filter(pc.field("pair") == _pair(pair, records))
-        records = _with_controls(pairs, records)
-    for name in pc.unique((pairs if pairs.num_rows else records)["pair"]).to_pylist():
-        _print_pair(records.filter(pc.field("pair") == name), console)
-    report("run", records)
-    found = _recordings(folder, None if not pair else pairs["pair"][0].as_py())
-    for path in found:
+    name = _pair(pair, records) if pair else None
+    shown = records.filter(pc.field("pair") == name if name else pc.field("sees"))
+    _print_facts(shown if shown.num_rows else records, console)
+    report("run", _with_controls(shown, records) if name else records)
+    for path in _recordings(folder, name):
         console.print(Text(f"recording: bench view {path}"), soft_wrap=True)
 
 
@@ -98,56 +96,57 @@ def _pair(beginning: str, records: pa.Table) -> str:
 
 def _with_controls(pairs: pa.Table, records: pa.Table) -> pa.Table:
     """A pair's records with its clean control and the reference drivers of its world."""
-    same = {name: pairs[name][0].as_py() for name in ("world", "world_params")}
-    victim = ("victim", "victim_params", "defense", "defense_params")
-    own = {name: pairs[name][0].as_py() for name in victim}
-    world = pc.scalar(True)
-    for name, value in same.items():
-        world = world & (pc.field(name) == value)
-    clean = pc.field("attack") == "none"
-    for name, value in own.items():
-        clean = clean & (pc.field(name) == value)
-    asked = pc.field("pair") == pairs["pair"][0].as_py()
-    return records.filter(asked | (world & (clean | ~pc.field("sees"))))
+
+    def same(*names: str) -> pc.Expression:
+        return functools.reduce(operator.and_, [pc.field(name) == pairs[name][0].as_py() for name in names])
+
+    driver = same("victim", "victim_params", "defense", "defense_params")
+    control = same("world", "world_params") & ((pc.field("attack") == "none") & driver | ~pc.field("sees"))
+    return records.filter(same("pair") | control)
 
 
-def _print_pair(records: pa.Table, console: Console) -> None:
-    """The configuration and the provenance of one pair, a line a fact."""
-    first: dict[str, Any] = records.slice(0, 1).to_pylist()[0]
-    console.print(Text(first["pair"], style="bold"))
+def _print_facts(records: pa.Table, console: Console) -> None:
+    """The pairs of some records, their configuration and their provenance; what differs between them has several lines."""
+    for name in pc.unique(records["pair"]).to_pylist():
+        console.print(Text(name, style="bold"))
     facts = Table.grid(padding=(0, 2, 0, 0))
     facts.add_column(style="dim", no_wrap=True)
     facts.add_column()
     for kind in registry.KINDS:
-        params = ", ".join(f"{key}={value}" for key, value in json.loads(first[f"{kind}_params"]).items())
-        facts.add_row(kind, Text(f"{first[kind]}  {params}  ({first[f'{kind}_shipped_by']})"))
-    facts.add_row(
-        "threat",
-        f"{first['threat_norm']} {first['threat_budget']:g}, access {first['threat_access']}, "
-        f"{first['threat_queries']} queries a step",
-    )
-    seeds = records["seed"].to_pylist()
-    facts.add_row("grid", f"{first['grid']}: {_cells(records)}, scenario seeds {min(seeds)} to {max(seeds)}")
+        facts.add_row(kind, _each(records, (kind, f"{kind}_params", f"{kind}_shipped_by"), _component))
+    threat = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
+    facts.add_row("threat", _each(records, threat, "{} {:g}, access {}, {} queries a step".format))
+    facts.add_row("cells", "; ".join(f"{axis} {_listed(records[axis])}" for axis in ("lanes", "density", "weather")))
+    seeds = pc.min_max(records["seed"]).as_py()
+    facts.add_row("scenario seeds", f"{seeds['min']} to {seeds['max']} ({_listed(records['grid'])})")
     facts.add_row("training seeds", _listed(records["training_seed"]))
     facts.add_row("weights", _listed(records["weights_sha256"], 12) or "none")
     facts.add_row("code", _listed(records["code_digest"], 12))
-    for libraries in pc.unique(records["libraries"]).to_pylist():
-        facts.add_row("libraries", ", ".join(f"{name} {version}" for name, version in json.loads(libraries).items()))
-    facts.add_row("machine", _listed(records["machine"]))
-    created = pc.min_max(records["created_at"])
+    facts.add_row("libraries", _each(records, ("libraries",), _versions))
+    facts.add_row("machine", _each(records, ("machine",), str))
     units = records.group_by("unit").aggregate([("wall_s", "max")])
-    wall = pc.sum(units["wall_s_max"]).as_py()
     facts.add_row(
-        "made", f"{created['max']}, {units.num_rows} units, {records.num_rows} episodes, {wall:.0f} s of work"
+        "made",
+        f"by {pc.max(records['created_at']).as_py():%Y-%m-%d %H:%M} UTC: {records.num_rows} episodes, "
+        f"{units.num_rows} units of work, {pc.sum(units['wall_s_max']).as_py():.0f} s",
     )
     console.print(facts, highlight=False)
     console.print()
 
 
-def _cells(records: pa.Table) -> str:
-    """`lanes 3, 4; density 1, 2; weather clear, rain`."""
-    axes = ("lanes", "density", "weather")
-    return "; ".join(f"{axis} {_listed(records[axis])}" for axis in axes)
+def _each(records: pa.Table, names: tuple[str, ...], describe: Callable[..., str]) -> Text:
+    """A line for every different combination of values in these columns."""
+    rows = records.select(names).group_by(list(names)).aggregate([]).to_pylist()
+    return Text("\n".join(sorted(describe(*(row[name] for name in names)) for row in rows)))
+
+
+def _component(name: str, params: str, shipped_by: str) -> str:
+    values = ", ".join(f"{key}={value}" for key, value in json.loads(params).items())
+    return f"{name}({values})  {shipped_by}" if values else f"{name}  {shipped_by}"
+
+
+def _versions(libraries: str) -> str:
+    return ", ".join(f"{name} {version}" for name, version in json.loads(libraries).items())
 
 
 def _listed(column: pa.ChunkedArray, digits: int | None = None) -> str:

@@ -189,10 +189,13 @@ def _omegaconf_type(hint: Any) -> Any:
 
 def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping[str, str]) -> dict[str, Any]:
     """Values in hydra's grammar as constructor arguments: typed, checked against the choices, tuples for lists."""
+    given_names = {key.partition(".")[0] for key in given}
+    if missing := [f"{kind}.{key}=…" for key, p in owned.items() if p.required and key not in given_names]:
+        raise UserError(f"{kind} {name!r} needs {', '.join(missing)}")
+    if not given:
+        return {}
     ConfigStore.instance().store(group=kind, name=name, node=_schema(owned))
     composed = _composed([f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())])[kind]
-    if missing := sorted(str(key) for key in OmegaConf.missing_keys(composed)):
-        raise UserError(f"{kind} {name!r} needs {', '.join(f'{kind}.{key}=…' for key in missing)}")
     arguments = OmegaConf.to_object(composed)
     values = {item: getattr(arguments, item) for item in owned}
     for key, value in values.items():

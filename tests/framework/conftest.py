@@ -1,0 +1,79 @@
+"""The toy plug-ins on the import path, and the command line as a function."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from bench import cli, registry
+from tests.framework.distributions import install_toy
+
+BENCH = (sys.executable, "-m", "bench.cli")
+
+
+@pytest.fixture(scope="session")
+def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where the toy distribution is installed; it is on the import path of this process."""
+    folder = tmp_path_factory.mktemp("site")
+    install_toy(folder)
+    sys.path.insert(0, str(folder))
+    registry.entries.cache_clear()
+    yield folder
+    sys.path.remove(str(folder))
+    registry.entries.cache_clear()
+
+
+@pytest.fixture
+def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on the import path of this process for distributions of the test's own."""
+    folder = tmp_path / "plugins"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(str(folder))
+    registry.entries.cache_clear()
+    yield folder
+    registry.entries.cache_clear()
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a command printed and how it ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def bench(toy_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+    """The command line in this process: bench("run", "attack=nudge") -> Said."""
+    monkeypatch.setenv("COLUMNS", "160")
+
+    def call(*words: str) -> Said:
+        monkeypatch.setattr(sys, "argv", ["bench", *words])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        said = capsys.readouterr()
+        return Said(int(ended.value.code or 0), said.out, said.err)
+
+    return call
+
+
+def started(folder: Path, *words: str) -> subprocess.Popen[str]:
+    """The command line as a process of its own, with the plug-ins of `folder`."""
+    environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1", "COLUMNS": "160"}
+    return subprocess.Popen(
+        [*BENCH, *words], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+
+
+def ran(folder: Path, *words: str) -> Said:
+    """The command line as a process of its own, to its end."""
+    process = started(folder, *words)
+    out, err = process.communicate(timeout=300)
+    return Said(process.returncode, out, err)

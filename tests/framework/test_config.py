@@ -1,0 +1,130 @@
+"""Words become typed, checked configurations; what cannot be read is refused in one line that says what is allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.config import RunConfig, component, run_config, train_config
+from bench.errors import UserError
+from bench.registry import load
+from bench.scenario import GRIDS
+
+pytestmark = pytest.mark.usefixtures("toy_folder")
+
+
+def read(line: str) -> RunConfig:
+    return run_config(line.split())
+
+
+def test_the_defaults_are_the_clean_dqn_on_the_standard_grid() -> None:
+    config = read("")
+    (pair,) = config.pairs
+    assert (pair.attack.name, pair.defense.name, pair.victim.name, pair.world.name) == (
+        "none",
+        "none",
+        "dqn",
+        "highway",
+    )
+    assert config.grid == GRIDS["standard-v1"]
+    assert (config.seeds, config.out, config.reference, config.record) == ((0, 1, 2), Path("results"), True, None)
+
+
+def test_a_line_of_words_sets_everything() -> None:
+    config = read(
+        "attack=noise defense=advtrain victim=dqn attack.scale=0.5 defense.skip=0.25 lanes=3,4 density=1 weather=clear,rain "
+        "episodes=20 threat.norm=linf threat.budget=0.2 world.vehicles=50 seeds=0,1 workers=2 out=some/where record=3"
+    )
+    (pair,) = config.pairs
+    assert (pair.attack.component.scale, pair.defense.component.skip, pair.world.component.vehicles) == (0.5, 0.25, 50)
+    assert (pair.threat.norm, pair.threat.budget, pair.threat.access) == ("linf", 0.2, "gradients")
+    assert (config.grid.lanes, config.grid.density, config.grid.weather) == ((3, 4), (1.0,), ("clear", "rain"))
+    assert (len(config.grid.seeds()), config.grid.name) == (20, "custom")
+    assert (config.seeds, config.workers, config.out, config.record) == ((0, 1), 2, Path("some/where"), 3)
+
+
+def test_comma_lists_sweep_over_names_parameters_and_threats() -> None:
+    config = read("attack=noise,nudge attack.scale=0.5,1 victim=toy,dqn threat.budget=0.1,0.2 world=toy")
+    seen = {
+        (pair.attack.name, pair.attack.component.scale, pair.victim.name, pair.threat.budget) for pair in config.pairs
+    }
+    assert len(config.pairs) == len(seen) == 2 * 2 * 2 * 2
+    assert len({pair.id for pair in config.pairs}) == 16
+
+
+def test_a_parameter_goes_to_those_of_a_sweep_that_have_it() -> None:
+    config = read("attack=noise,nudge attack.pause=0.5 attack.distribution=gaussian victim=toy world=toy")
+    noise, nudge = (pair.attack.component for pair in config.pairs)
+    assert (noise.distribution, nudge.pause) == ("gaussian", 0.5)
+
+
+def test_a_clean_pair_is_the_same_under_every_threat_model() -> None:
+    assert len(read("attack=none threat.budget=0.1,0.2").pairs) == 1
+
+
+def test_a_path_is_taken_as_it_is() -> None:
+    assert run_config(["out=/some/a,b=c {d}/[e]"]).out == Path("/some/a,b=c {d}/[e]")
+
+
+def test_plain_text_needs_no_quotes() -> None:
+    config = run_config(["defense=advtrain", "defense.attack_params=steps=3 step_size=0.7"])
+    assert config.pairs[0].defense.component.attack_params == "steps=3 step_size=0.7"
+
+
+@settings(deadline=None, max_examples=20)
+@given(pause=st.floats(0, 1e6), scale=st.floats(1e-6, 1), mood=st.sampled_from(["calm", "raise", "kill"]))
+def test_what_is_written_is_what_is_read(pause: float, scale: float, mood: str) -> None:
+    values = {"pause": repr(pause), "scale": repr(scale), "mood": mood}
+    assert component("attack", "nudge", values) == load("attack", "nudge")(pause=pause, scale=scale, mood=mood)
+
+
+BAD = {
+    "attack=nois": "unknown attack 'nois'; did you mean 'noise'?",
+    "defense=advtran": "unknown defense 'advtran'; did you mean 'advtrain'?",
+    "lane=3": "unknown key 'lane'; did you mean 'lanes'?",
+    "threat=linf": "unknown key 'threat'",
+    "threat.norm=l2": "unknown threat.norm 'l2'; known: relative, linf",
+    "threat.budget=-1": "threat.budget must be between 0 and 2, got -1",
+    "threat.budget=much": "cannot read threat.budget=much: value 'much' of type 'str' could not be converted to Float",
+    "attack=noise attack.steps=3": "unknown parameter attack.steps of noise; known: distribution, scale",
+    "attack=noise attack.distribution=normal": "unknown attack.distribution 'normal'; did you mean 'uniform'? known: uniform, gaussian",
+    "attack=pgd attack.steps=many": "cannot read attack.steps=many: value 'many' of type 'str' could not be converted",
+    "attack=pgd attack.steps=0": "attack 'pgd': ",
+    "attack=steer victim=toy": "attack 'steer' does not fit victim 'toy': it needs continuous actions",
+    "attack=steer victim=toy victim.actions=continuous threat.access=scores": "needs access 'gradients'",
+    "defense=guard": "defense 'guard' needs defense.digits=",
+    "lanes=9": "lanes must be between 2 and 8, got 9",
+    "density=-1": "density must be in (0, 4], got -1",
+    "weather=snow": "unknown weather 'snow'; known: clear, rain, fog",
+    "episodes=0": "episodes must be between 1 and 1000000, got 0",
+    "episodes=1,2": "episodes takes one value, got 1,2",
+    "grid=standard": "unknown grid 'standard'; did you mean 'standard-v1'?",
+    "world.vehicles=0": "world 'highway': vehicles must be between 1",
+    "workers=0": "workers must be at least 1, got 0",
+    "seeds=-1": "seeds must be different numbers of at least 0, got -1",
+    "record=101": "record must be between 0 and the 100 episodes, got 101",
+    "attack=zo attack=pgd": "attack is given twice",
+    "attack=": "attack has no value",
+    "zo": "cannot read 'zo': write key=value",
+    "+attack=zo": "cannot read '+attack=zo': write key=value",
+}
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_bad_words_are_refused_in_one_line(line: str) -> None:
+    with pytest.raises(UserError) as raised:
+        read(line)
+    assert BAD[line] in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_training_takes_one_policy_and_its_seeds() -> None:
+    config = train_config(["victim=dqn", "victim.batch=64", "seed=3"])
+    assert (config.victim.component.batch, config.defense.name, config.seeds) == (64, "none", (3,))
+    with pytest.raises(UserError, match="one policy a seed"):
+        train_config(["victim=dqn,ddpg"])
+    with pytest.raises(UserError, match="unknown key 'attack'"):
+        train_config(["attack=zo"])

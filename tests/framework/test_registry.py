@@ -1,0 +1,104 @@
+"""Components are found by entry points only, and a broken plug-in is named and breaks no other."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bench import registry
+from bench.contracts import Attack, Defense, Victim, World
+from bench.errors import UserError
+from bench.registry import GROUPS, KINDS
+from tests.framework.conftest import BENCH
+from tests.framework.distributions import TOY_POINTS, install, install_toy
+
+BASES = {"attack": Attack, "defense": Defense, "victim": Victim, "world": World}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_built_in_component_loads_by_its_name(kind: registry.Kind) -> None:
+    own = [name for name, claims in registry.entries(GROUPS[kind]).items() if claims[0].distribution == "cavbench"]
+    assert own
+    for name in own:
+        assert issubclass(registry.load(kind, name), BASES[kind])
+
+
+def test_a_plugin_is_found_like_a_built_in(plugins: Path) -> None:
+    install_toy(plugins)
+    for kind in KINDS:
+        for name in TOY_POINTS[GROUPS[kind]]:
+            assert name in registry.names(kind)
+            assert registry.find(GROUPS[kind], name, kind).shipped_by == "cavbench-toy 1.0"
+            assert issubclass(registry.load(kind, name), BASES[kind])
+
+
+def test_an_unknown_name_is_answered_with_the_nearest_and_all_others() -> None:
+    with pytest.raises(UserError, match=r"unknown attack 'nois'; did you mean 'noise'\? known: .*noise.*pgd"):
+        registry.load("attack", "nois")
+
+
+BROKEN = {
+    "cannot be imported: ZeroDivisionError": "1 / 0\n",
+    "is not a subclass of bench.contracts.Attack": "class Plugin: ...\n",
+    "cannot be imported: AttributeError": "class Other: ...\n",
+    "does not implement perturb": (
+        "from dataclasses import dataclass\nfrom bench.contracts import Attack\n"
+        "@dataclass(frozen=True, kw_only=True)\nclass Plugin(Attack): ...\n"
+    ),
+    "is not a frozen dataclass": (
+        "from bench.contracts import Attack\nclass Plugin(Attack):\n    def perturb(self, observation, oracle): ...\n"
+    ),
+    "takes steps by position": (
+        "from dataclasses import dataclass\nfrom bench.contracts import Attack\n"
+        "@dataclass(frozen=True)\nclass Plugin(Attack):\n    steps: int = 1\n    def perturb(self, o, oracle): ...\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("complaint", BROKEN)
+def test_a_broken_plugin_is_named_in_one_line_and_breaks_no_other(complaint: str, plugins: Path) -> None:
+    module = f"broken_{abs(hash(complaint))}"
+    install(plugins, "broken-pack", {"cavbench.attacks": {"wrong": f"{module}:Plugin"}}, {module: BROKEN[complaint]})
+    with pytest.raises(UserError) as raised:
+        registry.load("attack", "wrong")
+    message = str(raised.value)
+    assert complaint in message
+    assert "broken-pack 1.0" in message
+    assert "\n" not in message
+    assert "wrong" in registry.names("attack")
+    registry.load("attack", "noise")
+
+
+def test_a_name_that_two_packages_claim_is_refused_and_both_are_named(plugins: Path) -> None:
+    install(plugins, "rival", {"cavbench.attacks": {"noise": "rival:Noise"}}, {"rival": ""})
+    with pytest.raises(UserError, match=r"'noise' is shipped by cavbench .* and by rival 1.0; uninstall one"):
+        registry.load("attack", "noise")
+    registry.load("attack", "none")
+
+
+def test_listing_names_imports_no_torch() -> None:
+    code = (
+        "import sys; from bench import cli; sys.argv = ['bench', 'list']\n"
+        "try: cli.main()\nexcept SystemExit: pass\n"
+        "heavy = {'torch', 'hydra', 'numpy', 'duckdb', 'attacks.noise'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    for name in ("noise", "none", "dqn", "idm", "highway"):
+        assert name in ended.stdout
+
+
+def test_listing_names_takes_under_half_a_second() -> None:
+    def cpu_seconds() -> float:
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([*BENCH, "list"], capture_output=True, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+    # Processor time: what it takes on a machine that does nothing else.
+    assert min(cpu_seconds() for _ in range(4)) < 0.5

@@ -1,0 +1,162 @@
+"""A run: what it consists of, that its results depend on nothing but its configuration, and that it goes on where it stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from bench import results, runner
+from bench.config import run_config
+from bench.errors import UserError
+from bench.plan import plan
+from bench.unit import Unit
+
+pytestmark = pytest.mark.usefixtures("toy_folder")
+
+SMALL = "attack=nudge victim=toy world=toy lanes=3,4 density=1 weather=clear,fog episodes=4 seeds=0,1"
+BESIDE = ("attack_ms", "created_at", "wall_s")
+"""What two runs of the same unit may differ in."""
+
+
+class Silent:
+    """A watcher that remembers, and can stop the run."""
+
+    def __init__(self, stop_after: int | None = None) -> None:
+        self.done: list[Unit] = []
+        self.warnings: list[str] = []
+        self.stop_after = stop_after
+
+    def begin(self, *, episodes: int, finished: int) -> None:
+        self.episodes, self.there = episodes, finished
+
+    def working(self, units: Sequence[Unit]) -> None:
+        if len(self.done) == self.stop_after:
+            raise KeyboardInterrupt
+
+    def finished(self, unit: Unit, wall_s: float) -> None:
+        self.done.append(unit)
+
+    def warn(self, line: str) -> None:
+        self.warnings.append(line)
+
+
+def run(out: Path, *more: str, line: str = SMALL, watcher: Silent | None = None) -> tuple[pa.Table, Silent]:
+    words = dict(word.split("=", 1) for word in [*line.split(), "workers=1", f"out={out}", "record=0", *more])
+    config = run_config([f"{key}={value}" for key, value in words.items()])
+    watcher = watcher or Silent()
+    return results.read(out, runner.run(config, watcher)), watcher
+
+
+def comparable(records: pa.Table) -> pa.Table:
+    return records.drop_columns(list(BESIDE))
+
+
+def test_a_run_has_the_pair_its_clean_control_and_the_reference_drivers(tmp_path: Path) -> None:
+    records, watcher = run(tmp_path)
+    rows = records.to_pylist()
+    attacked = [row for row in rows if row["attack"] == "nudge"]
+    clean = [row for row in rows if row["attack"] == "none" and row["victim"] == "toy"]
+    reference = [row for row in rows if not row["sees"]]
+    assert len(attacked) == len(clean) == 2 * 2 * 2 * 4
+    assert {row["threat_budget"] for row in clean} == {0.0}
+    assert {row["training_seed"] for row in attacked} == {0, 1}
+    assert {row["victim"] for row in reference} == {"blind", "random", "idm"}
+    assert len({row["pair"] for row in reference}) == 6 + 1 + 1
+    assert {row["weather"] for row in reference} == {"clear"}
+    assert {row["training_seed"] for row in reference} == {0}
+    assert watcher.episodes == records.num_rows
+
+
+def test_the_same_scenarios_are_driven_by_all(tmp_path: Path) -> None:
+    records, _ = run(tmp_path)
+    cells: dict[str, set[tuple[int, float, int]]] = {}
+    for row in records.to_pylist():
+        cells.setdefault(row["pair"], set()).add((row["lanes"], row["density"], row["seed"]))
+    assert len(set(map(frozenset, cells.values()))) == 1
+
+
+def test_two_pairs_share_their_clean_control(tmp_path: Path) -> None:
+    config = run_config([*SMALL.replace("attack=nudge", "attack=nudge,noise").split(), "threat.budget=0.1,0.2"])
+    clean = [unit for unit in plan(config) if unit.pair.is_clean and unit.pair.victim.name == "toy"]
+    assert len(config.pairs) == 4
+    assert len(clean) == 2 * 2 * 2
+
+
+def test_references_can_be_left_out(tmp_path: Path) -> None:
+    records, _ = run(tmp_path, "reference=false")
+    assert all(records["sees"].to_pylist())
+
+
+def test_continuous_victims_are_held_against_continuous_drivers() -> None:
+    config = run_config(["attack=steer", "victim=toy", "victim.actions=continuous", "world=toy"])
+    kinds = {(unit.pair.victim.name, unit.pair.victim.component.action_type) for unit in plan(config)}
+    assert kinds == {("toy", "continuous"), ("blind", "continuous"), ("random", "continuous"), ("idm", "discrete")}
+
+
+@pytest.mark.slow
+def test_results_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+    one, _ = run(tmp_path / "one", "reference=false")
+    three, _ = run(tmp_path / "three", "reference=false", "workers=3")
+    assert comparable(one).equals(comparable(three))
+
+
+def test_results_do_not_depend_on_what_else_is_run(tmp_path: Path) -> None:
+    alone, _ = run(tmp_path / "alone", "reference=false", "seeds=1", line=SMALL)
+    among, _ = run(tmp_path / "among")
+    units = set(alone["unit"].to_pylist())
+    assert units <= set(among["unit"].to_pylist())
+    assert comparable(alone).equals(comparable(results.read(tmp_path / "among", units)))
+
+
+def test_a_finished_run_does_nothing(tmp_path: Path) -> None:
+    first, _ = run(tmp_path)
+    again, watcher = run(tmp_path)
+    assert watcher.done == []
+    assert watcher.there == watcher.episodes
+    assert again.equals(first)
+
+
+def test_an_interrupted_run_keeps_what_is_finished_and_goes_on_from_there(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "broken-off", watcher=Silent(stop_after=3))
+    assert results.read(tmp_path / "broken-off").num_rows == 3 * 4
+    went_on, watcher = run(tmp_path / "broken-off")
+    whole, _ = run(tmp_path / "whole")
+    assert watcher.there == 3 * 4
+    assert comparable(went_on).equals(comparable(whole))
+
+
+def test_a_failing_attack_is_named_with_its_cell_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserError) as raised:
+        run(tmp_path, "attack.mood=raise")
+    assert "nudge(mood=raise) + none + toy | 4 lanes, density 1, clear" in str(raised.value)
+    assert "ZeroDivisionError: the attack is at a loss" in str(raised.value)
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_is_reported_and_loses_no_finished_unit(tmp_path: Path) -> None:
+    calm, _ = run(tmp_path, "reference=false")
+    with pytest.raises(UserError, match="a worker process died"):
+        run(tmp_path, "attack.mood=calm,kill", "workers=2", "reference=false")
+    kept, watcher = run(tmp_path, "reference=false")
+    assert watcher.done == []
+    assert kept.equals(calm)
+
+
+def test_a_policy_that_is_missing_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
+    watcher = Silent()
+    with pytest.raises(UserError, match="bench train"):
+        run(tmp_path, "seeds=977", line="victim=dqn world=toy lanes=3 density=1 episodes=2", watcher=watcher)
+    assert watcher.done == []
+
+
+def test_the_grid_of_a_record_is_named_only_where_it_is_the_whole_cell() -> None:
+    whole = plan(run_config(["victim=toy", "world=toy", "lanes=3"]))
+    short = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=99"]))
+    other = plan(run_config(["victim=toy", "world=toy", "lanes=2"]))
+    assert {unit.grid for unit in whole} == {"standard-v1"}
+    assert {unit.grid for unit in (*short, *other)} == {"custom"}
