@@ -1,0 +1,52 @@
+"""Whole columns at once to a rerun recording: one block an entity, over the timelines `step` and `time`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from bench.recording.episode import STEPS_PER_SECOND
+
+Colour = tuple[int, int, int]
+
+
+class Columns:
+    """Sends the columns of one episode.
+
+    Args:
+        stream: the recording.
+        length: steps of the episode.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, length: int) -> None:
+        self.stream = stream
+        steps = np.arange(length)
+        self.index = [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=steps / STEPS_PER_SECOND)]
+
+    def send(self, path: str, columns: Iterable[Any]) -> None:
+        """One value a step, or one list of instances a step."""
+        rr.send_columns(path, self.index, columns, recording=self.stream)
+
+    def fixed(self, path: str, what: rr.AsComponents) -> None:
+        """One value for the whole recording."""
+        self.stream.log(path, what, static=True)
+
+    def note(self, path: str, markdown: str) -> None:
+        """A page of text."""
+        self.fixed(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
+
+    def curve(self, path: str, values: NDArray[np.generic], name: str, colour: Colour, width: float = 1.5) -> None:
+        """A curve [T] with its name in the legend; gaps where it is not finite."""
+        finite = np.where(np.isfinite(values), values, np.nan).astype(np.float64)
+        self.fixed(path, rr.SeriesLines(colors=[colour], widths=[width], names=[name]))
+        self.send(path, rr.Scalars.columns(scalars=finite))
+
+    def states(self, path: str, values: NDArray[np.generic], names: Iterable[str], colours: Iterable[Colour]) -> None:
+        """A band of states: `values` [T] index `names`."""
+        labels = list(names)
+        self.fixed(path, rr.StateConfiguration(values=labels, labels=labels, colors=list(colours)))
+        self.send(path, rr.StateChange.columns(state=[labels[int(value)] for value in values]))
