@@ -90,7 +90,7 @@ BAD = {
     "threat.budget=-1": "threat.budget must be between 0 and 2, got -1",
     "threat.budget=much": "cannot read threat.budget=much: value 'much' of type 'str' could not be converted to Float",
     "attack=noise attack.steps=3": "unknown parameter attack.steps of noise; known: distribution, scale",
-    "attack=noise attack.distribution=normal": "unknown attack.distribution 'normal'; did you mean 'uniform'? known: uniform, gaussian",
+    "attack=noise attack.distribution=normal": "'normal'; did you mean 'uniform'? known: uniform, gaussian",
     "attack=pgd attack.steps=many": "cannot read attack.steps=many: value 'many' of type 'str' could not be converted",
     "attack=pgd attack.steps=0": "attack 'pgd': ",
     "attack=steer victim=toy": "attack 'steer' does not fit victim 'toy': it needs continuous actions",

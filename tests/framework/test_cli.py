@@ -1,0 +1,204 @@
+"""The command line: what it prints, and one clear line and a non-zero exit for bad input."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pyarrow as pa
+import pytest
+
+from bench import results
+from tests.framework.conftest import Said, ran, started
+from tests.framework.test_runner import comparable
+
+Bench = Callable[..., Said]
+TOY = ("attack=nudge", "victim=toy", "world=toy", "lanes=3", "density=1", "weather=clear", "episodes=4", "seeds=0")
+
+
+def assert_one_line(said: Said, *parts: str) -> None:
+    assert said.code != 0
+    lines = said.err.strip().splitlines()
+    assert len(lines) == 1, said.err
+    assert lines[0].startswith("error: ")
+    for part in parts:
+        assert part in lines[0]
+
+
+def test_a_components_page_says_what_it_does_and_what_its_parameters_are(bench: Bench) -> None:
+    said = bench("list", "nudge")
+    assert said.code == 0
+    for part in (
+        "toy_plugin:Nudge, cavbench-toy 1.0",
+        "Pushes everything by a random sign.",
+        "Needs access oblivious and discrete or continuous actions.",
+        "attack.pause",
+        "0.0",
+        "seconds to sleep at every step.",
+        "one of calm, raise, kill",
+    ):
+        assert part in said.out
+
+
+def test_a_name_of_two_kinds_has_two_pages(bench: Bench) -> None:
+    said = bench("list", "none")
+    assert "attack none" in said.out
+    assert "defense none" in said.out
+
+
+def test_an_unknown_component_has_no_page(bench: Bench) -> None:
+    assert_one_line(bench("list", "nugde"), "unknown component 'nugde'; did you mean 'nudge'?", "known: advtrain")
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("attack=nugde",), "unknown attack 'nugde'; did you mean 'nudge'?"),
+        (("attack=nudge", "attack.pause=long"), "cannot read attack.pause=long"),
+        (("threat.budget=-1",), "threat.budget must be between 0 and 2, got -1"),
+        (("attack=steer", "victim=toy"), "attack 'steer' does not fit victim 'toy'"),
+        (("--fast",), "No such option"),
+    ],
+)
+def test_bad_input_is_refused_before_any_work(bench: Bench, tmp_path: Path, words: tuple[str, ...], part: str) -> None:
+    assert_one_line(bench("run", *words, f"out={tmp_path / 'out'}"), part)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_results_folder_that_cannot_be_written_is_refused(bench: Bench, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert_one_line(bench("run", *TOY, f"out={tmp_path / 'file' / 'out'}"), "cannot be written", "out=")
+
+
+def test_a_run_prints_its_table_and_a_second_one_only_that(bench: Bench, tmp_path: Path) -> None:
+    words = ("run", *TOY, "workers=1", "record=0", f"out={tmp_path}")
+    first, again = bench(*words), bench(*words)
+    assert (first.code, again.code) == (0, 0), first.err
+    assert "nudge" in first.out
+    assert first.out == again.out
+    assert "40/40 episodes" in first.err
+    assert again.err.strip() == "40 of 40 episodes were there already"
+
+
+def test_a_truncated_record_stops_every_command_that_reads_it(bench: Bench, tmp_path: Path) -> None:
+    run = ("run", *TOY, "workers=1", "record=0", "reference=false", f"out={tmp_path}")
+    bench(*run)
+    path = sorted((tmp_path / "episodes").glob("*.parquet"))[0]
+    path.write_bytes(path.read_bytes()[:100])
+    for words in (run, ("show", str(tmp_path)), ("report", f"out={tmp_path}")):
+        assert_one_line(bench(*words), f"the record {path} is truncated")
+
+
+def test_show_says_what_made_the_records(bench: Bench, tmp_path: Path) -> None:
+    bench("run", *TOY, "workers=1", "record=0", "attack.scale=0.5", f"out={tmp_path}")
+    whole = bench("show", str(tmp_path))
+    pair = next(line for line in whole.out.splitlines() if line.startswith("nudge-none-toy-")).strip()
+    one = bench("show", "nudge", "--out", str(tmp_path))
+    for said in (whole, one):
+        assert said.code == 0
+        for part in (pair, "nudge(mood=calm, pause=0.0, scale=0.5)  cavbench-toy 1.0", "relative 0.1", "torch "):
+            assert part in said.out
+    assert_one_line(bench("show", "nothing", "--out", str(tmp_path)), "unknown pair 'nothing'", pair)
+
+
+def test_report_prints_a_report_by_name(bench: Bench, tmp_path: Path) -> None:
+    bench("run", *TOY, "workers=1", "record=0", f"out={tmp_path}")
+    assert "nudge" in bench("report", f"out={tmp_path}").out
+    assert_one_line(bench("report", "theses", f"out={tmp_path}"), "unknown report 'theses'; did you mean 'thesis'?")
+    assert_one_line(bench("report", f"out={tmp_path / 'none'}"), "there are no records")
+
+
+def test_training_saves_to_the_zoo_and_says_how_long_it_took(bench: Bench, tmp_path: Path) -> None:
+    said = bench("train", "victim=toy", "world=toy", "seeds=0,1", f"out={tmp_path}")
+    assert said.code == 0
+    assert said.out.count("trained in 0 s, saved as") == 2
+    assert sorted(path.name for path in (tmp_path / "toy-discrete").glob("*.safetensors")) == [
+        "seed0.safetensors",
+        "seed1.safetensors",
+    ]
+
+
+def test_what_does_not_learn_cannot_be_trained(bench: Bench) -> None:
+    assert_one_line(bench("train", "victim=idm"), "there is nothing to train")
+    assert_one_line(bench("train", "victim=toy", "defense=guard", "defense.digits=1"), "there is nothing to train")
+
+
+def test_without_a_display_view_says_how_to_open_a_recording(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    path = tmp_path / "some.rrd"
+    path.write_bytes(b"")
+    said = bench("view", str(path))
+    assert f"rerun {path}" in said.out
+    assert_one_line(bench("view", str(tmp_path)), "has no recordings")
+
+
+def test_a_traceback_is_shown_to_who_asks_for_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    from bench import cli
+    from bench.errors import UserError
+
+    monkeypatch.setattr(sys, "argv", ["bench", "run", "attack=nugde", "--debug"])
+    with pytest.raises(UserError):
+        cli.main()
+
+
+@pytest.mark.slow
+def test_the_console_script_ends_bad_input_in_one_line(toy_folder: Path, tmp_path: Path) -> None:
+    assert_one_line(ran(toy_folder, "run", "attack=nugde", f"out={tmp_path}"), "unknown attack 'nugde'")
+
+
+@pytest.mark.slow
+def test_kill_9_loses_no_finished_unit_and_the_same_command_goes_on(
+    bench: Bench, toy_folder: Path, tmp_path: Path
+) -> None:
+    def words(out: Path) -> tuple[str, ...]:
+        more = ("workers=2", "reference=false", "record=0", "attack.pause=0.05", "lanes=3,4,5", "seeds=0,1,2")
+        return ("run", *(word for word in TOY if word[:5] not in ("lanes", "seeds")), *more, f"out={out}")
+
+    broken, whole = tmp_path / "broken", tmp_path / "whole"
+    process = started(toy_folder, *words(broken))
+    until = time.monotonic() + 240
+    while len(list(broken.glob("episodes/*.parquet"))) < 3:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    children = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    _, alive = psutil.wait_procs(children, timeout=60)
+    assert not alive, "workers outlive the run"
+
+    finished = {path: path.read_bytes() for path in broken.glob("episodes/*.parquet")}
+    assert 3 <= len(finished) < 18
+    said = ran(toy_folder, *words(broken))
+    assert said.code == 0, said.err
+    assert f"{4 * len(finished)} of 72 episodes were there already" in said.err
+    assert all(path.read_bytes() == blob for path, blob in finished.items())
+    assert bench(*words(whole)).code == 0
+    assert comparable(results.read(broken)).equals(comparable(results.read(whole)))
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_run_in_one_line_and_with_its_workers(toy_folder: Path, tmp_path: Path) -> None:
+    words = (*TOY, "attack.pause=0.2", "workers=2", "reference=false", "record=0", "lanes=3,4", f"out={tmp_path}")
+    process = started(toy_folder, "run", *dict.fromkeys(word for word in words if word != "lanes=3"))
+    until = time.monotonic() + 240
+    while len(list(tmp_path.glob("episodes/*.parquet"))) < 1:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    children = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode != 0
+    assert err.strip().splitlines()[-1].startswith("error: interrupted; ")
+    assert "Traceback" not in err
+    assert not psutil.wait_procs(children, timeout=60)[1]
+    assert isinstance(results.read(tmp_path), pa.Table)

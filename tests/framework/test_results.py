@@ -1,0 +1,125 @@
+"""Records appear whole or not at all, and what cannot be read is named in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from bench import results
+from bench.config import run_config
+from bench.errors import UserError
+from bench.plan import plan
+from bench.results import MEASUREMENTS, SCHEMA
+from bench.unit import Unit, drive
+
+pytestmark = pytest.mark.usefixtures("toy_folder")
+
+WORDS = ("attack=nudge", "victim=toy", "world=toy", "lanes=3,4", "density=1", "weather=clear", "episodes=3", "seeds=0")
+
+
+@pytest.fixture(scope="module")
+def units(toy_folder: Path) -> list[Unit]:
+    return plan(run_config([*WORDS, "reference=false"]))
+
+
+@pytest.fixture
+def written(units: list[Unit], tmp_path: Path) -> Path:
+    """A results folder with the records of all units."""
+    results.prepare(tmp_path)
+    for unit in units:
+        results.write(tmp_path, results.table(unit.constants(1.5), drive(unit)))
+    return tmp_path
+
+
+def test_a_rollout_measures_exactly_what_the_schema_says(units: list[Unit]) -> None:
+    assert set(drive(units[0])) == {field.name for field in MEASUREMENTS} | {"seed"}
+    assert all(field.metadata[b"meaning"] for field in SCHEMA)
+
+
+def test_what_is_written_is_what_is_read(written: Path, units: list[Unit]) -> None:
+    records = results.read(written, [unit.fingerprint for unit in units])
+    assert records.schema.equals(SCHEMA)
+    assert records.num_rows == 3 * len(units)
+    measured = drive(units[0])
+    own = records.filter(pa.compute.equal(records["unit"], units[0].fingerprint))
+    for name in ("safe_progress", "return", "linf", "seed"):
+        np.testing.assert_array_equal(own[name].to_numpy(), measured[name])
+    assert own["action_counts"].to_pylist() == measured["action_counts"].tolist()
+    assert json.loads(own["attack_params"][0].as_py()) == {"mood": "calm", "pause": 0.0, "scale": 1.0}
+    assert own["attack_shipped_by"][0].as_py() == "cavbench-toy 1.0"
+
+
+def test_a_write_that_fails_leaves_nothing_behind(
+    units: list[Unit], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results.prepare(tmp_path)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(UserError, match="cannot be written: No space left on device"):
+        results.write(tmp_path, results.table(units[0].constants(1.0), drive(units[0])))
+    assert list((tmp_path / "episodes").iterdir()) == []
+
+
+def test_what_a_killed_writer_leaves_is_no_record(written: Path, units: list[Unit]) -> None:
+    (written / "episodes" / f".{units[0].fingerprint}-x.tmp").write_bytes(b"PAR1 half")
+    assert results.read(written).num_rows == 3 * len(units)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_a_truncated_record_is_named(written: Path, units: list[Unit], share: float) -> None:
+    path = results.path_of(written, units[1].fingerprint)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    for read in (lambda: results.read(written), lambda: results.finished(written, [units[1].fingerprint])):
+        with pytest.raises(UserError, match=f"the record {path} is truncated or not Parquet; delete it"):
+            read()
+
+
+def test_a_record_whose_data_is_damaged_is_named(written: Path, units: list[Unit]) -> None:
+    path = results.path_of(written, units[1].fingerprint)
+    blob = bytearray(path.read_bytes())
+    blob[4 : len(blob) // 3] = b"\xff" * (len(blob) // 3 - 4)
+    path.write_bytes(bytes(blob))
+    with pytest.raises(UserError, match=f"the record {path} is truncated or not Parquet"):
+        results.read(written)
+
+
+def test_a_foreign_table_is_named(written: Path) -> None:
+    path = written / "episodes" / "other.parquet"
+    pq.write_table(pa.table({"a": [1]}), path)
+    with pytest.raises(UserError, match=f"the record {path} has other columns"):
+        results.read(written)
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"the results folder .*file/results cannot be written: Not a directory"):
+        results.prepare(tmp_path / "file" / "results")
+
+
+def test_an_empty_folder_says_how_to_fill_it(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"there are no records in .*; `bench run out="):
+        results.read(tmp_path)
+
+
+def test_reading_a_folder_takes_the_newest_code_and_drives_no_scenario_twice(written: Path, units: list[Unit]) -> None:
+    old = results.read(written, [units[0].fingerprint]).to_pylist()
+    newer = [
+        row | {"unit": "newer", "code_digest": "newer", "created_at": row["created_at"].replace(year=2999)}
+        for row in old
+    ]
+    longer = [row | {"unit": "longer", "seed": row["seed"] + 1} for row in newer]
+    for rows in (newer, longer):
+        results.write(written, pa.Table.from_pylist(rows, SCHEMA))
+    records = results.read(written).to_pylist()
+    same_pair = [row for row in records if (row["pair"], row["lanes"]) == (old[0]["pair"], old[0]["lanes"])]
+    assert {row["code_digest"] for row in same_pair} == {"newer"}
+    assert sorted(row["seed"] for row in same_pair) == sorted({row["seed"] for row in newer + longer})
