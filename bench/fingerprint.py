@@ -26,7 +26,7 @@ BESIDE_THE_RESULT = (
     "pair.py",
     "parameters.py",
     "plan.py",
-    "recording.py",
+    "recording",
     "registry.py",
     "results.py",
     "runner.py",

@@ -182,14 +182,14 @@ def _record(task: Task, trace: Trace) -> str:
     """Save the recordings of a task; why it failed, or nothing."""
     unit = task.unit
     try:
-        from bench import recording
+        from bench.recording import save
 
         for number, episode in enumerate(trace.episodes):
             one = {name: [step[number : number + 1] for step in steps] for name, steps in trace.steps.items()}
             seed = unit.seeds[episode]
             path = recording_path(task.out, unit, seed)
             path.parent.mkdir(parents=True, exist_ok=True)
-            recording.save(
+            save(
                 Trace(episodes=[episode], steps=one),
                 features=unit.pair.world.component.features,
                 meta=unit.constants(0.0) | {"seed": seed},
