@@ -108,8 +108,8 @@ def read_pairs(records: pa.Table) -> list[Pair]:
     reference driver and there are others. Of a scenario driven twice, the newest record counts.
     """
     records = newest(records)
-    attacked = [group for group in _groups(records, (*DEFENDED, *ATTACKER, "grid")) if group[0]["attack"] != "none"]
-    clean = _groups(records, DEFENDED, pc.equal(records["attack"], "none"))
+    attacked = [group for group in groups(records, (*DEFENDED, *ATTACKER, "grid")) if group[0]["attack"] != "none"]
+    clean = groups(records, DEFENDED, pc.equal(records["attack"], "none"))
     controls = {_drives(identity): Episodes.arrange(newest(rows, DEFENDED)) for identity, rows in clean}
     pairs = [_pair(identity, rows, controls) for identity, rows in attacked]
     used = {_drives(pair.identity) for pair in pairs}
@@ -131,7 +131,7 @@ def newest(records: pa.Table, identity: tuple[str, ...] = (*DEFENDED, *ATTACKER,
     return records.take(pa.array(rows))
 
 
-def _groups(
+def groups(
     records: pa.Table, columns: tuple[str, ...], keep: pa.ChunkedArray | None = None
 ) -> Iterator[tuple[dict[str, object], pa.Table]]:
     """The records that share the values of `columns`, in the order of their first appearance."""
