@@ -53,7 +53,7 @@ class DQN(LearningDriver):
 
 class _QLearner(Learner):
     def __init__(self, recipe: DQN, env: EnvBase, start: Policy | None) -> None:
-        self.recipe = recipe
+        self.recipe, self.gap = recipe, 0.0
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: QPolicy = QPolicy(features, ACTIONS, recipe.hidden)
         self.mean = QPolicy(features, ACTIONS, recipe.hidden)
@@ -75,17 +75,26 @@ class _QLearner(Learner):
 
     def enter(self, phase: Phase) -> None:
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
+        self.gap = phase.gap
         if phase.exploration < 1:
             self.greedy.eps_end.fill_(self.recipe.final_epsilon * phase.exploration)
             self.greedy.eps.fill_(self.recipe.final_epsilon * phase.exploration)
 
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
+        if self.gap > 0:
+            sample["next", "reward"] -= self.gap * self._disadvantage(sample)
         self.adam.param_groups[0]["lr"] = learning_rate
         self.adam.zero_grad()
         self.loss(sample)["loss"].backward()
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
         self.adam.step()
         self.target.step()
+
+    @torch.no_grad()
+    def _disadvantage(self, sample: TensorDictBase) -> torch.Tensor:
+        """V(s) - Q(s, a) [N, 1]: what advantage learning takes from the reward (Bellemare et al. 2016, Eq. 6)."""
+        values = self.policy.scores(sample["observation"])
+        return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
 
     def anneal(self) -> None:
         self.greedy.step()

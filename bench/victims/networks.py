@@ -16,7 +16,7 @@ class Encoder(nn.Module):
     is kept. What a car means does not depend on its row: on the same frames this crashes half as often as a plain MLP.
     """
 
-    width, pooled = 16, 32
+    width, pooled = 32, 32
 
     def __init__(self, features: int) -> None:
         super().__init__()

@@ -42,6 +42,7 @@ class Phase:
         gamma: discount a decision.
         n_step: decisions in a return.
         exploration: final exploration of the recipe is multiplied by this: random actions a second stay as rare.
+        gap: of advantage learning, in [0, 1): gaps between the values of actions grow by 1 / (1 - gap).
     """
 
     repeat: int
@@ -49,6 +50,7 @@ class Phase:
     gamma: float
     n_step: int
     exploration: float = 1.0
+    gap: float = 0.0
 
 
 class Learner(ABC):
@@ -103,8 +105,8 @@ class LearningDriver(Victim):
     learns: ClassVar[bool] = True
     policy_type: ClassVar[type[Policy]]
 
-    decisions: int = 40_000
-    fine: float = 0.4
+    decisions: int = 36_000
+    fine: float = 0.45
     repeat: int = 5
     hidden: int = 128
     gamma: float = 0.97
@@ -113,8 +115,8 @@ class LearningDriver(Victim):
     learning_rate: float = 5e-4
     batch: int = 512
     updates: int = 1
-    copies: int = 12
-    memory: int = 400_000
+    copies: int = 24
+    memory: int = 600_000
     tau: float = 0.005
     checkpoints: int = 8
 
@@ -135,7 +137,15 @@ class LearningDriver(Victim):
         fine = attack.decisions if attack and started else round(self.decisions * self.fine)
         phases = [
             Phase(self.repeat, self.decisions - fine, self.gamma, self.n_step),
-            Phase(1, fine, self.gamma ** (1 / self.repeat), self.n_step * self.repeat, 1 / self.repeat),
+            # One frame of another action is worth a fifth of five: the gap keeps the size it had.
+            Phase(
+                1,
+                fine,
+                self.gamma ** (1 / self.repeat),
+                self.n_step * self.repeat,
+                exploration=1 / self.repeat,
+                gap=1 - 1 / self.repeat,
+            ),
         ]
         whole = [replace(phase, decisions=max(1, round(phase.decisions / CHUNK)) * CHUNK) for phase in phases]
         return whole[1:] if started else whole
