@@ -113,13 +113,20 @@ class Source:
         """The return of a reference driver on the scenarios of `found`."""
         if found is None:
             return None
-        for table in self.tables:
-            blind = table.filter(pc.and_(pc.invert(table["sees"]), pc.equal(table["attack"], "none")))
-            drives = [Episodes.arrange(newest(rows, DEFENDED)) for _, rows in groups(blind, DEFENDED)]
+        for drives in self._reference_drivers:
             reference = references(found.episodes, drives).get(name)
             if reference:
                 return interval(reference.only(runs=reference.runs[:1]).column("return"))
         return None
+
+    @cached_property
+    def _reference_drivers(self) -> list[list[Episodes]]:
+        """Of the user's records, and of the published ones."""
+        made = []
+        for table in self.tables:
+            blind = table.filter(pc.and_(pc.invert(table["sees"]), pc.equal(table["attack"], "none")))
+            made.append([Episodes.arrange(newest(rows, DEFENDED)) for _, rows in groups(blind, DEFENDED)])
+        return made
 
     def commands(self) -> list[str]:
         """What to type for everything that was asked for and not found."""
