@@ -18,7 +18,7 @@ from scipy.special import ndtri
 Array = NDArray[np.float64]
 
 REPLICATES = 2000
-"""Bootstrap draws: another generator seed then moves the ends of an interval by about 3 % of its width."""
+"""Bootstrap draws: another generator seed then moves the ends of an interval by about 2 % of its width."""
 CONFIDENCE = 0.95
 
 

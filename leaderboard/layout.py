@@ -63,7 +63,7 @@ def _table(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subjec
         if section.title is not None:
             made.add_row(section.title)
         for subject in section.subjects:
-            made.add_row(*(column.value(subject) for column in columns))
+            made.add_row(*(_text(column.value(subject)) for column in columns))
         made.add_section()
     return made
 
@@ -71,3 +71,8 @@ def _table(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subjec
 def axis() -> str:
     """The heading of a strip chart: 0 at its left end, 1 at its right."""
     return "safe progress\n0" + "0.5".center(STRIP - 2) + "1"
+
+
+def _text(value: Text | str) -> Text:
+    """As it stands: a parameter like `speeds=[20]` is no markup."""
+    return value if isinstance(value, Text) else Text(value)

@@ -161,3 +161,9 @@ def test_numbers_are_written_short_and_strips_to_scale() -> None:
     assert estimate(Interval(0.5, np.nan, np.nan)).plain == "0.50"
     assert strip({CLEAN: Interval(0.5, 0.3, 0.7)}, 10).plain == "···──○──··"
     assert strip({CLEAN: Interval(1.0, 1.0, 1.0)}, 4).plain == "···○"
+
+
+def test_brackets_in_parameters_are_printed_as_they_are() -> None:
+    sweep = [drive(attack="zo", attack_params={"speeds": speeds}, skill=0.2) for speeds in (["bold"], ["red"])]
+    text = printed(pa.concat_tables([drive(), *sweep]))
+    assert "zo speeds=['bold']" in text.split("victim ")[0]
