@@ -118,12 +118,18 @@ def show(
 @app.command()
 def view(
     run: Annotated[str, typer.Argument(help="A recording (.rrd), a results folder, or the name of a pair in it.")],
+    where: Annotated[
+        list[str] | None, typer.Argument(metavar="COLUMN=VALUE...", help="Which record to replay.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
 ) -> None:
-    """Open a recording in the rerun viewer."""
-    from bench import cli_show
+    """Open a recording in the rerun viewer; with COLUMN=VALUE, drive that episode again and record it first.
 
-    cli_show.open_recording(run, out, Console())
+    For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017
+    """
+    from bench import cli_view
+
+    cli_view.open_recording(run, where or [], out, Console())
 
 
 @app.command()

@@ -1,13 +1,10 @@
-"""`bench show` and `bench view`: what a results folder holds, what made it, and its recordings."""
+"""`bench show`: what a results folder holds, what made it, and its recordings."""
 
 from __future__ import annotations
 
 import functools
 import json
 import operator
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -36,54 +33,22 @@ def print_run(run: str, out: Path, console: Console, report: Report) -> None:
     Raises:
         UserError: if there is no such run.
     """
-    folder, pair = _located(run, out)
+    folder, pair = located(run, out)
     records = results.read(folder)
-    name = _pair(pair, records) if pair else None
+    name = pair_named(pair, records) if pair else None
     shown = records.filter(pc.field("pair") == name if name else pc.field("sees"))
     _print_facts(shown if shown.num_rows else records, console)
     report("run", _with_controls(shown, records) if name else records)
-    for path in _recordings(folder, name):
+    for path in recordings(folder, name):
         console.print(Text(f"recording: bench view {path}"), soft_wrap=True)
 
 
-def open_recording(run: str, out: Path, console: Console) -> None:
-    """Open a recording in the rerun viewer, or say how to where there is no display.
-
-    Args:
-        run: a recording; or a results folder or the beginning of a pair's name, whose only recording is opened.
-        out: results folder to look for a pair in.
-        console: where to print.
-
-    Raises:
-        UserError: if there is no recording, or more than one to choose from.
-    """
-    path = Path(run)
-    if not path.is_file():
-        folder, pair = _located(run, out)
-        found = _recordings(folder, _pair(pair, results.read(folder)) if pair else None)
-        if not found:
-            raise UserError(f"{run} has no recordings; bench run … record=1 with another out= makes some")
-        if len(found) > 1:
-            console.print(Text(f"{run} has {len(found)} recordings; open one of them:"))
-            for path in found:
-                console.print(Text(f"bench view {path}"), soft_wrap=True)
-            return
-        path = found[0]
-    if path.suffix != ".rrd":
-        raise UserError(f"{path} is not a recording (.rrd)")
-    if not _has_display():
-        console.print(Text(f"There is no display here. Where there is one: rerun {path.resolve()}"), soft_wrap=True)
-        return
-    subprocess.Popen([sys.executable, "-m", "rerun", str(path)], start_new_session=True)
-    console.print(Text(f"opened {path} in the rerun viewer"), soft_wrap=True)
-
-
-def _located(run: str, out: Path) -> tuple[Path, str]:
+def located(run: str, out: Path) -> tuple[Path, str]:
     """The results folder and the beginning of a pair's name; the name is empty if `run` is a folder."""
     return (Path(run), "") if Path(run).is_dir() else (out, run)
 
 
-def _pair(beginning: str, records: pa.Table) -> str:
+def pair_named(beginning: str, records: pa.Table) -> str:
     """The one pair whose name begins so."""
     known = sorted(set(records["pair"].to_pylist()))
     found = [name for name in known if name.startswith(beginning)]
@@ -154,9 +119,5 @@ def _listed(column: pa.ChunkedArray, digits: int | None = None) -> str:
     return ", ".join(f"{value:g}" if isinstance(value, float) else str(value)[:digits] for value in values)
 
 
-def _recordings(folder: Path, pair: str | None) -> list[Path]:
+def recordings(folder: Path, pair: str | None) -> list[Path]:
     return sorted((folder / "recordings").glob(f"{pair or '*'}/*.rrd"))
-
-
-def _has_display() -> bool:
-    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -164,7 +164,8 @@ class AttackInLoop:
     Args:
         attack: called with (observation [B, V, F], policy, budget scale in (0, 1]) -> perturbed observation.
         skip: probability in [0, 1] with which a decision is left unattacked.
-        replay: attack the observations drawn from the replay buffer as well (afresh, against the victim as it is now).
+        where: `acting`: the observations it acts on, which the replay buffer then keeps; `replay`: the observations drawn from the
+            replay buffer, afresh against the victim as it is now; or `both`.
         ramp: the shares of the training between which the budget grows from 0 to 1.
         start: weights to go on from, frame by frame; None trains from scratch.
         decisions: of the further training, where there is a `start`.
@@ -172,7 +173,7 @@ class AttackInLoop:
 
     attack: Callable[[Tensor, Policy, float], Tensor]
     skip: float
-    replay: bool = True
+    where: Literal["acting", "replay", "both"] = "both"
     ramp: tuple[float, float] = (0.2, 0.5)
     start: Policy | None = None
     decisions: int = 0

@@ -28,6 +28,7 @@ BESIDE_THE_RESULT = (
     "plan.py",
     "recording",
     "registry.py",
+    "replay.py",
     "results.py",
     "runner.py",
     "statistics.py",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -105,6 +106,22 @@ class Pair:
     def clean(self) -> Pair:
         """The same victim and defence without the attack: the control of every attacked pair."""
         return replace(self, attack=choose("attack", "none"), threat=UNATTACKED)
+
+    def weights_sha256(self, training_seed: int) -> str:
+        """The hash that the defended policy carries of its weights or, where it carries none, the hash of what it has.
+
+        Raises:
+            UserError: if the policy cannot be loaded.
+        """
+        policy = self.defense.component.load(self.victim.component, training_seed)
+        state = policy.state_dict()
+        if policy.weights_sha256 or not state:
+            return policy.weights_sha256
+        hasher = hashlib.sha256()
+        for name, value in sorted(state.items()):
+            hasher.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+            hasher.update(value.detach().cpu().contiguous().numpy().tobytes())
+        return hasher.hexdigest()
 
     def __str__(self) -> str:
         return f"{self.attack} + {self.defense} + {self.victim}"

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from bench import registry
 from bench.config import RunConfig
-from bench.contracts import Policy
 from bench.fingerprint import canonical
 from bench.pair import UNATTACKED, Pair, choose
 from bench.parameters import parameters
@@ -40,7 +38,7 @@ def plan(config: RunConfig) -> list[Unit]:
                 [pair.defense.name, pair.defense.params, pair.victim.name, pair.victim.params, training_seed]
             )
             if key not in weights:
-                weights[key] = _weights(pair.defense.component.load(victim, training_seed))
+                weights[key] = pair.weights_sha256(training_seed)
             first = Unit(
                 pair=pair,
                 cell=config.grid.cells()[0],
@@ -68,15 +66,3 @@ def _cells(pair: Pair, cells: Iterable[Cell]) -> list[Cell]:
     if pair.victim.component.sees:
         return list(cells)
     return list(dict.fromkeys(replace(cell, weather="clear") for cell in cells))
-
-
-def _weights(policy: Policy) -> str:
-    """The hash a policy carries of its weights or, where it carries none, the hash of the weights it has."""
-    state = policy.state_dict()
-    if policy.weights_sha256 or not state:
-        return policy.weights_sha256
-    hasher = hashlib.sha256()
-    for name, value in sorted(state.items()):
-        hasher.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        hasher.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return hasher.hexdigest()

@@ -90,6 +90,23 @@ def recording_path(out: Path, unit: Unit, seed: int) -> Path:
     return out / "recordings" / unit.pair.id / f"{cell}-{seed}.rrd"
 
 
+def save_recordings(out: Path, unit: Unit, trace: Trace) -> None:
+    """Save a recording of each episode of a trace of the unit."""
+    from bench.recording import save
+
+    for number, episode in enumerate(trace.episodes):
+        one = {name: [step[number : number + 1] for step in steps] for name, steps in trace.steps.items()}
+        seed = unit.seeds[episode]
+        path = recording_path(out, unit, seed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(
+            Trace(episodes=[episode], steps=one),
+            features=unit.pair.world.component.features,
+            meta=unit.constants(0.0) | {"seed": seed},
+            path=path,
+        )
+
+
 def _tasks(config: RunConfig, units: Iterable[Unit]) -> Iterator[Task]:
     """The units in the order of the plan, and what to record: of the pairs asked for, with one training seed."""
     asked = {pair.id: pair for pair in config.pairs}
@@ -180,22 +197,9 @@ def _perform(task: Task) -> Outcome:
 
 def _record(task: Task, trace: Trace) -> str:
     """Save the recordings of a task; why it failed, or nothing."""
-    unit = task.unit
     try:
-        from bench.recording import save
-
-        for number, episode in enumerate(trace.episodes):
-            one = {name: [step[number : number + 1] for step in steps] for name, steps in trace.steps.items()}
-            seed = unit.seeds[episode]
-            path = recording_path(task.out, unit, seed)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            save(
-                Trace(episodes=[episode], steps=one),
-                features=unit.pair.world.component.features,
-                meta=unit.constants(0.0) | {"seed": seed},
-                path=path,
-            )
+        save_recordings(task.out, task.unit, trace)
     # The records are the result; a recording is a view of them, and its failure must not lose them.
     except Exception as error:
-        return f"{unit} was not recorded: {type(error).__name__}: {error}".splitlines()[0]
+        return f"{task.unit} was not recorded: {type(error).__name__}: {error}".splitlines()[0]
     return ""

@@ -30,8 +30,8 @@ class AdversarialTraining(Defense):
         budget: size of that set once the ramp is over.
         start: `trained` goes on from the victim of the same training seed, `scratch` trains a new one.
         decisions: of the further training, on every road at once; with `scratch` it is the victim's own.
-        replay: attack the observations drawn from the replay buffer, afresh against the policy as it is now, as well as the
-            ones it acts on; without it the buffer keeps the attacked observations of the past, as in the thesis.
+        where: `acting` attacks the observations it acts on, which the replay buffer keeps as they were then, as in the thesis;
+            `replay` attacks those drawn from the buffer, afresh against the policy as it is now; `both` does both.
         ramp_from: share of the training after which the budget begins to grow from 0.
         ramp_to: share of the training at which it is whole.
     """
@@ -42,8 +42,8 @@ class AdversarialTraining(Defense):
     norm: Norm = "relative"
     budget: float = 0.1
     start: Literal["trained", "scratch"] = "trained"
-    decisions: int = 12_000
-    replay: bool = True
+    decisions: int = 10_000
+    where: Literal["acting", "replay", "both"] = "both"
     ramp_from: float = 0.0
     ramp_to: float = 0.4
 
@@ -87,7 +87,7 @@ class AdversarialTraining(Defense):
         loop = AttackInLoop(
             attack=perturb,
             skip=self.skip,
-            replay=self.replay,
+            where=self.where,
             ramp=(self.ramp_from, self.ramp_to),
             start=victim.load(seed) if self.start == "trained" else None,
             decisions=self.decisions,

@@ -6,6 +6,7 @@ import copy
 import itertools
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import ClassVar
 
@@ -93,13 +94,13 @@ class LearningDriver(Victim):
         gamma: discount a decision of the first phase; a frame's share of it in the second.
         n_step: decisions in a return of the first phase; as many frames in the second.
         crash_penalty: reward of a crash or of leaving the road, in frames of perfect driving.
-        learning_rate: of Adam; falls linearly to a twentieth over the second half.
+        learning_rate: of Adam; falls linearly to a twentieth over the second half; half of it where a trained policy goes on.
         batch: transitions an update.
         updates: gradient updates a decision of the whole batch of roads.
         copies: of each of the six roads, driven at once.
         memory: transitions in the replay buffer.
         tau: rate of the target networks' soft update.
-        checkpoints: candidates for the final weights, spread over the second phase.
+        checkpoints: candidates for the final weights, spread over the last `fine` of the training.
     """
 
     learns: ClassVar[bool] = True
@@ -137,12 +138,13 @@ class LearningDriver(Victim):
         fine = attack.decisions if attack and started else round(self.decisions * self.fine)
         phases = [
             Phase(self.repeat, self.decisions - fine, self.gamma, self.n_step),
-            # One frame of another action is worth a fifth of five: the gap keeps the size it had.
+            # One frame of another action is worth a fifth of five: the gap keeps the size it had. Returns are short under
+            # attack, because they take what was done for what the policy would do.
             Phase(
                 1,
                 fine,
                 self.gamma ** (1 / self.repeat),
-                self.n_step * self.repeat,
+                self.repeat if attack else self.n_step * self.repeat,
                 exploration=1 / self.repeat,
                 gap=1 - 1 / self.repeat,
             ),
@@ -161,7 +163,7 @@ class LearningDriver(Victim):
         torch.manual_seed(seed)
         started = time.process_time()
         generator = torch.Generator().manual_seed(seed)
-        best, learner, done, attacked = Best(world, episodes=60), None, 0, 0
+        best, learner, done, attacked = Best(world, attack, episodes=60), None, 0, 0
         phases = self.phases(attack)
         total = sum(phase.decisions for phase in phases)
         for number, phase in enumerate(phases):
@@ -176,10 +178,10 @@ class LearningDriver(Victim):
                 done += CHUNK
                 learner.anneal()
                 if taken > WARM_UP:
-                    rate = self.learning_rate * max(0.05, min(1.0, 2 * (1 - share)))
+                    rate = self.learning_rate * max(0.05, min(1.0 if len(phases) > 1 else 0.5, 2 * (1 - share)))
                     for _ in range(CHUNK * self.updates):
                         learner.update(practice.sample(share), rate)
-                if phase.repeat == 1 and taken * self.checkpoints // phase.decisions > len(best.history):
+                if phase.repeat == 1 and self._due(done / total, len(best.history)):
                     best.offer(learner.averaged(), done / total)
                 progress(done / total, f"safe_progress {best.score:.2f}" if best.history else "")
             attacked += practice.attacked
@@ -187,6 +189,10 @@ class LearningDriver(Victim):
         card = {"victim": asdict(self), "seed": seed, "attacked_decisions": attacked, **best.card()}
         card["cpu_seconds"] = round(time.process_time() - started, 1)
         return TrainedPolicy(best.restore(learner.averaged()), card)
+
+    def _due(self, share: float, offered: int) -> bool:
+        """Whether another checkpoint is due; they are spread over the last `fine` of the training."""
+        return share >= 1 - self.fine * (1 - (offered + 1) / self.checkpoints) - 1e-9
 
 
 class Practice:
@@ -220,10 +226,11 @@ class Practice:
         chunk = []
         for _ in range(decisions):
             truth = self.td["observation"]
-            self.td.set("observation", self.perturbed(truth, share))
+            if self.attack is not None and self.attack.where != "replay":
+                self.td.set("observation", self.perturbed(truth, share))
             with set_exploration_type(ExplorationType.RANDOM):
                 self.learner.explore(self.td)
-            if self.attack is not None and self.attack.replay:
+            if self.attack is not None and self.attack.where == "both":
                 self.td.set("observation", truth)
             step, self.td = self.env.step_and_maybe_reset(self.td)
             chunk.append(self._transition(step))
@@ -234,7 +241,7 @@ class Practice:
     def sample(self, share: float) -> TensorDictBase:
         """A batch of transitions, attacked afresh where the defence attacks the replay."""
         sample = self.buffer.sample()
-        if self.attack is not None and self.attack.replay:
+        if self.attack is not None and self.attack.where != "acting":
             sample.set("observation", self.perturbed(sample["observation"], share))
         return sample
 
@@ -280,8 +287,17 @@ def target_state(params: TensorDictBase, module: nn.Module) -> dict[str, Tensor]
 
 
 @torch.no_grad()
-def selection_score(policy: Policy, world: World, episodes: int) -> dict[str, float]:
-    """Mean `safe_progress`, by road and over all, on the seeds that select checkpoints and are never reported."""
+def selection_score(
+    policy: Policy, world: World, episodes: int, perturb: Callable[[Tensor], Tensor] | None = None
+) -> dict[str, float]:
+    """Mean `safe_progress`, by road and over all, on the seeds that select checkpoints and are never reported.
+
+    Args:
+        policy: what drives.
+        world: where.
+        episodes: a road.
+        perturb: what the policy is shown for an observation [B, V, F]; None is the truth.
+    """
     cells = roads(episodes)
     env = world.make(cells, action_type=policy.action_type)
     seeds = torch.arange(SeedBlock.SELECT, SeedBlock.SELECT + episodes).repeat(len(cells) // episodes)
@@ -289,7 +305,11 @@ def selection_score(policy: Policy, world: World, episodes: int) -> dict[str, fl
     progress, failed = torch.zeros(len(cells)), torch.zeros(len(cells), dtype=torch.bool)
     for _ in range(world.max_steps):
         running = ~td["done"].squeeze(-1)
-        td.set("action", policy.decide(td["observation"]))
+        shown = td["observation"]
+        if perturb is not None:
+            shown = shown.clone()
+            shown[running] = perturb(shown[running])
+        td.set("action", policy.decide(shown))
         td = env.step(td)["next"]
         progress += td["info", "progress"].squeeze(-1) * running
         failed |= (td["info", "crashed"] | td["info", "offroad"]).squeeze(-1) & running
@@ -302,22 +322,29 @@ def selection_score(policy: Policy, world: World, episodes: int) -> dict[str, fl
 
 @dataclass
 class Best:
-    """The best checkpoint so far, by `selection_score`."""
+    """The best checkpoint so far: by its `selection_score`, or by the mean of that with and without the attack it trains on."""
 
     world: World
+    attack: AttackInLoop | None
     episodes: int
     score: float = -1.0
-    scores: dict[str, float] = field(default_factory=dict)
+    scores: dict[str, dict[str, float]] = field(default_factory=dict)
     share: float = 0.0
     weights: dict[str, Tensor] = field(default_factory=dict)
     history: list[tuple[float, float]] = field(default_factory=list)
 
     def offer(self, policy: Policy, share: float) -> None:
         """Score `policy` and keep its weights if none before was better."""
-        scores = selection_score(policy, self.world, self.episodes)
-        self.history.append((round(share, 3), round(scores["mean"], 4)))
-        if scores["mean"] > self.score:
-            self.score, self.scores, self.share = scores["mean"], scores, share
+        scores = {"clean": selection_score(policy, self.world, self.episodes)}
+        loop = self.attack
+        if loop is not None and loop.skip < 1:
+            scores["attacked"] = selection_score(
+                policy, self.world, self.episodes, lambda observation: loop.attack(observation, policy, 1.0)
+            )
+        score = sum(found["mean"] for found in scores.values()) / len(scores)
+        self.history.append((round(share, 3), round(score, 4)))
+        if score > self.score:
+            self.score, self.scores, self.share = score, scores, share
             self.weights = copy.deepcopy(policy.state_dict())
 
     def restore(self, policy: Policy) -> Policy:

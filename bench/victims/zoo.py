@@ -18,7 +18,7 @@ from safetensors.torch import save as save_tensors
 from bench.contracts import Policy
 from bench.errors import UserError
 
-SHIPPED = Path(__file__).parent / "zoo"
+SHIPPED = Path(__file__).parent / "policies"
 
 
 def own() -> Path:

@@ -39,7 +39,10 @@ def test_a_training_depends_on_its_seed_alone(victim: LearningDriver, world: Wor
 def test_the_card_says_what_was_trained_and_on_what_it_was_chosen(world: World) -> None:
     card = VICTIMS[0].train(world, seed=0, progress=silent).card
     assert card["victim"]["decisions"] == 160
-    assert set(card["selection"]["safe_progress"]) == {"mean", *(f"{n} lanes, density {d}" for n in (3, 4, 5) for d in (1, 2))}
+    assert set(card["selection"]["safe_progress"]["clean"]) == {
+        "mean",
+        *(f"{n} lanes, density {d}" for n in (3, 4, 5) for d in (1, 2)),
+    }
 
 
 def test_returns_end_where_the_episode_ends(world: World) -> None:
@@ -69,7 +72,7 @@ def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, w
         calls.append(len(observation))
         return observation
 
-    loop = AttackInLoop(attack=attack, skip=skip, replay=False, ramp=(0.0, 0.0))
+    loop = AttackInLoop(attack=attack, skip=skip, where="acting", ramp=(0.0, 0.0))
     card = VICTIMS[0].train(world, seed=0, attack=loop, progress=silent).card
     assert card["attacked_decisions"] == sum(calls)
     assert sum(calls) / (160 * 6) == pytest.approx(1 - skip, abs=0.06)
