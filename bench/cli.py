@@ -81,8 +81,10 @@ def train(words: Words = None) -> None:
     """
     from bench.config import train_config
     from bench.console import TrainingProgress
+    from bench.process import settle
     from bench.victims import zoo
 
+    settle()
     config = train_config(words or [])
     victim, defense, world = config.victim.component, config.defense.component, config.world.component
     hardens = config.defense.name != "none"

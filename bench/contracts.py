@@ -98,7 +98,10 @@ class Policy(nn.Module, ABC):
 
     def decide(self, observation: Tensor) -> Tensor:
         """The action taken: int64 [...] (discrete, the greedy one) or float [..., 2] in [-1, 1] (continuous)."""
-        scores = self.scores(observation)
+        return self.choose(self.scores(observation))
+
+    def choose(self, scores: Tensor) -> Tensor:
+        """The action that goes with scores; without a side effect, so that measurements may ask what would have been done."""
         return scores.argmax(-1) if self.action_type == "discrete" else scores
 
     def value(self, observation: Tensor, action: Tensor) -> Tensor:

@@ -154,7 +154,7 @@ class _Meter:
         touched = (shown != truth).flatten(1).any(1)
         clean = action.clone()
         if bool(touched.any()):
-            clean[touched] = self.policy.decide(truth[touched])
+            clean[touched] = self.policy.choose(self.policy.scores(truth)[touched])
         if self.policy.action_type == "discrete":
             return (clean != action).double()
         return ((clean - action).abs().amax(-1) > CHANGED).double()

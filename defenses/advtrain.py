@@ -42,7 +42,7 @@ class AdversarialTraining(Defense):
     norm: Norm = "relative"
     budget: float = 0.1
     start: Literal["trained", "scratch"] = "trained"
-    decisions: int = 10_000
+    decisions: int = 8_000
     where: Literal["acting", "replay", "both"] = "both"
     ramp_from: float = 0.0
     ramp_to: float = 0.4
