@@ -53,6 +53,7 @@ class Said:
 def bench(toy_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
     """The command line in this process: bench("run", "attack=nudge") -> Said."""
     monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setattr("bench.cli_view._has_display", lambda: False)
 
     def call(*words: str) -> Said:
         monkeypatch.setattr(sys, "argv", ["bench", *words])

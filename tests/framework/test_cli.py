@@ -127,17 +127,11 @@ def test_what_does_not_learn_cannot_be_trained(bench: Bench) -> None:
     assert_one_line(bench("train", "victim=toy", "defense=guard", "defense.digits=1"), "there is nothing to train")
 
 
-def test_without_a_display_view_says_how_to_open_a_recording(
-    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(sys, "platform", "linux")
+def test_without_a_display_view_says_how_to_open_a_recording(bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "some.rrd"
     path.write_bytes(b"")
-    said = bench("view", str(path))
-    assert f"rerun {path}" in said.out
-    assert_one_line(bench("view", str(tmp_path)), "has no recordings")
+    assert f"rerun {path}" in bench("view", str(path)).out
+    assert_one_line(bench("view", str(tmp_path / "other.rrd")), "there are no records in results")
 
 
 def test_a_traceback_is_shown_to_who_asks_for_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,50 @@
+"""The whole way with real components: the highway world, a blind driver and, where the zoo ships one, the DQN."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.compute as pc
+import pytest
+
+from bench import results
+from bench.replay import find, replay
+from bench.victims import zoo
+from tests.framework.conftest import Said
+
+ROAD = ("lanes=3", "density=1", "weather=clear,fog", "episodes=3")
+
+
+@pytest.mark.slow
+def test_a_blind_driver_is_scored_on_the_highway_and_its_episode_replayed(
+    bench: Callable[..., Said], tmp_path: Path
+) -> None:
+    said = bench("run", "victim=blind", *ROAD, "workers=2", f"out={tmp_path}")
+    assert said.code == 0, said.err
+    assert "IDM" in said.out
+    records = results.read(tmp_path)
+    assert set(records["weather"].to_pylist()) == {"clear"}
+    braking = records.filter(pc.field("victim_params") == '{"policy":"slower"}')
+    assert braking.num_rows == 3
+    assert not any(braking["crashed"].to_pylist())
+    np.testing.assert_array_equal(braking["steps"], 450)
+    assert 0 < max(braking["safe_progress"].to_pylist()) < 0.5
+    assert replay(tmp_path, find(records, {"victim": "random", "seed": "1000001"})).differences == ()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not zoo.seeds("dqn"), reason="the zoo has no DQN")
+def test_noise_leaves_the_dqn_driving_on_the_highway(bench: Callable[..., Said], tmp_path: Path) -> None:
+    seed = f"seeds={zoo.seeds('dqn')[0]}"
+    said = bench("run", "attack=noise", *ROAD, seed, "workers=2", "reference=false", f"out={tmp_path}")
+    assert said.code == 0, said.err
+    records = results.read(tmp_path)
+    assert records.num_rows == 2 * 2 * 3
+    assert set(records["weights_sha256"].to_pylist()) == {zoo.card("dqn", zoo.seeds("dqn")[0])["sha256"]}
+    attacked, clean = (records.filter(pc.field("attack") == name) for name in ("noise", "none"))
+    assert min(attacked["linf"].to_pylist()) > 0
+    assert set(clean["linf"].to_pylist()) == {0.0}
+    assert max(attacked["excess_max"].to_pylist()) < 1e-6
+    assert replay(tmp_path, find(attacked, {"weather": "fog"})).differences == ()

@@ -1,0 +1,61 @@
+"""Any episode can be driven again from its record alone, and comes out the same to the last bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from bench import results
+from bench.replay import find, replay
+from tests.framework.conftest import Said
+from tests.framework.test_cli import TOY, assert_one_line
+
+Bench = Callable[..., Said]
+
+
+@pytest.fixture
+def folder(bench: Bench, tmp_path: Path) -> Path:
+    """The results of a small run, one episode of each pair asked for recorded."""
+    said = bench("run", *TOY, "attack.scale=0.5", "workers=1", "reference=false", f"out={tmp_path}")
+    assert said.code == 0, said.err
+    assert "warning" not in said.err
+    return tmp_path
+
+
+def test_a_run_records_the_first_episode_of_each_pair_that_was_asked_for(folder: Path) -> None:
+    (path,) = folder.glob("recordings/*/*.rrd")
+    assert path.parent.name.startswith("nudge-none-toy-")
+    assert path.name == "3-lanes-density-1-clear-1000000.rrd"
+
+
+def test_a_replay_measures_what_the_record_says(folder: Path) -> None:
+    record = find(results.read(folder), {"attack": "nudge", "seed": "1000002"})
+    again = replay(folder, record)
+    assert (again.differences, again.changed) == ((), "")
+    assert again.path.name == "3-lanes-density-1-clear-1000002.rrd"
+    assert again.path.stat().st_size > 0
+
+
+def test_a_replay_that_comes_out_otherwise_says_in_what_and_why(folder: Path) -> None:
+    records = results.read(folder)
+    record = find(records, {"attack": "nudge"})
+    rows = records.filter(pa.compute.field("unit") == record["unit"]).to_pylist()
+    altered = [row | {"return": row["return"] + 1e-9, "code_digest": "another"} for row in rows]
+    results.write(folder, pa.Table.from_pylist(altered, results.SCHEMA))
+    again = replay(folder, find(results.read(folder), {"attack": "nudge"}))
+    assert (again.differences, again.changed) == (("return",), "code_digest")
+
+
+def test_view_lists_recordings_and_makes_others(bench: Bench, folder: Path) -> None:
+    made = bench("view", "nudge", "lanes=3", "seed=1000003", "--out", str(folder))
+    assert made.code == 0
+    assert "Replayed bit for bit" in made.out
+    listed = bench("view", str(folder))
+    assert "has 2 recordings" in listed.out
+    assert_one_line(bench("view", str(folder), "lanes=5"), "no record has lanes=5; there are 3")
+    assert_one_line(bench("view", str(folder), "lane=3"), "unknown column 'lane'; did you mean 'lanes'?")
+    assert_one_line(bench("view", str(folder), "seed=first"), "cannot read seed=first: the column holds int64")
+    assert_one_line(bench("view", "none", "--out", str(folder)), "has no recordings; name an episode to make one")
