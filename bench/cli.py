@@ -136,7 +136,10 @@ def view(
 
 @app.command()
 def report(words: Words = None) -> None:
-    """Print a report on all records of a results folder: bench report [NAME] [out=results], for instance thesis."""
+    """Print a report on all records of a results folder: bench report [NAME] [out=results], for instance thesis.
+
+    Without a folder and without out=, a report sees no records; it may have published ones of its own.
+    """
     from bench import results
 
     folders = [word.removeprefix("out=") for word in words or [] if word.startswith("out=")]
@@ -147,7 +150,9 @@ def report(words: Words = None) -> None:
         )
     name = names[0] if names else "run"
     function = _report(name)
-    function(results.read(Path(folders[0] if folders else "results").expanduser()), Console())
+    out = Path(folders[0] if folders else "results").expanduser()
+    records = results.SCHEMA.empty_table() if name != "run" and not folders and not out.exists() else results.read(out)
+    function(records, Console())
 
 
 def _report(name: str) -> Callable[[pa.Table, Console], None]:
