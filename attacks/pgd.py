@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, get_args
 import torch
 from torch import Tensor
 
-from attacks.objectives import Loss, Objective
+from attacks.objectives import ContinuousLoss, DiscreteLoss, Objective
 from bench.contracts import Access, Attack
 
 if TYPE_CHECKING:
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 class PGD(Attack):
     """Projected gradient descent (Madry et al. 2018, "Towards Deep Learning Models Resistant to Adversarial Attacks").
 
-    Sign steps on the victim's own gradient, projected after each; the best iterate of all restarts is shown. With `steps=1
-    step_size=1 random_start=false restarts=1` it is FGSM (Goodfellow et al. 2015). White box: access `gradients`.
+    Sign steps on the victim's own gradient, projected after each; the best iterate of all restarts is shown. With
+    `steps=1 step_size=1 random_start=false restarts=1` it is FGSM (Goodfellow et al. 2015). White box: access `gradients`.
+    All episodes share the random starts of a step, so what happens to one does not depend on the rest of the batch.
 
     Distance: L-inf in shares of the threat model's radius, feature by feature.
 
@@ -32,20 +33,22 @@ class PGD(Attack):
         restarts: independent starts, at least 1, all in one batch (default 4).
         random_start: begin at a random point of the set instead of the true observation (default true).
         momentum: decay of the accumulated gradient (MI-FGSM, Dong et al. 2018), in [0, 1); 0 is plain PGD (default 0).
-        objective: what is minimised (default `expected`): `expected` the clean Q expected under the attacked policy (for a
-            continuous victim its critic's Q(x, mu(x'))); `margin` the lead of the clean action (minus the distance from it);
-            `target` the lead over the target action (the distance to it).
-        temperature: of `expected`, as a share of the spread of the clean Q-values, above 0 (default 0.5).
+        objective: what is minimised (default `collision`). `expected`: the clean Q expected under the attacked policy (for
+            a continuous victim its critic's Q(x, mu(x'))). `collision`: the same, but braking counts as the best action (a
+            continuous one is judged as if it braked no harder than the clean one). `margin`: the lead of the clean action
+            (minus the distance from it). `target`: the lead over the target action (the distance to it).
+        temperature: of the expectation, as a share of the spread of the clean Q-values, above 0 (default 0.5).
         target_action: discrete target, at least 0 (default 3, FASTER).
         target_acceleration: continuous target, in [-1, 1] (default 1).
         target_steering: continuous target, in [-1, 1] (default 0.5).
+        braking_action: what `collision` spares, at least 0 (default 4, SLOWER).
 
     Shapes: observation [B, V, F] in, the same out. Queries a step: 1 + restarts * (steps + 1); fewer restarts, then fewer
     steps, where the threat model allows less.
 
     Example:
         >>> from attacks.pgd import PGD
-        >>> fgsm = PGD(steps=1, step_size=1.0, random_start=False)
+        >>> fgsm = PGD(steps=1, step_size=1.0, restarts=1, random_start=False)
     """
 
     access: ClassVar[Access] = "gradients"
@@ -55,91 +58,105 @@ class PGD(Attack):
     restarts: int = 4
     random_start: bool = True
     momentum: float = 0.0
-    objective: Objective = "expected"
+    objective: Objective = "collision"
     temperature: float = 0.5
     target_action: int = 3
     target_acceleration: float = 1.0
     target_steering: float = 0.5
+    braking_action: int = 4
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"pgd.steps must be at least 1, got {self.steps}")
+        for name in ("steps", "restarts"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"pgd.{name} must be at least 1, got {getattr(self, name)}")
         if not 0 < self.step_size <= 2:
             raise ValueError(f"pgd.step_size must be in (0, 2], got {self.step_size}")
-        if self.restarts < 1:
-            raise ValueError(f"pgd.restarts must be at least 1, got {self.restarts}")
         if not 0 <= self.momentum < 1:
             raise ValueError(f"pgd.momentum must be in [0, 1), got {self.momentum}")
         if self.objective not in get_args(Objective):
             raise ValueError(f"pgd.objective must be one of {', '.join(get_args(Objective))}, got {self.objective!r}")
         if not self.temperature > 0:
             raise ValueError(f"pgd.temperature must be above 0, got {self.temperature}")
-        if self.target_action < 0:
-            raise ValueError(f"pgd.target_action must be at least 0, got {self.target_action}")
+        for name in ("target_action", "braking_action"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"pgd.{name} must be at least 0, got {getattr(self, name)}")
         for name in ("target_acceleration", "target_steering"):
             if not -1 <= getattr(self, name) <= 1:
                 raise ValueError(f"pgd.{name} must be in [-1, 1], got {getattr(self, name)}")
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
-        remaining = int(oracle.remaining.min())
-        restarts = min(self.restarts, (remaining - 1) // 2)
+        if not len(observation):
+            return observation
+        affordable = int(oracle.remaining.min()) - 1
+        restarts = min(self.restarts, affordable // 2)
         if restarts < 1:
             return observation
-        steps = min(self.steps, (remaining - 1) // restarts - 1)
-        loss = self._loss(observation, oracle)
+        steps = min(self.steps, affordable // restarts - 1)
+        loss, key = self._loss(observation, oracle)
         x = observation.expand(restarts, *observation.shape)
         if self.random_start:
-            share = torch.rand(x.shape, generator=oracle.generator) * 2 - 1
+            share = torch.rand((restarts, 1, *observation.shape[1:]), generator=oracle.generator) * 2 - 1
             x = oracle.project(x + share * oracle.radius)
         accumulated = torch.zeros_like(x)
         best, lowest = x, torch.full(x.shape[:2], torch.inf)
         for step in range(steps):
-            key, gradient = self._ask(x, loss, oracle)
+            value, gradient = _ask(x, loss, key, oracle)
             if step > 0:
-                best, lowest = _better(best, lowest, x, key)
+                best, lowest = _better(best, lowest, x, value)
             accumulated = self.momentum * accumulated + _unit(gradient)
             x = oracle.project(x - self.step_size * oracle.radius * accumulated.sign())
-        best, lowest = _better(best, lowest, x, _key(loss, oracle.scores(x)))
-        return best[lowest.argmin(0), torch.arange(observation.shape[0])]
+        best, lowest = _better(best, lowest, x, key(oracle.scores(x)))
+        return best[lowest.argmin(0), torch.arange(len(observation))]
 
-    def _ask(self, x: Tensor, loss: Callable[[Tensor], Tensor], oracle: Oracle) -> tuple[Tensor, Tensor]:
-        """What iterates are compared by [R, B] and the loss's gradient [R, B, V, F], from one query."""
-        keys: list[Tensor] = []
-
-        def asked(scores: Tensor) -> Tensor:
-            keys.append(_key(loss, scores.detach()))
-            return loss(scores)
-
-        _, gradient = oracle.gradient(x, asked)
-        return keys[0], gradient
-
-    def _loss(self, observation: Tensor, oracle: Oracle) -> Callable[[Tensor], Tensor]:
-        """The loss [..., B] of the victim's scores, to be minimised."""
-        continuous = oracle.action_type == "continuous"
+    def _loss(
+        self, observation: Tensor, oracle: Oracle
+    ) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+        """The loss of the victim's scores, to be minimised, and what iterates are compared by; [..., B] each."""
         clean = oracle.scores(observation)
-        if continuous and self.objective == "expected":
-            return lambda action: oracle.value(observation.expand(*action.shape[:-1], *observation.shape[1:]), action)
-        return Loss(
-            objective=self.objective,
-            action_type=oracle.action_type,
-            clean=clean,
-            temperature=self.temperature,
-            target=(self.target_acceleration, self.target_steering) if continuous else self.target_action,
-        )
+        if oracle.action_type == "discrete":
+            discrete = DiscreteLoss(
+                objective=self.objective,
+                clean=clean,
+                temperature=self.temperature,
+                target_action=self.target_action,
+                braking_action=self.braking_action,
+            )
+            return discrete, discrete.key
+        if self.objective in ("margin", "target"):
+            target = (self.target_acceleration, self.target_steering) if self.objective == "target" else None
+            continuous = ContinuousLoss(clean=clean, target=target)
+            return continuous, continuous.key
+
+        def critic(action: Tensor) -> Tensor:
+            if self.objective == "collision":
+                acceleration = torch.maximum(action[..., :1], clean[..., :1])
+                action = torch.cat((acceleration, action[..., 1:]), -1)
+            return oracle.value(observation.expand(*action.shape[:-1], *observation.shape[1:]), action)
+
+        return critic, critic
 
 
-def _key(loss: Callable[[Tensor], Tensor], scores: Tensor) -> Tensor:
-    """What iterates are compared by, [R, B]."""
-    return loss.key(scores) if isinstance(loss, Loss) else loss(scores).detach()
+def _ask(
+    x: Tensor, loss: Callable[[Tensor], Tensor], key: Callable[[Tensor], Tensor], oracle: Oracle
+) -> tuple[Tensor, Tensor]:
+    """What iterates are compared by [R, B] and the loss's gradient [R, B, V, F], from one query."""
+    keys: list[Tensor] = []
+
+    def asked(scores: Tensor) -> Tensor:
+        keys.append(key(scores.detach()))
+        return loss(scores)
+
+    _, gradient = oracle.gradient(x, asked)
+    return keys[0], gradient
 
 
 def _unit(gradient: Tensor) -> Tensor:
-    """`gradient` [R, B, V, F] scaled to a mean magnitude of 1 an episode, so that momentum weighs directions, not lengths."""
+    """`gradient` [R, B, V, F] scaled to a mean magnitude of 1 an episode: momentum weighs directions, not lengths."""
     scale = gradient.abs().mean((-2, -1), keepdim=True)
     return gradient / scale.clamp(min=torch.finfo(gradient.dtype).tiny)
 
 
-def _better(best: Tensor, lowest: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """Keep the iterate with the lower loss, restart by restart and episode by episode."""
-    improved = value < lowest
-    return torch.where(improved[..., None, None], x, best), torch.where(improved, value, lowest)
+def _better(best: Tensor, lowest: Tensor, x: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
+    """Keep the better iterate, restart by restart and episode by episode."""
+    improved = key < lowest
+    return torch.where(improved[..., None, None], x, best), torch.where(improved, key, lowest)
