@@ -68,8 +68,8 @@ def run(config: RunConfig, watcher: Watcher) -> list[str]:
         UserError: if the results folder cannot be written, a policy is missing, a component fails or a worker dies;
             what was finished until then is kept.
     """
-    results.prepare(config.out)
     units = {unit.fingerprint: unit for unit in plan(config)}
+    results.prepare(config.out)
     done = results.finished(config.out, units)
     tasks = [task for task in _tasks(config, units.values()) if task.unit.fingerprint not in done]
     episodes = len(config.grid.seeds())
