@@ -38,7 +38,7 @@ class AdversarialTraining(Defense):
 
     skip: float = 0.3
     attack: str = "pgd"
-    attack_params: str = "steps=2 step_size=1"
+    attack_params: str = "objective=collision steps=2 step_size=1"
     norm: Norm = "relative"
     budget: float = 0.1
     start: Literal["trained", "scratch"] = "trained"
@@ -93,7 +93,8 @@ class AdversarialTraining(Defense):
             decisions=self.decisions,
         )
         trained = victim.train(world, seed=seed, attack=loop, progress=progress)
-        return TrainedPolicy(trained.policy, {**trained.card, "defense": asdict(self)})
+        made_by = {"defense": asdict(self), "attack": asdict(attack), "threat": asdict(threat)}
+        return TrainedPolicy(trained.policy, {**trained.card, **made_by})
 
 
 def _word(word: str) -> tuple[str, str]:
