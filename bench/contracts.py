@@ -167,7 +167,7 @@ class AttackInLoop:
     Args:
         attack: called with (observation [B, V, F], policy, budget scale in (0, 1]) -> perturbed observation.
         skip: probability in [0, 1] with which a decision is left unattacked.
-        where: `acting`: the observations it acts on, which the replay buffer then keeps; `replay`: the observations drawn from the
+        where: `acting`: the observations it acts on, which the replay buffer then keeps; `replay`: those drawn from the
             replay buffer, afresh against the victim as it is now; or `both`.
         ramp: the shares of the training between which the budget grows from 0 to 1.
         start: weights to go on from, frame by frame; None trains from scratch.
