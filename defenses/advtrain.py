@@ -38,7 +38,7 @@ class AdversarialTraining(Defense):
 
     skip: float = 0.3
     attack: str = "pgd"
-    attack_params: str = "objective=collision steps=2 step_size=1"
+    attack_params: str = "objective=expected steps=2 step_size=1"
     norm: Norm = "relative"
     budget: float = 0.1
     start: Literal["trained", "scratch"] = "trained"
