@@ -31,7 +31,8 @@ class PGD(Attack):
         steps: gradient steps a restart, at least 1 (default 10).
         step_size: length of a step as a share of the radius, in (0, 2] (default 0.5).
         restarts: independent starts, at least 1, all in one batch (default 4).
-        random_start: begin at a random point of the set instead of the true observation (default true).
+        random_start: begin at a random point of the set instead of the true observation (default true). `margin` on a
+            continuous victim needs it: its gradient at the truth is 0.
         momentum: decay of the accumulated gradient (MI-FGSM, Dong et al. 2018), in [0, 1); 0 is plain PGD (default 0).
         objective: what is minimised (default `collision`). `expected`: the clean Q expected under the attacked policy (for
             a continuous victim its critic's Q(x, mu(x'))). `collision`: the same, but braking counts as the best action (a

@@ -117,7 +117,7 @@ class ZOSignSGD(Attack):
             count = min(self.directions, int(oracle.remaining[rows].min()) - base) if len(rows) else 0
             if count < 1:
                 break
-            directions = _directions(count, shape, generator)
+            directions = _directions(count, shape, generator).to(observation)
             probes = oracle.project(x + self.smoothing * oracle.radius[rows] * directions.unsqueeze(1), rows)
             points = torch.cat((x.unsqueeze(0), probes))
             scores = oracle.scores(points[1 - base :], rows)
@@ -151,8 +151,10 @@ class ZOSignSGD(Attack):
         """The loss of every point asked, and what the best is chosen by, both [..., B]; Eq. 4.10 for `thesis`."""
         if self.objective != "thesis":
             return loss(scores), loss.key(scores)
-        value = loss(scores).clamp(min=0) + self.distortion_weight * distortion(points, observation)
-        return value, value
+        size = distortion(points, observation)
+        value = loss(scores).clamp(min=0) + self.distortion_weight * size
+        # What hits the target comes before all that does not, the least distorted first.
+        return value, torch.where(loss.met(scores), -1 / (1 + size), value)
 
 
 def _running(keep: Tensor, rows: Tensor, x: Tensor, loss: Loss) -> tuple[Tensor, Tensor, Loss]:

@@ -1,0 +1,110 @@
+"""PGD: FGSM is its first step, more of it is never weaker, and it beats noise."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from attacks.noise import Noise
+from attacks.objectives import DiscreteLoss, Objective
+from attacks.pgd import PGD
+from bench.contracts import ActionType, Policy
+from bench.threat import ThreatModel, project
+from tests.attacks.victims import FEATURES, Linear, observations, perturb, victim
+
+OBJECTIVES: tuple[Objective, ...] = ("collision", "expected", "margin", "target")
+
+
+def loss_of(policy: Policy, objective: Objective, observation: torch.Tensor) -> DiscreteLoss:
+    return DiscreteLoss(
+        objective=objective, clean=policy.scores(observation), temperature=0.5, target_action=3, braking_action=4
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 999), st.sampled_from(OBJECTIVES))
+def test_one_whole_step_from_the_truth_is_fgsm(seed: int, objective: Objective) -> None:
+    threat, policy, observation = ThreatModel(budget=0.1), victim("discrete", seed), observations(8, seed)
+    leaf = observation.clone().requires_grad_(True)
+    loss_of(policy, objective, observation)(policy.scores(leaf)).sum().backward()
+    assert leaf.grad is not None
+    radius = threat.radius(observation, FEATURES)
+    fgsm = project(observation - radius * leaf.grad.sign(), observation, radius)
+    attack = PGD(steps=1, step_size=1.0, restarts=1, random_start=False, objective=objective)
+    shown, _ = perturb(attack, policy, observation, threat)
+    assert torch.equal(shown, fgsm)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 99), st.booleans())
+def test_pgd_finds_the_optimum_of_a_linear_victim(seed: int, random_start: bool) -> None:
+    policy, observation = Linear(seed), observations(8, seed)
+    attack = PGD(steps=5, step_size=1.0, restarts=1, objective="margin", random_start=random_start)
+    shown, _ = perturb(attack, policy, observation)
+    action = policy.decide(observation)
+    slope = policy.layer.weight[action] - policy.layer.weight[1 - action]
+    radius = ThreatModel(budget=0.2).radius(observation, FEATURES)
+    optimum = project(observation - radius * slope.view_as(observation).sign(), observation, radius)
+    torch.testing.assert_close(shown, optimum)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_pgd_beats_noise_on_its_objective(objective: Objective) -> None:
+    policy, observation = victim("discrete"), observations(300)
+    loss = loss_of(policy, objective, observation)
+    attacked = loss.key(policy.scores(perturb(PGD(objective=objective), policy, observation)[0]))
+    noisy = loss.key(policy.scores(perturb(Noise(), policy, observation)[0]))
+    clean = loss.key(policy.scores(observation))
+    assert float((attacked <= noisy).float().mean()) > 0.95
+    assert float((clean - attacked).mean()) > 2 * float((clean - noisy).mean())
+
+
+@pytest.mark.parametrize(
+    ("weak", "strong"),
+    [(PGD(restarts=1, steps=1), PGD(restarts=1, steps=10)), (PGD(restarts=1, steps=5), PGD(restarts=8, steps=5))],
+    ids=["steps", "restarts"],
+)
+def test_more_work_makes_a_stronger_attack(weak: PGD, strong: PGD) -> None:
+    policy, observation = victim("discrete"), observations(300)
+    loss = loss_of(policy, "collision", observation)
+    keys = [loss.key(policy.scores(perturb(attack, policy, observation)[0])).mean() for attack in (weak, strong)]
+    assert float(keys[1]) < float(keys[0])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 5), st.integers(1, 4), st.sampled_from(("discrete", "continuous")))
+def test_queries_are_the_clean_one_and_one_an_iterate(steps: int, restarts: int, action_type: ActionType) -> None:
+    _, spent = perturb(PGD(steps=steps, restarts=restarts), victim(action_type), observations(3))
+    assert spent.tolist() == [1 + restarts * (steps + 1)] * 3
+
+
+@pytest.mark.parametrize("queries", [0, 1, 2])
+def test_without_queries_for_a_step_it_shows_the_truth(queries: int) -> None:
+    observation = observations(4)
+    shown, _ = perturb(PGD(), victim("discrete"), observation, ThreatModel(queries=queries))
+    assert torch.equal(shown, observation)
+
+
+def test_collision_never_prefers_braking() -> None:
+    policy, observation = victim("discrete"), observations(400)
+    brakes = {
+        objective: float((policy.decide(perturb(PGD(objective=objective), policy, observation)[0]) == 4).float().mean())
+        for objective in ("collision", "expected")
+    }
+    assert brakes["collision"] < brakes["expected"]
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_a_continuous_victim_is_moved_where_the_objective_asks(objective: Objective) -> None:
+    policy, observation = victim("continuous"), observations(200)
+    shown, _ = perturb(PGD(objective=objective), policy, observation)
+    before, after = policy.decide(observation), policy.decide(shown)
+    if objective == "margin":
+        assert float((after - before).norm(dim=-1).mean()) > 0.1
+    elif objective == "target":
+        target = torch.tensor([1.0, 0.5])
+        assert float((after - target).norm(dim=-1).mean()) < float((before - target).norm(dim=-1).mean())
+    else:
+        assert float(policy.value(observation, after).mean()) < float(policy.value(observation, before).mean())

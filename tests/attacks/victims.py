@@ -1,0 +1,69 @@
+"""Small real victims, and highway observations for them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from bench.contracts import ActionType, Attack, Features, Policy
+from bench.threat import Oracle, ThreatModel
+from bench.victims.networks import ActorPolicy, QPolicy
+
+FEATURES = Features(
+    names=("x", "y", "vx", "vy"),
+    low=(-100.0, -20.0, -40.0, -20.0),
+    high=(100.0, 20.0, 40.0, 20.0),
+    units=("m", "m", "m/s", "m/s"),
+)
+
+
+class Linear(Policy):
+    """Q-values linear in the observation: its gradient is the same everywhere, so an attack's optimum is known."""
+
+    action_type = "discrete"
+
+    def __init__(self, seed: int, rows: int = 4) -> None:
+        super().__init__()
+        torch.manual_seed(seed)
+        self.layer = nn.Linear(rows * 5, 2)
+        self.requires_grad_(False)
+
+    def scores(self, observation: Tensor) -> Tensor:
+        return self.layer(observation.flatten(-2))
+
+
+def victim(action_type: ActionType, seed: int = 0) -> Policy:
+    """The project's own networks with random weights large enough that decisions vary, and a state value far from 0."""
+    torch.manual_seed(seed)
+    policy: Policy = QPolicy(5, 5, 16) if action_type == "discrete" else ActorPolicy(5, 16, 0.5)
+    with torch.no_grad():
+        for weight in policy.parameters():
+            weight.mul_(3.0)
+    return policy.requires_grad_(False).eval()
+
+
+def observations(count: int, seed: int = 0, rows: int = 4) -> Tensor:
+    """[count, rows, 5] of which some rows are absent; the ego's never is."""
+    generator = torch.Generator().manual_seed(seed)
+    measured = torch.rand(count, rows, 4, generator=generator) * 2 - 1
+    present = (torch.rand(count, rows, 1, generator=generator) > 0.3).float()
+    present[:, 0] = 1.0
+    return torch.cat((present, measured * present), -1)
+
+
+def open_oracle(
+    policy: Policy, attack: Attack, observation: Tensor, threat: ThreatModel | None = None, seed: int = 0
+) -> Oracle:
+    """An oracle with a step begun on `observation`."""
+    threat = threat or ThreatModel(budget=0.2)
+    oracle = Oracle(policy, threat, attack.access, FEATURES, torch.Generator().manual_seed(seed))
+    oracle.begin_step(observation)
+    return oracle
+
+
+def perturb(
+    attack: Attack, policy: Policy, observation: Tensor, threat: ThreatModel | None = None, seed: int = 0
+) -> tuple[Tensor, Tensor]:
+    """What the attack shows [B, V, F], and the queries it spent [B]."""
+    oracle = open_oracle(policy, attack, observation, threat, seed)
+    return attack.perturb(observation, oracle), oracle.spent
