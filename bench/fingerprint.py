@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib.util
 import json
 import os
 import platform
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, is_dataclass
 from functools import cache
 from importlib import metadata
@@ -15,26 +17,27 @@ from typing import Any
 
 LIBRARIES = ("torch", "torchrl", "tensordict", "highway-env", "numba", "numpy")
 
-BESIDE_THE_RESULT = (
-    "cli.py",
-    "cli_",
-    "config.py",
-    "console.py",
-    "errors.py",
-    "fingerprint.py",
-    "metrics.py",
-    "pair.py",
-    "parameters.py",
-    "plan.py",
-    "recording",
-    "registry.py",
-    "replay.py",
-    "results.py",
-    "runner.py",
-    "statistics.py",
-    "words.py",
+BESIDE_THE_RESULT = frozenset(
+    [
+        "config",
+        "console",
+        "errors",
+        "fingerprint",
+        "metrics",
+        "pair",
+        "parameters",
+        "plan",
+        "process",
+        "recording",
+        "registry",
+        "replay",
+        "results",
+        "runner",
+        "statistics",
+        "words",
+    ]
 )
-"""Files of `bench`, by how their names begin, that choose, store or show results: editing them outdates no record."""
+"""Modules of `bench` that choose, store or show results: editing them outdates no record."""
 
 
 def canonical(value: Any) -> str:
@@ -50,22 +53,60 @@ def digest(value: Any) -> str:
 
 
 @cache
-def source_digest(package: str) -> str:
-    """sha256 over names and contents of a top-level package's Python files; of `bench`, those that make results."""
-    spec = importlib.util.find_spec(package)
-    roots = [Path(root) for root in (spec.submodule_search_locations or ())] if spec else []
-    files = {str(path.relative_to(root)): path for root in roots for path in root.rglob("*.py")}
-    if spec and spec.origin and not roots:
-        files = {Path(spec.origin).name: Path(spec.origin)}
-    if package == __name__.partition(".")[0]:
-        files = {name: path for name, path in files.items() if not name.startswith(BESIDE_THE_RESULT)}
+def code_digest(modules: tuple[str, ...]) -> str:
+    """sha256 over the names and contents of `sources(modules)`."""
+    files = sources(modules)
     return digest({name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()})
 
 
-@cache
-def code_digest(packages: tuple[str, ...]) -> str:
-    """`source_digest` of several packages at once, in any order."""
-    return digest({package: source_digest(package) for package in packages})
+def sources(modules: Iterable[str]) -> dict[str, Path]:
+    """The files that modules are made of: their own and those they import, anywhere in their code and at any remove.
+
+    Imports are followed within the modules' own top-level packages and `bench`, without those `BESIDE_THE_RESULT`; other
+    packages count by their version.
+    """
+    waiting = list(modules)
+    packages = {"bench", *(name.partition(".")[0] for name in waiting)}
+    found: dict[str, Path] = {}
+    while waiting:
+        name = waiting.pop()
+        path = _file(name)
+        package, *inner = name.split(".")
+        beside = package == "bench" and bool(inner) and inner[0] in BESIDE_THE_RESULT
+        if path is None or name in found or beside:
+            continue
+        found[name] = path
+        imported = (*_imports(name, path), name.rpartition(".")[0])
+        waiting += [other for other in imported if other.partition(".")[0] in packages]
+    return found
+
+
+def _file(module: str) -> Path | None:
+    """Where a module's code is, without importing it or its parents; None where there is no such module."""
+    top, *inner = module.split(".")
+    spec = importlib.util.find_spec(top)
+    if spec is None:
+        return None
+    if spec.submodule_search_locations is None:
+        return Path(spec.origin) if spec.origin and not inner else None
+    candidates = (
+        path
+        for root in spec.submodule_search_locations
+        for path in (Path(root, *inner, "__init__.py"), Path(root, *inner).with_suffix(".py"))
+    )
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _imports(module: str, path: Path) -> Iterator[str]:
+    """Every name that the import statements of a module mention, whether it is a module's or not."""
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+            yield base
+            yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
 @cache

@@ -40,8 +40,8 @@ class Unit:
 
     @property
     def code_digest(self) -> str:
-        """Of the source of the packages the unit is computed by: the framework's own and its components'."""
-        return code_digest(("bench", *sorted(type(part.component).__module__.partition(".")[0] for part in self.parts)))
+        """Of the source that computes the unit: the framework's and its components', with what they import."""
+        return code_digest((__name__, *sorted(type(part.component).__module__ for part in self.parts)))
 
     @property
     def parts(self) -> tuple[Chosen[Any], ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,8 @@ LINE = "attack=nudge victim=toy world=toy lanes=3 density=1 weather=clear episod
 
 
 def first(*more: str) -> Unit:
-    return plan(run_config([*LINE.split(), *more]))[0]
+    words = dict(word.split("=", 1) for word in [*LINE.split(), *more])
+    return plan(run_config([f"{key}={value}" for key, value in words.items()]))[0]
 
 
 @pytest.mark.parametrize(
@@ -62,27 +64,50 @@ def test_other_library_versions_are_another_unit(monkeypatch: pytest.MonkeyPatch
     assert unit.fingerprint != before
 
 
-def test_the_source_of_a_plugin_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_source_of_a_component_and_of_what_it_imports_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     package = tmp_path / "some_plugin"
     package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "attack.py").write_text("a = 1\n")
-    before = fingerprint.source_digest("some_plugin")
-    fingerprint.source_digest.cache_clear()
-    assert fingerprint.source_digest("some_plugin") == before
-    fingerprint.source_digest.cache_clear()
-    (package / "attack.py").write_text("a = 2\n")
-    assert fingerprint.source_digest("some_plugin") != before
-    fingerprint.source_digest.cache_clear()
+    files = {
+        "__init__": "",
+        "attack": "import json\nfrom some_plugin.loss import hinge\ndef f():\n    from . import late\n",
+        "loss": "from .deep import a, b\n",
+        "deep": "a = b = 1\n",
+        "late": "",
+        "unrelated": "",
+    }
+    for name, text in files.items():
+        (package / f"{name}.py").write_text(text)
+
+    def digest() -> str:
+        fingerprint.code_digest.cache_clear()
+        return fingerprint.code_digest(("some_plugin.attack",))
+
+    before = digest()
+    assert digest() == before
+    for name, text in files.items():
+        (package / f"{name}.py").write_text(text + "# changed\n")
+        assert (digest() == before) == (name == "unrelated"), name
+        (package / f"{name}.py").write_text(text)
+    assert digest() == before
 
 
-def test_every_file_of_the_framework_either_counts_or_is_named_as_beside_the_result() -> None:
-    root = Path(fingerprint.__file__).parent
-    counted = {path.name for path in root.glob("*.py") if not path.name.startswith(fingerprint.BESIDE_THE_RESULT)}
-    assert counted >= {"contracts.py", "pipeline.py", "rollout.py", "scenario.py", "threat.py", "unit.py"}
-    for prefix in fingerprint.BESIDE_THE_RESULT:
-        assert any(path.name.startswith(prefix) for path in root.iterdir()), f"{prefix} is gone: take it off the list"
+def test_the_code_of_a_unit_is_what_computes_it_and_nothing_else() -> None:
+    modules = [type(part.component).__module__ for part in first("world=highway", "attack=pgd", "victim=idm").parts]
+    counted = set(fingerprint.sources(["bench.unit", *modules]))
+    assert counted >= {
+        *(f"bench.{name}" for name in ("contracts", "pipeline", "rollout", "scenario", "threat", "unit")),
+        *("attacks.pgd", "attacks.objectives", "defenses.none", "bench.victims.reference"),
+        *("envs.highway.world", "envs.highway.batched", "envs.highway.engine", "envs.highway.sensor"),
+    }
+    assert not counted & {"attacks.zo", "bench.victims.dqn", "bench.results", "bench.cli", "leaderboard"}
+
+
+def test_every_module_that_is_beside_the_result_exists() -> None:
+    for name in fingerprint.BESIDE_THE_RESULT:
+        assert importlib.util.find_spec(f"bench.{name}"), f"{name} is gone: take it off the list"
 
 
 def test_canonical_json_does_not_depend_on_the_order_of_keys() -> None:
