@@ -1,0 +1,124 @@
+"""How much faster the batched ZO-SignSGD is than the loop of the thesis. One command:
+
+    python benchmarks/attack_speed.py [--episodes 128] [--steps 100] [--directions 20] [--rounds 3]
+
+Both attack the same network with the same number of queries, in turns, in one process and one thread. The thesis' loop is
+written as Algorithm 4 prints it: one environment, one direction after the other, one query after the other. What is compared
+is the wall time of one attacked step of one episode. A second line has the attack as `bench run attack=zo` runs it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from attacks.zo import ZOSignSGD
+from bench.contracts import Attack, Policy
+from bench.pipeline import AttackModule
+from bench.process import settle
+from bench.scenario import Cell, SeedBlock
+from bench.threat import ThreatModel
+from bench.victims.networks import QPolicy
+from envs.highway.world import HighwayWorld
+
+SMOOTHING, STEP_SIZE, FASTER = 0.01, 0.01, 3
+
+
+class SequentialZO:
+    """Algorithm 4 of the thesis: unconstrained, Eq. 4.10 towards FASTER, and not a tensor operation more than it asks for."""
+
+    def __init__(self, policy: Policy, steps: int, directions: int) -> None:
+        self.policy, self.steps, self.directions = policy, steps, directions
+        self.queries = 0
+
+    def loss(self, x: Tensor, observation: Tensor) -> Tensor:
+        """Eq. 4.10, one query."""
+        self.queries += 1
+        scores = self.policy.scores(x)
+        return (scores.amax() - scores[FASTER]).abs() + ((x - observation) ** 2).norm()
+
+    def estimate(self, x: Tensor, observation: Tensor) -> Tensor:
+        """GradEstimate(x, mu, q, d)."""
+        gradient, here = torch.zeros_like(x), self.loss(x, observation)
+        for _ in range(self.directions):
+            u = torch.randn(x.shape)
+            u = u / u.norm()
+            gradient += x.numel() * (self.loss(x + SMOOTHING * u, observation) - here) / SMOOTHING * u
+        return gradient
+
+    def perturb(self, observation: Tensor) -> Tensor:
+        """optimization(x): one observation [V, F]."""
+        x = observation
+        for _ in range(self.steps):
+            x = x - STEP_SIZE * self.estimate(x, observation).sign()
+        return x
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--episodes", type=int, default=128, help="batch size of the batched attack")
+    parser.add_argument("--steps", type=int, default=100, help="iterations T of both")
+    parser.add_argument("--directions", type=int, default=20, help="random directions q of both")
+    parser.add_argument("--rounds", type=int, default=3)
+    words = parser.parse_args()
+    settle()
+    torch.manual_seed(0)
+    world, policy = HighwayWorld(), QPolicy(5, 5, 64).requires_grad_(False).eval()
+    observation = _observations(world, words.episodes)
+    same = ZOSignSGD(objective="thesis", steps=words.steps, directions=words.directions, early_stop=False)
+    batched = _batched(same, policy, world, observation)
+    usual = _batched(ZOSignSGD(), policy, world, observation)
+    loop = SequentialZO(policy, words.steps, words.directions)
+    seconds: dict[str, list[float]] = {"loop": [], "batched": [], "usual": []}
+    for index in range(words.rounds + 1):
+        alone = observation[index % words.episodes]
+        taken = {
+            "loop": _timed(lambda alone=alone: loop.perturb(alone)),  # type: ignore[misc]
+            "batched": _timed(batched) / words.episodes,
+            "usual": _timed(usual) / words.episodes,
+        }
+        for name, value in taken.items():
+            seconds[name].append(value)
+    # The first round warms the caches up.
+    milliseconds = {name: statistics.median(values[1:]) * 1000 for name, values in seconds.items()}
+    queries = words.steps * (words.directions + 1)
+    print(f"one attacked step of one episode, median of {words.rounds} rounds in turns, one thread")
+    print(f"  thesis' loop, {queries} queries         {milliseconds['loop']:10.3f} ms")
+    for name, what in (("batched", f"{queries} queries"), ("usual", "attack=zo")):
+        label = f"batch of {words.episodes}, {what}"
+        print(
+            f"  {label:<30}  {milliseconds[name]:10.3f} ms   {milliseconds['loop'] / milliseconds[name]:6.0f} times faster"
+        )
+
+
+def _observations(world: HighwayWorld, episodes: int) -> Tensor:
+    """[episodes, V, F] the start of as many episodes."""
+    env = world.make([Cell(lanes=3, density=1.0)] * episodes)
+    seeds = torch.arange(SeedBlock.TUNE, SeedBlock.TUNE + episodes)
+    observation: Tensor = env.reset(TensorDict({"seed": seeds}, batch_size=env.batch_size))["observation"]
+    return observation
+
+
+def _batched(attack: Attack, policy: Policy, world: HighwayWorld, observation: Tensor) -> Callable[[], object]:
+    """A step of the pipeline, with the oracle and everything it enforces."""
+    module = AttackModule(attack, policy, ThreatModel(queries=1_000_000), world.features, seed=0)
+    done = torch.zeros(len(observation), 1, dtype=torch.bool)
+    step = TensorDict({"observation": observation, "done": done}, batch_size=[len(observation)])
+    return lambda: module(step)
+
+
+def _timed(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+if __name__ == "__main__":
+    with torch.no_grad():
+        main()
