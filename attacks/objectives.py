@@ -97,15 +97,16 @@ class DiscreteLoss:
             return -margin(scores, torch.full(scores.shape[-2:-1], self.target_action))
         return expected(scores, self._worth(), self.temperature)
 
-    def key(self, scores: Tensor) -> Tensor:
-        """What the best of several asked points is chosen by, [..., B], lower is better.
+    def key(self, scores: Tensor, loss: Tensor | None = None) -> Tensor:
+        """What the best of several asked points is chosen by, [..., B], lower is better; `loss` is that of the `scores`, if known.
 
         The victim takes its greedy action, so an expectation is compared by what that action is worth, and the loss decides
         between points where it is the same. Elsewhere it is the loss.
         """
+        loss = self(scores) if loss is None else loss
         if self.objective in ("margin", "target"):
-            return self(scores)
-        return self._given(scores) + TIE_BREAK * self(scores)
+            return loss
+        return self._given(scores) + TIE_BREAK * loss
 
     def met(self, scores: Tensor) -> Tensor:
         """Whether the victim already does what the attacker wants, bool [..., B]."""
@@ -147,9 +148,9 @@ class ContinuousLoss:
             return -distance(scores, self.clean)
         return distance(scores, torch.tensor(self.target).to(scores))
 
-    def key(self, scores: Tensor) -> Tensor:
+    def key(self, scores: Tensor, loss: Tensor | None = None) -> Tensor:
         """What the best of several asked points is chosen by: the loss."""
-        return self(scores)
+        return self(scores) if loss is None else loss
 
     def met(self, scores: Tensor) -> Tensor:
         """Whether the victim already does what the attacker wants, bool [..., B]."""

@@ -30,8 +30,8 @@ class ZOSignSGD(Attack):
     Distance: L-inf in shares of the threat model's radius, feature by feature.
 
     Args:
-        steps: iterations T, at least 1 (default 5).
-        directions: random directions q, at least 1 (default 20).
+        steps: iterations T, at least 1 (default 4).
+        directions: random directions q, at least 1 (default 16).
         smoothing: mu, length of a probe as a share of the radius, in (0, 2] (default 1).
         step_size: delta as a share of the radius, in (0, 2] (default 1).
         objective: what is minimised (default `collision`). `expected`: the clean Q expected under the attacked policy.
@@ -61,8 +61,8 @@ class ZOSignSGD(Attack):
 
     access: ClassVar[Access] = "scores"
 
-    steps: int = 5
-    directions: int = 20
+    steps: int = 4
+    directions: int = 16
     smoothing: float = 1.0
     step_size: float = 1.0
     objective: ZOObjective = "collision"
@@ -150,7 +150,8 @@ class ZOSignSGD(Attack):
     def _value(self, loss: Loss, scores: Tensor, points: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
         """The loss of every point asked, and what the best is chosen by, both [..., B]; Eq. 4.10 for `thesis`."""
         if self.objective != "thesis":
-            return loss(scores), loss.key(scores)
+            value = loss(scores)
+            return value, loss.key(scores, value)
         size = distortion(points, observation)
         value = loss(scores).clamp(min=0) + self.distortion_weight * size
         # What hits the target comes before all that does not, the least distorted first.

@@ -172,6 +172,7 @@ class AttackInLoop:
         ramp: the shares of the training between which the budget grows from 0 to 1.
         start: weights to go on from, frame by frame; None trains from scratch.
         decisions: of the further training, where there is a `start`.
+        consistency: weight of the loss that asks for the same decision under attack as on the truth; see `Learner.update`.
     """
 
     attack: Callable[[Tensor, Policy, float], Tensor]
@@ -180,6 +181,7 @@ class AttackInLoop:
     ramp: tuple[float, float] = (0.2, 0.5)
     start: Policy | None = None
     decisions: int = 0
+    consistency: float = 0.0
 
 
 class Attack(ABC):

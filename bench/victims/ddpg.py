@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
-from bench.contracts import ActionType, Policy
+from bench.contracts import ActionType, AttackInLoop, Policy
 from bench.victims.networks import ActorPolicy
 from bench.victims.training import CHUNK, Learner, LearningDriver, Phase, target_state
 
@@ -34,6 +34,9 @@ class DDPG(LearningDriver):
 
     policy_type = ActorPolicy
 
+    # Smaller and shorter than the DQN's: actor and critic learn in turns, and it is the clock that ends it.
+    decisions: int = 24_000
+    hidden: int = 64
     steering_limit: float = 0.1
     noise: float = 0.15
     actor_delay: int = 2
@@ -54,12 +57,13 @@ class DDPG(LearningDriver):
     def zoo_name(self) -> str:
         return "ddpg"
 
-    def learner(self, env: EnvBase, start: Policy | None) -> Learner:
-        return _ActorCriticLearner(self, env, start)
+    def learner(self, env: EnvBase, attack: AttackInLoop | None) -> Learner:
+        return _ActorCriticLearner(self, env, attack)
 
 
 class _ActorCriticLearner(Learner):
-    def __init__(self, recipe: DDPG, env: EnvBase, start: Policy | None) -> None:
+    def __init__(self, recipe: DDPG, env: EnvBase, attack: AttackInLoop | None) -> None:
+        start = attack.start if attack else None
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: ActorPolicy = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
         self.mean = ActorPolicy(features, recipe.hidden, recipe.steering_limit)

@@ -13,11 +13,13 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
-from bench.contracts import ActionType, Policy
+from bench.contracts import ActionType, AttackInLoop, Policy
 from bench.victims.networks import QPolicy
 from bench.victims.training import CHUNK, Learner, LearningDriver, Phase, target_state
 
 ACTIONS = 5
+TEMPERATURE = 0.5
+"""Of the decisions that are compared, in standard deviations of the Q-values over the actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,13 +49,16 @@ class DQN(LearningDriver):
     def zoo_name(self) -> str:
         return "dqn"
 
-    def learner(self, env: EnvBase, start: Policy | None) -> Learner:
-        return _QLearner(self, env, start)
+    def learner(self, env: EnvBase, attack: AttackInLoop | None) -> Learner:
+        return _QLearner(self, env, attack)
 
 
 class _QLearner(Learner):
-    def __init__(self, recipe: DQN, env: EnvBase, start: Policy | None) -> None:
+    def __init__(self, recipe: DQN, env: EnvBase, attack: AttackInLoop | None) -> None:
         self.recipe, self.gap = recipe, 0.0
+        start = attack.start if attack else None
+        self.consistency = attack.consistency if attack else 0.0
+        self.teacher = start
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: QPolicy = QPolicy(features, ACTIONS, recipe.hidden)
         self.mean = QPolicy(features, ACTIONS, recipe.hidden)
@@ -85,7 +90,10 @@ class _QLearner(Learner):
             sample["next", "reward"] -= self.gap * self._disadvantage(sample)
         self.adam.param_groups[0]["lr"] = learning_rate
         self.adam.zero_grad()
-        self.loss(sample)["loss"].backward()
+        loss = self.loss(sample)["loss"]
+        if self.consistency > 0 and "truth" in sample.keys():
+            loss = loss + self.consistency * self._inconsistency(sample)
+        loss.backward()
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
         self.adam.step()
         self.target.step()
@@ -95,6 +103,15 @@ class _QLearner(Learner):
         """V(s) - Q(s, a) [N, 1]: what advantage learning takes from the reward (Bellemare et al. 2016, Eq. 6)."""
         values = self.policy.scores(sample["observation"])
         return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
+
+    def _inconsistency(self, sample: TensorDictBase) -> torch.Tensor:
+        """Mean divergence of the decision under attack from the target network's on the truth (TRADES, Zhang et al. 2019)."""
+        with torch.no_grad():
+            values = self.teacher.scores(sample["truth"])
+            tau = TEMPERATURE * values.std(-1, keepdim=True).clamp(min=1e-6)
+            wanted = torch.softmax(values / tau, -1)
+        shown = self.policy.scores(sample["observation"]) / tau
+        return torch.nn.functional.kl_div(torch.log_softmax(shown, -1), wanted, reduction="batchmean")
 
     def anneal(self) -> None:
         self.greedy.step()

@@ -27,9 +27,12 @@ class Encoder(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         ego, cars = observation[..., 0, 1:], observation[..., 1:, :]
-        hidden = (self.car(cars) + self.ego(ego).unsqueeze(-2)).relu()
-        response = self.pair(hidden).relu() * cars[..., :1]
-        return torch.cat((ego, response.amax(-2)), -1)
+        # One product on contiguous rows: half again as fast as one a layer, and these are what an attack's queries cost.
+        rows = torch.cat((cars, ego.unsqueeze(-2).expand(*cars.shape[:-1], -1)), -1)
+        weight = torch.cat((self.car.weight, self.ego.weight), 1)
+        hidden = nn.functional.linear(rows, weight, self.car.bias).relu_()
+        response = (self.pair(hidden) * cars[..., :1]).amax(-2).relu()
+        return torch.cat((ego, response), -1)
 
 
 class QNetwork(nn.Module):

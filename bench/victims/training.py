@@ -153,8 +153,8 @@ class LearningDriver(Victim):
         return whole[1:] if started else whole
 
     @abstractmethod
-    def learner(self, env: EnvBase, start: Policy | None) -> Learner:
-        """The algorithm on `env`, from fresh weights or from `start`."""
+    def learner(self, env: EnvBase, attack: AttackInLoop | None) -> Learner:
+        """The algorithm on `env`, from fresh weights or from `attack.start`."""
 
     def train(
         self, world: World, *, seed: int, attack: AttackInLoop | None = None, progress: Progress
@@ -169,7 +169,7 @@ class LearningDriver(Victim):
         for number, phase in enumerate(phases):
             env = world.make(roads(self.copies), action_type=self.action_type, action_repeat=phase.repeat)
             env.set_seed(SeedBlock.TRAIN * (seed + 1) + number * SeedBlock.REPORT)
-            learner = learner or self.learner(env, attack.start if attack else None)
+            learner = learner or self.learner(env, attack)
             learner.enter(phase)
             practice = Practice(env, learner, self, phase, attack, generator)
             for taken in range(CHUNK, phase.decisions + 1, CHUNK):
@@ -242,6 +242,7 @@ class Practice:
         """A batch of transitions, attacked afresh where the defence attacks the replay."""
         sample = self.buffer.sample()
         if self.attack is not None and self.attack.where != "acting":
+            sample.set("truth", sample["observation"])
             sample.set("observation", self.perturbed(sample["observation"], share))
         return sample
 
