@@ -98,7 +98,7 @@ class DiscreteLoss:
         return expected(scores, self._worth(), self.temperature)
 
     def key(self, scores: Tensor, loss: Tensor | None = None) -> Tensor:
-        """What the best of several asked points is chosen by, [..., B], lower is better; `loss` is that of the `scores`, if known.
+        """What the best of several asked points is chosen by, [..., B], lower is better; `loss` is that of `scores`, if known.
 
         The victim takes its greedy action, so an expectation is compared by what that action is worth, and the loss decides
         between points where it is the same. Elsewhere it is the loss.

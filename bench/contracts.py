@@ -172,7 +172,7 @@ class AttackInLoop:
         ramp: the shares of the training between which the budget grows from 0 to 1.
         start: weights to go on from, frame by frame; None trains from scratch.
         decisions: of the further training, where there is a `start`.
-        consistency: weight of the loss that asks for the same decision under attack as on the truth; see `Learner.update`.
+        consistency: weight, beside the victim's own loss, of deciding under attack what `start` decides on the truth.
     """
 
     attack: Callable[[Tensor, Policy, float], Tensor]

@@ -80,6 +80,10 @@ class Pair:
                 f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}: "
                 f"it needs {' or '.join(attack.action_types)} actions, the victim's are {victim.action_type}"
             )
+        if not victim.sees and not self.is_clean:
+            raise UserError(
+                f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}, which ignores what it is shown"
+            )
         if not self.threat.allows(attack.access):
             raise UserError(
                 f"attack {self.attack.name!r} needs access {attack.access!r}, the threat model allows "

@@ -30,6 +30,8 @@ class AdversarialTraining(Defense):
         budget: size of that set once the ramp is over.
         start: `trained` goes on from the victim of the same training seed, `scratch` trains a new one.
         decisions: of the further training, on every road at once; with `scratch` it is the victim's own.
+        consistency: weight, beside the victim's own loss, of deciding under attack what the victim it started from decides on
+            the truth (TRADES, Zhang et al. 2019); 0 is the thesis' algorithm. Nothing to be consistent with from `scratch`.
         where: `acting` attacks the observations it acts on, which the replay buffer keeps as they were then, as in the thesis;
             `replay` attacks those drawn from the buffer, afresh against the policy as it is now; `both` does both.
         ramp_from: share of the training after which the budget begins to grow from 0.
@@ -38,20 +40,23 @@ class AdversarialTraining(Defense):
 
     skip: float = 0.3
     attack: str = "pgd"
-    attack_params: str = "objective=expected steps=2 step_size=1"
+    attack_params: str = "steps=1 step_size=1 temperature=1"
     norm: Norm = "relative"
     budget: float = 0.1
     start: Literal["trained", "scratch"] = "trained"
     decisions: int = 8_000
+    consistency: float = 0.1
     where: Literal["acting", "replay", "both"] = "both"
     ramp_from: float = 0.0
-    ramp_to: float = 0.4
+    ramp_to: float = 0.3
 
     def __post_init__(self) -> None:
         if not 0 <= self.skip <= 1:
             raise ValueError(f"skip must be between 0 and 1, got {self.skip}")
         if self.decisions < 1:
             raise ValueError(f"decisions must be at least 1, got {self.decisions}")
+        if not self.consistency >= 0:
+            raise ValueError(f"consistency must be at least 0, got {self.consistency}")
         if not 0 <= self.ramp_from <= self.ramp_to <= 1:
             raise ValueError(
                 f"ramp_from and ramp_to must be in order between 0 and 1, got {self.ramp_from} and {self.ramp_to}"
@@ -91,6 +96,7 @@ class AdversarialTraining(Defense):
             ramp=(self.ramp_from, self.ramp_to),
             start=victim.load(seed) if self.start == "trained" else None,
             decisions=self.decisions,
+            consistency=self.consistency,
         )
         trained = victim.train(world, seed=seed, attack=loop, progress=progress)
         made_by = {"defense": asdict(self), "attack": asdict(attack), "threat": asdict(threat)}

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from rich.console import Console
 
 from bench import results
 from bench.results import SCHEMA
@@ -48,4 +49,4 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("file", type=Path)
     words = parser.parse_args()
-    print(f"{publish(words.folder, words.file)} episodes in {words.file}")
+    Console().print(f"{publish(words.folder, words.file)} episodes in {words.file}")

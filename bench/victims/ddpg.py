@@ -69,6 +69,7 @@ class _ActorCriticLearner(Learner):
         self.mean = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
         if start is not None:
             self.policy.load_state_dict(start.state_dict())
+        self.teacher, self.consistency = start, attack.consistency if attack else 0.0
         self.delay, self.updates = recipe.actor_delay, 0
         limit = self.policy.actor.limit
         actor = TensorDictModule(self.policy.actor, in_keys=["observation"], out_keys=["action"])
@@ -105,8 +106,18 @@ class _ActorCriticLearner(Learner):
         _descend(self.critic_adam, value, learning_rate)
         if self.updates % self.delay == 0:
             actor, _ = self.loss.actor_loss(sample)
+            if self.teacher is not None and self.consistency > 0:
+                actor = actor + self.consistency * self._distance(self.teacher, sample)
             _descend(self.actor_adam, actor, learning_rate)
             self.target.step()
+
+    def _distance(self, teacher: Policy, sample: TensorDictBase) -> torch.Tensor:
+        """Mean squared distance of the action on what is shown from the teacher's on the truth, in shares of the limits."""
+        with torch.no_grad():
+            wanted = teacher.scores(sample["truth"])
+        with self.loss.actor_network_params.to_module(self.loss.actor_network):
+            shown = self.loss.actor_network.module(sample["observation"])
+        return ((shown - wanted) / self.policy.actor.limit).square().mean()
 
     def anneal(self) -> None:
         self.noise.step()

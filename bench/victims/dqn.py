@@ -19,7 +19,7 @@ from bench.victims.training import CHUNK, Learner, LearningDriver, Phase, target
 
 ACTIONS = 5
 TEMPERATURE = 0.5
-"""Of the decisions that are compared, in standard deviations of the Q-values over the actions."""
+"""Of the decisions compared in adversarial training, in standard deviations of the Q-values over the actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +57,7 @@ class _QLearner(Learner):
     def __init__(self, recipe: DQN, env: EnvBase, attack: AttackInLoop | None) -> None:
         self.recipe, self.gap = recipe, 0.0
         start = attack.start if attack else None
-        self.consistency = attack.consistency if attack else 0.0
-        self.teacher = start
+        self.teacher, self.consistency = start, attack.consistency if attack else 0.0
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: QPolicy = QPolicy(features, ACTIONS, recipe.hidden)
         self.mean = QPolicy(features, ACTIONS, recipe.hidden)
@@ -91,8 +90,8 @@ class _QLearner(Learner):
         self.adam.param_groups[0]["lr"] = learning_rate
         self.adam.zero_grad()
         loss = self.loss(sample)["loss"]
-        if self.consistency > 0 and "truth" in sample.keys():
-            loss = loss + self.consistency * self._inconsistency(sample)
+        if self.teacher is not None and self.consistency > 0:
+            loss = loss + self.consistency * _divergence(self.policy, self.teacher, sample)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
         self.adam.step()
@@ -104,18 +103,23 @@ class _QLearner(Learner):
         values = self.policy.scores(sample["observation"])
         return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
 
-    def _inconsistency(self, sample: TensorDictBase) -> torch.Tensor:
-        """Mean divergence of the decision under attack from the target network's on the truth (TRADES, Zhang et al. 2019)."""
-        with torch.no_grad():
-            values = self.teacher.scores(sample["truth"])
-            tau = TEMPERATURE * values.std(-1, keepdim=True).clamp(min=1e-6)
-            wanted = torch.softmax(values / tau, -1)
-        shown = self.policy.scores(sample["observation"]) / tau
-        return torch.nn.functional.kl_div(torch.log_softmax(shown, -1), wanted, reduction="batchmean")
-
     def anneal(self) -> None:
         self.greedy.step()
 
     def averaged(self) -> Policy:
         self.mean.network.load_state_dict(target_state(self.loss.target_value_network_params, self.mean.network))
         return self.mean
+
+
+def _divergence(policy: Policy, teacher: Policy, sample: TensorDictBase) -> torch.Tensor:
+    """Mean KL divergence of what `policy` decides on what it is shown from what `teacher` decides on the truth.
+
+    The regulariser of TRADES (Zhang et al. 2019, Eq. 5), with a teacher that stays as it is. Decisions are softmax(Q / tau), tau
+    a share of the spread of the teacher's Q-values.
+    """
+    with torch.no_grad():
+        values = teacher.scores(sample["truth"])
+        tau = TEMPERATURE * values.std(-1, keepdim=True).clamp(min=torch.finfo(values.dtype).tiny)
+        wanted = torch.softmax(values / tau, -1)
+    shown = torch.log_softmax(policy.scores(sample["observation"]) / tau, -1)
+    return torch.nn.functional.kl_div(shown, wanted, reduction="batchmean")

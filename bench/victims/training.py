@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -100,7 +101,7 @@ class LearningDriver(Victim):
         copies: of each of the six roads, driven at once.
         memory: transitions in the replay buffer.
         tau: rate of the target networks' soft update.
-        checkpoints: candidates for the final weights, spread over the last `fine` of the training.
+        checkpoints: candidates for the final weights, spread over the last `fine` of the training; half as many under attack.
     """
 
     learns: ClassVar[bool] = True
@@ -181,7 +182,7 @@ class LearningDriver(Victim):
                     rate = self.learning_rate * max(0.05, min(1.0 if len(phases) > 1 else 0.5, 2 * (1 - share)))
                     for _ in range(CHUNK * self.updates):
                         learner.update(practice.sample(share), rate)
-                if phase.repeat == 1 and self._due(done / total, len(best.history)):
+                if phase.repeat == 1 and self._due(done / total, len(best.history), bool(attack)):
                     best.offer(learner.averaged(), done / total)
                 progress(done / total, f"safe_progress {best.score:.2f}" if best.history else "")
             attacked += practice.attacked
@@ -190,9 +191,10 @@ class LearningDriver(Victim):
         card["cpu_seconds"] = round(time.process_time() - started, 1)
         return TrainedPolicy(best.restore(learner.averaged()), card)
 
-    def _due(self, share: float, offered: int) -> bool:
+    def _due(self, share: float, offered: int, attacked: bool) -> bool:
         """Whether another checkpoint is due; they are spread over the last `fine` of the training."""
-        return share >= 1 - self.fine * (1 - (offered + 1) / self.checkpoints) - 1e-9
+        checkpoints = math.ceil(self.checkpoints / 2) if attacked else self.checkpoints
+        return share >= 1 - self.fine * (1 - (offered + 1) / checkpoints) - 1e-9
 
 
 class Practice:
@@ -239,10 +241,10 @@ class Practice:
             self.buffer.extend(transitions.exclude("gamma", "nonterminal", ("next", "original_reward")).reshape(-1))
 
     def sample(self, share: float) -> TensorDictBase:
-        """A batch of transitions, attacked afresh where the defence attacks the replay."""
+        """A batch of transitions, attacked afresh where the defence attacks the replay; `truth` is what was remembered."""
         sample = self.buffer.sample()
+        sample.set("truth", sample["observation"])
         if self.attack is not None and self.attack.where != "acting":
-            sample.set("truth", sample["observation"])
             sample.set("observation", self.perturbed(sample["observation"], share))
         return sample
 
@@ -339,8 +341,9 @@ class Best:
         scores = {"clean": selection_score(policy, self.world, self.episodes)}
         loop = self.attack
         if loop is not None and loop.skip < 1:
+            # An attacked episode costs more than ten clean ones.
             scores["attacked"] = selection_score(
-                policy, self.world, self.episodes, lambda observation: loop.attack(observation, policy, 1.0)
+                policy, self.world, self.episodes // 3, lambda observation: loop.attack(observation, policy, 1.0)
             )
         score = sum(found["mean"] for found in scores.values()) / len(scores)
         self.history.append((round(share, 3), round(score, 4)))
