@@ -5,9 +5,11 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,10 +17,11 @@ from hypothesis.extra.numpy import arrays
 from rich.console import Console
 from synthetic import CLEAR, drive, reference_drivers
 
+from bench import results
 from bench.config import run_config
 from bench.results import SCHEMA
 from leaderboard import thesis_records
-from leaderboard.published import published
+from leaderboard.published import publish, published
 from leaderboard.thesis import printed, thesis_report
 from leaderboard.thesis_records import Source, Wanted
 from leaderboard.trend import trend
@@ -128,6 +131,16 @@ def test_published_records_fill_what_the_user_has_not_and_are_marked() -> None:
 
 def test_published_records_have_the_schema_of_records() -> None:
     assert published().schema.names == SCHEMA.names
+
+
+def test_what_is_published_is_what_was_recorded(tmp_path: Path) -> None:
+    recorded = drive(cells=CLEAR)
+    results.prepare(tmp_path)
+    results.write(tmp_path, recorded)
+    assert publish(tmp_path, tmp_path / "published.parquet") == recorded.num_rows
+    shipped = pq.read_table(tmp_path / "published.parquet")
+    assert shipped.schema.equals(SCHEMA)
+    assert sorted(shipped["safe_progress"].to_pylist()) == sorted(recorded["safe_progress"].to_pylist())
 
 
 def test_the_report_reads_published_records(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from bench import registry
 from bench.contracts import AttackInLoop, World
 from bench.victims import zoo
 from bench.victims.ddpg import DDPG
 from bench.victims.dqn import DQN
+from bench.victims.networks import ActorPolicy, QPolicy
 from bench.victims.training import LearningDriver, Practice, roads
 from defenses.advtrain import AdversarialTraining
 
@@ -72,6 +74,39 @@ def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, w
     loop = AttackInLoop(attack=attack, skip=skip, where="acting", ramp=(0.0, 0.0))
     card = VICTIMS[0].train(world, seed=0, attack=loop, progress=silent).card
     assert card["attacked_decisions"] / (160 * 6) == pytest.approx(1 - skip, abs=0.06)
+
+
+@pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
+def test_consistency_brings_decisions_under_attack_to_those_on_the_truth(victim: LearningDriver, world: World) -> None:
+    env = world.make(roads(1), action_type=victim.action_type)
+    shape = {"features": 5, "hidden": 8}
+    torch.manual_seed(0)
+    discrete = victim.action_type == "discrete"
+    teacher = QPolicy(actions=5, **shape) if discrete else ActorPolicy(steering_limit=0.1, **shape)
+    truth = torch.rand(64, 10, 5)
+    shown = (truth + 0.3 * torch.randn(truth.shape)).clamp(-1, 1)
+    action = torch.randint(5, (64,)) if discrete else torch.rand(64, 2) - 0.5
+    after = {"observation": truth, "reward": torch.zeros(64, 1), "done": torch.zeros(64, 1, dtype=torch.bool)}
+    after["terminated"] = after["done"].clone()
+    sample = TensorDict({"observation": shown, "truth": truth, "action": action, "next": after}, [64])
+
+    def distance(consistency: float) -> float:
+        """How far the scores on what is shown are from the teacher's on the truth, after training."""
+        loop = AttackInLoop(attack=lambda o, p, s: o, skip=0.0, start=teacher, consistency=consistency)
+        learner = victim.learner(env, loop)
+        learner.enter(victim.phases(loop)[0])
+        for _ in range(150):
+            learner.update(sample.clone(), 3e-3)
+        learner.anneal()
+        trained = learner.policy if discrete else learner.averaged()
+        wanted, found = teacher.scores(truth), trained.scores(shown)
+        if discrete:
+            wanted, found = (
+                torch.softmax(values / (0.5 * wanted.std(-1, keepdim=True)), -1) for values in (wanted, found)
+            )
+        return float((wanted - found).detach().square().mean())
+
+    assert distance(10.0) < 0.7 * distance(0.0)
 
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
