@@ -10,6 +10,7 @@ import torch
 
 from bench.errors import UserError
 from bench.victims import zoo
+from bench.victims.ddpg import DDPG
 from bench.victims.dqn import DQN
 from bench.victims.networks import QPolicy
 from defenses.advtrain import AdversarialTraining
@@ -77,7 +78,8 @@ def test_a_broken_card_is_named(saved: Path) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_shipped_policies_are_those_of_the_default_recipes(seed: int, home: Path) -> None:
-    victim = DQN()
-    for policy in (victim.load(seed), AdversarialTraining().load(victim, seed)):
-        assert policy.action_type == victim.action_type
+    dqn, ddpg = DQN(), DDPG()
+    hardened = [AdversarialTraining(skip=skip).load(dqn, seed) for skip in (0.0, 0.3, 0.5, 1.0)]
+    for policy in (dqn.load(seed), *hardened):
         assert policy.decide(torch.zeros(2, 10, 5)).shape == (2,)
+    assert ddpg.load(seed).decide(torch.zeros(2, 10, 5)).shape == (2, 2)
