@@ -31,7 +31,7 @@ class ZOSignSGD(Attack):
 
     Args:
         steps: iterations T, at least 1 (default 4).
-        directions: random directions q, at least 1 (default 16).
+        directions: random directions q, at least 1 (default 10).
         smoothing: mu, length of a probe as a share of the radius, in (0, 2] (default 1).
         step_size: delta as a share of the radius, in (0, 2] (default 1).
         objective: what is minimised (default `collision`). `expected`: the clean Q expected under the attacked policy.
@@ -62,7 +62,7 @@ class ZOSignSGD(Attack):
     access: ClassVar[Access] = "scores"
 
     steps: int = 4
-    directions: int = 16
+    directions: int = 10
     smoothing: float = 1.0
     step_size: float = 1.0
     objective: ZOObjective = "collision"
