@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -52,13 +54,14 @@ def test_zo_stops_at_the_query_budget(queries: int, random_start: bool) -> None:
 @pytest.mark.parametrize("objective", ["collision", "expected", "margin", "target", "thesis"])
 def test_early_stop_saves_queries_and_meets_the_same_goals(objective: ZOObjective) -> None:
     policy, observation, threat = victim("discrete"), observations(200), ThreatModel(norm="linf", budget=0.8)
-    stopped, few = perturb(ZOSignSGD(objective=objective), policy, observation, threat)
-    full, many = perturb(ZOSignSGD(objective=objective, early_stop=False), policy, observation, threat)
+    attack = ZOSignSGD(objective=objective, steps=5, directions=20)
+    stopped, few = perturb(attack, policy, observation, threat)
+    full, many = perturb(replace(attack, early_stop=False), policy, observation, threat)
     bound: Objective = "target" if objective == "thesis" else objective
     loss = DiscreteLoss(
         objective=bound, clean=policy.scores(observation), temperature=0.5, target_action=3, braking_action=4
     )
-    most = ZOSignSGD().steps * (ZOSignSGD().directions + 1)
+    most = attack.steps * (attack.directions + 1)
     assert int(many.min()) == int(many.max()) == most
     assert float(few.double().mean()) < 0.95 * most
     met = loss.met(policy.scores(stopped))
