@@ -7,6 +7,7 @@ Scores are Q-values [..., B, A] of a discrete victim or the action [..., B, 2] o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -18,7 +19,7 @@ TIE_BREAK = 1e-3
 """Weight of the soft loss beside what the greedy action is worth, when points are compared."""
 
 
-def expected(scores: Tensor, worth: Tensor, temperature: float) -> Tensor:
+def expected(scores: Tensor, worth: Tensor, tau: Tensor) -> Tensor:
     """The worth of an action, expected under the attacked policy: softmax(Q(x') / tau) . Q(x).
 
     Least where the victim is driven to what it itself thinks the worst action; needs nothing but scores.
@@ -26,9 +27,8 @@ def expected(scores: Tensor, worth: Tensor, temperature: float) -> Tensor:
     Args:
         scores: Q(x') [..., B, A].
         worth: of each action, Q(x) or what `spared` makes of it, [B, A].
-        temperature: tau as a share of the spread (standard deviation over the actions) of `worth`, so it is scale-free.
+        tau: temperature [B, 1].
     """
-    tau = (temperature * worth.std(-1, keepdim=True)).clamp(min=torch.finfo(worth.dtype).tiny)
     return (torch.softmax(scores / tau, -1) * worth).sum(-1)
 
 
@@ -67,7 +67,8 @@ class DiscreteLoss:
         objective: `collision` or `expected`: the worth expected, with braking spared or not; `margin`: away from the clean
             action; `target`: towards one action.
         clean: Q(x) [B, A].
-        temperature: of the expectation, see `expected`.
+        temperature: of the expectation, as a share of the spread (standard deviation over the actions) of what they are
+            worth, so it is scale-free.
         target_action: index of the action that `target` asks for.
         braking_action: index of the action that `collision` spares.
         enough: share in (0, 1] of what there is to lose that the greedy action must give up for an expectation to be met.
@@ -95,15 +96,14 @@ class DiscreteLoss:
             return margin(scores, self.clean.argmax(-1))
         if self.objective == "target":
             return -margin(scores, torch.full(scores.shape[-2:-1], self.target_action))
-        return expected(scores, self._worth(), self.temperature)
+        return expected(scores, self._worth, self._tau)
 
-    def key(self, scores: Tensor, loss: Tensor | None = None) -> Tensor:
-        """What the best of several asked points is chosen by, [..., B], lower is better; `loss` is that of `scores`, if known.
+    def key(self, scores: Tensor, loss: Tensor) -> Tensor:
+        """What the best of several asked points is chosen by, [..., B], lower is better; `loss` is that of `scores`.
 
         The victim takes its greedy action, so an expectation is compared by what that action is worth, and the loss decides
         between points where it is the same. Elsewhere it is the loss.
         """
-        loss = self(scores) if loss is None else loss
         if self.objective in ("margin", "target"):
             return loss
         return self._given(scores) + TIE_BREAK * loss
@@ -112,20 +112,32 @@ class DiscreteLoss:
         """Whether the victim already does what the attacker wants, bool [..., B]."""
         if self.objective in ("margin", "target"):
             return self(scores) < 0
-        worth = self._worth()
-        best, worst = worth.amax(-1), worth.amin(-1)
-        return best - self._given(scores) >= self.enough * (best - worst)
+        return self._given(scores) <= self._goal
 
     def of(self, rows: Tensor) -> DiscreteLoss:
         """The same for some of the episodes."""
         return replace(self, clean=self.clean[rows])
 
+    @cached_property
     def _worth(self) -> Tensor:
+        """Of each action, [B, A]."""
         return spared(self.clean, self.braking_action) if self.objective == "collision" else self.clean
+
+    @cached_property
+    def _tau(self) -> Tensor:
+        """Of the expectation, [B, 1]."""
+        spread = self._worth.std(-1, keepdim=True)
+        return (self.temperature * spread).clamp(min=torch.finfo(spread.dtype).tiny)
+
+    @cached_property
+    def _goal(self) -> Tensor:
+        """What the greedy action may be worth at most for an expectation to be met, [B]."""
+        best = self._worth.amax(-1)
+        return best - self.enough * (best - self._worth.amin(-1))
 
     def _given(self, scores: Tensor) -> Tensor:
         """What the greedy action is worth, [..., B]."""
-        return self._worth().expand(scores.shape).gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
+        return self._worth.expand(scores.shape).gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,9 +160,9 @@ class ContinuousLoss:
             return -distance(scores, self.clean)
         return distance(scores, torch.tensor(self.target).to(scores))
 
-    def key(self, scores: Tensor, loss: Tensor | None = None) -> Tensor:
+    def key(self, scores: Tensor, loss: Tensor) -> Tensor:
         """What the best of several asked points is chosen by: the loss."""
-        return self(scores) if loss is None else loss
+        return loss
 
     def met(self, scores: Tensor) -> Tensor:
         """Whether the victim already does what the attacker wants, bool [..., B]."""

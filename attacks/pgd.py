@@ -101,18 +101,19 @@ class PGD(Attack):
         accumulated = torch.zeros_like(x)
         best, lowest = x, torch.full(x.shape[:2], torch.inf)
         for step in range(steps):
-            value, gradient = _ask(x, loss, key, oracle)
+            asked, gradient = _ask(x, loss, key, oracle)
             if step > 0:
-                best, lowest = _better(best, lowest, x, value)
+                best, lowest = _better(best, lowest, x, asked)
             accumulated = self.momentum * accumulated + _unit(gradient)
             x = oracle.project(x - self.step_size * oracle.radius * accumulated.sign())
-        best, lowest = _better(best, lowest, x, key(oracle.scores(x)))
+        scores = oracle.scores(x)
+        best, lowest = _better(best, lowest, x, key(scores, loss(scores)))
         return best[lowest.argmin(0), torch.arange(len(observation))]
 
     def _loss(
         self, observation: Tensor, oracle: Oracle
-    ) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
-        """The loss of the victim's scores, to be minimised, and what iterates are compared by; [..., B] each."""
+    ) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], Tensor]]:
+        """The loss of the victim's scores, to be minimised, and what iterates are compared by given it; [..., B] each."""
         clean = oracle.scores(observation)
         if oracle.action_type == "discrete":
             discrete = DiscreteLoss(
@@ -134,18 +135,19 @@ class PGD(Attack):
                 action = torch.cat((acceleration, action[..., 1:]), -1)
             return oracle.value(observation.expand(*action.shape[:-1], *observation.shape[1:]), action)
 
-        return critic, critic
+        return critic, lambda _, loss: loss
 
 
 def _ask(
-    x: Tensor, loss: Callable[[Tensor], Tensor], key: Callable[[Tensor], Tensor], oracle: Oracle
+    x: Tensor, loss: Callable[[Tensor], Tensor], key: Callable[[Tensor, Tensor], Tensor], oracle: Oracle
 ) -> tuple[Tensor, Tensor]:
     """What iterates are compared by [R, B] and the loss's gradient [R, B, V, F], from one query."""
     keys: list[Tensor] = []
 
     def asked(scores: Tensor) -> Tensor:
-        keys.append(key(scores.detach()))
-        return loss(scores)
+        value = loss(scores)
+        keys.append(key(scores.detach(), value.detach()))
+        return value
 
     _, gradient = oracle.gradient(x, asked)
     return keys[0], gradient

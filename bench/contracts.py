@@ -173,6 +173,7 @@ class AttackInLoop:
         start: weights to go on from, frame by frame; None trains from scratch.
         decisions: of the further training, where there is a `start`.
         consistency: weight, beside the victim's own loss, of deciding under attack what `start` decides on the truth.
+        margin: what a change of lane must be worth more than anything else for a consistent decision to be for it, in values.
     """
 
     attack: Callable[[Tensor, Policy, float], Tensor]
@@ -182,6 +183,7 @@ class AttackInLoop:
     start: Policy | None = None
     decisions: int = 0
     consistency: float = 0.0
+    margin: float = 0.0
 
 
 class Attack(ABC):

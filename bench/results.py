@@ -1,11 +1,10 @@
 """Episode records: an append-only Parquet data set, one file a finished unit of work, one row an episode.
 
-A file appears whole or not at all (written aside, synced, renamed), so a killed run leaves only finished units behind.
+A file appears whole or not at all, so a killed run leaves only finished units behind.
 """
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from bench import files
 from bench.errors import UserError
 
 FOLDER = "episodes"
@@ -130,19 +130,11 @@ def finished(out: Path, units: Iterable[str]) -> set[str]:
 def write(out: Path, records: pa.Table) -> Path:
     """Write the records of one unit and return the file; it appears whole or not at all."""
     path = path_of(out, records["unit"][0].as_py())
-    handle, aside = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".tmp")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with files.whole(path) as file:
             pq.write_table(records, file, compression="zstd")
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(aside, 0o644)
-        os.replace(aside, path)
-    except BaseException as error:
-        Path(aside).unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise UserError(f"the record {path} cannot be written: {error.strerror}") from error
-        raise
+    except OSError as error:
+        raise UserError(f"the record {path} cannot be written: {error.strerror}") from error
     return path
 
 

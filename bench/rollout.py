@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -98,97 +99,99 @@ def _traced(before: TensorDictBase, after: TensorDictBase, policy: Policy) -> di
 
 
 class _Meter:
-    """Running sums of a batch of episodes; an episode counts until it is done."""
+    """Running sums of a batch of episodes; an episode counts until it is done.
+
+    In NumPy: a step is some forty operations on [B] numbers, and what each costs is its call.
+    """
+
+    SUMS = ("steps", "return", "progress", "mean_speed", "changed", "linf", "l2", "linf_m", "linf_mps", "attack_ms")
 
     def __init__(self, batch: int, policy: Policy, features: Features) -> None:
         self.policy = policy
-        self.half_range = features.half_range()
-        self.positions = torch.tensor([unit == "m" for unit in features.units])
-        names = ("steps", "return", "progress", "speed", "changed", "linf", "l2", "linf_m", "linf_mps", "attack_ms")
-        self.sums = {name: torch.zeros(batch, dtype=torch.float64) for name in names}
-        self.largest = {name: torch.zeros(batch) for name in ("linf_max", "excess_max")}
-        self.min_ttc = torch.full((batch,), torch.inf)
-        self.crashed = torch.zeros(batch, dtype=torch.bool)
-        self.offroad = torch.zeros(batch, dtype=torch.bool)
-        self.start_x = torch.full((batch,), torch.nan)
-        self.end_x = torch.zeros(batch)
-        self.queries: list[Tensor] = []
-        self.actions: list[Tensor] = []
+        self.half_range = features.half_range().numpy()
+        self.positions = np.array([unit == "m" for unit in features.units])
+        self.sums = np.zeros((len(self.SUMS), batch))
+        self.linf_max, self.excess_max = np.zeros(batch, np.float32), np.zeros(batch, np.float32)
+        self.min_ttc = np.full(batch, np.inf, np.float32)
+        self.crashed, self.offroad = np.zeros(batch, np.bool_), np.zeros(batch, np.bool_)
+        self.start_x, self.end_x = np.full(batch, np.nan, np.float32), np.zeros(batch, np.float32)
+        self.queries: list[NDArray[np.int64]] = []
+        self.actions: list[NDArray[np.int64]] = []
 
     def step(self, before: TensorDictBase, after: TensorDictBase, milliseconds: float) -> None:
         """Count one step of the episodes that were running before it."""
-        running = ~before["done"].squeeze(-1)
-        info = after["info"]
-        rows = running.nonzero().squeeze(-1)
-        offset = (before["perturbed"] - before["observation"])[rows, :, 1:].abs()
+        running = ~before["done"].squeeze(-1).numpy()
+        info = {name: value.squeeze(-1).numpy() for name, value in after["info"].items()}
+        offset = (before["perturbed"] - before["observation"]).abs().numpy()[..., 1:]
         physical = offset * self.half_range
-        self._add("steps", rows, 1.0)
-        self._add("return", rows, after["reward"][rows, 0])
-        self._add("progress", rows, info["progress"][rows, 0])
-        self._add("speed", rows, info["speed"][rows, 0])
-        self._add("changed", rows, self._changed(before, rows))
-        self._add("linf", rows, offset.flatten(1).amax(1))
-        self._add("l2", rows, offset.flatten(1).norm(dim=1))
-        self._add("linf_m", rows, physical[..., self.positions].flatten(1).amax(1))
-        self._add("linf_mps", rows, physical[..., ~self.positions].flatten(1).amax(1))
-        self._add("attack_ms", rows, milliseconds / max(len(rows), 1))
-        self.largest["linf_max"][rows] = torch.maximum(self.largest["linf_max"][rows], offset.flatten(1).amax(1))
-        self.largest["excess_max"] = torch.maximum(self.largest["excess_max"], before["excess"])
-        self.min_ttc[rows] = torch.minimum(self.min_ttc[rows], info["ttc"][rows, 0])
-        self.crashed[rows] |= info["crashed"][rows, 0]
-        self.offroad[rows] |= info["offroad"][rows, 0]
-        first = self.start_x.isnan()
-        self.start_x[first] = info["x"][first, 0]
-        self.end_x[rows] = info["x"][rows, 0]
-        self.queries.append(torch.where(running, before["queries"], -1))
+        linf = offset.max((1, 2))
+        measured = (
+            np.ones(len(running)),
+            after["reward"].squeeze(-1).numpy(),
+            info["progress"],
+            info["speed"],
+            self._changed(before, running & (linf > 0)),
+            linf,
+            np.sqrt(np.square(offset).sum((1, 2))),
+            physical[..., self.positions].max((1, 2), initial=0.0),
+            physical[..., ~self.positions].max((1, 2), initial=0.0),
+            np.full(len(running), milliseconds / max(running.sum(), 1)),
+        )
+        self.sums += np.where(running, np.stack(measured), 0.0)
+        np.maximum(self.linf_max, linf, out=self.linf_max, where=running)
+        np.maximum(self.excess_max, before["excess"].numpy(), out=self.excess_max)
+        np.minimum(self.min_ttc, info["ttc"], out=self.min_ttc, where=running)
+        self.crashed |= info["crashed"] & running
+        self.offroad |= info["offroad"] & running
+        np.copyto(self.start_x, info["x"], where=np.isnan(self.start_x))
+        np.copyto(self.end_x, info["x"], where=running)
+        self.queries.append(np.where(running, before["queries"].numpy(), -1))
         if self.policy.action_type == "discrete":
-            self.actions.append(torch.where(running, before["action"], -1))
+            self.actions.append(np.where(running, before["action"].numpy(), -1))
 
-    def _add(self, name: str, rows: Tensor, value: Tensor | float) -> None:
-        self.sums[name][rows] += value
-
-    def _changed(self, before: TensorDictBase, rows: Tensor) -> Tensor:
-        """[rows] 1.0 where the attack changed the victim's decision."""
-        shown, action = before["perturbed"][rows], before["action"][rows]
-        truth = before["observation"][rows]
-        touched = (shown != truth).flatten(1).any(1)
-        clean = action.clone()
-        if bool(touched.any()):
-            clean[touched] = self.policy.choose(self.policy.scores(truth)[touched])
-        if self.policy.action_type == "discrete":
-            return (clean != action).double()
-        return ((clean - action).abs().amax(-1) > CHANGED).double()
+    def _changed(self, before: TensorDictBase, touched: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """[B] 1 where the attack changed the victim's decision; it can have only where the observation is `touched` [B]."""
+        changed = np.zeros(len(touched))
+        if touched.any():
+            rows = torch.from_numpy(touched)
+            action, clean = before["action"][rows], self.policy.choose(self.policy.scores(before["observation"][rows]))
+            if self.policy.action_type == "discrete":
+                changed[touched] = (clean != action).numpy()
+            else:
+                changed[touched] = ((clean - action).abs().amax(-1) > CHANGED).numpy()
+        return changed
 
     def columns(self, max_steps: int) -> Columns:
         """The measurements of each episode."""
-        sums, steps = self.sums, self.sums["steps"].clamp(min=1)
+        sums = dict(zip(self.SUMS, self.sums, strict=True))
+        steps = np.maximum(sums["steps"], 1)
         failed = self.crashed | self.offroad
-        queries = torch.stack(self.queries).double()
-        queries[queries < 0] = torch.nan
-        mean_names = {"speed": "mean_speed", "changed": "changed", "linf": "linf", "l2": "l2"}
-        mean_names |= {"linf_m": "linf_m", "linf_mps": "linf_mps", "attack_ms": "attack_ms"}
-        columns = {
-            "steps": sums["steps"].int(),
+        queries = np.stack(self.queries).astype(np.float64)
+        queries[queries < 0] = np.nan
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # An episode that was never driven has no queries.
+            mean, median = np.nanmean(queries, 0), np.nanquantile(queries, 0.5, 0, method="lower")
+        return {
+            "steps": sums["steps"].astype(np.int32),
             "return": sums["return"],
-            "safe_progress": torch.where(failed, 0.0, sums["progress"] / max_steps),
+            "safe_progress": np.where(failed, 0.0, sums["progress"] / max_steps),
             "crashed": self.crashed,
             "offroad": self.offroad,
-            "distance_m": (self.end_x - self.start_x).double(),
-            "min_ttc_s": self.min_ttc.double(),
-            "queries": queries.nanmean(0),
-            "queries_median": queries.nanmedian(0).values,
-            "queries_max": queries.nan_to_num(nan=0.0).amax(0),
-            **{name: value.double() for name, value in self.largest.items()},
-            **{mean_names[name]: value / steps for name, value in sums.items() if name in mean_names},
+            "distance_m": (self.end_x - self.start_x).astype(np.float64),
+            "min_ttc_s": self.min_ttc.astype(np.float64),
+            "queries": mean,
+            "queries_median": median,
+            "queries_max": np.nan_to_num(queries).max(0),
+            "linf_max": self.linf_max.astype(np.float64),
+            "excess_max": self.excess_max.astype(np.float64),
+            **{name: sums[name] / steps for name in self.SUMS[3:]},
+            "action_counts": self._action_counts(),
         }
-        arrays: Columns = {name: value.numpy() for name, value in columns.items()}
-        arrays["action_counts"] = self._action_counts()
-        return arrays
 
     def _action_counts(self) -> NDArray[np.generic]:
         """[B, A] how often each discrete action was taken; [B, 0] for continuous ones."""
         if not self.actions:
             return np.zeros((len(self.crashed), 0), np.int32)
-        actions = torch.stack(self.actions, 1)
-        count = int(actions.max()) + 1
-        return torch.stack([(actions == a).sum(1) for a in range(max(count, 5))], 1).int().numpy()
+        actions = np.stack(self.actions, 1)
+        count = max(int(actions.max()) + 1, 5)
+        return np.stack([(actions == a).sum(1) for a in range(count)], 1).astype(np.int32)

@@ -82,9 +82,18 @@ def project(perturbed: Tensor, observation: Tensor, radius: Tensor) -> Tensor:
 
     NaN counts as no perturbation.
     """
-    offset = torch.nan_to_num(perturbed - observation, nan=0.0, posinf=2.0, neginf=-2.0)
-    within = observation + torch.maximum(torch.minimum(offset, radius), -radius)
-    return within.clamp(-1.0, 1.0)
+    return _between(perturbed, observation, *_bounds(observation, radius))
+
+
+def _bounds(observation: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    return (observation - radius).clamp(-1.0, 1.0), (observation + radius).clamp(-1.0, 1.0)
+
+
+def _between(perturbed: Tensor, observation: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    within = torch.clamp(perturbed, low, high)
+    return (
+        within if bool(within.sum().isfinite()) else torch.where(within.isnan(), observation.clamp(-1.0, 1.0), within)
+    )
 
 
 class QueryBudgetError(UserError):
@@ -124,6 +133,8 @@ class Oracle:
         """Open a step on the true observations [B, V, F]: the perturbation set follows them, the query counters start at 0."""
         self.observation = observation
         self.radius = self.threat.radius(observation, self.features, scale)
+        self._set = self._subset = (observation, *_bounds(observation, self.radius))
+        self._rows: Tensor | None = None
         self.spent = torch.zeros(observation.shape[0], dtype=torch.int64)
 
     @property
@@ -134,8 +145,11 @@ class Oracle:
     def project(self, perturbed: Tensor, rows: Tensor | None = None) -> Tensor:
         """`perturbed` [..., B, V, F], or of the episodes `rows`, brought into the perturbation set. Costs no query."""
         if rows is None:
-            return project(perturbed, self.observation, self.radius)
-        return project(perturbed, self.observation[rows], self.radius[rows])
+            return _between(perturbed, *self._set)
+        if rows is not self._rows:
+            truth, low, high = self._set
+            self._rows, self._subset = rows, (truth[rows], low[rows], high[rows])
+        return _between(perturbed, *self._subset)
 
     def decide(self, observation: Tensor, rows: Tensor | None = None) -> Tensor:
         """The victim's actions; needs access `decisions`."""

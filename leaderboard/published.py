@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from rich.console import Console
 
 from bench import results
+from bench.files import whole
 from bench.results import SCHEMA
 
 
@@ -40,7 +41,8 @@ def publish(folder: Path, file: Path) -> int:
         How many episodes that are.
     """
     records = results.read(folder)
-    pq.write_table(records, file, compression="zstd", compression_level=19)
+    with whole(file) as made:
+        pq.write_table(records, made, compression="zstd", compression_level=19)
     return int(records.num_rows)
 
 

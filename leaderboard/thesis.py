@@ -194,18 +194,6 @@ def _or_nan(ratio: Callable[[Mapping[str, float]], float], of: Mapping[str, floa
         return float("nan")
 
 
-ROAD_HEADINGS = (
-    "lanes ×\ndensity",
-    "clean\nthesis",
-    "\nours",
-    "attacked\nthesis",
-    "\nours",
-    "lost\nthesis",
-    "\nours",
-    "best\nblind",
-)
-
-
 def road_table(section: Mapping[str, Any], source: Source) -> tuple[Table, list[Text]]:
     """Table 4.3: DDPG over lanes and density."""
     made = _table(

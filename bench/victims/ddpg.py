@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 from torchrl.modules import AdditiveGaussianModule
@@ -63,13 +64,12 @@ class DDPG(LearningDriver):
 
 class _ActorCriticLearner(Learner):
     def __init__(self, recipe: DDPG, env: EnvBase, attack: AttackInLoop | None) -> None:
-        start = attack.start if attack else None
+        super().__init__(attack)
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: ActorPolicy = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
         self.mean = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
-        if start is not None:
-            self.policy.load_state_dict(start.state_dict())
-        self.teacher, self.consistency = start, attack.consistency if attack else 0.0
+        if self.start is not None:
+            self.policy.load_state_dict(self.start.state_dict())
         self.delay, self.updates = recipe.actor_delay, 0
         limit = self.policy.actor.limit
         actor = TensorDictModule(self.policy.actor, in_keys=["observation"], out_keys=["action"])
@@ -78,7 +78,7 @@ class _ActorCriticLearner(Learner):
         )
         self.noise = AdditiveGaussianModule(
             Bounded(-limit.expand(batch, 2), limit.expand(batch, 2)),
-            sigma_init=max(0.4, recipe.noise) if start is None else recipe.noise,
+            sigma_init=max(0.4, recipe.noise) if self.start is None else recipe.noise,
             sigma_end=recipe.noise,
             annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
             std=limit,
@@ -106,18 +106,15 @@ class _ActorCriticLearner(Learner):
         _descend(self.critic_adam, value, learning_rate)
         if self.updates % self.delay == 0:
             actor, _ = self.loss.actor_loss(sample)
-            if self.teacher is not None and self.consistency > 0:
-                actor = actor + self.consistency * self._distance(self.teacher, sample)
-            _descend(self.actor_adam, actor, learning_rate)
+            _descend(self.actor_adam, actor + self.inconsistency(sample), learning_rate)
             self.target.step()
 
-    def _distance(self, teacher: Policy, sample: TensorDictBase) -> torch.Tensor:
-        """Mean squared distance of the action on what is shown from the teacher's on the truth, in shares of the limits."""
-        with torch.no_grad():
-            wanted = teacher.scores(sample["truth"])
+    def divergence(self, observation: Tensor, wanted: Tensor) -> Tensor:
+        """Mean squared distance of the actions, in shares of the limits."""
+        # The loss trains weights of its own.
         with self.loss.actor_network_params.to_module(self.loss.actor_network):
-            shown = self.loss.actor_network.module(sample["observation"])
-        return ((shown - wanted) / self.policy.actor.limit).square().mean()
+            action = self.loss.actor_network.module(observation)
+        return ((action - wanted) / self.policy.actor.limit).square().mean()
 
     def anneal(self) -> None:
         self.noise.step()
@@ -130,7 +127,7 @@ class _ActorCriticLearner(Learner):
         return self.mean
 
 
-def _descend(adam: torch.optim.Adam, loss: torch.Tensor, learning_rate: float) -> None:
+def _descend(adam: torch.optim.Adam, loss: Tensor, learning_rate: float) -> None:
     adam.param_groups[0]["lr"] = learning_rate
     adam.zero_grad()
     loss.backward()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
+from torch import Tensor
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueActor
@@ -18,6 +19,8 @@ from bench.victims.networks import QPolicy
 from bench.victims.training import CHUNK, Learner, LearningDriver, Phase, target_state
 
 ACTIONS = 5
+CHANGES_LANE = torch.tensor([1.0, 0.0, 1.0, 0.0, 0.0])
+"""LANE_LEFT and LANE_RIGHT among them."""
 TEMPERATURE = 0.5
 """Of the decisions compared in adversarial training, in standard deviations of the Q-values over the actions."""
 
@@ -55,20 +58,19 @@ class DQN(LearningDriver):
 
 class _QLearner(Learner):
     def __init__(self, recipe: DQN, env: EnvBase, attack: AttackInLoop | None) -> None:
-        self.recipe, self.gap = recipe, 0.0
-        start = attack.start if attack else None
-        self.teacher, self.consistency = start, attack.consistency if attack else 0.0
+        super().__init__(attack)
+        self.recipe, self.gap, self.margin = recipe, 0.0, attack.margin if attack else 0.0
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: QPolicy = QPolicy(features, ACTIONS, recipe.hidden)
         self.mean = QPolicy(features, ACTIONS, recipe.hidden)
-        if start is not None:
-            self.policy.load_state_dict(start.state_dict())
+        if self.start is not None:
+            self.policy.load_state_dict(self.start.state_dict())
         actor = QValueActor(
             self.policy.network, in_keys=["observation"], spec=Categorical(ACTIONS), action_space="categorical"
         )
         self.greedy = EGreedyModule(
             Categorical(ACTIONS, shape=(batch,)),
-            eps_init=1.0 if start is None else recipe.final_epsilon,
+            eps_init=1.0 if self.start is None else recipe.final_epsilon,
             eps_end=recipe.final_epsilon,
             annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
         )
@@ -89,19 +91,24 @@ class _QLearner(Learner):
             sample["next", "reward"] -= self.gap * self._disadvantage(sample)
         self.adam.param_groups[0]["lr"] = learning_rate
         self.adam.zero_grad()
-        loss = self.loss(sample)["loss"]
-        if self.teacher is not None and self.consistency > 0:
-            loss = loss + self.consistency * _divergence(self.policy, self.teacher, sample)
+        loss = self.loss(sample)["loss"] + self.inconsistency(sample)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
         self.adam.step()
         self.target.step()
 
     @torch.no_grad()
-    def _disadvantage(self, sample: TensorDictBase) -> torch.Tensor:
+    def _disadvantage(self, sample: TensorDictBase) -> Tensor:
         """V(s) - Q(s, a) [N, 1]: what advantage learning takes from the reward (Bellemare et al. 2016, Eq. 6)."""
         values = self.policy.scores(sample["observation"])
         return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
+
+    def divergence(self, observation: Tensor, wanted: Tensor) -> Tensor:
+        """KL divergence of decisions softmax(Q / tau), tau a share of the spread of the values that are wanted."""
+        tau = TEMPERATURE * wanted.std(-1, keepdim=True).clamp(min=torch.finfo(wanted.dtype).tiny)
+        decided = torch.log_softmax(self.policy.scores(observation) / tau, -1)
+        reluctant = torch.softmax((wanted - self.margin * CHANGES_LANE) / tau, -1)
+        return torch.nn.functional.kl_div(decided, reluctant, reduction="batchmean")
 
     def anneal(self) -> None:
         self.greedy.step()
@@ -109,17 +116,3 @@ class _QLearner(Learner):
     def averaged(self) -> Policy:
         self.mean.network.load_state_dict(target_state(self.loss.target_value_network_params, self.mean.network))
         return self.mean
-
-
-def _divergence(policy: Policy, teacher: Policy, sample: TensorDictBase) -> torch.Tensor:
-    """Mean KL divergence of what `policy` decides on what it is shown from what `teacher` decides on the truth.
-
-    The regulariser of TRADES (Zhang et al. 2019, Eq. 5), with a teacher that stays as it is. Decisions are softmax(Q / tau), tau
-    a share of the spread of the teacher's Q-values.
-    """
-    with torch.no_grad():
-        values = teacher.scores(sample["truth"])
-        tau = TEMPERATURE * values.std(-1, keepdim=True).clamp(min=torch.finfo(values.dtype).tiny)
-        wanted = torch.softmax(values / tau, -1)
-    shown = torch.log_softmax(policy.scores(sample["observation"]) / tau, -1)
-    return torch.nn.functional.kl_div(shown, wanted, reduction="batchmean")

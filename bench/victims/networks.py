@@ -27,7 +27,7 @@ class Encoder(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         ego, cars = observation[..., 0, 1:], observation[..., 1:, :]
-        # One product on contiguous rows: half again as fast as one a layer, and these are what an attack's queries cost.
+        # One product on contiguous rows: a third faster than one a layer, and these are what an attack's queries cost.
         rows = torch.cat((cars, ego.unsqueeze(-2).expand(*cars.shape[:-1], -1)), -1)
         weight = torch.cat((self.car.weight, self.ego.weight), 1)
         hidden = nn.functional.linear(rows, weight, self.car.bias).relu_()

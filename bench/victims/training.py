@@ -56,12 +56,35 @@ class Phase:
 
 
 class Learner(ABC):
-    """One algorithm: networks, loss, optimiser."""
+    """One algorithm: networks, loss, optimiser.
+
+    Args:
+        attack: what it learns under, None for nothing.
+    """
 
     policy: Policy
     """The network that is trained; the attack in the loop aims at it."""
     explore: nn.Module
     """Takes a tensordict with `observation` [B, V, F], writes an exploring `action`."""
+
+    def __init__(self, attack: AttackInLoop | None) -> None:
+        self.start = attack.start if attack else None
+        self.consistency = attack.consistency if attack else 0.0
+
+    def inconsistency(self, sample: TensorDictBase) -> Tensor | float:
+        """How far what is decided on what is shown is from what `start` decides on the truth, weighted; 0 without a start.
+
+        The regulariser of TRADES (Zhang et al. 2019, Eq. 5), with a teacher that stays as it is.
+        """
+        if self.start is None or self.consistency == 0:
+            return 0.0
+        with torch.no_grad():
+            wanted = self.start.scores(sample["truth"])
+        return self.consistency * self.divergence(sample["observation"], wanted)
+
+    @abstractmethod
+    def divergence(self, observation: Tensor, wanted: Tensor) -> Tensor:
+        """Mean distance of what the trained network decides on [N, V, F] from the scores `wanted` [N, A] or [N, 2]."""
 
     @abstractmethod
     def enter(self, phase: Phase) -> None:

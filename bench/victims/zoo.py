@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from safetensors.torch import save as save_tensors
 
 from bench.contracts import Policy
 from bench.errors import UserError
+from bench.files import whole
 
 SHIPPED = Path(__file__).parent / "policies"
 
@@ -41,8 +41,12 @@ def save(policy: Policy, card: Mapping[str, object], *, name: str, seed: int, ro
     blob = save_tensors({key: value.contiguous() for key, value in policy.state_dict().items()})
     full = {"name": name, **card, "shape": policy.shape, "sha256": hashlib.sha256(blob).hexdigest()}
     path = folder / f"seed{seed}.safetensors"
-    _write(path, blob)
-    _write(path.with_suffix(".json"), json.dumps(full, indent=1, sort_keys=True).encode() + b"\n")
+    for at, content in (
+        (path, blob),
+        (path.with_suffix(".json"), json.dumps(full, indent=1, sort_keys=True).encode() + b"\n"),
+    ):
+        with whole(at) as file:
+            file.write(content)
     return path
 
 
@@ -112,13 +116,3 @@ def _find(name: str, seed: int) -> Path:
     known = seeds(name)
     have = f"it has seeds {', '.join(map(str, known))}" if known else "it has no such policy"
     raise UserError(f"the zoo has no {name!r} of training seed {seed} ({have}); `bench train` makes one")
-
-
-def _write(path: Path, blob: bytes) -> None:
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}")
-    with os.fdopen(handle, "wb") as file:
-        file.write(blob)
-        file.flush()
-        os.fsync(file.fileno())
-    os.chmod(temporary, 0o644)
-    os.replace(temporary, path)

@@ -8,19 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from attacks.noise import Noise
-from attacks.objectives import DiscreteLoss, Objective
+from attacks.none import NoAttack
+from attacks.objectives import Objective
 from attacks.pgd import PGD
-from bench.contracts import ActionType, Policy
+from bench.contracts import ActionType
 from bench.threat import ThreatModel, project
-from tests.attacks.victims import FEATURES, Linear, observations, perturb, victim
+from tests.attacks.victims import FEATURES, Linear, left, loss_of, observations, perturb, victim
 
 OBJECTIVES: tuple[Objective, ...] = ("collision", "expected", "margin", "target")
-
-
-def loss_of(policy: Policy, objective: Objective, observation: torch.Tensor) -> DiscreteLoss:
-    return DiscreteLoss(
-        objective=objective, clean=policy.scores(observation), temperature=0.5, target_action=3, braking_action=4
-    )
 
 
 @settings(max_examples=30, deadline=None)
@@ -53,10 +48,8 @@ def test_pgd_finds_the_optimum_of_a_linear_victim(seed: int, random_start: bool)
 @pytest.mark.parametrize("objective", OBJECTIVES)
 def test_pgd_beats_noise_on_its_objective(objective: Objective) -> None:
     policy, observation = victim("discrete"), observations(300)
-    loss = loss_of(policy, objective, observation)
-    attacked = loss.key(policy.scores(perturb(PGD(objective=objective), policy, observation)[0]))
-    noisy = loss.key(policy.scores(perturb(Noise(), policy, observation)[0]))
-    clean = loss.key(policy.scores(observation))
+    attacks = (PGD(objective=objective), Noise(), NoAttack())
+    attacked, noisy, clean = (left(attack, policy, observation, objective) for attack in attacks)
     assert float((attacked <= noisy).float().mean()) > 0.95
     assert float((clean - attacked).mean()) > 2 * float((clean - noisy).mean())
 
@@ -68,9 +61,7 @@ def test_pgd_beats_noise_on_its_objective(objective: Objective) -> None:
 )
 def test_more_work_makes_a_stronger_attack(weak: PGD, strong: PGD) -> None:
     policy, observation = victim("discrete"), observations(300)
-    loss = loss_of(policy, "collision", observation)
-    keys = [loss.key(policy.scores(perturb(attack, policy, observation)[0])).mean() for attack in (weak, strong)]
-    assert float(keys[1]) < float(keys[0])
+    assert float(left(strong, policy, observation).mean()) < float(left(weak, policy, observation).mean())
 
 
 @settings(max_examples=30, deadline=None)

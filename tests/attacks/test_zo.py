@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from attacks.noise import Noise
-from attacks.objectives import DiscreteLoss, Objective, distortion
+from attacks.none import NoAttack
+from attacks.objectives import Objective, distortion
 from attacks.zo import ZOObjective, ZOSignSGD, _directions
 from bench.contracts import ActionType, Policy
 from bench.threat import ThreatModel
-from tests.attacks.victims import Linear, observations, perturb, victim
+from tests.attacks.victims import Linear, left, loss_of, observations, perturb, victim
 
 
 class Counting(Policy):
@@ -58,9 +59,7 @@ def test_early_stop_saves_queries_and_meets_the_same_goals(objective: ZOObjectiv
     stopped, few = perturb(attack, policy, observation, threat)
     full, many = perturb(replace(attack, early_stop=False), policy, observation, threat)
     bound: Objective = "target" if objective == "thesis" else objective
-    loss = DiscreteLoss(
-        objective=bound, clean=policy.scores(observation), temperature=0.5, target_action=3, braking_action=4
-    )
+    loss = loss_of(policy, bound, observation)
     most = attack.steps * (attack.directions + 1)
     assert int(many.min()) == int(many.max()) == most
     assert float(few.double().mean()) < 0.95 * most
@@ -88,11 +87,8 @@ def test_half_of_what_there_is_to_lose_is_found_sooner() -> None:
 @given(st.integers(0, 99))
 def test_the_answer_is_never_worse_for_the_attacker_than_the_truth(seed: int) -> None:
     policy, observation = victim("discrete", seed), observations(20, seed)
-    loss = DiscreteLoss(
-        objective="collision", clean=policy.scores(observation), temperature=0.5, target_action=3, braking_action=4
-    )
-    shown, _ = perturb(ZOSignSGD(), policy, observation)
-    assert bool((loss.key(policy.scores(shown)) <= loss.key(policy.scores(observation)) + 1e-5).all())
+    attacked, clean = (left(attack, policy, observation) for attack in (ZOSignSGD(), NoAttack()))
+    assert bool((attacked <= clean + 1e-5).all())
 
 
 @settings(max_examples=20, deadline=None)
@@ -127,12 +123,8 @@ def test_as_many_directions_as_a_full_hadamard_matrix_are_orthogonal() -> None:
 
 def test_zo_beats_noise_on_its_objective() -> None:
     policy, observation = victim("discrete"), observations(300)
-    loss = DiscreteLoss(
-        objective="collision", clean=policy.scores(observation), temperature=0.5, target_action=3, braking_action=4
-    )
-    values = [loss.key(policy.scores(perturb(attack, policy, observation)[0])) for attack in (ZOSignSGD(), Noise())]
-    clean = loss.key(policy.scores(observation))
-    assert float((clean - values[0]).mean()) > 2 * float((clean - values[1]).mean())
+    attacked, noisy, clean = (left(attack, policy, observation) for attack in (ZOSignSGD(), Noise(), NoAttack()))
+    assert float((clean - attacked).mean()) > 2 * float((clean - noisy).mean())
 
 
 def test_a_heavier_distortion_weight_leaves_a_smaller_perturbation() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from attacks.objectives import DiscreteLoss, Objective
 from bench.contracts import ActionType, Attack, Features, Policy
 from bench.threat import Oracle, ThreatModel
 from bench.victims.networks import ActorPolicy, QPolicy
@@ -67,3 +68,16 @@ def perturb(
     """What the attack shows [B, V, F], and the queries it spent [B]."""
     oracle = open_oracle(policy, attack, observation, threat, seed)
     return attack.perturb(observation, oracle), oracle.spent
+
+
+def loss_of(policy: Policy, objective: Objective, observation: Tensor) -> DiscreteLoss:
+    """The objective with the attacks' default temperature and actions, bound to `observation`."""
+    return DiscreteLoss(
+        objective=objective, clean=policy.scores(observation), temperature=0.5, target_action=3, braking_action=4
+    )
+
+
+def left(attack: Attack, policy: Policy, observation: Tensor, objective: Objective = "collision") -> Tensor:
+    """[B] what the attack leaves of the victim's decision, by the key that attacks compare points by; lower is stronger."""
+    loss, scores = loss_of(policy, objective, observation), policy.scores(perturb(attack, policy, observation)[0])
+    return loss.key(scores, loss(scores))
