@@ -44,7 +44,13 @@ def print_run(run: str, out: Path, console: Console, report: Report) -> None:
 
 
 def located(run: str, out: Path) -> tuple[Path, str]:
-    """The results folder and the beginning of a pair's name; the name is empty if `run` is a folder."""
+    """The results folder and the beginning of a pair's name; the name is empty if `run` is a folder.
+
+    Raises:
+        UserError: if `run` can only be a path, and nothing is there.
+    """
+    if "/" in run and not Path(run).is_dir():
+        raise UserError(f"there is nothing at {run}")
     return (Path(run), "") if Path(run).is_dir() else (out, run)
 
 

@@ -32,6 +32,9 @@ class AdversarialTraining(Defense):
         decisions: of the further training, on every road at once; with `scratch` it is the victim's own.
         consistency: weight, beside the victim's own loss, of deciding under attack what the victim it started from decides on
             the truth (TRADES, Zhang et al. 2019); 0 is the thesis' algorithm. Nothing to be consistent with from `scratch`.
+        margin: what a change of lane must be worth more than anything else, in the values of that policy (1 is perfect driving
+            for ever), for consistency to ask for it. One frame's wrong change of lane is a crash, one frame's delay is
+            nothing: this is the room between the two that an attack has to cross. Discrete victims only.
         where: `acting` attacks the observations it acts on, which the replay buffer keeps as they were then, as in the thesis;
             `replay` attacks those drawn from the buffer, afresh against the policy as it is now; `both` does both.
         ramp_from: share of the training after which the budget begins to grow from 0.
@@ -45,7 +48,8 @@ class AdversarialTraining(Defense):
     budget: float = 0.1
     start: Literal["trained", "scratch"] = "trained"
     decisions: int = 8_000
-    consistency: float = 0.1
+    consistency: float = 0.4
+    margin: float = 0.02
     where: Literal["acting", "replay", "both"] = "both"
     ramp_from: float = 0.0
     ramp_to: float = 0.3
@@ -55,8 +59,9 @@ class AdversarialTraining(Defense):
             raise ValueError(f"skip must be between 0 and 1, got {self.skip}")
         if self.decisions < 1:
             raise ValueError(f"decisions must be at least 1, got {self.decisions}")
-        if not self.consistency >= 0:
-            raise ValueError(f"consistency must be at least 0, got {self.consistency}")
+        for name in ("consistency", "margin"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
         if not 0 <= self.ramp_from <= self.ramp_to <= 1:
             raise ValueError(
                 f"ramp_from and ramp_to must be in order between 0 and 1, got {self.ramp_from} and {self.ramp_to}"
@@ -97,6 +102,7 @@ class AdversarialTraining(Defense):
             start=victim.load(seed) if self.start == "trained" else None,
             decisions=self.decisions,
             consistency=self.consistency,
+            margin=self.margin,
         )
         trained = victim.train(world, seed=seed, attack=loop, progress=progress)
         made_by = {"defense": asdict(self), "attack": asdict(attack), "threat": asdict(threat)}

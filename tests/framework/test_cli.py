@@ -103,6 +103,7 @@ def test_show_says_what_made_the_records(bench: Bench, tmp_path: Path) -> None:
         for part in (pair, "nudge(mood=calm, pause=0.0, scale=0.5)  cavbench-toy 1.0", "relative 0.1", "torch "):
             assert part in said.out
     assert_one_line(bench("show", "nothing", "--out", str(tmp_path)), "unknown pair 'nothing'", pair)
+    assert_one_line(bench("show", "no/where", "--out", str(tmp_path)), "there is nothing at no/where")
 
 
 def test_report_prints_a_report_by_name(bench: Bench, tmp_path: Path) -> None:
@@ -134,7 +135,7 @@ def test_without_a_display_view_says_how_to_open_a_recording(
     path = tmp_path / "some.rrd"
     path.write_bytes(b"")
     assert f"rerun {path}" in bench("view", str(path)).out
-    assert_one_line(bench("view", str(tmp_path / "other.rrd")), "there are no records in results")
+    assert_one_line(bench("view", str(tmp_path / "other.rrd")), "there is nothing at ")
 
 
 def test_a_traceback_is_shown_to_who_asks_for_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

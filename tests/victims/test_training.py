@@ -76,37 +76,55 @@ def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, w
     assert card["attacked_decisions"] / (160 * 6) == pytest.approx(1 - skip, abs=0.06)
 
 
+class Lesson:
+    """A teacher, transitions shown otherwise than they were, and a learner that goes on from the teacher."""
+
+    def __init__(self, victim: LearningDriver, world: World) -> None:
+        torch.manual_seed(0)
+        discrete = victim.action_type == "discrete"
+        shape = {"features": 5, "hidden": 8}
+        self.victim, self.env = victim, world.make(roads(1), action_type=victim.action_type)
+        self.teacher = QPolicy(actions=5, **shape) if discrete else ActorPolicy(steering_limit=0.1, **shape)
+        self.truth = torch.rand(64, 10, 5)
+        self.shown = (self.truth + 0.3 * torch.randn(self.truth.shape)).clamp(-1, 1)
+        action = torch.randint(5, (64,)) if discrete else torch.rand(64, 2) - 0.5
+        after = {"observation": self.truth, "reward": torch.zeros(64, 1), "done": torch.zeros(64, 1, dtype=torch.bool)}
+        after["terminated"] = after["done"].clone()
+        self.sample = TensorDict(
+            {"observation": self.shown, "truth": self.truth, "action": action, "next": after}, [64]
+        )
+
+    def decided(self, **loop: float) -> torch.Tensor:
+        """What the learner decides on what is shown after 150 updates: softmax probabilities, or the action."""
+        attack = AttackInLoop(attack=lambda o, p, s: o, skip=0.0, start=self.teacher, **loop)
+        learner = self.victim.learner(self.env, attack)
+        learner.enter(self.victim.phases(attack)[0])
+        for _ in range(150):
+            learner.update(self.sample.clone(), 3e-3)
+        learner.anneal()
+        trained = learner.policy if self.victim.action_type == "discrete" else learner.averaged()
+        return self.decision(trained.scores(self.shown).detach())
+
+    def decision(self, scores: torch.Tensor) -> torch.Tensor:
+        """The probabilities that scores stand for, on the teacher's scale; an action is what it is."""
+        if self.victim.action_type == "continuous":
+            return scores
+        return torch.softmax(scores / (0.5 * self.teacher.scores(self.truth).std(-1, keepdim=True)), -1).detach()
+
+
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
 def test_consistency_brings_decisions_under_attack_to_those_on_the_truth(victim: LearningDriver, world: World) -> None:
-    env = world.make(roads(1), action_type=victim.action_type)
-    shape = {"features": 5, "hidden": 8}
-    torch.manual_seed(0)
-    discrete = victim.action_type == "discrete"
-    teacher = QPolicy(actions=5, **shape) if discrete else ActorPolicy(steering_limit=0.1, **shape)
-    truth = torch.rand(64, 10, 5)
-    shown = (truth + 0.3 * torch.randn(truth.shape)).clamp(-1, 1)
-    action = torch.randint(5, (64,)) if discrete else torch.rand(64, 2) - 0.5
-    after = {"observation": truth, "reward": torch.zeros(64, 1), "done": torch.zeros(64, 1, dtype=torch.bool)}
-    after["terminated"] = after["done"].clone()
-    sample = TensorDict({"observation": shown, "truth": truth, "action": action, "next": after}, [64])
+    lesson = Lesson(victim, world)
+    wanted = lesson.decision(lesson.teacher.scores(lesson.truth))
+    far, near = ((lesson.decided(consistency=weight) - wanted).square().mean() for weight in (0.0, 10.0))
+    assert float(near) < 0.7 * float(far)
 
-    def distance(consistency: float) -> float:
-        """How far the scores on what is shown are from the teacher's on the truth, after training."""
-        loop = AttackInLoop(attack=lambda o, p, s: o, skip=0.0, start=teacher, consistency=consistency)
-        learner = victim.learner(env, loop)
-        learner.enter(victim.phases(loop)[0])
-        for _ in range(150):
-            learner.update(sample.clone(), 3e-3)
-        learner.anneal()
-        trained = learner.policy if discrete else learner.averaged()
-        wanted, found = teacher.scores(truth), trained.scores(shown)
-        if discrete:
-            wanted, found = (
-                torch.softmax(values / (0.5 * wanted.std(-1, keepdim=True)), -1) for values in (wanted, found)
-            )
-        return float((wanted - found).detach().square().mean())
 
-    assert distance(10.0) < 0.7 * distance(0.0)
+def test_a_margin_makes_changes_of_lane_less_wanted(world: World) -> None:
+    lesson = Lesson(VICTIMS[0], world)
+    spread = float(lesson.teacher.scores(lesson.truth).std(-1).mean())
+    without, reluctant = (lesson.decided(consistency=10.0, margin=margin).mean(0) for margin in (0.0, spread))
+    assert bool((reluctant[[0, 2]] < 0.7 * without[[0, 2]]).all())
 
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])

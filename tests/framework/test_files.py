@@ -1,0 +1,50 @@
+"""A file appears whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bench.files import whole
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from bench.files import whole
+with whole(Path(sys.argv[1])) as file:
+    file.write(b"half")
+    file.flush()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_block_that_raises_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "record"
+    path.write_bytes(b"old")
+
+    def fail() -> None:
+        with whole(path) as file:
+            file.write(b"new")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["record"]
+
+
+def test_a_process_that_is_killed_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "record"
+    path.write_bytes(b"old")
+    died = subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
+    assert died.returncode == -signal.SIGKILL
+    assert path.read_bytes() == b"old"
+    with whole(path) as file:
+        file.write(b"new")
+    assert path.read_bytes() == b"new"
+    assert path.stat().st_mode & 0o777 == 0o644
