@@ -49,9 +49,11 @@ def located(run: str, out: Path) -> tuple[Path, str]:
     Raises:
         UserError: if `run` can only be a path, and nothing is there.
     """
-    if "/" in run and not Path(run).is_dir():
+    if Path(run).is_dir():
+        return Path(run), ""
+    if "/" in run:
         raise UserError(f"there is nothing at {run}")
-    return (Path(run), "") if Path(run).is_dir() else (out, run)
+    return out, run
 
 
 def pair_named(beginning: str, records: pa.Table) -> str:

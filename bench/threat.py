@@ -86,14 +86,16 @@ def project(perturbed: Tensor, observation: Tensor, radius: Tensor) -> Tensor:
 
 
 def _bounds(observation: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """The lowest and the highest value of every entry of the perturbation set."""
     return (observation - radius).clamp(-1.0, 1.0), (observation + radius).clamp(-1.0, 1.0)
 
 
 def _between(perturbed: Tensor, observation: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """`perturbed` brought between the bounds, what is NaN back to the observation; one look for NaN is cheaper than a where."""
     within = torch.clamp(perturbed, low, high)
-    return (
-        within if bool(within.sum().isfinite()) else torch.where(within.isnan(), observation.clamp(-1.0, 1.0), within)
-    )
+    if bool(within.sum().isfinite()):
+        return within
+    return torch.where(within.isnan(), observation.clamp(-1.0, 1.0), within)
 
 
 class QueryBudgetError(UserError):
@@ -127,6 +129,8 @@ class Oracle:
         self.action_type = policy.action_type
         self.observation = torch.empty(0)
         self.radius = torch.empty(0)
+        self._set = self._subset = (torch.empty(0), torch.empty(0), torch.empty(0))
+        self._rows: Tensor | None = None
         self.spent = torch.empty(0, dtype=torch.int64)
 
     def begin_step(self, observation: Tensor, scale: float = 1.0) -> None:
@@ -134,7 +138,7 @@ class Oracle:
         self.observation = observation
         self.radius = self.threat.radius(observation, self.features, scale)
         self._set = self._subset = (observation, *_bounds(observation, self.radius))
-        self._rows: Tensor | None = None
+        self._rows = None
         self.spent = torch.zeros(observation.shape[0], dtype=torch.int64)
 
     @property

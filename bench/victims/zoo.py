@@ -41,12 +41,10 @@ def save(policy: Policy, card: Mapping[str, object], *, name: str, seed: int, ro
     blob = save_tensors({key: value.contiguous() for key, value in policy.state_dict().items()})
     full = {"name": name, **card, "shape": policy.shape, "sha256": hashlib.sha256(blob).hexdigest()}
     path = folder / f"seed{seed}.safetensors"
-    for at, content in (
-        (path, blob),
-        (path.with_suffix(".json"), json.dumps(full, indent=1, sort_keys=True).encode() + b"\n"),
-    ):
-        with whole(at) as file:
-            file.write(content)
+    with whole(path) as file:
+        file.write(blob)
+    with whole(path.with_suffix(".json")) as file:
+        file.write(json.dumps(full, indent=1, sort_keys=True).encode() + b"\n")
     return path
 
 
