@@ -65,6 +65,7 @@ class DDPG(LearningDriver):
 class _ActorCriticLearner(Learner):
     def __init__(self, recipe: DDPG, env: EnvBase, attack: AttackInLoop | None) -> None:
         super().__init__(attack)
+        self.attacked = attack is not None
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: ActorPolicy = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
         self.mean = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
@@ -92,6 +93,8 @@ class _ActorCriticLearner(Learner):
             noise_clip=0.5 * limit,
             deactivate_vmap=True,
         )
+        # The loss trains twins of its own; this one is their copy, for attacks to ask.
+        self.policy.critic.requires_grad_(False)
         self.target = SoftUpdate(self.loss, tau=recipe.tau)
         self.actor_adam = torch.optim.Adam(list(self.loss.actor_network_params.flatten_keys().values()))
         self.critic_adam = torch.optim.Adam(list(self.loss.qvalue_network_params.flatten_keys().values()))
@@ -102,23 +105,30 @@ class _ActorCriticLearner(Learner):
 
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
         self.updates += 1
-        value, _ = self.loss.value_loss(sample)
+        truth = sample.copy().set("observation", sample["truth"])
+        value, _ = self.loss.value_loss(truth)
         _descend(self.critic_adam, value, learning_rate)
         if self.updates % self.delay == 0:
-            actor, _ = self.loss.actor_loss(sample)
-            _descend(self.actor_adam, actor + self.inconsistency(sample), learning_rate)
+            actor = self._misled_loss(sample) if self.attacked else self.loss.actor_loss(sample)[0]
+            # Asked for under attack alone, it drives faster on the truth than the policy it is to be consistent with.
+            _descend(self.actor_adam, actor + self.inconsistency(sample) + self.inconsistency(truth), learning_rate)
             self.target.step()
+
+    def _misled_loss(self, sample: TensorDictBase) -> Tensor:
+        """-Q(s, mu(s')): only the actor is misled, the critic that judges it knows the truth."""
+        return -self.policy.value(sample["truth"], self._decided(sample["observation"])).mean()
+
+    def _decided(self, observation: Tensor) -> Tensor:
+        """mu(s) [N, 2] of the weights that the loss trains, which are its own."""
+        with self.loss.actor_network_params.to_module(self.loss.actor_network):
+            return self.loss.actor_network.module(observation)
 
     def divergence(self, observation: Tensor, wanted: Tensor) -> Tensor:
         """Mean squared distance of the actions, in shares of the limits."""
-        # The loss trains weights of its own.
-        with self.loss.actor_network_params.to_module(self.loss.actor_network):
-            action = self.loss.actor_network.module(observation)
-        return ((action - wanted) / self.policy.actor.limit).square().mean()
+        return ((self._decided(observation) - wanted) / self.policy.actor.limit).square().sum(-1).mean()
 
     def anneal(self) -> None:
         self.noise.step()
-        # The loss trains twins of its own; an attack in the loop asks the policy's critic.
         self.policy.critic.load_state_dict(target_state(self.loss.qvalue_network_params, self.policy.critic))
 
     def averaged(self) -> Policy:
