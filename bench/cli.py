@@ -155,8 +155,8 @@ def report(words: Words = None) -> None:
     function(records, Console())
 
 
-@app.command("fetch")
-def fetch_files(
+@app.command()
+def fetch(
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="What to fetch.")] = None,
 ) -> None:
     """Fetch published weights into the cache, or list what there is.

@@ -15,7 +15,7 @@ def print_downloads(console: Console) -> None:
     """Every file with its size, licence and origin, and whether it is in the cache."""
     table = Table(box=None, pad_edge=False, header_style="dim")
     for column in ("name", "size", "licence", "here", "from"):
-        table.add_column(column)
+        table.add_column(column, overflow="fold")
     for name, download in fetch.DOWNLOADS.items():
         here = "yes" if fetch.cached(name) else "no"
         size = f"{download.size / 1e6:.1f} MB"

@@ -145,7 +145,7 @@ def confidence(predictions: Predictions, label: int, boxes: Tensor, *, iou: floa
     """The best score [N] of a class at the object's true place; 0 where no prediction lies there.
 
     The default of `iou` is that of a box moved by half its width: what YOLOv3-tiny says of a stop sign that nobody attacks
-    overlaps it by 0.8 and more, and an attack shall make the sign go away, not nudge its box.
+    overlaps it by 0.75 and more, and an attack shall make the sign go away, not nudge its box.
 
     Args:
         predictions: of N pictures.

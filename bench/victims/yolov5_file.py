@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
 
 import torch
 from safetensors import safe_open
@@ -27,7 +26,7 @@ from bench.vision import Detector
 
 EXPECTED = re.compile(
     r"models\.(yolo|common)\.\w+|torch\.nn\.modules\.\w+\.\w+"
-    r"|pathlib\.\w*Path|argparse\.Namespace|numpy\.(dtype|ndarray)|numpy\._?core\.multiarray\.(scalar|_reconstruct)"
+    r"|pathlib\.(_local\.)?\w*Path|argparse\.Namespace|numpy\.(dtype|ndarray)|numpy\._?core\.multiarray\.(scalar|_reconstruct)"
 )
 """What a checkpoint names: the model's classes, and those of the training's options and figures."""
 
@@ -80,7 +79,7 @@ def save(detector: Detector, path: Path) -> None:
 def _safetensors(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
     with safe_open(path, "pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        return tensors, _names(json.loads(file.metadata()["names"]))
+        return tensors, _names(json.loads((file.metadata() or {})["names"]))
 
 
 def _checkpoint(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
@@ -89,11 +88,13 @@ def _checkpoint(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
         raise UserError(f"the weights {path} are refused: they name {shorten(', '.join(strange), 200)}")
     with safe_globals([(_Inert, name) for name in named]):
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    model = checkpoint.get("ema") or checkpoint["model"]
-    return dict(_tensors(model)), _names(model.names)
+    model = isinstance(checkpoint, dict) and (checkpoint.get("ema") or checkpoint.get("model"))
+    if not isinstance(model, _Inert):
+        raise UserError(f"the weights {path} cannot be read: they are no checkpoint with a model")
+    return dict(_tensors(model)), _names(vars(model)["names"])
 
 
-def _tensors(module: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
+def _tensors(module: _Inert, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
     """The parameters and buffers of an inert module tree, by the names of its state dict."""
     state = vars(module)
     for name, tensor in {**state["_parameters"], **state["_buffers"]}.items():

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
 from bench.errors import UserError
 from bench.vision import Detector, Predictions, confidence, detections, overlap
 
+relaxed = settings(deadline=None)
 LENGTH = st.integers(0, 12)
 
 
@@ -48,6 +49,7 @@ def by_hand(boxes: Tensor, scores: Tensor, threshold: float, iou: float) -> list
     return sorted(found, key=lambda one: -one[1])
 
 
+@relaxed
 @given(predictions(pictures=2), st.sampled_from([0.0, 0.3, 0.9]), st.sampled_from([0.0, 0.31, 0.7, 1.0]))
 def test_suppression_is_that_of_the_definition(given: Predictions, threshold: float, iou: float) -> None:
     found = detections(given, threshold=threshold, iou=iou)
@@ -56,6 +58,7 @@ def test_suppression_is_that_of_the_definition(given: Predictions, threshold: fl
         assert got == by_hand(boxes, scores, threshold, iou)
 
 
+@relaxed
 @given(predictions(), st.randoms(use_true_random=False))
 def test_the_order_of_the_predictions_does_not_matter(given: Predictions, random) -> None:
     order = list(range(given.boxes.shape[1]))
@@ -73,6 +76,7 @@ def test_two_classes_at_one_place_are_both_found() -> None:
     assert found.labels.tolist() == [0, 1]
 
 
+@relaxed
 @given(st.tuples(*[LENGTH] * 4), st.tuples(*[LENGTH] * 4))
 def test_overlap_is_that_of_the_definition(a: tuple[int, ...], b: tuple[int, ...]) -> None:
     boxes = [[x, y, x + width, y + height] for x, y, width, height in (a, b)]
@@ -80,6 +84,7 @@ def test_overlap_is_that_of_the_definition(a: tuple[int, ...], b: tuple[int, ...
     assert got == pytest.approx(area_shared(*boxes))
 
 
+@relaxed
 @given(predictions(pictures=3), st.sampled_from([0.1, 0.3, 0.8]), st.tuples(*[LENGTH] * 4))
 def test_confidence_is_the_best_score_at_the_true_place(given: Predictions, iou: float, true: tuple[int, ...]) -> None:
     x, y, width, height = true
