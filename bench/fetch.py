@@ -112,23 +112,14 @@ def _download(name: str, folder: Path) -> Path:
     download = DOWNLOADS[name]
     requirement = folder / "requirement.txt"
     requirement.write_text(f"{download.wheel} --hash=sha256:{download.wheel_sha256}\n")
+    what = ("--no-deps", "--only-binary", ":all:", "--require-hashes", "--requirement", requirement, "--dest", folder)
     tags = ("--python-version", download.python, "--implementation", "py", "--abi", "none", "--platform", "any")
-    command = (
-        sys.executable,
-        "-m",
-        "pip",
-        "download",
-        "--no-deps",
-        "--only-binary",
-        ":all:",
-        *tags,
-        "--require-hashes",
-    )
-    options = ("--no-input", "--retries", "1", "--progress-bar", "raw", "--requirement", requirement, "--dest", folder)
+    how = ("--no-input", "--retries", "1", "--progress-bar", "raw")
+    command = (sys.executable, "-m", "pip", "download", *what, *tags, *how)
     with (
         DownloadProgress(Console(stderr=True), name) as progress,
         (folder / "complaints").open("w+") as complaints,
-        subprocess.Popen((*command, *options), stdout=subprocess.PIPE, stderr=complaints, text=True) as pip,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=complaints, text=True) as pip,
     ):
         assert pip.stdout is not None
         for line in pip.stdout:
