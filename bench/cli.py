@@ -1,4 +1,4 @@
-"""The command line: `bench run | train | list | show | view | report`.
+"""The command line: `bench run | train | list | show | view | report | fetch`.
 
 Commands import what they need when they are called, so that `bench list` and `--help` do not wait for torch.
 """
@@ -153,6 +153,19 @@ def report(words: Words = None) -> None:
     out = Path(folders[0] if folders else "results").expanduser()
     records = results.SCHEMA.empty_table() if name != "run" and not folders and not out.exists() else results.read(out)
     function(records, Console())
+
+
+@app.command()
+def fetch(
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="What to fetch.")] = None,
+) -> None:
+    """Fetch published weights into the cache, or list what there is.
+
+    What is needed is fetched when it is first needed; this is for a machine that will be without a network later.
+    """
+    from bench import cli_fetch
+
+    cli_fetch.print_fetched(names, Console()) if names else cli_fetch.print_downloads(Console())
 
 
 def _report(name: str) -> Callable[[pa.Table, Console], None]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Self
 from rich.console import Console
 from rich.progress import (
     BarColumn,
+    DownloadColumn,
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
@@ -101,6 +102,32 @@ class TrainingProgress:
             seconds = time.perf_counter() - self.started
             line = f"{self.label} | {share:.0%} | {seconds:.0f} s | {text}"
             self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+class DownloadProgress:
+    """The progress of one download, called with the bytes that came and those there are: a bar on a terminal, else a line."""
+
+    def __init__(self, console: Console, label: str) -> None:
+        self.console = console
+        self.label = label
+        self.bar = _bar(console, DownloadColumn())
+        self.task = self.bar.add_task(label, total=None)
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self.bar.start()
+        else:
+            self.console.print(f"downloading {self.label}", highlight=False, markup=False)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.console.is_terminal:
+            self.bar.stop()
+
+    def __call__(self, done: int, total: int) -> None:
+        self.bar.update(self.task, completed=done, total=total)
 
 
 def _bar(console: Console, *counts: ProgressColumn) -> Progress:

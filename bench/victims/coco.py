@@ -1,0 +1,7 @@
+"""The classes of the COCO detection data set (Lin et al. 2014), in the order that detectors trained on it label them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+NAMES = tuple(Path(__file__).with_name("coco.names").read_text().splitlines())

@@ -1,0 +1,158 @@
+"""What a detector is: pictures in, boxes with scores out, differentiable to the pixel.
+
+A box is [x1, y1, x2, y2] in pixels of the picture given: x to the right, y down, from the outer corner of the first pixel.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from bench.errors import UserError
+from bench.registry import unknown
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Everything a detector says of N pictures before anything is thrown away, with the graph back to the pixels.
+
+    Args:
+        boxes: [N, K, 4] in pixels; they may reach beyond the picture.
+        objectness: [N, K] in [0, 1], the probability that there is an object at all.
+        classes: [N, K, C] in [0, 1], the probability of each class if there is one; they need not sum to 1.
+    """
+
+    boxes: Tensor
+    objectness: Tensor
+    classes: Tensor
+
+    @property
+    def scores(self) -> Tensor:
+        """[N, K, C] in [0, 1]: objectness times class probability (Redmon et al. 2016, Eq. 1)."""
+        return self.objectness.unsqueeze(-1) * self.classes
+
+
+@dataclass(frozen=True)
+class Detections:
+    """The objects found in one picture, best first: boxes [M, 4] in pixels, scores [M] in [0, 1], labels int64 [M]."""
+
+    boxes: Tensor
+    scores: Tensor
+    labels: Tensor
+
+
+class Detector(nn.Module, ABC):
+    """An object detector whose every picture of a batch is looked at by itself."""
+
+    names: tuple[str, ...]
+    """Of the classes, by label."""
+    stride: int
+    """Height and width of a picture must be multiples of it."""
+    weights_sha256: str = ""
+    """Hash of the weights file it was loaded from; empty where there is none."""
+
+    @abstractmethod
+    def predict(self, pictures: Tensor) -> Predictions:
+        """What `forward` returns, for pictures whose shape is right."""
+
+    def forward(self, pictures: Tensor) -> Predictions:
+        """All predictions for a batch of pictures.
+
+        Args:
+            pictures: float [N, 3, H, W], sRGB in [0, 1], H and W multiples of `stride`.
+
+        Raises:
+            ValueError: if the shape is another.
+        """
+        if pictures.ndim != 4 or pictures.shape[1] != 3 or any(side % self.stride for side in pictures.shape[2:]):
+            wanted = f"[N, 3, H, W] with H and W multiples of {self.stride}"
+            raise ValueError(f"pictures must be {wanted}, got {list(pictures.shape)}")
+        return self.predict(pictures)
+
+    def index(self, name: str) -> int:
+        """The label of a class.
+
+        Raises:
+            UserError: if the detector knows no such class.
+        """
+        if name not in self.names:
+            raise UserError(unknown(f"class {name!r}", name, self.names))
+        return self.names.index(name)
+
+
+class DetectorVictim(ABC):
+    """A kind of detector; the fields of the dataclass are its parameters."""
+
+    @abstractmethod
+    def load(self, seed: int) -> Detector:
+        """The detector of training seed `seed`, in eval mode, without gradients on its weights.
+
+        Raises:
+            UserError: if its weights are not there or not what they should be.
+        """
+
+
+def overlap(a: Tensor, b: Tensor) -> Tensor:
+    """Intersection over union of boxes [..., 4] and [..., 4], broadcast, in [0, 1]; 0 where neither has an area."""
+    low, high = torch.maximum(a[..., :2], b[..., :2]), torch.minimum(a[..., 2:], b[..., 2:])
+    intersection = (high - low).clamp(min=0).prod(-1)
+    union = _area(a) + _area(b) - intersection
+    return intersection / union.clamp(min=torch.finfo(union.dtype).tiny)
+
+
+def _area(boxes: Tensor) -> Tensor:
+    return (boxes[..., 2:] - boxes[..., :2]).prod(-1)
+
+
+@torch.no_grad()
+def detections(predictions: Predictions, *, threshold: float, iou: float) -> list[Detections]:
+    """The objects in each picture, after greedy non-maximum suppression within each class.
+
+    A box may be found as more than one class. The time grows with the number of boxes kept, so with a falling threshold.
+
+    Args:
+        predictions: of N pictures.
+        threshold: a score must be above it, in [0, 1].
+        iou: a box that overlaps a better one of its class by more than this is dropped, in [0, 1].
+    """
+    return [
+        _suppressed(boxes, scores, threshold, iou)
+        for boxes, scores in zip(predictions.boxes, predictions.scores, strict=True)
+    ]
+
+
+def _suppressed(boxes: Tensor, scores: Tensor, threshold: float, iou: float) -> Detections:
+    """Of one picture: boxes [K, 4], scores [K, C]."""
+    place, labels = (scores > threshold).nonzero(as_tuple=True)
+    order = scores[place, labels].argsort(descending=True, stable=True)
+    place, labels = place[order], labels[order]
+    kept, left = [], torch.arange(len(place), device=boxes.device)
+    while len(left):
+        best, left = left[0], left[1:]
+        kept.append(best)
+        covered = overlap(boxes[place[best]], boxes[place[left]]) > iou
+        left = left[~covered | (labels[left] != labels[best])]
+    chosen = torch.stack(kept) if kept else left
+    place, labels = place[chosen], labels[chosen]
+    return Detections(boxes[place], scores[place, labels], labels)
+
+
+@torch.no_grad()
+def confidence(predictions: Predictions, label: int, boxes: Tensor, *, iou: float = 0.3) -> Tensor:
+    """The best score [N] of a class at the object's true place; 0 where no prediction lies there.
+
+    The default of `iou` is that of a box moved by half its width: what YOLOv3-tiny says of a stop sign that nobody attacks
+    overlaps it by 0.75 and more, and an attack shall make the sign go away, not nudge its box.
+
+    Args:
+        predictions: of N pictures.
+        label: of the class.
+        boxes: [N, 4], the true box in each picture.
+        iou: how much a prediction must overlap the true box to count.
+    """
+    there = overlap(predictions.boxes, boxes.unsqueeze(1)) >= iou
+    scores = predictions.objectness * predictions.classes[..., label] * there
+    return nn.functional.pad(scores, (0, 1)).amax(-1)

@@ -1,0 +1,72 @@
+"""What a look at a picture costs, and what its gradient costs. One command:
+
+    python benchmarks/detector_speed.py [--side 640] [--rounds 5]
+
+Random weights: the time does not depend on them. The least of the rounds counts, on a machine that may do other things.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import torch
+
+from bench.process import settle
+from bench.victims.yolo import frozen
+from bench.victims.yolov3_tiny import YOLOv3TinyNetwork
+from bench.victims.yolov5 import YOLOv5Network
+from bench.vision import Detector
+
+STOP_SIGN = 11
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--side", type=int, default=640, help="of the pictures in pixels")
+    parser.add_argument("--rounds", type=int, default=5)
+    words = parser.parse_args()
+    settle()
+    torch.manual_seed(0)
+    detectors = {"yolov3_tiny": YOLOv3TinyNetwork(), "yolov5n": YOLOv5Network("n"), "yolov5s": YOLOv5Network("s")}
+    print(f"milliseconds for pictures of {words.side} x {words.side}, least of {words.rounds} rounds")
+    print(f"{'':<12} {'threads':>8} {'pictures':>9} {'forward':>9} {'and back':>9}")
+    for name, network in detectors.items():
+        detector = frozen(network)
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            for count in (1, 4):
+                pictures = torch.rand(count, 3, words.side, words.side)
+                works = (look(detector, pictures), differentiate(detector, pictures))
+                forward, back = (least(work, words.rounds) for work in works)
+                print(f"{name:<12} {threads:>8} {count:>9} {forward * 1000:>9.0f} {back * 1000:>9.0f}", flush=True)
+
+
+def look(detector: Detector, pictures: torch.Tensor) -> Callable[[], object]:
+    """All predictions, without a graph."""
+    return torch.no_grad()(lambda: detector(pictures))
+
+
+def differentiate(detector: Detector, pictures: torch.Tensor) -> Callable[[], object]:
+    """The gradient of each picture's best score of one class."""
+
+    def work() -> None:
+        shown = pictures.clone().requires_grad_()
+        detector(shown).scores[..., STOP_SIGN].amax(-1).sum().backward()
+
+    return work
+
+
+def least(work: Callable[[], object], rounds: int) -> float:
+    """Seconds, after one round to warm up."""
+    seconds = []
+    for _ in range(rounds + 1):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds[1:])
+
+
+if __name__ == "__main__":
+    main()
