@@ -83,6 +83,36 @@ class Detector(nn.Module, ABC):
         return self.names.index(name)
 
 
+class Scenes(ABC):
+    """Frames of a camera world, each with a sign that a patch can be stuck on.
+
+    A patch is [3, P, P] sRGB in [0, 1], its first row the top, P from 8 to 512 texels; it covers a square in the middle of the
+    sign's face, whose side is `share` of the sign's.
+    """
+
+    size: tuple[int, int]
+    """Height and width of every frame in pixels."""
+    boxes: Tensor
+    """[M, 4] the sign in each frame, clipped to the picture, in pixels."""
+    visible: Tensor
+    """[M] share of the sign that is in the picture and not hidden, in [0, 1]."""
+    distance: Tensor
+    """[M] from the camera to the sign along the road, in m."""
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    @abstractmethod
+    def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
+        """Pictures [N, 3, H, W] sRGB in [0, 1], differentiable to the patches.
+
+        Args:
+            frames: int64 [N], which frames.
+            patches: [N, 3, P, P], or [1, 3, P, P] for the same in all; None leaves the sign as it is.
+            share: side of the patch in shares of the sign's, in (0, 1].
+        """
+
+
 class DetectorVictim(ABC):
     """A kind of detector; the fields of the dataclass are its parameters."""
 

@@ -1,0 +1,105 @@
+"""Which pictures of the street there are: approaches for scoring, and other views of other places for training."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from functools import cache
+from typing import get_args
+
+import numpy as np
+
+from envs.camera.camera import Camera
+from envs.camera.street.layout import LOCATIONS
+from envs.camera.street.light import Lighting
+
+DISTANCES = tuple(float(distance) for distance in np.linspace(30.0, 8.0, 10))
+"""Of the frames of an approach before the sign, in m."""
+LANES, DENSITIES = (3, 4, 5), (1.0, 2.0)
+TRAINING_VIEWS = 12
+"""Of each training place under each lighting."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pose:
+    """One view of one place.
+
+    Args:
+        location: a name in `LOCATIONS`.
+        lanes: of the road.
+        density: of the traffic.
+        lighting: what it is traced under.
+        distance: of the camera before the sign in m.
+        x: of the camera, to the right of the lane's middle in m.
+        yaw_deg, pitch_deg: of the camera.
+    """
+
+    location: str
+    lanes: int
+    density: float
+    lighting: Lighting
+    distance: float
+    x: float = 0.0
+    yaw_deg: float = 0.0
+    pitch_deg: float = 1.0
+
+    @property
+    def camera(self) -> Camera:
+        """Where it is seen from."""
+        return Camera(x=self.x, y=-self.distance, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg)
+
+    @property
+    def seed(self) -> int:
+        """Of everything random in its picture."""
+        text = ",".join(f"{key}={value}" for key, value in asdict(self).items())
+        return int(hashlib.sha256(text.encode()).hexdigest()[:8], 16)
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        road = f"{self.lanes}-lanes-density-{self.density:g}"
+        return f"{self.location}-{self.lighting}-{road}-{self.distance:.2f}m-{self.seed:08x}"
+
+
+def approach(location: str, lanes: int, density: float, lighting: Lighting) -> tuple[Pose, ...]:
+    """The ten poses of an approach, farthest first."""
+    return tuple(
+        Pose(location=location, lanes=lanes, density=density, lighting=lighting, distance=distance)
+        for distance in DISTANCES
+    )
+
+
+@cache
+def scored() -> tuple[Pose, ...]:
+    """Every pose of every approach."""
+    return tuple(
+        pose
+        for lighting in get_args(Lighting)
+        for lanes in LANES
+        for density in DENSITIES
+        for location in LOCATIONS.values()
+        if not location.training
+        for pose in approach(location.name, lanes, density, lighting)
+    )
+
+
+@cache
+def training() -> tuple[Pose, ...]:
+    """Views of the training places, at random distances and a little off the lane's middle and direction."""
+    poses = []
+    for lighting in get_args(Lighting):
+        for location in LOCATIONS.values():
+            rng = np.random.default_rng([location.seed, get_args(Lighting).index(lighting)])
+            for _ in range(TRAINING_VIEWS if location.training else 0):
+                pose = Pose(
+                    location=location.name,
+                    lanes=int(rng.choice(LANES)),
+                    density=float(rng.choice(DENSITIES)),
+                    lighting=lighting,
+                    distance=round(float(np.exp(rng.uniform(np.log(8.5), np.log(31.0)))), 2),
+                    x=round(float(rng.normal(0, 0.25)), 2),
+                    yaw_deg=round(float(rng.normal(0, 1.0)), 2),
+                    pitch_deg=round(float(rng.normal(1.0, 0.5)), 2),
+                )
+                poses.append(pose)
+    return tuple(poses)

@@ -1,0 +1,91 @@
+"""The stop sign: its octagon, its face as a texture, and where a patch is stuck on it."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.camera.camera import Array, Camera
+
+SIZE_M = 1.2
+"""Across flats: 48 inches, the oversized R1-1 of the MUTCD (2009, table 2B-1)."""
+HEIGHT_M = 2.7
+"""Of its middle above the road: 7 feet (2.1 m) to its lower edge (MUTCD 2009, section 2A.18)."""
+TEXELS = 512
+"""Side of the face's texture, which covers the octagon's bounding square."""
+PATCH_SHARE = 0.5
+"""Side of a patch in shares of the sign's, in its middle."""
+RED, WHITE = (0.68, 0.08, 0.12), (0.94, 0.94, 0.92)
+"""sRGB."""
+
+_LETTER_HEIGHT, _STROKE, _LETTER_WIDTH, _GAP = 1 / 3, 0.05, 0.165, 0.05
+"""In shares of the sign's side: 16 of 48 inches high (Standard Highway Signs 2004, R1-1)."""
+
+
+def corners(x: float) -> Array:
+    """[8, 3] corners of the octagon of a sign that stands at `x`, in m."""
+    angle = np.deg2rad(22.5 + 45 * np.arange(8))
+    radius = SIZE_M / 2 / np.cos(np.pi / 8)
+    return np.stack([x + radius * np.cos(angle), np.zeros(8), HEIGHT_M + radius * np.sin(angle)], 1)
+
+
+def box(x: float, camera: Camera) -> Array:
+    """[4] x0, y0, x1, y1 of the sign in pixels, not clipped to the picture."""
+    seen = camera.project(corners(x))
+    return np.concatenate([seen.min(0), seen.max(0)])
+
+
+def pixel_to_face(x: float, camera: Camera) -> Array:
+    """[3, 3] homography from pixels to the face's texture: (0, 0) is its top left corner, (1, 1) its bottom right one."""
+    half = SIZE_M / 2
+    square = [(x - half, 0, HEIGHT_M + half), (x + half, 0, HEIGHT_M + half)]
+    square += [(x + half, 0, HEIGHT_M - half), (x - half, 0, HEIGHT_M - half)]
+    seen = camera.project(np.array(square)).astype(np.float32)
+    face = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    return cv2.getPerspectiveTransform(seen, face)
+
+
+def inside(face: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which points [..., 2] of the texture's unit square are on the octagon."""
+    offset = np.abs(face - 0.5) * 2
+    return (offset.max(-1) <= 1) & (offset.sum(-1) <= np.sqrt(2))
+
+
+@cache
+def _strokes() -> list[tuple[list[tuple[float, float]], bool]]:
+    """Centre lines of S, T, O, P in letter boxes of width 1 and height 1, and whether each is closed."""
+
+    def arc(x: float, y: float, rx: float, ry: float, start: float, end: float) -> list[tuple[float, float]]:
+        angles = np.deg2rad(np.linspace(start, end, 24))
+        return [(x + rx * float(np.cos(a)), y + ry * float(np.sin(a))) for a in angles]
+
+    s = arc(0.5, 0.26, 0.5, 0.26, -15, -180) + arc(0.5, 0.26, 0.5, 0.24, 180, 90)
+    s += arc(0.5, 0.74, 0.5, 0.24, -90, 0) + arc(0.5, 0.74, 0.5, 0.26, 0, 165)
+    o = arc(0.5, 0.3, 0.5, 0.3, -180, 0) + arc(0.5, 0.7, 0.5, 0.3, 0, 180)
+    p = [(0.0, 1.0), (0.0, 0.0), (0.5, 0.0), *arc(0.55, 0.27, 0.45, 0.27, -90, 90), (0.0, 0.54)]
+    return [(s, False), ([(0.0, 0.0), (1.0, 0.0)], False), ([(0.5, 0.0), (0.5, 1.0)], False), (o, True), (p, False)]
+
+
+@cache
+def face() -> NDArray[np.float32]:
+    """[3, TEXELS, TEXELS] the stop sign's face, sRGB in [0, 1]. Do not write into it."""
+    scale = 4
+    side = TEXELS * scale
+    picture = np.empty((side, side, 3), np.float32)
+    picture[:] = WHITE
+    angle = np.deg2rad(22.5 + 45 * np.arange(8))
+    radius = side / 2 / np.cos(np.pi / 8) * 0.955
+    octagon = side / 2 + radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+    cv2.fillPoly(picture, [octagon.astype(np.int32)], RED)
+    letters = (0, 1, 1, 2, 3)
+    left = 0.5 - (4 * _LETTER_WIDTH + 3 * _GAP) / 2
+    for (line, closed), letter in zip(_strokes(), letters, strict=True):
+        points = np.array(line) * (_LETTER_WIDTH - _STROKE, _LETTER_HEIGHT - _STROKE) + _STROKE / 2
+        points += (left + letter * (_LETTER_WIDTH + _GAP), 0.5 - _LETTER_HEIGHT / 2)
+        thickness = round(_STROKE * side)
+        cv2.polylines(picture, [(points * side).astype(np.int32)], closed, WHITE, thickness, cv2.LINE_AA)
+    small = cv2.resize(picture, (TEXELS, TEXELS), interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(small.transpose(2, 0, 1))

@@ -1,0 +1,353 @@
+"""One pose, path-traced with Mitsuba 3 (Jakob et al. 2022): the light that reaches the camera, and how much of it a sign adds.
+
+A matt sign's light is linear in its texture, L = B + G * texture: B is the picture with a black sign, G what a white one adds.
+So a pose is traced once, and any texture is put on the sign afterwards.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.camera import sign
+from envs.camera.camera import Array, Camera
+from envs.camera.street import light as lights
+from envs.camera.street.layout import lamp_heads
+from envs.camera.street.light import Light
+from envs.camera.street.material import Material
+from envs.camera.street.mesh import Mesh
+from envs.camera.street.textures import noise
+from envs.camera.street.vehicles import Part
+
+SAMPLES, GUIDE_SAMPLES, SIGN_SAMPLES = 8, 4, 64
+"""Paths a pixel of the picture, of the denoiser's guides, and of the sign's crop."""
+BOUNCES = 5
+MARGIN = 3
+"""Pixels around the sign that belong to its crop."""
+RETROREFLECTION = ((0.2, 250.0), (0.5, 95.0), (1.0, 18.0), (2.0, 5.5), (4.0, 1.6), (8.0, 0.6))
+"""White sheeting of ASTM D4956 type III by observation angle in degrees, in cd/lx/m2; beyond 0.5 degrees extrapolated."""
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What the path tracer leaves of a pose, in linear light.
+
+    Args:
+        black: [H, W, 3] with a black sign.
+        crop: x0, y0, x1, y1 around the sign in pixels, within the picture; empty if it is outside.
+        gain: [h, w, 3] what a white sign adds on the crop.
+        coverage: [h, w] share of each pixel of the crop that is sign and not hidden by what stands before it.
+        depth: [H, W] along the line of sight in m; inf is the sky.
+    """
+
+    black: NDArray[np.float32]
+    crop: tuple[int, int, int, int]
+    gain: NDArray[np.float32]
+    coverage: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+
+@cache
+def variant() -> str:
+    """The Mitsuba variant in use: MITSUBA_VARIANT, or `llvm_ad_rgb` where LLVM can be loaded, or `scalar_rgb`.
+
+    Results are equal across processes and thread counts for one variant, and differ in noise between two.
+    """
+    wanted = os.environ.get("MITSUBA_VARIANT")
+    if not wanted:
+        # Some LLVM versions abort the whole process, so another one tries it first.
+        probe = "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.load_dict(mi.cornell_box())"
+        works = subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0
+        wanted = "llvm_ad_rgb" if works else "scalar_rgb"
+    return wanted
+
+
+def trace(parts: list[Part], light: Light, camera: Camera, sign_x: float, seed: int) -> Traced:
+    """Trace a pose.
+
+    Args:
+        parts: everything but the sign's face.
+        light: of the weather.
+        camera: where it is seen from.
+        sign_x: where the sign stands.
+        seed: of the sampler.
+    """
+    mi = _mitsuba()
+    scene = _scene(parts, light, camera, sign_x)
+    scene["sign"] = _shape("sign", _face(sign_x), {"type": "diffuse", "reflectance": _rgb((0, 0, 0))})
+    world = mi.load_dict(scene)
+    path = mi.load_dict({"type": "path", "max_depth": BOUNCES})
+    guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal,depth:depth"})
+    crop = _crop(camera, sign_x)
+
+    def seen(integrator: Any, samples: int, window: tuple[int, int, int, int] | None = None) -> NDArray[np.float32]:
+        sensor = mi.load_dict(_sensor(camera, window))
+        return np.array(mi.render(world, sensor=sensor, integrator=integrator, spp=samples, seed=seed), np.float32)
+
+    picture, guide = seen(path, SAMPLES)[..., :3], seen(guides, GUIDE_SAMPLES)
+    albedo, normal, depth = guide[..., :3], guide[..., 3:6], guide[..., 6]
+    black = _denoised(picture, albedo, normal)
+    gain = np.zeros((crop[3] - crop[1], crop[2] - crop[0], 3), np.float32)
+    if gain.size:
+        painted = mi.traverse(world)
+
+        def with_sign(reflectance: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            painted["sign.bsdf.reflectance.value"] = reflectance
+            painted.update()
+            return seen(path, SIGN_SAMPLES, crop)[..., :3], seen(guides, SIGN_SAMPLES, crop)[..., 0]
+
+        (dark, no_albedo), (bright, albedo) = with_sign(0.0), with_sign(1.0)
+        coverage = np.clip(albedo - no_albedo, 0, 1)
+        gain = np.where(coverage[..., None] > 0, np.clip(bright - dark, 0, None), 0).astype(np.float32)
+        if light.headlights:
+            gain += coverage[..., None] * _retroreflected(camera, sign_x)
+    else:
+        coverage = gain[..., 0]
+    return Traced(black, crop, gain, coverage, np.where(depth > 0, depth, np.inf).astype(np.float32))
+
+
+def _crop(camera: Camera, sign_x: float) -> tuple[int, int, int, int]:
+    """The sign's box with a margin, cut to the picture."""
+    x0, y0, x1, y1 = sign.box(sign_x, camera)
+    left, top = max(0, int(x0) - MARGIN), max(0, int(y0) - MARGIN)
+    right, bottom = min(camera.width, int(x1) + MARGIN + 1), min(camera.height, int(y1) + MARGIN + 1)
+    return left, top, max(left, right), max(top, bottom)
+
+
+def _retroreflected(camera: Camera, sign_x: float) -> NDArray[np.float32]:
+    """[3] radiance that white sheeting throws back of the headlights."""
+    middle = np.array([sign_x, 0.0, sign.HEIGHT_M])
+    beam = lights.low_beam()
+    total = 0.0
+    for x in lights.HEADLIGHTS_X:
+        lamp = camera.position + (x, lights.HEADLIGHT_AHEAD_M, lights.HEADLIGHT_HEIGHT_M - camera.z)
+        ray, line = middle - lamp, middle - camera.position
+        half = np.tan(np.deg2rad(lights.BEAM_FIELD_DEG / 2))
+        column = int((ray[0] / ray[1] / half + 1) / 2 * beam.shape[1])
+        row = int((1 - ray[2] / ray[1] / half * beam.shape[1] / beam.shape[0]) / 2 * beam.shape[0])
+        lux = lights.BEAM_PEAK_CD * beam[row, column] * ray[1] / np.linalg.norm(ray) ** 3
+        cosine = ray @ line / np.linalg.norm(ray) / np.linalg.norm(line)
+        angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+        angles, coefficients = zip(*RETROREFLECTION, strict=True)
+        total += lux * np.exp(np.interp(np.log(angle), np.log(angles), np.log(coefficients)))
+    return (total * np.array([1.0, 0.97, 0.9])).astype(np.float32)
+
+
+def _denoised(
+    picture: NDArray[np.float32], albedo: NDArray[np.float32], normal: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Intel's Open Image Denoise, guided by albedo and normals."""
+    import pyoidn
+
+    guides = {"albedo": np.ascontiguousarray(np.clip(albedo, 0, 1)), "normal": np.ascontiguousarray(normal)}
+    return np.array(pyoidn.denoise(np.ascontiguousarray(picture), hdr=True, **guides), np.float32)
+
+
+@cache
+def _mitsuba() -> Any:
+    import mitsuba
+
+    mitsuba.set_variant(variant())
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+    return mitsuba
+
+
+def _rgb(colour: Any) -> dict[str, Any]:
+    return {"type": "rgb", "value": [float(part) for part in colour]}
+
+
+def _bitmap(texture: NDArray[np.float32]) -> dict[str, Any]:
+    # A texture's first row is its top, and v points up.
+    data = np.ascontiguousarray(texture[::-1] if texture.ndim == 3 else texture[::-1, :, None], np.float32)
+    return {"type": "bitmap", "data": _mitsuba().TensorXf(data), "raw": True}
+
+
+def _reflectance(material: Material, factor: float = 1.0) -> dict[str, Any]:
+    if material.texture is not None:
+        return _bitmap(material.texture * np.float32(factor))
+    return _rgb(np.array(material.colour) * factor)
+
+
+@cache
+def _puddles() -> NDArray[np.float32]:
+    """Roughness of a wet road: films of water among damp asphalt."""
+    share = np.clip((noise(1024, np.random.default_rng(5), 5, 6) - 0.42) * 4, 0, 1)
+    return (0.07 + 0.33 * share).astype(np.float32)
+
+
+def _bsdf(material: Material, wet: bool) -> dict[str, Any]:
+    kind = material.kind
+    if kind == "metal":
+        tint = {"type": "rgb", "value": [float(part) for part in material.colour]}
+        surface: dict[str, Any] = {
+            "type": "roughconductor",
+            "material": "Al",
+            "alpha": 0.35,
+            "specular_reflectance": tint,
+        }
+    elif kind in ("paint", "glass"):
+        coat = {"clearcoat": 1.0, "clearcoat_gloss": 0.95} if kind == "paint" else {}
+        rough, specular = (0.35, 0.5) if kind == "paint" else (0.08, 0.8)
+        surface = {"type": "principled", "base_color": _reflectance(material), "roughness": rough} | coat
+        surface["specular"] = specular
+    elif kind == "road":
+        surface = {"type": "principled", "base_color": _reflectance(material, 0.45 if wet else 1.0)}
+        surface |= {"roughness": _bitmap(_puddles()) if wet else 0.75, "specular": 0.6 if wet else 0.3}
+    elif kind == "paving" and wet:
+        surface = {"type": "principled", "base_color": _reflectance(material, 0.6), "roughness": 0.3, "specular": 0.5}
+    elif kind == "lamp":
+        surface = {"type": "diffuse", "reflectance": _rgb((0, 0, 0))}
+    else:
+        surface = {"type": "diffuse", "reflectance": _reflectance(material, 0.8 if wet else 1.0)}
+    return {"type": "twosided", "surface": surface}
+
+
+def _shape(
+    name: str, mesh: Mesh, bsdf: dict[str, Any], emitter: dict[str, Any] | None = None, smooth: bool = False
+) -> Any:
+    mi = _mitsuba()
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(bsdf)
+    if emitter:
+        props["emitter"] = mi.load_dict(emitter)
+    shape = mi.Mesh(
+        name,
+        len(mesh.vertices),
+        len(mesh.triangles),
+        has_vertex_normals=smooth,
+        has_vertex_texcoords=True,
+        props=props,
+    )
+    params = mi.traverse(shape)
+    params["vertex_positions"] = mesh.vertices.ravel()
+    params["vertex_texcoords"] = mesh.uv.ravel()
+    params["faces"] = mesh.triangles.ravel()
+    params.update()
+    if smooth:
+        shape.recompute_vertex_normals()
+    return shape
+
+
+def _face(x: float) -> Mesh:
+    corners = sign.corners(x)
+    fan = [[0, i, i + 1] for i in range(1, 7)]
+    return Mesh(corners.astype(np.float32), np.array(fan, np.uint32), np.zeros((8, 2), np.float32))
+
+
+def _sensor(camera: Camera, window: tuple[int, int, int, int] | None) -> dict[str, Any]:
+    mi = _mitsuba()
+    film: dict[str, Any] = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb"}
+    film |= {"component_format": "float32", "rfilter": {"type": "box"}}
+    if window is not None:
+        x0, y0, x1, y1 = window
+        film |= {"crop_offset_x": x0, "crop_offset_y": y0, "crop_width": x1 - x0, "crop_height": y1 - y0}
+    position = camera.position
+    to_world = mi.ScalarTransform4f().look_at(
+        origin=position.tolist(), target=(position + camera.forward).tolist(), up=[0, 0, 1]
+    )
+    return {
+        "type": "perspective",
+        "fov": camera.field_of_view_deg,
+        "fov_axis": "x",
+        "near_clip": 0.05,
+        "far_clip": 2000.0,
+        "to_world": to_world,
+        "film": film,
+        "sampler": {"type": "independent"},
+    }
+
+
+def _scene(parts: list[Part], light: Light, camera: Camera, sign_x: float) -> dict[str, Any]:
+    mi = _mitsuba()
+    scene: dict[str, Any] = {"type": "scene"}
+    for number, (mesh, material) in enumerate(parts):
+        glow = {"type": "area", "radiance": _rgb(material.colour)} if material.kind == "lamp" else None
+        scene[f"part{number}"] = _shape(f"part{number}", mesh, _bsdf(material, light.wet), glow, material.kind in ("paint", "glass"))
+    sky = light.sky
+    if light.sun is not None:
+        sky, irradiance = _clear_sky(tuple(light.sun.tolist()))
+        direction = [float(-part) for part in light.sun]
+        scene["sun"] = {"type": "directional", "direction": direction, "irradiance": _rgb(irradiance)}
+    assert sky is not None
+    upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    scene["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": upright}
+    if light.headlights:
+        scene |= _headlights(camera) | _street_lamps()
+    return scene
+
+
+@cache
+def _clear_sky(sun: tuple[float, float, float]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Radiance [H, W, 3] of a clear sky, as `Light.sky`, and irradiance [3] of its sun.
+
+    Mitsuba's own model of both (Hosek and Wilkie 2012, 2013) costs more a sample than all the rest of the scene; as a map and
+    a parallel beam they cost next to nothing.
+    """
+    height = 128
+    polar, azimuth = np.meshgrid(
+        (np.arange(height) + 0.5) / height * np.pi, (np.arange(2 * height) + 0.5) / height * np.pi, indexing="ij"
+    )
+    directions = np.stack([np.sin(polar) * np.sin(azimuth), np.sin(polar) * np.cos(azimuth), np.cos(polar)], -1)
+    sky = _radiance({"sun_scale": 0.0}, sun, directions.reshape(-1, 3)).reshape(height, 2 * height, 3)
+    # Below the horizon the model is black; the far ground is not.
+    sky[height // 2 :] = 0.3 * sky[height // 2 - 1].mean(0)
+    disc = _radiance({"sky_scale": 0.0}, sun, np.array([sun]))[0]
+    limb_darkening = 0.8
+    return sky.astype(np.float32), disc * limb_darkening * 2 * np.pi * (1 - np.cos(np.deg2rad(0.2665)))
+
+
+def _radiance(scales: dict[str, float], sun: tuple[float, float, float], towards: NDArray[np.float64]) -> Array:
+    """[N, 3] what the sun and sky send from the directions [N, 3]."""
+    mi = _mitsuba()
+    emitter = mi.load_dict(
+        {"type": "sunsky", "sun_direction": list(sun), "turbidity": 3.0, "albedo": 0.2, "sun_aperture": 0.533} | scales
+    )
+    if "llvm" in variant():
+        si = mi.SurfaceInteraction3f()
+        si.wi = mi.Vector3f(*(-towards.T.astype(np.float32)))
+        return np.array(emitter.eval(si)).T.astype(float)
+    found = []
+    for direction in towards:
+        si = mi.SurfaceInteraction3f()
+        si.wi = mi.ScalarVector3f(*(-direction))
+        found.append(np.array(emitter.eval(si)))
+    return np.array(found)
+
+
+def _headlights(camera: Camera) -> dict[str, Any]:
+    mi = _mitsuba()
+    found = {}
+    for number, x in enumerate(lights.HEADLIGHTS_X):
+        origin = camera.position + (x, lights.HEADLIGHT_AHEAD_M, lights.HEADLIGHT_HEIGHT_M - camera.z)
+        found[f"headlight{number}"] = {
+            "type": "projector",
+            "irradiance": _bitmap(lights.low_beam()[::-1]),
+            # The projector's scale is pi times the intensity along its axis.
+            "scale": lights.BEAM_PEAK_CD / np.pi,
+            "fov": lights.BEAM_FIELD_DEG,
+            "to_world": mi.ScalarTransform4f().look_at(
+                origin=origin.tolist(), target=(origin + (0, 1, 0)).tolist(), up=[0, 0, 1]
+            ),
+        }
+    return found
+
+
+def _street_lamps() -> dict[str, Any]:
+    mi = _mitsuba()
+    return {
+        f"street_lamp{number}": {
+            "type": "spot",
+            "intensity": _rgb(lights.LAMP_CD * np.array([1.0, 0.85, 0.62])),
+            "cutoff_angle": 75.0,
+            "beam_width": 55.0,
+            "to_world": mi.ScalarTransform4f().look_at(origin=[x, y, z], target=[x, y + 0.01, 0], up=[0, 1, 0]),
+        }
+        for number, (x, y, z) in enumerate(lamp_heads())
+    }
