@@ -18,7 +18,7 @@ NOISE = {"sun": 0.005, "overcast": 0.008, "night": 0.02}
 def exposure(light: NDArray[np.float32]) -> float:
     """The factor that an automatic exposure puts before the light [H, W, 3] of a frame.
 
-    The logarithmic mean becomes middle grey, without the brightest 3 % counting, unless that would burn out more than 4 %.
+    The logarithmic mean becomes middle grey, or less where more than 4 % of the picture would burn out.
     """
     luminance = light @ np.array(LUMINANCE, np.float32)
     dim = np.minimum(luminance, np.quantile(luminance, 0.97))

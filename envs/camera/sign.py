@@ -6,7 +6,9 @@ from functools import cache
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from envs.camera.camera import Array, Camera
 
@@ -16,8 +18,6 @@ HEIGHT_M = 2.7
 """Of its middle above the road: 7 feet (2.1 m) to its lower edge (MUTCD 2009, section 2A.18)."""
 TEXELS = 512
 """Side of the face's texture, which covers the octagon's bounding square."""
-PATCH_SHARE = 0.5
-"""Side of a patch in shares of the sign's, in its middle."""
 RED, WHITE = (0.68, 0.08, 0.12), (0.94, 0.94, 0.92)
 """sRGB."""
 
@@ -45,7 +45,7 @@ def pixel_to_face(x: float, camera: Camera) -> Array:
     square += [(x + half, 0, HEIGHT_M - half), (x - half, 0, HEIGHT_M - half)]
     seen = camera.project(np.array(square)).astype(np.float32)
     face = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
-    return cv2.getPerspectiveTransform(seen, face)
+    return np.asarray(cv2.getPerspectiveTransform(seen, face), np.float64)
 
 
 def inside(face: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -89,3 +89,19 @@ def face() -> NDArray[np.float32]:
         cv2.polylines(picture, [(points * side).astype(np.int32)], closed, WHITE, thickness, cv2.LINE_AA)
     small = cv2.resize(picture, (TEXELS, TEXELS), interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(small.transpose(2, 0, 1))
+
+
+def stick(patches: Tensor, share: float) -> Tensor:
+    """The face with patches on it, [N, 3, TEXELS, TEXELS] sRGB; every texel of a patch is a printed square.
+
+    Args:
+        patches: [N, 3, P, P] sRGB in [0, 1].
+        share: side of the patch in shares of the sign's, in (0, 1].
+    """
+    side = max(1, round(share * TEXELS))
+    first = (TEXELS - side) // 2
+    printed = torch.nn.functional.interpolate(patches, size=(side, side), mode="nearest-exact")
+    covered = torch.zeros(TEXELS, TEXELS)
+    covered[first : first + side, first : first + side] = 1
+    margin = (first, TEXELS - side - first)
+    return torch.where(covered > 0, torch.nn.functional.pad(printed, margin * 2), torch.from_numpy(face()))

@@ -23,8 +23,6 @@ SMALLEST_MM = 0.6
 """Diameter of the drops that are drawn."""
 SKY_M = 1500.0
 """Depth given to the sky: what is beyond is not seen through rain or fog."""
-LENS_DROPS_PER_MM_H = 1.1
-"""Drops on the windscreen before the camera between two strokes of the wiper, by rain rate."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,6 @@ class Air:
     Args:
         transmitted: [H, W, 1].
         added: [H, W, 3].
-        blur: [H, W] of 0 and 1: where a drop on the windscreen blurs the picture.
     """
 
     transmitted: Image
@@ -99,7 +96,7 @@ def streaks(rate_mm_h: float, depth: Image, speed_mps: float, focal: float, rng:
     wide = np.maximum(diameter / 1000 / z * focal, 1e-3)
     length = np.linalg.norm(end - start, axis=1) + wide
     # Thinner than a pixel, it hides a share of it; it is anywhere on its streak for a share of the exposure.
-    share = np.minimum(wide, 1.0) * np.clip(wide / length, 0, 1) ** 0.5
+    share = np.minimum(wide, 1.0) * wide / length
     clear = np.ones((height, width), np.float32)
     for layer in np.array_split(np.argsort(-z), 12):
         drawn = np.zeros((height, width), np.float32)
@@ -109,6 +106,6 @@ def streaks(rate_mm_h: float, depth: Image, speed_mps: float, focal: float, rng:
             cv2.line(drawn, a.tolist(), b.tolist(), float(share[number]), thick, cv2.LINE_AA, 4)
         near = z[layer].mean()
         # Near drops are out of focus.
-        drawn = cv2.GaussianBlur(drawn, (0, 0), 0.5 + 1.2 / near)
-        clear *= np.where(depth > near, 1 - np.clip(drawn, 0, 0.95), 1)
+        soft = cv2.GaussianBlur(drawn, (0, 0), 0.5 + 1.2 / near)
+        clear *= np.where(depth > near, 1 - np.clip(soft, 0, 0.95), 1)
     return 1 - clear

@@ -88,9 +88,7 @@ def street(location: Location, *, lanes: int, density: float, distance: float, l
     for placed in traffic(location, lanes=lanes, density=density):
         y = placed.y + placed.speed * (_START - distance) / SPEED_MPS
         paint = PAINTS[placed.paint]
-        parts += [
-            (mesh.moved(placed.x, y), material) for mesh, material in vehicle(placed.model, paint, lights=lights)
-        ]
+        parts += [(mesh.moved(placed.x, y), material) for mesh, material in vehicle(placed.model, paint, lights=lights)]
     return _merged(parts)
 
 

@@ -127,7 +127,7 @@ def _retroreflected(camera: Camera, sign_x: float) -> NDArray[np.float32]:
     beam = lights.low_beam()
     total = 0.0
     for x in lights.HEADLIGHTS_X:
-        lamp = camera.position + (x, lights.HEADLIGHT_AHEAD_M, lights.HEADLIGHT_HEIGHT_M - camera.z)
+        lamp = _lamp(camera, x)
         ray, line = middle - lamp, middle - camera.position
         half = np.tan(np.deg2rad(lights.BEAM_FIELD_DEG / 2))
         column = int((ray[0] / ray[1] / half + 1) / 2 * beam.shape[1])
@@ -138,6 +138,11 @@ def _retroreflected(camera: Camera, sign_x: float) -> NDArray[np.float32]:
         angles, coefficients = zip(*RETROREFLECTION, strict=True)
         total += lux * np.exp(np.interp(np.log(angle), np.log(angles), np.log(coefficients)))
     return (total * np.array([1.0, 0.97, 0.9])).astype(np.float32)
+
+
+def _lamp(camera: Camera, x: float) -> Array:
+    """[3] where the headlight at `x` of the car's middle is."""
+    return camera.position + np.array([x, lights.HEADLIGHT_AHEAD_M, lights.HEADLIGHT_HEIGHT_M - camera.z])
 
 
 def _denoised(
@@ -269,7 +274,9 @@ def _scene(parts: list[Part], light: Light, camera: Camera, sign_x: float) -> di
     scene: dict[str, Any] = {"type": "scene"}
     for number, (mesh, material) in enumerate(parts):
         glow = {"type": "area", "radiance": _rgb(material.colour)} if material.kind == "lamp" else None
-        scene[f"part{number}"] = _shape(f"part{number}", mesh, _bsdf(material, light.wet), glow, material.kind in ("paint", "glass"))
+        scene[f"part{number}"] = _shape(
+            f"part{number}", mesh, _bsdf(material, light.wet), glow, material.kind in ("paint", "glass")
+        )
     sky = light.sky
     if light.sun is not None:
         sky, irradiance = _clear_sky(tuple(light.sun.tolist()))
@@ -325,7 +332,7 @@ def _headlights(camera: Camera) -> dict[str, Any]:
     mi = _mitsuba()
     found = {}
     for number, x in enumerate(lights.HEADLIGHTS_X):
-        origin = camera.position + (x, lights.HEADLIGHT_AHEAD_M, lights.HEADLIGHT_HEIGHT_M - camera.z)
+        origin = _lamp(camera, x)
         found[f"headlight{number}"] = {
             "type": "projector",
             "irradiance": _bitmap(lights.low_beam()[::-1]),
@@ -333,7 +340,7 @@ def _headlights(camera: Camera) -> dict[str, Any]:
             "scale": lights.BEAM_PEAK_CD / np.pi,
             "fov": lights.BEAM_FIELD_DEG,
             "to_world": mi.ScalarTransform4f().look_at(
-                origin=origin.tolist(), target=(origin + (0, 1, 0)).tolist(), up=[0, 0, 1]
+                origin=origin.tolist(), target=(origin + np.array([0, 1, 0])).tolist(), up=[0, 0, 1]
             ),
         }
     return found

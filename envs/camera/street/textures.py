@@ -18,7 +18,7 @@ def noise(side: int, rng: Rng, octaves: int = 6, cells: int = 4, persistence: fl
         grid = min(cells * 2**octave, side)
         layer = rng.random((grid, grid)).astype(np.float32)
         # The border is repeated so that the texture tiles.
-        layer = cv2.copyMakeBorder(layer, 2, 2, 2, 2, cv2.BORDER_WRAP)
+        layer = np.pad(layer, 2, mode="wrap")
         wide = round(side * (grid + 4) / grid)
         edge = round(2 * side / grid)
         total += weight * cv2.resize(layer, (wide, wide), interpolation=cv2.INTER_CUBIC)[edge:, edge:][:side, :side]

@@ -1,0 +1,125 @@
+"""The transport bank: every frame of the camera world, rendered once; a file for each place in each weather."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+from torch import Tensor
+
+from bench.errors import UserError
+from bench.files import whole
+from bench.scenario import WEATHERS
+from bench.vision import Scenes
+from envs.camera import develop, sign
+from envs.camera.frame import Frame, background, noise_level, signed
+from envs.camera.poses import Pose
+from envs.camera.street.layout import sign_x
+
+SHIPPED = Path(__file__).parent / "data"
+
+
+def path_of(folder: Path, location: str, weather: str) -> Path:
+    """Where the frames of a place in a weather are."""
+    return folder / f"{location}-{weather}.safetensors"
+
+
+def write(
+    folder: Path, location: str, weather: str, poses: Sequence[Pose], frames: Sequence[Frame], made_by: object
+) -> Path:
+    """Keep the frames of a place in a weather, atomically."""
+    tensors: dict[str, NDArray[np.generic]] = {
+        "crop": np.array([frame.crop for frame in frames], np.int32),
+        "scale": np.array([frame.scale for frame in frames], np.float32),
+        "visible": np.array([frame.visible for frame in frames], np.float32),
+    }
+    for name in ("picture", "black", "gain"):
+        parts = [getattr(frame, name).ravel() for frame in frames]
+        tensors[name] = np.concatenate(parts)
+        tensors[f"{name}_ends"] = np.cumsum([len(part) for part in parts]).astype(np.int64)
+    metadata = {"poses": json.dumps([asdict(pose) for pose in poses]), "made_by": json.dumps(made_by)}
+    path = path_of(folder, location, weather)
+    folder.mkdir(parents=True, exist_ok=True)
+    with whole(path) as file:
+        file.write(save(tensors, metadata))
+    return path
+
+
+def read(folder: Path, location: str, weather: str) -> list[tuple[Pose, Frame]]:
+    """The frames of a place in a weather.
+
+    Raises:
+        UserError: if they are not there, saying what renders them, or cannot be read.
+    """
+    path = path_of(folder, location, weather)
+    if not path.exists():
+        raise UserError(f"there are no frames of {location} in {weather} at {path}; `bench render` makes them")
+    try:
+        with safe_open(path, "np") as file:
+            held = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            poses = [Pose(**fields) for fields in json.loads(file.metadata()["poses"])]
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"the frames {path} cannot be read: {str(error).splitlines()[0]}") from None
+    parts = {name: np.split(held[name], held[f"{name}_ends"][:-1]) for name in ("picture", "black", "gain")}
+    found = []
+    for number, pose in enumerate(poses):
+        x0, y0, x1, y1 = (int(edge) for edge in held["crop"][number])
+        shape = (y1 - y0, x1 - x0, 3)
+        black_scale, gain_scale = (float(scale) for scale in held["scale"][number])
+        frame = Frame(
+            picture=parts["picture"][number],
+            crop=(x0, y0, x1, y1),
+            black=parts["black"][number].reshape(shape),
+            gain=parts["gain"][number].reshape(shape),
+            scale=(black_scale, gain_scale),
+            visible=float(held["visible"][number]),
+        )
+        found.append((pose, frame))
+    return found
+
+
+class BankScenes(Scenes):
+    """Frames of the bank, in the order given.
+
+    Args:
+        frames: poses with their frames.
+        weathers: the name of each one's weather.
+    """
+
+    def __init__(self, frames: Sequence[tuple[Pose, Frame]], weathers: Sequence[str]) -> None:
+        self.poses = tuple(pose for pose, _ in frames)
+        self.frames = tuple(frame for _, frame in frames)
+        self.weathers = tuple(weathers)
+        camera = self.poses[0].camera
+        self.size = (camera.height, camera.width)
+        limit = np.array([camera.width, camera.height] * 2)
+        boxes = [sign.box(sign_x(pose.lanes), pose.camera).clip(0, limit) for pose in self.poses]
+        self.boxes = torch.from_numpy(np.array(boxes)).float()
+        self.visible = torch.tensor([frame.visible for frame in self.frames])
+        self.distance = torch.tensor([pose.distance for pose in self.poses])
+
+    def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
+        if patches is None:
+            faces = torch.from_numpy(sign.face()).unsqueeze(0)
+        else:
+            faces = sign.stick(patches, share)
+        faces = develop.linear(faces).expand(len(frames), -1, -1, -1)
+        return torch.stack([self._picture(int(number), face) for number, face in zip(frames, faces, strict=True)])
+
+    def _picture(self, number: int, face: Tensor) -> Tensor:
+        """[3, H, W] frame `number` with a linear face texture [3, S, S] on the sign."""
+        pose, frame = self.poses[number], self.frames[number]
+        picture = background(frame)
+        x0, y0, x1, y1 = frame.crop
+        if x1 > x0 and y1 > y0:
+            picture[:, y0:y1, x0:x1] = signed(frame, face, pose.camera, sign_x(pose.lanes))
+        generator = torch.Generator().manual_seed(pose.seed)
+        noise = torch.randn(picture.shape, generator=generator) * noise_level(WEATHERS[self.weathers[number]])
+        return (picture + noise).clamp(0, 1)
