@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from bench.errors import UserError
 from bench.files import whole
 from bench.scenario import WEATHERS
 from bench.vision import Scenes
-from envs.camera import develop, sign
+from envs.camera import sign
 from envs.camera.frame import Frame, background, noise_level, signed
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
@@ -85,6 +86,16 @@ def read(folder: Path, location: str, weather: str) -> list[tuple[Pose, Frame]]:
     return found
 
 
+GRAIN_SHIFT = 97
+"""One field of noise serves all frames, each from a place of its own within so many pixels down and to the right."""
+
+
+@cache
+def _grain(height: int, width: int) -> Tensor:
+    """[3, height, width] the sensor's noise at a standard deviation of 1."""
+    return torch.randn(3, height, width, generator=torch.Generator().manual_seed(0))
+
+
 class BankScenes(Scenes):
     """Frames of the bank, in the order given.
 
@@ -106,20 +117,17 @@ class BankScenes(Scenes):
         self.distance = torch.tensor([pose.distance for pose in self.poses])
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
-        if patches is None:
-            faces = torch.from_numpy(sign.face()).unsqueeze(0)
-        else:
-            faces = sign.stick(patches, share)
-        faces = develop.linear(faces).expand(len(frames), -1, -1, -1)
+        faces = sign.painted(patches, share).expand(len(frames), -1, -1, -1)
         return torch.stack([self._picture(int(number), face) for number, face in zip(frames, faces, strict=True)])
 
     def _picture(self, number: int, face: Tensor) -> Tensor:
-        """[3, H, W] frame `number` with a linear face texture [3, S, S] on the sign."""
+        """[3, H, W] frame `number` with linear reflectances [3, S, S] on the sign."""
         pose, frame = self.poses[number], self.frames[number]
         picture = background(frame)
         x0, y0, x1, y1 = frame.crop
         if x1 > x0 and y1 > y0:
             picture[:, y0:y1, x0:x1] = signed(frame, face, pose.camera, sign_x(pose.lanes))
-        generator = torch.Generator().manual_seed(pose.seed)
-        noise = torch.randn(picture.shape, generator=generator) * noise_level(WEATHERS[self.weathers[number]])
-        return (picture + noise).clamp(0, 1)
+        grain = _grain(picture.shape[1] + GRAIN_SHIFT, picture.shape[2] + GRAIN_SHIFT)
+        down, right = pose.seed % GRAIN_SHIFT, pose.seed // GRAIN_SHIFT % GRAIN_SHIFT
+        noise = grain[:, down : down + picture.shape[1], right : right + picture.shape[2]]
+        return (picture + noise_level(WEATHERS[self.weathers[number]]) * noise).clamp(0, 1)

@@ -91,7 +91,7 @@ def signed(kept: Frame, face: Tensor, camera: Camera, x: float) -> Tensor:
 
     Args:
         kept: the frame; its crop must not be empty.
-        face: the linear texture of the whole face [3, S, S].
+        face: linear reflectances of the whole face [3, S, S].
         camera: of the frame.
         x: where the sign stands.
     """

@@ -10,14 +10,15 @@ from typing import get_args
 import numpy as np
 
 from envs.camera.camera import Camera
-from envs.camera.street.layout import LOCATIONS
+from envs.camera.street import occlusion
+from envs.camera.street.layout import DISTANCES, LOCATIONS, sign_x, traffic
 from envs.camera.street.light import Lighting
 
-DISTANCES = tuple(float(distance) for distance in np.linspace(30.0, 8.0, 10))
-"""Of the frames of an approach before the sign, in m."""
 LANES, DENSITIES = (3, 4, 5), (1.0, 2.0)
 TRAINING_VIEWS = 12
 """Of each training place under each lighting."""
+LEAST_VISIBLE = 0.6
+"""Share of the sign that a training view shows, about."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +91,8 @@ def training() -> tuple[Pose, ...]:
     for lighting in get_args(Lighting):
         for location in LOCATIONS.values():
             rng = np.random.default_rng([location.seed, get_args(Lighting).index(lighting)])
-            for _ in range(TRAINING_VIEWS if location.training else 0):
+            wanted = len(poses) + TRAINING_VIEWS * location.training
+            while len(poses) < wanted:
                 pose = Pose(
                     location=location.name,
                     lanes=int(rng.choice(LANES)),
@@ -101,5 +103,13 @@ def training() -> tuple[Pose, ...]:
                     yaw_deg=round(float(rng.normal(0, 1.0)), 2),
                     pitch_deg=round(float(rng.normal(1.0, 0.5)), 2),
                 )
-                poses.append(pose)
+                if _visible(pose) >= LEAST_VISIBLE:
+                    poses.append(pose)
     return tuple(poses)
+
+
+def _visible(pose: Pose) -> float:
+    """Share of the sign that a view shows, about."""
+    placed = traffic(LOCATIONS[pose.location], pose.lanes, pose.density)
+    vehicles = [(each.model, each.x, each.later(pose.distance)) for each in placed]
+    return occlusion.visible(pose.camera, sign_x(pose.lanes), vehicles)

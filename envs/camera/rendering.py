@@ -1,18 +1,27 @@
-"""Tracing the poses of the bank, one file each, so that a render that was broken off goes on."""
+"""Making the bank: every pose traced once and kept, then developed in each weather that has its light.
+
+A pose is a file of its own, so a render that was broken off goes on.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 
+from bench.errors import UserError
 from bench.files import whole
+from bench.scenario import WEATHERS
+from envs.camera import bank
+from envs.camera.frame import frame
 from envs.camera.poses import Pose
-from envs.camera.street import layout
-from envs.camera.street.light import light
+from envs.camera.street import layout, render
+from envs.camera.street.light import light, lighting
 from envs.camera.street.render import Traced, trace, variant
 
-VERSION = 1
+VERSION = 2
 """Of everything that decides what is traced; raised when the street or its light change."""
 
 
@@ -43,3 +52,53 @@ def traced(folder: Path, pose: Pose) -> Traced:
         single = {name: kept[name].astype(np.float32) for name in kept.files if name != "crop"}
         x0, y0, x1, y1 = (int(edge) for edge in kept["crop"])
     return Traced(crop=(x0, y0, x1, y1), **single)
+
+
+def make(poses: Sequence[Pose], *, kept: Path, out: Path, progress: Callable[[float, str], None]) -> list[Path]:
+    """Trace the poses that are not there yet, and write the bank of all of them.
+
+    Args:
+        poses: of any places and lightings.
+        kept: folder of traced poses, some 4 MB each.
+        out: folder of the bank.
+        progress: called with the share done and a short text.
+
+    Returns:
+        The files written, one for each place and weather.
+
+    Raises:
+        UserError: if the renderer is not installed.
+    """
+    missing = [pose for pose in poses if not path_of(kept, pose).exists()]
+    if missing:
+        _check_installed()
+    for number, pose in enumerate(missing):
+        progress(number / len(missing), pose.name)
+        traced(kept, pose)
+    written = []
+    for location in dict.fromkeys(pose.location for pose in poses):
+        for weather in WEATHERS.values():
+            there = [pose for pose in poses if pose.location == location and pose.lighting == lighting(weather)]
+            if there:
+                progress(1.0, f"{location} in {weather.name}")
+                frames = [frame(traced(kept, pose), pose, weather) for pose in there]
+                written.append(bank.write(out, location, weather.name, there, frames, _made_by()))
+    return written
+
+
+def _made_by() -> dict[str, object]:
+    """What a file of the bank says of its making."""
+    return {
+        "version": VERSION,
+        "variant": variant(),
+        "samples": [render.SAMPLES, render.GUIDE_SAMPLES, render.SIGN_SAMPLES],
+        "libraries": {name: metadata.version(name) for name in ("mitsuba", "pyoidn")},
+    }
+
+
+def _check_installed() -> None:
+    for name in ("mitsuba", "pyoidn"):
+        try:
+            metadata.version(name)
+        except metadata.PackageNotFoundError:
+            raise UserError(f"rendering needs {name}: pip install 'cavbench[render]'") from None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.camera.camera import Array, Camera
+from envs.camera.develop import linear
 
 SIZE_M = 1.2
 """Across flats: 48 inches, the oversized R1-1 of the MUTCD (2009, table 2B-1)."""
@@ -91,17 +92,25 @@ def face() -> NDArray[np.float32]:
     return np.ascontiguousarray(small.transpose(2, 0, 1))
 
 
-def stick(patches: Tensor, share: float) -> Tensor:
-    """The face with patches on it, [N, 3, TEXELS, TEXELS] sRGB; every texel of a patch is a printed square.
+def painted(patches: Tensor | None, share: float) -> Tensor:
+    """Reflectances of the face with patches on it, linear [N, 3, TEXELS, TEXELS]; every texel of a patch is a printed square.
 
     Args:
-        patches: [N, 3, P, P] sRGB in [0, 1].
+        patches: [N, 3, P, P] sRGB in [0, 1]; None for the face alone, N = 1.
         share: side of the patch in shares of the sign's, in (0, 1].
     """
+    plain = _reflectance().unsqueeze(0)
+    if patches is None:
+        return plain
     side = max(1, round(share * TEXELS))
     first = (TEXELS - side) // 2
-    printed = torch.nn.functional.interpolate(patches, size=(side, side), mode="nearest-exact")
-    covered = torch.zeros(TEXELS, TEXELS)
-    covered[first : first + side, first : first + side] = 1
-    margin = (first, TEXELS - side - first)
-    return torch.where(covered > 0, torch.nn.functional.pad(printed, margin * 2), torch.from_numpy(face()))
+    printed = torch.nn.functional.interpolate(linear(patches), size=(side, side), mode="nearest-exact")
+    faces = plain.repeat(len(patches), 1, 1, 1)
+    faces[:, :, first : first + side, first : first + side] = printed
+    return faces
+
+
+@cache
+def _reflectance() -> Tensor:
+    """[3, TEXELS, TEXELS] of the plain face, linear."""
+    return linear(torch.from_numpy(face()))

@@ -5,15 +5,17 @@ Coordinates are those of `envs.camera.camera`: the sign's face at y = 0, the mid
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Literal, get_args
 
 import numpy as np
 
 from envs.camera import sign
+from envs.camera.camera import Camera
 from envs.camera.street import material as m
-from envs.camera.street import textures
+from envs.camera.street import occlusion, textures
 from envs.camera.street.material import Material
 from envs.camera.street.mesh import Mesh, Rng, block, foliage, ground, join, quad, rod
 from envs.camera.street.vehicles import LENGTH, PAINTS, Model, Part, vehicle
@@ -23,6 +25,10 @@ LANES_TO_THE_LEFT = 2
 """Of the ego's: it keeps to the third lane from the left, so every lane more puts the sign a lane further away."""
 VERGE_M = 1.1
 """From the kerb to the middle of the sign."""
+DISTANCES = tuple(float(distance) for distance in np.linspace(30.0, 8.0, 10))
+"""Of the frames of an approach before the sign, in m."""
+MOST_HIDDEN = 4
+"""Frames of an approach in which the traffic may hide the sign."""
 SPEED_MPS = 10.0
 """The ego's, between the frames of an approach."""
 CROSSING = (2.5, 11.5)
@@ -85,8 +91,8 @@ def street(location: Location, *, lanes: int, density: float, distance: float, l
         lights: whether tail lights are on.
     """
     parts = list(_standing(location, lanes))
-    for placed in traffic(location, lanes=lanes, density=density):
-        y = placed.y + placed.speed * (_START - distance) / SPEED_MPS
+    for placed in traffic(location, lanes, density):
+        y = placed.later(distance)
         paint = PAINTS[placed.paint]
         parts += [(mesh.moved(placed.x, y), material) for mesh, material in vehicle(placed.model, paint, lights=lights)]
     return _merged(parts)
@@ -99,13 +105,9 @@ def _standing(location: Location, lanes: int) -> tuple[Part, ...]:
     return tuple(_merged(parts + _other_signs(location, lanes)))
 
 
-_START = 30.0
-"""The distance at which traffic positions are drawn, in m."""
-
-
 @dataclass(frozen=True)
 class Placed:
-    """A vehicle when the ego is 30 m before the sign: its middle in m, its speed in m/s, a number in `PAINTS`."""
+    """A vehicle when the ego is at the first of `DISTANCES`: its middle in m, its speed in m/s, a number in `PAINTS`."""
 
     model: Model
     x: float
@@ -113,27 +115,48 @@ class Placed:
     speed: float
     paint: int
 
+    def later(self, distance: float) -> float:
+        """y of its middle when the ego is `distance` m before the sign."""
+        return self.y + self.speed * (DISTANCES[0] - distance) / SPEED_MPS
 
-def traffic(location: Location, *, lanes: int, density: float) -> list[Placed]:
-    """The vehicles around the ego.
 
-    Those to its right, between it and the sign, slow down for the crossing, so that the ego comes past them: what hides the
-    sign in one frame has given it free some frames later.
+@cache
+def traffic(location: Location, lanes: int, density: float) -> tuple[Placed, ...]:
+    """The vehicles around the ego: the first draw that hides the sign in some frames of the approach at most.
+
+    Where there are lanes between the ego and the sign and the traffic is dense, it hides it in one frame at least.
     """
-    rng = np.random.default_rng([location.seed, lanes, round(100 * density)])
+    least = 1 if lanes > LANES_TO_THE_LEFT + 1 and density > 1 else 0
+    for attempt in itertools.count():
+        placed = _drawn(np.random.default_rng([location.seed, lanes, round(100 * density), attempt]), lanes, density)
+        if least <= sum(_hidden(placed, lanes, distance) for distance in DISTANCES) <= MOST_HIDDEN:
+            return placed
+    raise AssertionError
+
+
+def _drawn(rng: Rng, lanes: int, density: float) -> tuple[Placed, ...]:
+    """Vehicles in every lane. Those to the ego's right slow down for the crossing or wait there, so that it comes past them."""
     models = get_args(Model)
     placed = []
     for lane in range(lanes):
         x = LANE_M * (lane - LANES_TO_THE_LEFT)
         side = lane - LANES_TO_THE_LEFT
-        y = -_START + (14.0 if side == 0 else 5.0) + rng.uniform(0, 18 / density)
-        speed = SPEED_MPS * (rng.uniform(0.3, 0.6) if side > 0 else rng.uniform(0.95, 1.15))
+        y = -DISTANCES[0] + (14.0 if side == 0 else 5.0) + rng.uniform(0, 18 / density)
+        speed = SPEED_MPS * (rng.uniform(0.0, 0.5) if side > 0 else rng.uniform(0.95, 1.15))
         while y < 90:
             model = models[int(rng.choice(4, p=(0.35, 0.3, 0.2, 0.15)))]
             half = LENGTH[model] / 2
             placed.append(Placed(model, x + rng.normal(0, 0.1), y + half, speed, int(rng.integers(len(PAINTS)))))
             y += 2 * half + 6.0 + rng.exponential(30 / density)
-    return placed
+    return tuple(placed)
+
+
+def _hidden(placed: tuple[Placed, ...], lanes: int, distance: float) -> bool:
+    """Whether vehicles hide more than half of the sign, which may be outside the picture beside that."""
+    camera, x = Camera(y=-distance), sign_x(lanes)
+    alone = occlusion.visible(camera, x, ())
+    seen = occlusion.visible(camera, x, [(each.model, each.x, each.later(distance)) for each in placed])
+    return seen < alone / 2
 
 
 def _merged(parts: list[Part]) -> list[Part]:

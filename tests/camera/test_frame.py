@@ -1,0 +1,136 @@
+"""Frames: a texture on the sign, weather, the bank on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.errors import UserError
+from bench.scenario import WEATHERS, Weather
+from envs.camera import bank, sign
+from envs.camera.frame import frame
+from envs.camera.poses import approach
+from envs.camera.weather import air, streaks
+from tests.camera.scenes import lit, scenes
+
+
+def test_a_sign_is_where_its_box_is() -> None:
+    plain = scenes()
+    pictures = plain.render(torch.arange(10), None, 0.5)
+    assert pictures.shape == (10, 3, 384, 1248)
+    assert pictures.min() >= 0
+    assert pictures.max() <= 1
+    red = (pictures[:, 0] - pictures[:, 1] > 0.25).float()
+    for picture, (x0, y0, x1, y1) in zip(red, plain.boxes.tolist(), strict=True):
+        rows, columns = picture.nonzero(as_tuple=True)
+        found = [int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1]
+        # The border is white, 2.25 % of the side.
+        assert np.allclose(found, [x0, y0, x1, y1], atol=1.5 + 0.0225 * (x1 - x0))
+
+
+def test_the_patch_covers_its_share_of_the_sign_and_nothing_else() -> None:
+    plain = scenes()
+    frames = torch.tensor([9])
+    without, with_patch = plain.render(frames, None, 0.5), plain.render(frames, torch.ones(1, 3, 16, 16), 0.5)
+    changed = (without - with_patch).abs().amax(1)[0] > 0.02
+    rows, columns = changed.nonzero(as_tuple=True)
+    x0, y0, x1, y1 = plain.boxes[9].tolist()
+    assert int(columns.max() - columns.min()) + 1 == pytest.approx((x1 - x0) / 2, abs=2)
+    assert int(rows.max() - rows.min()) + 1 == pytest.approx((y1 - y0) / 2, abs=2)
+    assert float(columns.float().mean()) == pytest.approx((x0 + x1) / 2, abs=1)
+
+
+def test_the_picture_is_differentiable_to_the_patch() -> None:
+    """Against a central difference, in the linear part of the tone curve's range."""
+    plain = scenes()
+    patch = torch.full((1, 3, 8, 8), 0.5, requires_grad=True)
+    weights = torch.randn(3, 384, 1248, generator=torch.Generator().manual_seed(0))
+
+    def loss(value: torch.Tensor) -> torch.Tensor:
+        return (plain.render(torch.tensor([8]), value, 0.5)[0] * weights).sum()
+
+    (gradient,) = torch.autograd.grad(loss(patch), patch)
+    direction = torch.randn(patch.shape, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        slope = (loss(patch + 0.01 * direction) - loss(patch - 0.01 * direction)) / 0.02
+    assert float((gradient * direction).sum()) == pytest.approx(float(slope), rel=0.03)
+
+
+def test_a_frame_does_not_depend_on_the_others_of_the_batch() -> None:
+    plain = scenes("rain")
+    patch = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    together = plain.render(torch.tensor([0, 4, 9]), patch, 0.4)
+    alone = torch.cat([plain.render(torch.tensor([number]), patch, 0.4) for number in (0, 4, 9)])
+    assert torch.equal(together, alone)
+
+
+@pytest.mark.parametrize("weather", ["rain", "fog"])
+def test_weather_takes_contrast_from_the_far_sign_more_than_from_the_near_one(weather: str) -> None:
+    clear, dim = scenes(), scenes(weather)
+    contrast = []
+    for number in (0, 9):
+        x0, y0, x1, y1 = (int(edge) for edge in clear.boxes[number])
+        spread = [s.render(torch.tensor([number]), None, 0.5)[0, :, y0:y1, x0:x1].std() for s in (dim, clear)]
+        contrast.append(float(spread[0] / spread[1]))
+    assert contrast[0] < contrast[1] < 1.1
+
+
+@settings(max_examples=20, deadline=None)
+@given(visibility=st.floats(20, 5000), distance=st.floats(1, 200))
+def test_fog_follows_koschmieder(visibility: float, distance: float) -> None:
+    depth = np.full((4, 4), distance, np.float32)
+    street = np.full((4, 4, 3), 0.1, np.float32)
+    found = air(Weather(name="mist", visibility_m=visibility), depth, street, 10.0, 721.0, 0)
+    assert np.allclose(found.transmitted, np.exp(-3.0 / visibility * distance), rtol=1e-4)
+    assert np.allclose(found.added, 0.1 * (1 - found.transmitted), rtol=1e-4)
+
+
+def test_more_rain_hides_more() -> None:
+    depth = np.full((96, 312), 50, np.float32)
+    cover = [streaks(rate, depth, 10.0, 180.0, np.random.default_rng(0)).mean() for rate in (2.0, 10.0, 50.0)]
+    assert 0 < cover[0] < cover[1] < cover[2] < 0.5
+
+
+def test_night_has_no_airlight() -> None:
+    depth = np.full((4, 4), 20, np.float32)
+    found = air(WEATHERS["night"], depth, np.ones((4, 4, 3), np.float32), 10.0, 721.0, 0)
+    assert np.array_equal(found.transmitted, np.ones((4, 4, 1), np.float32))
+    assert not found.added.any()
+
+
+def test_the_bank_gives_back_what_was_written(tmp_path: Path) -> None:
+    poses = approach("sun-behind-ego", 4, 2.0, "sun")[:3]
+    frames = [frame(lit(pose), pose, WEATHERS["clear"]) for pose in poses]
+    bank.write(tmp_path, "sun-behind-ego", "clear", poses, frames, {"version": 0})
+    for (pose, kept), wanted, original in zip(
+        bank.read(tmp_path, "sun-behind-ego", "clear"), poses, frames, strict=True
+    ):
+        assert pose == wanted
+        assert kept.crop == original.crop
+        assert kept.scale == pytest.approx(original.scale)
+        for name in ("picture", "black", "gain"):
+            assert np.array_equal(getattr(kept, name), getattr(original, name))
+
+
+def test_a_bank_that_is_not_there_or_cut_short_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="bench render"):
+        bank.read(tmp_path, "sun-beside", "fog")
+    bank.path_of(tmp_path, "sun-beside", "fog").write_bytes(b"\x10\0\0\0\0\0\0\0{}")
+    with pytest.raises(UserError, match="cannot be read"):
+        bank.read(tmp_path, "sun-beside", "fog")
+
+
+def test_the_face_is_red_with_white_letters() -> None:
+    face = sign.face()
+    assert face.shape == (3, sign.TEXELS, sign.TEXELS)
+    assert face.min() >= 0
+    assert face.max() <= 1
+    red = (face[0] - face[1] > 0.3).mean()
+    white = (face.min(0) > 0.8).mean()
+    assert red > 0.5
+    assert 0.1 < white < 0.4
