@@ -52,6 +52,7 @@ WEATHERS: dict[str, Weather] = {
         Weather(name="clear"),
         Weather(name="rain", visibility_m=2000.0, precipitation_mm_h=25.0, sun_elevation_deg=30.0),
         Weather(name="fog", visibility_m=120.0, sun_elevation_deg=30.0),
+        Weather(name="night", sun_elevation_deg=-10.0),
     )
 }
 
@@ -149,5 +150,12 @@ GRIDS: dict[str, Grid] = {
         density=(1.0, 2.0),
         weather=("clear", "rain", "fog"),
         episodes=100,
-    )
+    ),
+    "approach-v1": Grid(
+        name="approach-v1",
+        lanes=(3, 4, 5),
+        density=(1.0, 2.0),
+        weather=("clear", "rain", "fog"),
+        episodes=3,
+    ),
 }
