@@ -13,7 +13,7 @@ from typing import Any
 from bench import registry
 from bench.contracts import Track
 from bench.errors import UserError
-from bench.pair import Chosen, Pair
+from bench.pair import Chosen, Pair, check_track
 from bench.registry import KINDS, Kind
 from bench.scenario import GRIDS, WEATHERS, Grid
 from bench.words import Words, configured
@@ -75,6 +75,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
+        check_track(self.victim, self.defense, self.world)
 
 
 def check_seeds(seeds: tuple[int, ...]) -> None:

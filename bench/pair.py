@@ -65,6 +65,21 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
         raise UserError(f"{kind} {name!r}: {str(error).splitlines()[0]}") from error
 
 
+def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:
+    """Refuse components that are not of the victim's track.
+
+    Raises:
+        UserError: naming the first that is not, and what fits.
+    """
+    track = victim.component.tracks()[0]
+    for part in parts:
+        if track not in part.component.tracks():
+            fitting = ", ".join(tracks.names(part.kind, track)) or "none is installed"
+            raise UserError(
+                f"{part.kind} {part.name!r} does not fit victim {victim.name!r} of the {track} track; what fits: {fitting}"
+            )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Pair:
     """An attack on a defended victim in a world, under a threat model: what a grid is driven with.
@@ -82,13 +97,7 @@ class Pair:
 
     def __post_init__(self) -> None:
         attack, victim = self.attack.component, self.victim.component
-        for part in (self.attack, self.defense, self.world):
-            if self.track not in part.component.tracks():
-                fitting = ", ".join(tracks.names(part.kind, self.track)) or "none is installed"
-                raise UserError(
-                    f"{part.kind} {part.name!r} does not fit victim {self.victim.name!r} of the {self.track} track; "
-                    f"what fits: {fitting}"
-                )
+        check_track(self.victim, self.attack, self.defense, self.world)
         if not isinstance(self.threat, THREATS[self.track]):
             raise UserError(f"a {type(self.threat).__name__} is no threat model of the {self.track} track")
         if isinstance(victim, DrivingVictim):

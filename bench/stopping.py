@@ -41,7 +41,7 @@ def first(flags: Flags, distance_m: Array) -> Array:
 
 def deceleration(confirmed_m: Array) -> Array:
     """[A] what the car brakes with, in m/s^2, when the sign is confirmed at these distances (0: when it is passed)."""
-    room = np.maximum(confirmed_m - SPEED_MPS * REACTION_S, np.finfo(np.float64).tiny)
+    room = np.maximum(confirmed_m - SPEED_MPS * REACTION_S, 1e-3)
     needed = SPEED_MPS**2 / (2 * room)
     return np.clip(needed, COMFORTABLE_DECELERATION, GREATEST_DECELERATION)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property
 from typing import Any
 
 from bench import registry
@@ -73,7 +72,7 @@ class Crafting(_Work):
 
     module = CRAFT
 
-    @cached_property
+    @property
     def fingerprint(self) -> str:
         """sha256 of everything that decides the patch."""
         return digest(self.origin)
@@ -115,7 +114,7 @@ class Unit(_Work):
             return None
         return Crafting(pair=self.pair, training_seed=self.training_seed, weights_sha256=self.weights_sha256)
 
-    @cached_property
+    @property
     def fingerprint(self) -> str:
         """sha256 of everything that decides the result."""
         patch = {"patch": self.crafting.fingerprint} if self.crafting else {}

@@ -122,10 +122,11 @@ def _sections(pairs: Sequence[Patched]) -> Iterator[Section[Line]]:
 
 
 def _size(pairs: Sequence[Patched]) -> str:
-    sizes = {(str(pair.identity["grid"]), pair.own.shape[1:]) for pair in pairs}
+    sizes = {pair.own.shape[1:] for pair in pairs}
     if len(sizes) > 1:
         return "several grids"
-    grid, (cells, approaches) = sizes.pop()
+    cells, approaches = sizes.pop()
+    grid = " and ".join(sorted({grid for pair in pairs for grid in pair.own.table["grid"].to_pylist()}))
     seeds = max(len(pair.own.runs) for pair in pairs)
     return f"{grid}: {_count(cells, 'cell')} of {_count(approaches, 'approach', 'approaches')}, {_count(seeds, 'patch seed')}"
 

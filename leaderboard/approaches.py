@@ -60,14 +60,16 @@ class Patched:
     """One attack on one defended detector, and its controls on the same approaches, named after the same patch seeds.
 
     Args:
-        identity: the values of `DEFENDED`, `ATTACKER` and `grid`; the attack is `none` where only that was driven.
+        identity: the values of `DEFENDED` and `ATTACKER`; the attack is `none` where only that was driven.
         own: its approaches.
         controls: by attack: `none`, and those of `REFERENCE_PATCHES` that were driven with a patch of the same size.
+        stand_ins: the controls that have one run, which stands for all.
     """
 
     identity: Mapping[str, object]
     own: Episodes
     controls: Mapping[str, Episodes]
+    stand_ins: frozenset[str] = frozenset()
 
     @property
     def attacked(self) -> bool:
@@ -85,8 +87,11 @@ class Patched:
 
     @cached_property
     def control(self) -> dict[str, Measured]:
-        """Its controls, measured."""
-        return {name: measure(approaches) for name, approaches in self.controls.items()}
+        """Its controls, measured; the same run again and again would feign certainty, so it counts once."""
+        once = {
+            name: one.only(runs=one.runs[:1]) if name in self.stand_ins else one for name, one in self.controls.items()
+        }
+        return {name: measure(approaches) for name, approaches in once.items()}
 
     @property
     def lost(self) -> float:
@@ -123,10 +128,10 @@ class Patched:
 
 def read_patched(records: pa.Table) -> list[Patched]:
     """Every pair in the records: by world, detector and defence, the strongest attack first, what it is held against last."""
-    records = newest(records)
+    records = newest(records, (*DEFENDED, *ATTACKER))
     found = {
         tuple(identity.values()): (identity, Episodes.arrange(rows))
-        for identity, rows in groups(records, (*DEFENDED, *ATTACKER, "grid"))
+        for identity, rows in groups(records, (*DEFENDED, *ATTACKER))
     }
     attacked = [(identity, own) for identity, own in found.values() if identity["attack"] != NO_PATCH]
     defended = {_values(identity, DEFENDED) for identity, _ in attacked}
@@ -144,7 +149,7 @@ def _patched(
     all_found: Collection[tuple[Mapping[str, object], Episodes]],
     cleans: Mapping[tuple[object, ...], Episodes],
 ) -> Patched:
-    same = (*DEFENDED, "threat_budget", "grid")
+    same = (*DEFENDED, "threat_budget")
     candidates = {NO_PATCH: cleans.get(_values(identity, DEFENDED))}
     for other, approaches in all_found:
         if other["attack"] in REFERENCE_PATCHES and _values(other, same) == _values(identity, same):
@@ -154,8 +159,9 @@ def _patched(
         if cells & set(one.cells) and seeds & set(one.seeds):
             cells, seeds = cells & set(one.cells), seeds & set(one.seeds)
     own = own.only(cells=cells, seeds=seeds)
-    controls = {name: _named(one, own) for name, one in candidates.items() if one and _covers(one, own)}
-    return Patched(identity, own, controls)
+    covering = {name: one for name, one in candidates.items() if one and _covers(one, own)}
+    controls = {name: _named(one, own) for name, one in covering.items()}
+    return Patched(identity, own, controls, frozenset(name for name, one in covering.items() if len(one.runs) == 1))
 
 
 def _covers(control: Episodes, own: Episodes) -> bool:
