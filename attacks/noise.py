@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 import torch
 from torch import Tensor
 
-from bench.contracts import Access, Attack
+from bench.contracts import Access
+from bench.driving import DrivingAttack
 
 if TYPE_CHECKING:
     from bench.threat import Oracle
@@ -17,7 +18,7 @@ Distribution = Literal["uniform", "gaussian"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Noise(Attack):
+class Noise(DrivingAttack):
     """Random noise within the budget; asks the victim nothing.
 
     Distance: whatever set the threat model defines; `scale` is a share of its radius, feature by feature.

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Objective
-from bench.contracts import Access, Attack
+from bench.contracts import Access
+from bench.driving import DrivingAttack
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PGD(Attack):
+class PGD(DrivingAttack):
     """Projected gradient descent (Madry et al. 2018, "Towards Deep Learning Models Resistant to Adversarial Attacks").
 
     Sign steps on the victim's own gradient, projected after each; the best iterate of all restarts is shown. With

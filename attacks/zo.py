@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion
-from bench.contracts import Access, Attack
+from bench.contracts import Access
+from bench.driving import DrivingAttack
 
 if TYPE_CHECKING:
     from bench.threat import Oracle
@@ -19,7 +20,7 @@ ZOObjective = Literal["collision", "expected", "margin", "target", "thesis"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ZOSignSGD(Attack):
+class ZOSignSGD(DrivingAttack):
     """ZO-SignSGD (Liu, Chen, Chen and Hong 2019, "signSGD via Zeroth-Order Oracle"; thesis Algorithm 4, Eq. 4.7 to 4.10).
 
     Black box, access `scores`. Each of T iterations asks for the loss at x and at q random points x + mu u around it, in

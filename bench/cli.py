@@ -69,7 +69,7 @@ def run(words: Words = None) -> None:
         except KeyboardInterrupt:
             kept = f"{progress.done} of {progress.total} episodes are kept"
             raise UserError(f"interrupted; {kept}, and the same command goes on from there") from None
-    _print_report("run", results.read(config.out, units))
+    _print_report("run", results.read(config.out, units, track=config.pairs[0].track))
     Console().print(Text(f"Records in {config.out}: `bench show {config.out}` says what made them."), soft_wrap=True)
 
 
@@ -86,7 +86,7 @@ def train(words: Words = None) -> None:
 
     settle()
     config = train_config(words or [])
-    victim, defense, world = config.victim.component, config.defense.component, config.world.component
+    victim, defense, world = (part.component for part in (config.victim, config.defense, config.world))
     hardens = config.defense.name != "none"
     try:
         name = defense.zoo_name(victim) if hardens else victim.zoo_name()
@@ -101,7 +101,7 @@ def train(words: Words = None) -> None:
                 trained = victim.train(world, seed=seed, progress=progress)
         if trained is None:
             raise UserError(f"there is nothing to train: defense {config.defense.name!r} works at run time only")
-        path = zoo.save(trained.policy, trained.card, name=name, seed=seed, root=config.out)
+        path = zoo.save(trained.network, trained.card, name=name, seed=seed, root=config.out)
         seconds = time.perf_counter() - start
         Console().print(Text(f"{name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"), soft_wrap=True)
 
@@ -151,7 +151,11 @@ def report(words: Words = None) -> None:
     name = names[0] if names else "run"
     function = _report(name)
     out = Path(folders[0] if folders else "results").expanduser()
-    records = results.SCHEMA.empty_table() if name != "run" and not folders and not out.exists() else results.read(out)
+    if name == "run":
+        for track in results.tracks(out):
+            function(results.read(out, track=track), Console())
+        return
+    records = results.SCHEMA.empty_table() if not folders and not out.exists() else results.read(out)
     function(records, Console())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -11,18 +12,20 @@ from rich.text import Text
 from bench import registry
 from bench.errors import UserError
 from bench.registry import GROUPS, KINDS, Kind
+from bench.tracks import tracks_of
 
 
 def print_names(console: Console) -> None:
-    """Every component by kind, with the package that ships it. Imports none of them."""
+    """Every component by kind, with its tracks and the package that ships it. Imports none of them."""
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for column in ("kind", "name", "shipped by"):
+    for column in ("kind", "name", "track", "shipped by"):
         table.add_column(column)
     for kind in KINDS:
         for number, (name, claims) in enumerate(registry.entries(GROUPS[kind]).items()):
             complaint = registry.problem(claims)
             shipped_by = Text(complaint, style="red") if complaint else Text(claims[0].shipped_by)
-            table.add_row(kind if number == 0 else "", Text(name, style="bold"), shipped_by)
+            served = ", ".join(tracks_of(claims[0].target)) or "?"
+            table.add_row(kind if number == 0 else "", Text(name, style="bold"), served, shipped_by)
     console.print(table)
     console.print("\n`bench list NAME` says what one does and what its parameters are.", style="dim", highlight=False)
 
@@ -53,9 +56,8 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
     for paragraph in _paragraphs(description(component)):
         console.print(_with_code(paragraph), highlight=False)
         console.print()
-    if needs := _needs(kind, component):
-        console.print(needs, highlight=False)
-        console.print()
+    console.print(_fits(kind, component), highlight=False)
+    console.print()
     known = parameters(component)
     if not known:
         console.print("It has no parameters.")
@@ -72,11 +74,13 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
     console.print(table)
 
 
-def _needs(kind: Kind, component: type) -> str:
-    """What of an attack decides where it fits."""
+def _fits(kind: Kind, component: type[Any]) -> str:
+    """What decides where it fits: its track and, of an attack, what it needs."""
+    track = f"Track: {' and '.join(component.tracks())}."
     if kind != "attack":
-        return ""
-    return f"Needs access {component.access} and {' or '.join(component.action_types)} actions."  # type: ignore[attr-defined]
+        return track
+    actions = f" and {' or '.join(component.action_types)} actions" if "driving" in component.tracks() else ""
+    return f"{track} Needs access {component.access}{actions}."
 
 
 def _shown(value: object) -> str:

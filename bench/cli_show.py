@@ -17,6 +17,7 @@ from rich.text import Text
 
 from bench import registry, results
 from bench.errors import UserError
+from bench.plan import REFERENCE_PATCHES
 
 Report = Callable[[str, pa.Table], None]
 
@@ -34,11 +35,12 @@ def print_run(run: str, out: Path, console: Console, report: Report) -> None:
         UserError: if there is no such run.
     """
     folder, pair = located(run, out)
-    records = results.read(folder)
-    name = pair_named(pair, records) if pair else None
-    shown = records.filter(pc.field("pair") == name if name else pc.field("sees"))
-    _print_facts(shown if shown.num_rows else records, console)
-    report("run", _with_controls(shown, records) if name else records)
+    name = None
+    for records in records_of(folder, pair):
+        name = pair_named(pair, records) if pair else None
+        shown = records.filter(pc.field("pair") == name if name else pc.field("sees"))
+        _print_facts(shown if shown.num_rows else records, console)
+        report("run", _with_controls(shown, records) if name else records)
     for path in recordings(folder, name):
         console.print(Text(f"recording: bench view {path}"), soft_wrap=True)
 
@@ -56,6 +58,13 @@ def located(run: str, out: Path) -> tuple[Path, str]:
     return out, run
 
 
+def records_of(folder: Path, pair: str = "") -> list[pa.Table]:
+    """The records of each track in a folder; where a pair's name begins with `pair`, those of its track alone."""
+    found = [results.read(folder, track=track) for track in results.tracks(folder)]
+    with_it = [records for records in found if pc.any(pc.starts_with(records["pair"], pair)).as_py()]
+    return with_it[:1] if pair and with_it else found
+
+
 def pair_named(beginning: str, records: pa.Table) -> str:
     """The one pair whose name begins so."""
     known = sorted(set(records["pair"].to_pylist()))
@@ -68,14 +77,15 @@ def pair_named(beginning: str, records: pa.Table) -> str:
 
 
 def _with_controls(pairs: pa.Table, records: pa.Table) -> pa.Table:
-    """A pair's records with its clean control and the reference drivers of its world."""
+    """A pair's records with its clean control and what it is held against: reference drivers, or reference patches."""
 
     def same(*names: str) -> pc.Expression:
         return functools.reduce(operator.and_, [pc.field(name) == pairs[name][0].as_py() for name in names])
 
     driver = same("victim", "victim_params", "defense", "defense_params")
-    control = same("world", "world_params") & ((pc.field("attack") == "none") & driver | ~pc.field("sees"))
-    return records.filter(same("pair") | control)
+    patches = pc.field("attack").isin(REFERENCE_PATCHES) & same("threat_norm", "threat_budget")
+    control = (((pc.field("attack") == "none") | patches) & driver) | ~pc.field("sees")
+    return records.filter(same("pair") | (same("world", "world_params") & control))
 
 
 def _print_facts(records: pa.Table, console: Console) -> None:
@@ -88,7 +98,7 @@ def _print_facts(records: pa.Table, console: Console) -> None:
     for kind in registry.KINDS:
         facts.add_row(kind, _each(records, (kind, f"{kind}_params", f"{kind}_shipped_by"), _component))
     threat = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
-    facts.add_row("threat", _each(records, threat, "{} {:g}, access {}, {} queries a step".format))
+    facts.add_row("threat", _each(records, threat, "{} {:g}, access {}, {} queries".format))
     facts.add_row("cells", "; ".join(f"{axis} {_listed(records[axis])}" for axis in ("lanes", "density", "weather")))
     seeds = pc.min_max(records["seed"]).as_py()
     facts.add_row("scenario seeds", f"{seeds['min']} to {seeds['max']} ({_listed(records['grid'])})")

@@ -13,8 +13,7 @@ import pyarrow.compute as pc
 from rich.console import Console
 from rich.text import Text
 
-from bench import results
-from bench.cli_show import located, pair_named, recordings
+from bench.cli_show import located, pair_named, recordings, records_of
 from bench.errors import UserError
 
 
@@ -48,7 +47,7 @@ def open_recording(run: str, where: Sequence[str], out: Path, console: Console) 
 
 def _listed(folder: Path, beginning: str, console: Console) -> Path | None:
     """The only recording there is; if there are more, they are listed."""
-    records = results.read(folder)
+    records = records_of(folder, beginning)[0]
     pair = pair_named(beginning, records) if beginning else None
     found = recordings(folder, pair)
     if len(found) == 1:
@@ -69,10 +68,10 @@ def _example(folder: Path, pair: str | None, records: pa.Table) -> str:
     return f"bench view {first['pair']} {where} --out {folder}"
 
 
-def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Console) -> Path:
+def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Console) -> Path | None:
     from bench.replay import find, replay
 
-    records = results.read(folder)
+    records = records_of(folder, beginning)[0]
     words = dict(word.partition("=")[::2] for word in where)
     if beginning:
         words = {"pair": pair_named(beginning, records)} | words

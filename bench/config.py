@@ -11,12 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from bench import registry
-from bench.contracts import Defense, Victim, World
+from bench.contracts import Track
 from bench.errors import UserError
-from bench.pair import Chosen, Pair
+from bench.pair import Chosen, Pair, check_track
 from bench.registry import KINDS, Kind
 from bench.scenario import GRIDS, WEATHERS, Grid
 from bench.words import Words, configured
+
+STANDARD: dict[Track, str] = {"driving": "standard-v1", "detection": "approach-v1"}
+"""The grid that each track is scored on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,11 +29,11 @@ class RunConfig:
     Args:
         pairs: what is run.
         grid: the cells and the scenario seeds.
-        seeds: training seeds of the policies.
+        seeds: training seeds of the victims; of detectors also the seeds of the patches.
         workers: worker processes; results do not depend on their number.
         out: results folder.
         record: episodes to record of every cell of each pair; None records one, of the first cell.
-        reference: whether the reference drivers are run too.
+        reference: whether the reference drivers, or the reference patches, are run too.
 
     Raises:
         ValueError: if a number is out of range.
@@ -64,20 +67,33 @@ class TrainConfig:
         out: the zoo to save to; None is the user's own.
     """
 
-    victim: Chosen[Victim]
-    defense: Chosen[Defense]
-    world: Chosen[World]
+    victim: Chosen[Any]
+    defense: Chosen[Any]
+    world: Chosen[Any]
     seeds: tuple[int, ...] = (0,)
     out: Path | None = None
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
+        check_track(self.victim, self.defense, self.world)
 
 
 def check_seeds(seeds: tuple[int, ...]) -> None:
     """Raise ValueError unless there is at least one training seed, none negative and none twice."""
     if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must be different numbers of at least 0, got {','.join(map(str, seeds)) or 'none'}")
+
+
+def check_weather(name: str, track: Track) -> None:
+    """Refuse weather that is unknown, or that is only a matter of light where nothing looks at it.
+
+    Raises:
+        UserError: if it is.
+    """
+    if name not in WEATHERS:
+        raise UserError(registry.unknown(f"weather {name!r}", name, WEATHERS))
+    if track == "driving" and WEATHERS[name].sun_elevation_deg < 0:
+        raise UserError(f"weather {name!r} is for cameras: the sensors of the driving track bring their own light")
 
 
 def cores() -> int:
@@ -89,7 +105,7 @@ def cores() -> int:
 class RunWords:
     """The words of `bench run` that choose no component, with their types and defaults."""
 
-    grid: str = "standard-v1"
+    grid: str | None = None
     lanes: list[int] | None = None
     density: list[float] | None = None
     weather: list[str] | None = None
@@ -120,13 +136,13 @@ def run_config(words: Sequence[str]) -> RunConfig:
     axes = {key: tuple(settings[key]) for key in ("lanes", "density", "weather") if settings[key] is not None}
     if settings["episodes"] is not None:
         axes["episodes"] = settings["episodes"]
-    if settings["grid"] not in GRIDS:
-        raise UserError(registry.unknown(f"grid {settings['grid']!r}", settings["grid"], GRIDS))
+    name = settings["grid"] or STANDARD[given.track]
+    if name not in GRIDS:
+        raise UserError(registry.unknown(f"grid {name!r}", name, GRIDS))
     for weather in axes.get("weather", ()):
-        if weather not in WEATHERS:
-            raise UserError(registry.unknown(f"weather {weather!r}", weather, WEATHERS))
+        check_weather(weather, given.track)
     with _one_line():
-        grid: Grid = GRIDS[settings["grid"]].with_(**axes)
+        grid: Grid = GRIDS[name].with_(**axes)
         choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS]
         pairs = [
             Pair(attack=attack, defense=defense, victim=victim, world=world, threat=threat)

@@ -23,7 +23,7 @@ from rich.progress import (
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from bench.unit import Unit
+    from bench.runner import Work
 
 
 class RunProgress:
@@ -37,8 +37,8 @@ class RunProgress:
         self.console = console
         self.bar = _bar(console, MofNCompleteColumn(), TextColumn("episodes"))
         self.task: TaskID | None = None
-        self.total = self.done = self.kept = 0
-        self.current: Sequence[Unit] = ()
+        self.total = self.done = 0
+        self.working_on: dict[str, str] = {}
 
     def __enter__(self) -> Self:
         if self.console.is_terminal:
@@ -56,19 +56,27 @@ class RunProgress:
         if finished:
             self.console.print(f"{finished} of {episodes} episodes were there already", style="dim", highlight=False)
 
-    def working(self, units: Sequence[Unit]) -> None:
-        self.current = units
-        if self.task is not None and units:
-            self.bar.update(self.task, description=_on_one_line(units))
+    def working(self, works: Sequence[Work]) -> None:
+        self.working_on = {str(work): self.working_on.get(str(work), "") for work in works}
+        self._describe()
 
-    def finished(self, unit: Unit, wall_s: float) -> None:
-        self.done += len(unit.seeds)
-        self.kept += 1
+    def crafting(self, work: str, share: float, text: str) -> None:
+        self.working_on[work] = f" {share:.0%} {text}"
+        self._describe()
+
+    def finished(self, work: Work, wall_s: float) -> None:
+        # A patch is no episode: it is counted with those that show it.
+        self.done += len(getattr(work, "seeds", ()))
         if self.task is not None:
             self.bar.update(self.task, completed=self.done)
         if not self.console.is_terminal:
-            line = f"{self.done}/{self.total} episodes | {unit} | {wall_s:.1f} s"
+            line = f"{self.done}/{self.total} episodes | {work} | {wall_s:.1f} s"
             self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def _describe(self) -> None:
+        if self.task is not None and self.working_on:
+            first, *others = (f"{work}{news}" for work, news in self.working_on.items())
+            self.bar.update(self.task, description=f"{first} (+{len(others)})" if others else first)
 
     def warn(self, line: str) -> None:
         self.console.print(Text(f"warning: {line}", style="yellow"), soft_wrap=True)
@@ -142,8 +150,3 @@ def _bar(console: Console, *counts: ProgressColumn) -> Progress:
         console=console,
         transient=True,
     )
-
-
-def _on_one_line(units: Sequence[Unit]) -> str:
-    more = f" (+{len(units) - 1})" if len(units) > 1 else ""
-    return f"{units[0]}{more}"

@@ -1,220 +1,139 @@
-"""The small abstract classes that a plug-in author meets: World, Policy, Victim, Attack, Defense.
+"""What every plug-in is, whatever its track: World, Victim, Attack, Defense, and the threat model between them.
 
 A component is a frozen, keyword-only dataclass: its fields are its parameters, so that `attack.steps=50` on the command line,
 the record of a run and the constructor are the same thing. Check ranges in `__post_init__` and raise ValueError with one line.
+
+A track is a kind of victim. The base classes of `driving` are in `bench.driving`, those of `detection` in `bench.vision`; a
+component that derives from both serves both.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import Any, ClassVar, Generic, Literal, TypeVar, get_args
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
-if TYPE_CHECKING:
-    from torchrl.envs import EnvBase
+from bench.errors import UserError
 
-    from bench.scenario import Cell
-    from bench.threat import Oracle
-
-ActionType = Literal["discrete", "continuous"]
+Track = Literal["driving", "detection"]
+TRACKS: tuple[Track, ...] = get_args(Track)
 Access = Literal["oblivious", "decisions", "scores", "gradients"]
 """What an attacker may ask of the victim, in rising order."""
-Driver = Literal["agent", "idm"]
 Progress = Callable[[float, str], None]
 """Called with the share done in [0, 1] and a short text; the command line draws the bar."""
+Network = TypeVar("Network", bound=nn.Module)
 
 
-@dataclass(frozen=True)
-class Features:
-    """The measured features of an observation row, in order, with the range that maps to [-1, 1].
+class Component(ABC):
+    """What has a name on the command line."""
 
-    An observation is a float tensor [B, V, F]: V vehicles (row 0 is the ego, absolute; the rest relative to it, nearest
-    first, all zero where absent), F = 1 + len(names): `presence` in {0, 1}, then each measured feature over its range.
-    """
+    track: ClassVar[Track]
+    """Set by the base classes of a track, and by them only."""
 
-    names: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    units: tuple[str, ...]
-
-    def half_range(self) -> Tensor:
-        """[F - 1] physical units that one unit of the normalised observation stands for."""
-        return (torch.tensor(self.high) - torch.tensor(self.low)) / 2
+    @classmethod
+    def tracks(cls) -> tuple[Track, ...]:
+        """The tracks whose base classes it derives from."""
+        own = {base.__dict__.get("track") for base in cls.__mro__}
+        return tuple(track for track in TRACKS if track in own)
 
 
-class World(ABC):
-    """Makes TorchRL environments for the cells of a grid.
-
-    The environments are batched ([B] episodes), take an explicit scenario seed an episode in the reset tensordict (`seed`,
-    int64 [B]; without it seeds are drawn from `set_seed`), and write under `("next", ...)`:
-    `observation` float32 [B, V, F]; `reward` float32 [B, 1]; `done`, `terminated`, `truncated` bool [B, 1]; and `info`, the
-    ground truth that scoring reads and no policy or attack may: `progress` (Eq. 4.1 without its offset, over 0.5, in [0, 1]),
-    `speed` m/s, `x` m, `ttc` s (time to collision with the car ahead in the ego's lane, inf if none), each float32 [B, 1],
-    `crashed` and `offroad` bool [B, 1].
-    """
-
-    features: ClassVar[Features]
-    max_steps: int
-
-    @abstractmethod
-    def make(
-        self,
-        cells: Sequence[Cell],
-        *,
-        action_type: ActionType = "discrete",
-        driver: Driver = "agent",
-        action_repeat: int = 1,
-    ) -> EnvBase:
-        """An environment of len(cells) episodes, episode b on cells[b].
-
-        Args:
-            cells: the cell of each episode of the batch.
-            action_type: discrete lane-changing actions, or continuous [acceleration, steering] in [-1, 1].
-            driver: `idm` lets highway-env's own IDM/MOBIL driver steer the ego and ignores the actions.
-            action_repeat: frames a decision is held (training only): lane changes are sent once, the rest is repeated;
-                reward and progress are summed over the frames, an episode stops where it ends.
-        """
+class World(Component):
+    """Where victims are put to the test: it makes what the cells of a grid stand for."""
 
 
-class Policy(nn.Module, ABC):
-    """A victim at the wheel: a differentiable map from observations to scores, and from scores to an action."""
-
-    action_type: ActionType
-    driver: Driver = "agent"
-    weights_sha256: str = ""
-    """Hash of the weights file it was loaded from; empty where there is none."""
-
-    @abstractmethod
-    def scores(self, observation: Tensor) -> Tensor:
-        """What a score-based attacker reads: Q-values [..., A] (discrete) or the action itself [..., 2] (continuous).
-
-        Args:
-            observation: float [..., V, F].
-        """
-
-    def decide(self, observation: Tensor) -> Tensor:
-        """The action taken: int64 [...] (discrete, the greedy one) or float [..., 2] in [-1, 1] (continuous)."""
-        return self.choose(self.scores(observation))
-
-    def choose(self, scores: Tensor) -> Tensor:
-        """The action that goes with scores; without a side effect, so that measurements may ask what would have been done."""
-        return scores.argmax(-1) if self.action_type == "discrete" else scores
-
-    def value(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Q(observation, action) [...], differentiable in both; for white-box attacks on continuous actions.
-
-        Raises:
-            NotImplementedError: if the victim has no critic.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has no critic")
-
-    def reset(self, seeds: Tensor) -> None:
-        """Called before an episode batch with its scenario seeds [B]; for policies with a state or their own randomness."""
-
-    def forward(self, observation: Tensor) -> Tensor:
-        return self.decide(observation)
-
-
-class Victim(ABC):
-    """A kind of driver: how to load it from the zoo and, if it learns, how to train it. Fields are its hyper-parameters."""
+class Victim(Component):
+    """What is attacked: how to load it and, if it learns, how to train it."""
 
     learns: ClassVar[bool] = False
-    sees: ClassVar[bool] = True
-    """False for drivers that ignore the observation: attacks and weather cannot touch them."""
-    policy_type: ClassVar[type[Policy] | None] = None
-    """The class of its trained policies, which the zoo builds from a card."""
-
-    @property
-    @abstractmethod
-    def action_type(self) -> ActionType:
-        """Whether it takes discrete lane-changing decisions or steers itself."""
 
     def zoo_name(self) -> str:
         """The name of this victim's entries in the zoo; only victims that learn have one."""
         raise NotImplementedError(f"{type(self).__name__} does not learn")
 
     @abstractmethod
-    def load(self, seed: int) -> Policy:
-        """The policy of training seed `seed`, in eval mode, without gradients on its weights.
+    def load(self, seed: int) -> nn.Module:
+        """The network of training seed `seed`, in eval mode, without gradients on its weights.
 
         Raises:
-            bench.errors.UserError: if the zoo has no such policy, saying which command trains it.
+            UserError: if it is not there, saying which command makes it.
         """
 
-    def train(
-        self, world: World, *, seed: int, attack: AttackInLoop | None = None, progress: Progress
-    ) -> TrainedPolicy:
-        """Train from scratch (or from `attack.start`), with an attack in the loop where a defence asks for it."""
-        raise NotImplementedError(f"{type(self).__name__} does not learn")
 
-
-@dataclass(frozen=True)
-class TrainedPolicy:
-    """What a training leaves: the policy, and what its card says of the training."""
-
-    policy: Policy
-    card: Mapping[str, object]
-
-
-@dataclass(frozen=True, kw_only=True)
-class AttackInLoop:
-    """Adversarial training, Algorithm 5 of the thesis: at each decision the attack is skipped with probability `skip`.
-
-    Args:
-        attack: called with (observation [B, V, F], policy, budget scale in (0, 1]) -> perturbed observation.
-        skip: probability in [0, 1] with which a decision is left unattacked.
-        where: `acting`: the observations it acts on, which the replay buffer then keeps; `replay`: those drawn from the
-            replay buffer, afresh against the victim as it is now; or `both`.
-        ramp: the shares of the training between which the budget grows from 0 to 1.
-        start: weights to go on from, frame by frame; None trains from scratch.
-        decisions: of the further training, where there is a `start`.
-        consistency: weight, beside the victim's own loss, of deciding under attack what `start` decides on the truth.
-        margin: what a change of lane must be worth more than anything else for a consistent decision to be for it, in values.
-    """
-
-    attack: Callable[[Tensor, Policy, float], Tensor]
-    skip: float
-    where: Literal["acting", "replay", "both"] = "both"
-    ramp: tuple[float, float] = (0.2, 0.5)
-    start: Policy | None = None
-    decisions: int = 0
-    consistency: float = 0.0
-    margin: float = 0.0
-
-
-class Attack(ABC):
-    """Changes what the victim sees, within a threat model. Batched over episodes; stateless between steps."""
+class Attack(Component):
+    """Changes what the victim sees, within a threat model."""
 
     access: ClassVar[Access]
     """The least access it needs: oblivious, decisions, scores or gradients."""
-    action_types: ClassVar[tuple[ActionType, ...]] = ("discrete", "continuous")
-
-    @abstractmethod
-    def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
-        """The observation the victim is shown instead, [B, V, F].
-
-        Args:
-            observation: the true observation, float32 [B, V, F], of the episodes that are still running.
-            oracle: the only door to the victim; it holds the perturbation set (`radius`, `project`), the query budget
-                (`remaining`), and the run's random generator (`generator`).
-        """
 
 
-class Defense(ABC):
+class Defense(Component):
     """Protects a victim: at training time, at run time, or both."""
 
-    def train(self, victim: Victim, world: World, *, seed: int, progress: Progress) -> TrainedPolicy | None:
-        """Train the hardened policy of training seed `seed`; None where there is nothing to train."""
+    def train(self, victim: Any, world: Any, *, seed: int, progress: Progress) -> Trained[Any] | None:
+        """Train the hardened network of training seed `seed`; None where there is nothing to train."""
         return None
 
-    def zoo_name(self, victim: Victim) -> str:
+    @property
+    def trains(self) -> bool:
+        """Whether what it makes of a victim depends on a training seed."""
+        return type(self).train is not Defense.train
+
+    def zoo_name(self, victim: Any) -> str:
         """The name of the zoo entries that hold what `train` made of `victim`."""
         raise NotImplementedError(f"{type(self).__name__} trains nothing")
 
     @abstractmethod
-    def load(self, victim: Victim, seed: int) -> Policy:
-        """The defended policy, ready to drive: from the zoo, wrapped, or both."""
+    def load(self, victim: Any, seed: int) -> nn.Module:
+        """The defended network, ready for use: from the zoo, wrapped, or both."""
+
+
+@dataclass(frozen=True)
+class Trained(Generic[Network]):
+    """What a training leaves: the network, and what its card says of the training."""
+
+    network: Network
+    card: Mapping[str, object]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThreatModel:
+    """What an attacker may do. Enforced, never trusted.
+
+    Args:
+        norm: names the set of changes it may choose from.
+        budget: size of that set.
+        access: the most an attack may use; attacks that need more are refused.
+        queries: most evaluations of the victim.
+    """
+
+    norm: str
+    budget: float
+    access: Access = "gradients"
+    queries: int
+
+    def __post_init__(self) -> None:
+        if self.access not in get_args(Access):
+            raise ValueError(f"threat.access must be one of {', '.join(get_args(Access))}, got {self.access!r}")
+        if self.queries < 0:
+            raise ValueError(f"threat.queries must be at least 0, got {self.queries}")
+
+    def allows(self, access: Access) -> bool:
+        """Whether an attack that needs `access` fits this threat model."""
+        return get_args(Access).index(access) <= get_args(Access).index(self.access)
+
+
+def permit(asked: Access, declared: Access) -> None:
+    """Refuse an attack that asks for more than it declares that it needs.
+
+    Raises:
+        UserError: if it does.
+    """
+    if get_args(Access).index(asked) > get_args(Access).index(declared):
+        raise UserError(f"the attack asked for {asked!r}, but declares that it needs {declared!r} only")
+
+
+class QueryBudgetError(UserError):
+    """An attack asked for more queries than its threat model allows."""

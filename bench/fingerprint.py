@@ -26,6 +26,7 @@ BESIDE_THE_RESULT = frozenset(
         "metrics",
         "pair",
         "parameters",
+        "patches",
         "plan",
         "process",
         "recording",
@@ -34,6 +35,7 @@ BESIDE_THE_RESULT = frozenset(
         "results",
         "runner",
         "statistics",
+        "tracks",
         "words",
     ]
 )
@@ -70,7 +72,7 @@ def sources(modules: Iterable[str]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     while waiting:
         name = waiting.pop()
-        path = _file(name)
+        path = file_of(name)
         package, *inner = name.split(".")
         beside = package == "bench" and bool(inner) and inner[0] in BESIDE_THE_RESULT
         if path is None or name in found or beside:
@@ -81,7 +83,7 @@ def sources(modules: Iterable[str]) -> dict[str, Path]:
     return found
 
 
-def _file(module: str) -> Path | None:
+def file_of(module: str) -> Path | None:
     """Where a module's code is, without importing it or its parents; None where there is no such module."""
     top, *inner = module.split(".")
     spec = importlib.util.find_spec(top)
@@ -107,6 +109,15 @@ def _imports(module: str, path: Path) -> Iterator[str]:
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
             yield base
             yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def state_digest(network: Any) -> str:
+    """sha256 of a torch module's weights and buffers: names, types, shapes and values."""
+    hasher = hashlib.sha256()
+    for name, value in sorted(network.state_dict().items()):
+        hasher.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        hasher.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return hasher.hexdigest()
 
 
 @cache

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from bench import registry
-from bench.contracts import Attack, Defense, Victim, World
+from bench import registry, tracks
+from bench.contracts import Attack, Defense, ThreatModel, Track, Victim, World
+from bench.driving import DrivingAttack, DrivingVictim
 from bench.errors import UserError
-from bench.fingerprint import canonical, digest
+from bench.fingerprint import canonical, digest, state_digest
 from bench.parameters import parameters
+from bench.patch import PatchThreat
 from bench.registry import Kind
-from bench.threat import ThreatModel
+from bench.threat import ObservationThreat
+from bench.vision import PatchAttack
 
 C = TypeVar("C", Attack, Defense, Victim, World)
 
-UNATTACKED = ThreatModel(budget=0.0, access="oblivious", queries=0)
+THREATS: dict[Track, type[ThreatModel]] = {"driving": ObservationThreat, "detection": PatchThreat}
+UNATTACKED: dict[Track, ThreatModel] = {
+    "driving": ObservationThreat(budget=0.0, access="oblivious", queries=0),
+    "detection": PatchThreat(budget=0.0, access="oblivious", queries=0),
+}
 """The threat model of every clean run, so that runs with different threats share it."""
 
 
@@ -59,12 +65,28 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
         raise UserError(f"{kind} {name!r}: {str(error).splitlines()[0]}") from error
 
 
+def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:
+    """Refuse components that are not of the victim's track.
+
+    Raises:
+        UserError: naming the first that is not, and what fits.
+    """
+    track = victim.component.tracks()[0]
+    for part in parts:
+        if track not in part.component.tracks():
+            fitting = ", ".join(tracks.names(part.kind, track)) or "none is installed"
+            raise UserError(
+                f"{part.kind} {part.name!r} does not fit victim {victim.name!r} of the {track} track; what fits: {fitting}"
+            )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Pair:
     """An attack on a defended victim in a world, under a threat model: what a grid is driven with.
 
     Raises:
-        UserError: if the attack does not fit the victim or needs more than the threat model allows.
+        UserError: if a part is of another track than the victim, or if the attack does not fit the victim or needs more than
+            the threat model allows.
     """
 
     attack: Chosen[Attack]
@@ -75,6 +97,20 @@ class Pair:
 
     def __post_init__(self) -> None:
         attack, victim = self.attack.component, self.victim.component
+        check_track(self.victim, self.attack, self.defense, self.world)
+        if not isinstance(self.threat, THREATS[self.track]):
+            raise UserError(f"a {type(self.threat).__name__} is no threat model of the {self.track} track")
+        if isinstance(victim, DrivingVictim):
+            self._check_driving(victim)
+        if not self.threat.allows(attack.access):
+            raise UserError(
+                f"attack {self.attack.name!r} needs access {attack.access!r}, the threat model allows "
+                f"{self.threat.access!r} at most; say threat.access={attack.access} to allow it"
+            )
+
+    def _check_driving(self, victim: DrivingVictim) -> None:
+        attack = self.attack.component
+        assert isinstance(attack, DrivingAttack)
         if victim.action_type not in attack.action_types:
             raise UserError(
                 f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}: "
@@ -84,11 +120,19 @@ class Pair:
             raise UserError(
                 f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}, which ignores what it is shown"
             )
-        if not self.threat.allows(attack.access):
-            raise UserError(
-                f"attack {self.attack.name!r} needs access {attack.access!r}, the threat model allows "
-                f"{self.threat.access!r} at most; say threat.access={attack.access} to allow it"
-            )
+
+    @property
+    def track(self) -> Track:
+        """The victim's."""
+        return self.victim.component.tracks()[0]
+
+    @property
+    def is_seeded(self) -> bool:
+        """Whether training seeds make a difference: to the victim, to its defence or, of a detector, to the patch."""
+        attack, victim = self.attack.component, self.victim.component
+        if self.track == "driving":
+            return victim.learns
+        return victim.learns or self.defense.component.trains or (isinstance(attack, PatchAttack) and attack.seeded)
 
     @property
     def is_clean(self) -> bool:
@@ -109,23 +153,17 @@ class Pair:
 
     def clean(self) -> Pair:
         """The same victim and defence without the attack: the control of every attacked pair."""
-        return replace(self, attack=choose("attack", "none"), threat=UNATTACKED)
+        return replace(self, attack=choose("attack", "none"), threat=UNATTACKED[self.track])
 
     def weights_sha256(self, training_seed: int) -> str:
-        """The hash that the defended policy carries of its weights or, where it carries none, the hash of what it has.
+        """The hash that the defended network carries of its weights or, where it carries none, the hash of what it has.
 
         Raises:
-            UserError: if the policy cannot be loaded.
+            UserError: if it cannot be loaded.
         """
-        policy = self.defense.component.load(self.victim.component, training_seed)
-        state = policy.state_dict()
-        if policy.weights_sha256 or not state:
-            return policy.weights_sha256
-        hasher = hashlib.sha256()
-        for name, value in sorted(state.items()):
-            hasher.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-            hasher.update(value.detach().cpu().contiguous().numpy().tobytes())
-        return hasher.hexdigest()
+        network = self.defense.component.load(self.victim.component, training_seed)
+        carried = str(getattr(network, "weights_sha256", ""))
+        return carried if carried or not network.state_dict() else state_digest(network)
 
     def __str__(self) -> str:
         return f"{self.attack} + {self.defense} + {self.victim}"

@@ -9,8 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
-from bench.contracts import Attack, Features, Policy
-from bench.threat import Oracle, ThreatModel
+from bench.driving import DrivingAttack, Features, Policy
+from bench.threat import ObservationThreat, Oracle
 
 
 class AttackModule(TensorDictModuleBase):
@@ -28,7 +28,9 @@ class AttackModule(TensorDictModuleBase):
         seed: of the attack's random generator.
     """
 
-    def __init__(self, attack: Attack, policy: Policy, threat: ThreatModel, features: Features, *, seed: int) -> None:
+    def __init__(
+        self, attack: DrivingAttack, policy: Policy, threat: ObservationThreat, features: Features, *, seed: int
+    ) -> None:
         super().__init__()
         self.in_keys = ["observation"]
         self.out_keys = ["perturbed", "queries", "excess"]
@@ -77,7 +79,7 @@ class PolicyModule(TensorDictModuleBase):
 
 
 def attacked(
-    attack: Attack, policy: Policy, threat: ThreatModel, features: Features, *, seed: int
+    attack: DrivingAttack, policy: Policy, threat: ObservationThreat, features: Features, *, seed: int
 ) -> TensorDictSequential:
     """The victim under attack, as one TorchRL policy."""
     return TensorDictSequential(

@@ -1,4 +1,4 @@
-"""A run as units of work: every pair, its clean control and the reference drivers, on every cell of the grid."""
+"""A run as units of work: every pair, its clean control and what it is held against, on every cell of the grid."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from bench import registry
 from bench.config import RunConfig
+from bench.driving import DrivingVictim
 from bench.fingerprint import canonical
 from bench.pair import UNATTACKED, Pair, choose
 from bench.parameters import parameters
@@ -15,25 +16,26 @@ from bench.scenario import Cell
 from bench.unit import Unit
 
 REFERENCES = ("blind", "random", "idm")
-"""The drivers that every victim is held against."""
+"""The drivers that every victim at the wheel is held against."""
+REFERENCE_PATCHES = ("noise_patch", "grey_patch")
+"""The attacks that every attacked detector is held against, where they are installed."""
 
 
 def plan(config: RunConfig) -> list[Unit]:
-    """Every unit of a run, each once: the pairs, their clean controls and, if asked for, the reference drivers.
+    """Every unit of a run, each once: the pairs, their clean controls and, if asked for, the references.
 
-    Loads every policy once, so that one that is missing is refused before any work.
+    Loads every victim once, so that one that is missing is refused before any work.
 
     Raises:
-        UserError: if a policy cannot be loaded.
+        UserError: if one cannot be loaded.
     """
     clean = [pair.clean() for pair in config.pairs]
-    reference = [other for pair in clean for other in references(pair)] if config.reference else []
+    reference = [other for pair in config.pairs for other in references(pair)] if config.reference else []
     pairs = {pair.id: pair for pair in (*config.pairs, *clean, *reference)}
     weights: dict[str, str] = {}
     units = []
     for pair in pairs.values():
-        victim = pair.victim.component
-        for training_seed in config.seeds if victim.learns else (0,):
+        for training_seed in config.seeds if pair.is_seeded else (0,):
             key = canonical(
                 [pair.defense.name, pair.defense.params, pair.victim.name, pair.victim.params, training_seed]
             )
@@ -51,18 +53,34 @@ def plan(config: RunConfig) -> list[Unit]:
 
 
 def references(pair: Pair) -> Iterator[Pair]:
-    """The reference drivers in a pair's world: those of its action type, and IDM, which obeys no actions."""
+    """What a pair is held against: reference drivers in its world, or reference patches on its detector."""
+    return _drivers(pair) if pair.track == "driving" else _patches(pair)
+
+
+def _patches(pair: Pair) -> Iterator[Pair]:
+    """The patches that know nothing, of the same size, on the same defended detector."""
+    installed = registry.names("attack") if not pair.is_clean else []
+    for name in REFERENCE_PATCHES:
+        if name in installed and name != pair.attack.name:
+            yield replace(pair, attack=choose("attack", name))
+
+
+def _drivers(pair: Pair) -> Iterator[Pair]:
+    """Those of its action type, and IDM, which obeys no actions."""
+    own = pair.victim.component
+    assert isinstance(own, DrivingVictim)
     for name in REFERENCES:
         choices = {key: p.choices for key, p in parameters(registry.load("victim", name)).items() if p.choices}
         for values in itertools.product(*choices.values()):
             victim = choose("victim", name, **dict(zip(choices, values, strict=True)))
-            if name == "idm" or victim.component.action_type == pair.victim.component.action_type:
+            if name == "idm" or victim.component.action_type == own.action_type:
                 none = {"attack": choose("attack", "none"), "defense": choose("defense", "none")}
-                yield replace(pair, **none, victim=victim, threat=UNATTACKED)
+                yield replace(pair, **none, victim=victim, threat=UNATTACKED["driving"])
 
 
 def _cells(pair: Pair, cells: Iterable[Cell]) -> list[Cell]:
     """The cells to drive; weather cannot touch a driver that does not see."""
-    if pair.victim.component.sees:
+    victim = pair.victim.component
+    if not isinstance(victim, DrivingVictim) or victim.sees:
         return list(cells)
     return list(dict.fromkeys(replace(cell, weather="clear") for cell in cells))

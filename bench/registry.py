@@ -112,16 +112,19 @@ def load(kind: Kind, name: str) -> type[Any]:
 
     Raises:
         UserError: if the name is unknown or taken twice, or if the plug-in is broken: it cannot be imported, or is
-            not a frozen dataclass derived from the base class of its kind.
+            not a frozen dataclass derived from a base class of its kind and of a track.
     """
     from bench import contracts
 
-    component = resolve(GROUPS[kind], name, kind)
+    component: Any = resolve(GROUPS[kind], name, kind)
     entry = find(GROUPS[kind], name, kind)
     base = getattr(contracts, kind.capitalize())
     where = f"{kind} {name!r} ({entry.target} of {entry.shipped_by})"
     if not (inspect.isclass(component) and issubclass(component, base)):
         raise UserError(f"{where} is not a subclass of bench.contracts.{base.__name__}")
+    known: type[Any] = component
+    if not known.tracks():
+        raise UserError(f"{where} is of no track: derive it from a base class of bench.driving or bench.vision")
     if missing := sorted(getattr(component, "__abstractmethods__", ())):
         raise UserError(f"{where} does not implement {', '.join(missing)}")
     if not (is_dataclass(component) and component.__dataclass_params__.frozen):  # type: ignore[attr-defined]

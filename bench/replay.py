@@ -12,17 +12,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench import registry, results
+from bench import patches, registry, results
 from bench.errors import UserError
-from bench.pair import Chosen, Pair, choose
+from bench.pair import THREATS, Chosen, Pair, choose
 from bench.rollout import Trace
-from bench.runner import recording_path, save_recordings
+from bench.runner import measured, recording_path, save_recordings
 from bench.scenario import Cell
-from bench.threat import ThreatModel
-from bench.unit import Unit, drive
+from bench.unit import Unit
 
-TIMES = ("attack_ms",)
-"""Measurements that no replay can repeat."""
+BESIDE = ("attack_ms", "patch")
+"""Measurements that no replay can repeat, and the name of the patch, which changes with the code that crafts it."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +29,12 @@ class Replay:
     """What a replay made.
 
     Args:
-        path: of the recording.
+        path: of the recording; None for the detection track, which has none yet.
         changed: what has changed since the record was made (code, libraries, weights), in words; empty if nothing.
         differences: the measurements that came out otherwise than in the record.
     """
 
-    path: Path
+    path: Path | None
     changed: str
     differences: tuple[str, ...]
 
@@ -48,7 +47,7 @@ def find(records: pa.Table, where: Mapping[str, str]) -> dict[str, Any]:
     """
     for name, value in where.items():
         if name not in records.column_names:
-            known = [field.name for field in results.IDENTITY]
+            known = [field.name for field in results.IDENTITY] + ["location"] * ("location" in records.column_names)
             raise UserError(registry.unknown(f"column {name!r}", name, known))
         kind = records.schema.field(name).type
         try:
@@ -74,27 +73,33 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     Raises:
         UserError: if a component or the policy is not there any more.
     """
-    before = results.read(out, [record["unit"]]).sort_by("seed")
+    track = results.track_of(record)
+    before = results.read(out, [record["unit"]], track=track).sort_by("seed")
     unit = _unit(record, before["seed"].to_pylist())
-    trace = Trace(episodes=[unit.seeds.index(record["seed"])])
-    measured = drive(unit, trace)
-    columns = [field.name for field in results.MEASUREMENTS if field.name not in TIMES]
-    after = results.table(unit.constants(0.0), measured)
-    differences = tuple(name for name in columns if not _equal(before[name], after[name]))
-    save_recordings(out, unit, trace)
+    driving = track == "driving"
+    trace = Trace(episodes=[unit.seeds.index(record["seed"])]) if driving else None
+    patch = patches.read(out, record["patch"]) if record.get("patch") else None
     now = unit.constants(0.0)
+    after = results.table(now, measured(unit, patch, trace), track=track)
+    columns = [field.name for field in results.MEASUREMENTS[track] if field.name not in BESIDE]
+    differences = tuple(name for name in columns if not _equal(before[name], after[name]))
+    path = None
+    if trace:
+        save_recordings(out, unit, trace)
+        path = recording_path(out, unit, record["seed"])
     origin = ("weights_sha256", "code_digest", "libraries", "machine")
     changed = ", ".join(name for name in origin if now[name] != record[name])
-    return Replay(recording_path(out, unit, record["seed"]), changed, differences)
+    return Replay(path, changed, differences)
 
 
 def _unit(record: Mapping[str, Any], seeds: list[int]) -> Unit:
+    threat = THREATS[results.track_of(record)]
     pair = Pair(
         attack=_chosen("attack", record),
         defense=_chosen("defense", record),
         victim=_chosen("victim", record),
         world=_chosen("world", record),
-        threat=ThreatModel(
+        threat=threat(
             norm=record["threat_norm"],
             budget=record["threat_budget"],
             access=record["threat_access"],

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from bench import files
+from bench.contracts import TRACKS, Track
 from bench.errors import UserError
 
 FOLDER = "episodes"
@@ -27,7 +28,7 @@ def _field(name: str, kind: pa.DataType, meaning: str, unit: str = "") -> pa.Fie
 
 _text, _float, _int = pa.string(), pa.float64(), pa.int64()
 
-MEASUREMENTS: tuple[pa.Field, ...] = (
+_DRIVING: tuple[pa.Field, ...] = (
     _field("steps", pa.int32(), "decisions driven until the episode ended", "steps"),
     _field("return", _float, "highway-env's normalised reward, summed over the episode", "reward, 0 to 450"),
     _field("safe_progress", _float, "0 if crashed or off the road, else mean progress over 450 steps", "share, 0 to 1"),
@@ -49,7 +50,36 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
     _field("attack_ms", _float, "the attack's wall time a step and episode (its batch's time shared out)", "ms"),
     _field("action_counts", pa.list_(pa.int32()), "times each discrete action was taken; empty for continuous ones"),
 )
-"""What `bench.rollout.rollout` measures of an episode, with `seed`."""
+_DETECTION: tuple[pa.Field, ...] = (
+    _field("location", _text, "of the approach"),
+    _field(
+        "confidence_mean",
+        _float,
+        "in the sign at its true place, mean over the frames; 0 in a frame that misses it",
+        "0 to 1",
+    ),
+    _field("confidence_median", _float, "the same, median over the frames", "0 to 1"),
+    _field("detection_rate", _float, "frames with a confidence above 0.25", "share, 0 to 1"),
+    _field("first_seen_m", _float, "distance at which it is first detected; 0 if it never is", "m"),
+    _field("confirmed_m", _float, "distance at which it is detected in 3 of the last 5 frames; 0 if it never is", "m"),
+    _field("overrun_m", _float, "how far beyond the line the car stops; 0 if before it", "m"),
+    _field("ran", pa.bool_(), "the car never braked for the sign, or stopped more than 1 m beyond the line"),
+    _field(
+        "visible_share", _float, "of the sign, mean over the frames: in the picture and not hidden", "share, 0 to 1"
+    ),
+    _field("false_alarms", _float, "stop signs detected where there is none, mean over the frames", "detections"),
+    _field("queries", _float, "pictures the detector was asked about to craft the patch", "pictures"),
+    _field("gradients", _float, "pictures whose gradient was taken to craft the patch", "pictures"),
+    _field("crafting_s", _float, "wall time of crafting the patch", "s"),
+    _field("excess", _float, "farthest the attack's own texels were outside [0, 1]", "texel value"),
+    _field("patch", _text, "fingerprint of the patch, patches/<this>.safetensors; empty where there is none"),
+    _field("patch_sha256", _text, "of its texels; empty where it leaves the sign alone"),
+    _field("frame_distance_m", pa.list_(_float), "of each frame, from the camera to the sign", "m"),
+    _field("frame_confidence", pa.list_(_float), "of each frame, in the sign at its true place", "0 to 1"),
+    _field("frame_visible", pa.list_(_float), "of each frame, share of the sign to be seen", "share, 0 to 1"),
+)
+MEASUREMENTS: dict[Track, tuple[pa.Field, ...]] = {"driving": _DRIVING, "detection": _DETECTION}
+"""What `bench.rollout.rollout` measures of an episode, and `bench.approach.score` of an approach; with `seed`."""
 
 IDENTITY: tuple[pa.Field, ...] = (
     _field("unit", _text, "fingerprint of the unit of work: sha256 of everything that decides the result"),
@@ -62,13 +92,13 @@ IDENTITY: tuple[pa.Field, ...] = (
     _field("victim_params", _text, "canonical JSON"),
     _field("world", _text, "name"),
     _field("world_params", _text, "canonical JSON"),
-    _field("action_type", _text, "the victim's: discrete or continuous"),
+    _field("action_type", _text, "the victim's: discrete or continuous; empty for detectors"),
     _field("sees", pa.bool_(), "false for drivers that ignore the observation; their weather is always clear"),
-    _field("training_seed", _int, "of the policy; 0 for victims that do not learn"),
+    _field("training_seed", _int, "of the victim and of the patch; 0 where it changes nothing"),
     _field("threat_norm", _text, "perturbation set; a clean run has budget 0"),
     _field("threat_budget", _float, "size of the perturbation set", "share or normalised, by the norm"),
     _field("threat_access", _text, "the most the attacker may ask"),
-    _field("threat_queries", _int, "most queries a step", "queries"),
+    _field("threat_queries", _int, "most queries: a step of an episode, or a patch", "queries"),
     _field("grid", _text, "name of the grid"),
     _field("lanes", pa.int32(), "of the cell", "lanes"),
     _field("density", _float, "of the cell: highway-env's vehicles_density", "factor"),
@@ -91,8 +121,12 @@ PROVENANCE: tuple[pa.Field, ...] = (
 )
 """What produced it, where and when."""
 
-SCHEMA = pa.schema((*IDENTITY, *MEASUREMENTS, *PROVENANCE), metadata={"cavbench": "1"})
-"""The columns of a record; each field's metadata says its unit and its meaning."""
+SCHEMAS: dict[Track, pa.Schema] = {
+    track: pa.schema((*IDENTITY, *measured, *PROVENANCE), metadata={"cavbench": "1"})
+    for track, measured in MEASUREMENTS.items()
+}
+"""The columns of a record of each track; each field's metadata says its unit and its meaning."""
+SCHEMA = SCHEMAS["driving"]
 
 
 def prepare(out: Path) -> None:
@@ -138,11 +172,29 @@ def write(out: Path, records: pa.Table) -> Path:
     return path
 
 
-def read(out: Path, units: Collection[str] | None = None) -> pa.Table:
-    """Records as a table of `SCHEMA`, ordered by pair, training seed, cell and scenario seed.
+def track_of(columns: Collection[str]) -> Track:
+    """The track whose records have these columns."""
+    return next(track for track in TRACKS if set(SCHEMAS[track].names) == set(columns))
+
+
+def tracks(out: Path) -> list[Track]:
+    """The tracks that a results folder has records of.
+
+    Raises:
+        UserError: if there are no records, or if a file is truncated or foreign.
+    """
+    found = {_check(path) for path in sorted((out / FOLDER).glob("[!.]*.parquet"))}
+    if not found:
+        raise UserError(_NOTHING.format(out=out))
+    return [track for track in TRACKS if track in found]
+
+
+def read(out: Path, units: Collection[str] | None = None, *, track: Track = "driving") -> pa.Table:
+    """Records of one track as a table of its schema, ordered by pair, training seed, cell and scenario seed.
 
     Args:
         out: results folder.
+        track: whose records; those of the other are left alone.
         units: fingerprints of the units to read. None reads the newest result of everything that is there: of each pair
             and training seed only what the newest code and weights made, and of a scenario driven twice the last one.
 
@@ -153,20 +205,20 @@ def read(out: Path, units: Collection[str] | None = None) -> pa.Table:
         paths = sorted((out / FOLDER).glob("[!.]*.parquet"))
     else:
         paths = [path_of(out, unit) for unit in sorted(set(units))]
+    paths = [path for path in paths if _check(path) == track]
     if not paths:
-        raise UserError(f"there are no records in {out}; `bench run out={out}` makes some")
-    for path in paths:
-        _check(path)
+        raise UserError(_NOTHING.format(out=out))
     query = "from read_parquet(?)" + (_NEWEST if units is None else "") + _ORDER
     try:
         with duckdb.connect() as connection:
-            return connection.sql(query, params=[[str(path) for path in paths]]).to_arrow_table().cast(SCHEMA)
+            return connection.sql(query, params=[[str(path) for path in paths]]).to_arrow_table().cast(SCHEMAS[track])
     except duckdb.Error as error:
         for path in paths:
             _check(path, thoroughly=True)
         raise UserError(f"the records in {out} cannot be read: {str(error).splitlines()[0]}") from error
 
 
+_NOTHING = "there are no records in {out}; `bench run out={out}` makes some"
 _NEWEST = """
     qualify (code_digest, weights_sha256) = first_value((code_digest, weights_sha256)) over (
         partition by pair, training_seed order by created_at desc, unit)
@@ -176,27 +228,32 @@ _NEWEST = """
 _ORDER = " order by pair, training_seed, weather, lanes, density, seed"
 
 
-def _check(path: Path, *, thoroughly: bool = False) -> None:
-    """Refuse a file that is not a record: by its footer and columns, or by reading it all."""
+def _check(path: Path, *, thoroughly: bool = False) -> Track:
+    """The track of a record; refuse a file that is none: by its footer and columns, or by reading it all."""
     try:
         schema = pq.read_table(path).schema if thoroughly else pq.read_schema(path)
     except (pa.ArrowException, OSError) as error:
         reason = "not there" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
         raise UserError(f"the record {path} is {reason}; delete it and run again to make it anew") from None
-    if not schema.equals(SCHEMA):
-        raise UserError(f"the record {path} has other columns than this version writes; use another folder with out=")
+    for track in TRACKS:
+        if schema.equals(SCHEMAS[track]):
+            return track
+    raise UserError(f"the record {path} has other columns than this version writes; use another folder with out=")
 
 
-def table(constants: Mapping[str, object], measured: Mapping[str, NDArray[np.generic]]) -> pa.Table:
+def table(
+    constants: Mapping[str, object], measured: Mapping[str, NDArray[np.generic]], *, track: Track = "driving"
+) -> pa.Table:
     """The records of a unit, one row an episode.
 
     Args:
         constants: what every row says (`bench.plan.Unit.constants`).
-        measured: a column [B] a measurement (`bench.rollout.rollout`); `action_counts` is [B, A].
+        measured: a column [B] a measurement (`MEASUREMENTS`), [B, n] where it is a list.
+        track: whose records they are.
     """
     rows = len(measured["seed"])
     columns = []
-    for column in SCHEMA:
+    for column in SCHEMAS[track]:
         values = [constants[column.name]] * rows if column.name in constants else measured[column.name].tolist()
         columns.append(pa.array(values, column.type))
-    return pa.Table.from_arrays(columns, schema=SCHEMA)
+    return pa.Table.from_arrays(columns, schema=SCHEMAS[track])

@@ -13,9 +13,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from bench.contracts import Attack, Features, Policy
+from bench.driving import DrivingAttack, Features, Policy
 from bench.pipeline import AttackModule, PolicyModule
-from bench.threat import ThreatModel
+from bench.threat import ObservationThreat
 
 CHANGED = 0.1
 """A continuous action counts as changed when it is off by more than this on its [-1, 1] scale."""
@@ -39,8 +39,8 @@ class Trace:
 def rollout(
     env: EnvBase,
     policy: Policy,
-    attack: Attack,
-    threat: ThreatModel,
+    attack: DrivingAttack,
+    threat: ObservationThreat,
     seeds: Sequence[int],
     *,
     features: Features,

@@ -1,5 +1,7 @@
 """Carries out a run: units of work in worker processes, a file of records for each that is finished.
 
+A patch is crafted before the units that show it, and kept as a file for them.
+
 A unit is a pure function of its configuration: results do not depend on the number of workers or the order of work.
 """
 
@@ -10,21 +12,32 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Protocol
 
-from bench import results
+from bench import patches, results
+from bench.approach import score
 from bench.config import RunConfig
+from bench.crafting import craft
+from bench.drive import drive
 from bench.errors import UserError
+from bench.patch import Patch
 from bench.plan import plan
 from bench.process import settle
 from bench.rollout import Columns, Trace
-from bench.unit import Unit, drive
+from bench.unit import Crafting, Unit
+
+NEWS_S = 1.0
+"""Seconds between two looks at how far the patches are."""
+
+Work = Unit | Crafting
 
 
 class Watcher(Protocol):
@@ -33,11 +46,14 @@ class Watcher(Protocol):
     def begin(self, *, episodes: int, finished: int) -> None:
         """The run has `episodes` in all, of which `finished` were there already."""
 
-    def working(self, units: Sequence[Unit]) -> None:
+    def working(self, works: Sequence[Work]) -> None:
         """These are being worked on now."""
 
-    def finished(self, unit: Unit, wall_s: float) -> None:
-        """One more unit is written; it took `wall_s` seconds."""
+    def crafting(self, work: str, share: float, text: str) -> None:
+        """How far a patch is, in [0, 1], in the attack's own words."""
+
+    def finished(self, work: Work, wall_s: float) -> None:
+        """One more unit, or patch, is written; it took `wall_s` seconds."""
 
     def warn(self, line: str) -> None:
         """Something went wrong that does not touch the records."""
@@ -45,16 +61,24 @@ class Watcher(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A unit and how many of its first episodes to record in the results folder."""
+    """A piece of work.
 
-    unit: Unit
+    Args:
+        work: what to do.
+        record: how many of a unit's first episodes to record in the results folder.
+        out: results folder.
+        after: fingerprint of the patch that must be there first; empty if none.
+    """
+
+    work: Work
     record: int = 0
     out: Path = Path()
+    after: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What a worker hands back: measurements [B] each, wall seconds, and why a recording failed, if it did."""
+    """What a worker hands back: measurements [B] each (of a unit), wall seconds, and why a recording failed, if it did."""
 
     columns: Columns
     wall_s: float
@@ -71,14 +95,15 @@ def run(config: RunConfig, watcher: Watcher) -> list[str]:
     units = {unit.fingerprint: unit for unit in plan(config)}
     results.prepare(config.out)
     done = results.finished(config.out, units)
-    tasks = [task for task in _tasks(config, units.values()) if task.unit.fingerprint not in done]
+    tasks = list(_tasks(config, {key: unit for key, unit in units.items() if key not in done}, units.values()))
     episodes = len(config.grid.seeds())
     watcher.begin(episodes=episodes * len(units), finished=episodes * len(done))
     with closing(_spread(_longest_first(tasks), config.workers, watcher)) as finished:
         for task, outcome in finished:
-            records = results.table(task.unit.constants(outcome.wall_s), outcome.columns)
-            results.write(config.out, records)
-            watcher.finished(task.unit, outcome.wall_s)
+            if isinstance(task.work, Unit):
+                constants = task.work.constants(outcome.wall_s)
+                results.write(config.out, results.table(constants, outcome.columns, track=task.work.pair.track))
+            watcher.finished(task.work, outcome.wall_s)
             if outcome.warning:
                 watcher.warn(outcome.warning)
     return list(units)
@@ -94,6 +119,7 @@ def save_recordings(out: Path, unit: Unit, trace: Trace) -> None:
     """Save a recording of each episode of a trace of the unit."""
     from bench.recording import save
 
+    *_, world = (part.component for part in unit.parts)
     for number, episode in enumerate(trace.episodes):
         one = {name: [step[number : number + 1] for step in steps] for name, steps in trace.steps.items()}
         seed = unit.seeds[episode]
@@ -101,26 +127,48 @@ def save_recordings(out: Path, unit: Unit, trace: Trace) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         save(
             Trace(episodes=[episode], steps=one),
-            features=unit.pair.world.component.features,
+            features=world.features,
             meta=unit.constants(0.0) | {"seed": seed},
             path=path,
         )
 
 
-def _tasks(config: RunConfig, units: Iterable[Unit]) -> Iterator[Task]:
-    """The units in the order of the plan, and what to record: of the pairs asked for, with one training seed."""
-    asked = {pair.id: pair for pair in config.pairs}
+def measured(unit: Unit, patch: Patch | None, trace: Trace | None) -> Columns:
+    """Do the work of a unit and return its measurements, [B] each.
+
+    Args:
+        unit: what to measure.
+        patch: what `unit.crafting` made, of the detection track.
+        trace: filled with every step of its episodes, of the driving track.
+    """
+    return drive(unit, trace) if unit.pair.track == "driving" else score(unit, patch)
+
+
+def _tasks(config: RunConfig, missing: Mapping[str, Unit], units: Iterable[Unit]) -> Iterator[Task]:
+    """What is left to do, patches first, and what to record: of the pairs asked for, with one training seed."""
+    asked = {pair.id for pair in config.pairs}
     first: dict[str, Unit] = {}
     for unit in units:
-        shown = first.setdefault(unit.pair.id, unit)
-        wanted = unit.pair.id in asked and unit.training_seed == shown.training_seed
+        first.setdefault(unit.pair.id, unit)
+    craftings = {crafting.fingerprint: crafting for unit in missing.values() if (crafting := unit.crafting)}
+    absent = {key for key in craftings if not patches.path_of(config.out, key).exists()}
+    yield from (Task(work=craftings[key], out=config.out) for key in craftings if key in absent)
+    for unit in missing.values():
+        shown = first[unit.pair.id]
+        wanted = unit.pair.id in asked and unit.training_seed == shown.training_seed and unit.pair.track == "driving"
         episodes = config.record if config.record is not None else int(unit is shown)
-        yield Task(unit=unit, record=episodes if wanted else 0, out=config.out)
+        after = unit.crafting.fingerprint if unit.crafting else ""
+        yield Task(work=unit, record=episodes if wanted else 0, out=config.out, after=after if after in absent else "")
 
 
 def _longest_first(tasks: Iterable[Task]) -> list[Task]:
-    """Attacked units before clean ones and dense traffic before light, so that no long one is left for the end."""
-    return sorted(tasks, key=lambda t: (t.unit.pair.is_clean, -t.unit.cell.density, -t.unit.cell.lanes))
+    """Patches, then attacked units before clean ones and dense traffic before light: no long one is left for the end."""
+
+    def rank(task: Task) -> tuple[float, ...]:
+        work = task.work
+        return (1, work.pair.is_clean, -work.cell.density, -work.cell.lanes) if isinstance(work, Unit) else (0,)
+
+    return sorted(tasks, key=rank)
 
 
 def _spread(tasks: Sequence[Task], workers: int, watcher: Watcher) -> Generator[tuple[Task, Outcome], None, None]:
@@ -128,15 +176,15 @@ def _spread(tasks: Sequence[Task], workers: int, watcher: Watcher) -> Generator[
     if min(workers, len(tasks)) <= 1:
         settle()
         for task in tasks:
-            watcher.working([task.unit])
-            yield task, _perform(task)
+            watcher.working([task.work])
+            yield task, _perform(task, watcher.crafting)
         return
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(
-        min(workers, len(tasks)), mp_context=multiprocessing.get_context("spawn"), initializer=_begin_work
-    )
+    context = multiprocessing.get_context("spawn")
+    news: SimpleQueue[tuple[str, float, str]] = context.SimpleQueue()
+    pool = ProcessPoolExecutor(min(workers, len(tasks)), context, initializer=_begin_work, initargs=(news,))
     try:
-        yield from _pooled(pool, tasks, workers, watcher)
+        yield from _pooled(pool, tasks, workers, watcher, news)
     except BrokenProcessPool:
         raise UserError(
             "a worker process died (killed, or out of memory); "
@@ -151,23 +199,45 @@ def _spread(tasks: Sequence[Task], workers: int, watcher: Watcher) -> Generator[
 
 
 def _pooled(
-    pool: ProcessPoolExecutor, tasks: Sequence[Task], workers: int, watcher: Watcher
+    pool: ProcessPoolExecutor,
+    tasks: Sequence[Task],
+    workers: int,
+    watcher: Watcher,
+    news: SimpleQueue[tuple[str, float, str]],
 ) -> Iterator[tuple[Task, Outcome]]:
     """Keep every worker busy and no task waiting in the pool, so that what is in flight is what is worked on."""
-    waiting = list(reversed(tasks))
+    waiting = list(tasks)
+    uncrafted = {task.work.fingerprint for task in tasks if isinstance(task.work, Crafting)}
     running: dict[Future[Outcome], Task] = {}
     while waiting or running:
-        while waiting and len(running) < workers:
-            task = waiting.pop()
+        ready = [task for task in waiting if task.after not in uncrafted]
+        for task in ready[: workers - len(running)]:
+            waiting.remove(task)
             running[pool.submit(_perform, task)] = task
-        watcher.working([task.unit for task in running.values()])
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
+        watcher.working([task.work for task in running.values()])
+        finished = wait(running, NEWS_S, FIRST_COMPLETED).done
+        while not news.empty():
+            watcher.crafting(*news.get())
+        for future in finished:
             task = running.pop(future)
-            yield task, future.result()
+            outcome = future.result()
+            uncrafted.discard(task.work.fingerprint)
+            yield task, outcome
 
 
-def _begin_work() -> None:
+_news: SimpleQueue[tuple[str, float, str]] | None = None
+"""Of a worker process: where it tells how far a patch is."""
+
+
+def _tell(work: str, share: float, text: str) -> None:
+    if _news is not None:
+        _news.put((work, share, text))
+
+
+def _begin_work(news: SimpleQueue[tuple[str, float, str]]) -> None:
     """Set up a worker process: one thread, deaf to Ctrl-C (the parent ends it), and gone when the parent is gone."""
+    global _news
+    _news = news
     settle()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -180,26 +250,33 @@ def _begin_work() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
-def _perform(task: Task) -> Outcome:
+def _perform(task: Task, tell: Callable[[str, float, str], None] = _tell) -> Outcome:
     start = time.perf_counter()
     trace = Trace(episodes=range(task.record)) if task.record else None
+    columns: Columns = {}
     try:
-        columns = drive(task.unit, trace)
+        if isinstance(task.work, Crafting):
+            patches.write(task.out, task.work, craft(task.work, partial(tell, str(task.work))))
+        else:
+            crafting = task.work.crafting
+            patch = patches.read(task.out, crafting.fingerprint) if crafting else None
+            columns = measured(task.work, patch, trace)
     except UserError as error:
-        raise UserError(f"{task.unit}: {error}") from error
+        raise UserError(f"{task.work}: {error}") from error
     # Third-party code may fail in any way; the person at the terminal is told which component did.
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise UserError(f"{task.unit} failed: {reason} (--debug shows where)") from error
+        raise UserError(f"{task.work} failed: {reason} (--debug shows where)") from error
     wall_s = time.perf_counter() - start
     return Outcome(columns=columns, wall_s=wall_s, warning=_record(task, trace) if trace else "")
 
 
 def _record(task: Task, trace: Trace) -> str:
     """Save the recordings of a task; why it failed, or nothing."""
+    assert isinstance(task.work, Unit)
     try:
-        save_recordings(task.out, task.unit, trace)
+        save_recordings(task.out, task.work, trace)
     # The records are the result; a recording is a view of them, and its failure must not lose them.
     except Exception as error:
-        return f"{task.unit} was not recorded: {type(error).__name__}: {error}".splitlines()[0]
+        return f"{task.work} was not recorded: {type(error).__name__}: {error}".splitlines()[0]
     return ""

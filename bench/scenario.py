@@ -150,5 +150,12 @@ GRIDS: dict[str, Grid] = {
         density=(1.0, 2.0),
         weather=("clear", "rain", "fog"),
         episodes=100,
-    )
+    ),
+    "approach-v1": Grid(
+        name="approach-v1",
+        lanes=(3, 4, 5),
+        density=(1.0, 2.0),
+        weather=("clear", "rain", "fog"),
+        episodes=3,
+    ),
 }

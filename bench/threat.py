@@ -1,4 +1,4 @@
-"""What an attacker may know and change, and the oracle that enforces it."""
+"""What an attacker of a driver may know and change, and the oracle that enforces it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from bench.contracts import Access, Features, Policy
+from bench.contracts import Access, QueryBudgetError, ThreatModel, permit
+from bench.driving import Features, Policy
 from bench.errors import UserError
 
 Norm = Literal["relative", "linf"]
@@ -22,15 +23,14 @@ FLOORS = {"x": 0.5, "y": 0.2, "vx": 0.3, "vy": 0.2}
 
 
 @dataclass(frozen=True, kw_only=True)
-class ThreatModel:
-    """The perturbation set, the access and the query budget of an attacker. Enforced, never trusted.
+class ObservationThreat(ThreatModel):
+    """The threat model of the driving track.
 
     Args:
         norm: `relative`: each measured value of a present row may be off by `budget` times its actual value, or by the
             feature's floor (scaled with the budget) where that is larger (thesis 4.3.1). `linf`: by `budget` on the [-1, 1]
             scale (thesis 4.4.3, read as a range; a stress test).
         budget: size of the set, in [0, 2].
-        access: the most an attack may use; attacks that need more are refused.
         queries: most policy evaluations an episode may spend in one step.
 
     `presence` cannot be forged and absent rows cannot be filled. What leaves [-1, 1], the range of every sensor, is clipped.
@@ -38,22 +38,14 @@ class ThreatModel:
 
     norm: Norm = "relative"
     budget: float = 0.1
-    access: Access = "gradients"
     queries: int = 1000
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.norm not in get_args(Norm):
             raise ValueError(f"threat.norm must be one of {', '.join(get_args(Norm))}, got {self.norm!r}")
         if not 0 <= self.budget <= 2:
             raise ValueError(f"threat.budget must be between 0 and 2, got {self.budget}")
-        if self.access not in get_args(Access):
-            raise ValueError(f"threat.access must be one of {', '.join(get_args(Access))}, got {self.access!r}")
-        if self.queries < 0:
-            raise ValueError(f"threat.queries must be at least 0, got {self.queries}")
-
-    def allows(self, access: Access) -> bool:
-        """Whether an attack that needs `access` fits this threat model."""
-        return get_args(Access).index(access) <= get_args(Access).index(self.access)
 
     def radius(self, observation: Tensor, features: Features, scale: float = 1.0) -> Tensor:
         """[..., V, F] the largest deviation of each entry, on the normalised scale; 0 for presence and absent rows.
@@ -98,10 +90,6 @@ def _between(perturbed: Tensor, observation: Tensor, low: Tensor, high: Tensor) 
     return torch.where(within.isnan(), observation.clamp(-1.0, 1.0), within)
 
 
-class QueryBudgetError(UserError):
-    """An attack asked for more queries than its threat model allows."""
-
-
 class Oracle:
     """The only door to the victim. It refuses what the access level forbids, counts every query, and stops at the budget.
 
@@ -117,12 +105,12 @@ class Oracle:
     """
 
     def __init__(
-        self, policy: Policy, threat: ThreatModel, access: Access, features: Features, generator: torch.Generator
+        self, policy: Policy, threat: ObservationThreat, access: Access, features: Features, generator: torch.Generator
     ) -> None:
         if not threat.allows(access):
             raise UserError(f"the attack needs access {access!r}, the threat model allows {threat.access!r} at most")
         self._policy = policy
-        self._levels = get_args(Access).index(access)
+        self._access: Access = access
         self.threat = threat
         self.features = features
         self.generator = generator
@@ -181,7 +169,7 @@ class Oracle:
 
         White-box knowledge of the weights, evaluated by the attacker, so it costs no query.
         """
-        self._require("gradients")
+        permit("gradients", self._access)
         return self._policy.value(observation, action)
 
     @torch.no_grad()
@@ -191,13 +179,8 @@ class Oracle:
         answer = torch.cat([ask(part) for part in flat.split(CHUNK)]) if len(flat) else ask(flat)
         return answer.unflatten(0, observation.shape[:-2])
 
-    def _require(self, access: Access) -> None:
-        if get_args(Access).index(access) > self._levels:
-            allowed = get_args(Access)[self._levels]
-            raise UserError(f"the attack asked for {access!r}, but declares that it needs {allowed!r} only")
-
     def _spend(self, observation: Tensor, rows: Tensor | None, access: Access) -> None:
-        self._require(access)
+        permit(access, self._access)
         each = observation.shape[:-3].numel()
         if rows is None:
             self.spent += each

@@ -1,4 +1,4 @@
-"""The unit of work: one pair on every scenario seed of a cell, a pure function of its configuration."""
+"""The units of work, pure functions of their configuration: a pair on every scenario seed of a cell, and crafting a patch."""
 
 from __future__ import annotations
 
@@ -6,42 +6,47 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-import torch
-
 from bench import registry
+from bench.contracts import Track
+from bench.driving import DrivingVictim
 from bench.fingerprint import canonical, code_digest, digest, libraries, machine
 from bench.pair import Chosen, Pair
-from bench.rollout import Columns, Trace, rollout
 from bench.scenario import GRIDS, Cell
+
+WORK: dict[Track, str] = {"driving": "bench.drive", "detection": "bench.approach"}
+"""The module that does the work of a track's units."""
+CRAFT = "bench.crafting"
+"""The module that crafts patches."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unit:
-    """One batch of episodes: a pair on every scenario seed of a cell, with one training seed.
+class _Work:
+    """What units of both kinds have.
 
     Args:
         pair: attack, defence, victim, world, threat model.
-        cell: lanes, density, weather.
-        training_seed: of the policy.
-        seeds: the scenario seed of each episode.
-        weights_sha256: of the policy's weights.
+        training_seed: of the victim; of a patch too.
+        weights_sha256: of the victim's weights.
     """
 
     pair: Pair
-    cell: Cell
     training_seed: int
-    seeds: range
     weights_sha256: str
 
     @property
-    def attack_seed(self) -> int:
-        """Of the attack's random generator: the same for every pair and every order of work."""
-        return int(digest([canonical(self.cell), self.training_seed])[:15], 16)
+    def module(self) -> str:
+        """The module that does the work."""
+        raise NotImplementedError
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Those whose source computes it, with all they import."""
+        return (__name__, self.module, *sorted(type(part.component).__module__ for part in self.parts))
 
     @property
     def code_digest(self) -> str:
-        """Of the source that computes the unit: the framework's and its components', with what they import."""
-        return code_digest((__name__, *sorted(type(part.component).__module__ for part in self.parts)))
+        """Of the source that computes it: the framework's and its components', with what they import."""
+        return code_digest(self.modules)
 
     @property
     def parts(self) -> tuple[Chosen[Any], ...]:
@@ -49,20 +54,72 @@ class Unit:
         return self.pair.attack, self.pair.defense, self.pair.victim, self.pair.world
 
     @property
+    def origin(self) -> dict[str, object]:
+        """What decides the result."""
+        return {
+            "pair": self.pair.identity,
+            "training_seed": self.training_seed,
+            "weights": self.weights_sha256,
+            "code": self.code_digest,
+            "shipped_by": [_entry(part).shipped_by for part in self.parts],
+            "libraries": libraries(),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crafting(_Work):
+    """One patch of an attack on a defended detector, crafted on the training scenes of a world."""
+
+    module = CRAFT
+
+    @property
+    def fingerprint(self) -> str:
+        """sha256 of everything that decides the patch."""
+        return digest(self.origin)
+
+    @property
+    def attack_seed(self) -> int:
+        """Of the attack's random generator: the same for every pair."""
+        return int(digest(["patch", self.training_seed])[:15], 16)
+
+    def __str__(self) -> str:
+        return f"{self.pair} | patch, seed {self.training_seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unit(_Work):
+    """One batch of episodes: a pair on every scenario seed of a cell, with one training seed.
+
+    Args:
+        cell: lanes, density, weather.
+        seeds: the scenario seed of each episode.
+    """
+
+    cell: Cell
+    seeds: range
+
+    @property
+    def module(self) -> str:
+        return WORK[self.pair.track]
+
+    @property
+    def attack_seed(self) -> int:
+        """Of the attack's random generator: the same for every pair and every order of work."""
+        return int(digest([canonical(self.cell), self.training_seed])[:15], 16)
+
+    @property
+    def crafting(self) -> Crafting | None:
+        """What makes the patch it shows; None where there is none to make."""
+        if self.pair.track != "detection" or self.pair.is_clean:
+            return None
+        return Crafting(pair=self.pair, training_seed=self.training_seed, weights_sha256=self.weights_sha256)
+
+    @property
     def fingerprint(self) -> str:
         """sha256 of everything that decides the result."""
-        return digest(
-            {
-                "pair": self.pair.identity,
-                "cell": canonical(self.cell),
-                "training_seed": self.training_seed,
-                "seeds": [self.seeds.start, self.seeds.stop],
-                "weights": self.weights_sha256,
-                "code": self.code_digest,
-                "shipped_by": [_entry(part).shipped_by for part in self.parts],
-                "libraries": libraries(),
-            }
-        )
+        patch = {"patch": self.crafting.fingerprint} if self.crafting else {}
+        scenarios = {"cell": canonical(self.cell), "seeds": [self.seeds.start, self.seeds.stop]}
+        return digest(self.origin | scenarios | patch)
 
     @property
     def grid(self) -> str:
@@ -73,13 +130,15 @@ class Unit:
     def constants(self, wall_s: float) -> dict[str, object]:
         """What every record of the unit says: the columns IDENTITY (but `seed`) and PROVENANCE of `bench.results`."""
         pair, cell, threat = self.pair, self.cell, self.pair.threat
+        victim = pair.victim.component
+        driver = victim if isinstance(victim, DrivingVictim) else None
         return {
             "unit": self.fingerprint,
             "pair": pair.id,
             **{part.kind: part.name for part in self.parts},
             **{f"{part.kind}_params": part.params for part in self.parts},
-            "action_type": pair.victim.component.action_type,
-            "sees": pair.victim.component.sees,
+            "action_type": driver.action_type if driver else "",
+            "sees": driver.sees if driver else True,
             "training_seed": self.training_seed,
             "threat_norm": threat.norm,
             "threat_budget": float(threat.budget),
@@ -99,37 +158,8 @@ class Unit:
         }
 
     def __str__(self) -> str:
-        seed = f", seed {self.training_seed}" if self.pair.victim.component.learns else ""
+        seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""
         return f"{self.pair} | {self.cell}{seed}"
-
-
-def drive(unit: Unit, trace: Trace | None = None) -> Columns:
-    """Do the work of a unit and return the measurements of its episodes, [B] each (`bench.rollout.rollout`).
-
-    Args:
-        unit: what to drive.
-        trace: filled with every step of its episodes.
-    """
-    pair, world = unit.pair, unit.pair.world.component
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(unit.attack_seed)
-        policy = pair.defense.component.load(pair.victim.component, unit.training_seed)
-        cells = [unit.cell] * len(unit.seeds)
-        env = world.make(cells, action_type=policy.action_type, driver=policy.driver)
-        try:
-            return rollout(
-                env,
-                policy,
-                pair.attack.component,
-                pair.threat,
-                unit.seeds,
-                features=world.features,
-                max_steps=world.max_steps,
-                attack_seed=unit.attack_seed,
-                trace=trace,
-            )
-        finally:
-            env.close(raise_if_closed=False)
 
 
 def _entry(part: Chosen[Any]) -> registry.Entry:

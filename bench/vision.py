@@ -1,4 +1,6 @@
-"""What a detector is: pictures in, boxes with scores out, differentiable to the pixel.
+"""The detection track: detectors, camera worlds, and the base classes of its components.
+
+A detector takes pictures and gives boxes with scores, differentiable to the pixel.
 
 A box is [x1, y1, x2, y2] in pixels of the picture given: x to the right, y down, from the outer corner of the first pixel.
 """
@@ -7,12 +9,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from bench.contracts import Attack, Defense, Progress, Track, Trained, Victim, World
 from bench.errors import UserError
 from bench.registry import unknown
+
+if TYPE_CHECKING:
+    from bench.patch import VisionOracle
+    from bench.scenario import Cell
 
 
 @dataclass(frozen=True)
@@ -113,8 +121,46 @@ class Scenes(ABC):
         """
 
 
-class DetectorVictim(ABC):
+@dataclass(frozen=True)
+class Approach:
+    """A drive up to one stop sign, the sign's face as it is until a patch is rendered onto it.
+
+    Args:
+        seed: scenario seed.
+        location: name of the place.
+        scenes: its frames, farthest first, in the order they are driven through.
+    """
+
+    seed: int
+    location: str
+    scenes: Scenes
+
+
+class CameraWorld(World):
+    """Streets with a stop sign, rendered. What is scored is never shown to anyone who crafts or trains."""
+
+    track: ClassVar[Track] = "detection"
+    locations: ClassVar[tuple[str, ...]]
+    """Names of the places; scenario seed s is driven at `locations[s % len(locations)]`."""
+
+    @abstractmethod
+    def training_scenes(self) -> Scenes:
+        """All that crafting a patch or hardening a detector may look at."""
+
+    @abstractmethod
+    def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
+        """One held-out approach a seed, all of the same number of frames.
+
+        Args:
+            cell: lanes (how far the sign stands from the ego's), traffic density (cars, which may hide it), weather.
+            seeds: scenario seeds.
+        """
+
+
+class DetectorVictim(Victim):
     """A kind of detector; the fields of the dataclass are its parameters."""
+
+    track: ClassVar[Track] = "detection"
 
     @abstractmethod
     def load(self, seed: int) -> Detector:
@@ -122,6 +168,45 @@ class DetectorVictim(ABC):
 
         Raises:
             UserError: if its weights are not there or not what they should be.
+        """
+
+    def train(self, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
+        """Train a detector on the training scenes of a world."""
+        raise NotImplementedError(f"{type(self).__name__} does not learn")
+
+
+class DetectorDefense(Defense):
+    """Protects a detector. `train(victim, world, seed, progress)` may look at `world.training_scenes()` only."""
+
+    track: ClassVar[Track] = "detection"
+
+    @abstractmethod
+    def load(self, victim: DetectorVictim, seed: int) -> Detector:
+        """The defended detector: hardened, from the zoo, or one that transforms the pictures first.
+
+        A transformation without a useful gradient should have a straight-through one (Athalye et al. 2018): an attack that
+        runs into a wall by accident proves nothing.
+        """
+
+
+class PatchAttack(Attack):
+    """Makes a patch for the middle of the sign, once, from training scenes; it is scored on approaches it never saw."""
+
+    track: ClassVar[Track] = "detection"
+    seeded: ClassVar[bool] = True
+    """Whether its patch depends on the patch seed; one that does not is crafted for one seed only."""
+
+    @abstractmethod
+    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor | None:
+        """The patch [3, P, P] sRGB in [0, 1], P from 8 to 512; None leaves the sign alone.
+
+        Its width is `oracle.threat.budget` times the sign's: what `scenes.render` takes as `share`.
+
+        Args:
+            oracle: the only door to the detector; it holds the label to hide (`label`), the query budget (`remaining`) and the
+                random generator (`generator`).
+            scenes: to craft on.
+            progress: told how far it is.
         """
 
 

@@ -13,7 +13,7 @@ import types
 from collections.abc import Mapping, Sequence
 from dataclasses import field, fields, is_dataclass, make_dataclass
 from enum import Enum
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -26,13 +26,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench import registry
+from bench.contracts import ThreatModel, Track
 from bench.errors import UserError
-from bench.pair import Chosen, choose
+from bench.pair import THREATS, Chosen, choose
 from bench.parameters import Parameter, parameters
 from bench.registry import Kind
-from bench.threat import ThreatModel
 
-DEFAULTS: dict[Kind, str] = {"attack": "none", "defense": "none", "victim": "dqn", "world": "highway"}
+DEFAULTS: dict[Kind, str] = {"attack": "none", "defense": "none", "victim": "dqn"}
+WORLDS: dict[Track, str] = {"driving": "highway", "detection": "camera"}
+"""The default world of each track; the track is the victim's."""
 
 
 class Words:
@@ -81,9 +83,24 @@ class Words:
         assert isinstance(found, dict)
         return {str(key): value for key, value in found.items()} | ({"out": self.out[0]} if self.out else {})
 
+    @cached_property
+    def track(self) -> Track:
+        """Of the victims asked for.
+
+        Raises:
+            UserError: if they are not all of one.
+        """
+        found = {chosen.component.tracks()[0]: chosen.name for chosen in self.chosen("victim")}
+        if len(found) > 1:
+            victims = " and ".join(f"{name!r} ({track})" for track, name in found.items())
+            raise UserError(
+                f"victims {victims} are of different tracks: run one after the other, with the same out= if you like"
+            )
+        return next(iter(found))
+
     def chosen(self, kind: Kind) -> list[Chosen[Any]]:
         """Every component of a kind that is asked for, with every combination of its parameters' values."""
-        names = self.values.get(kind, (DEFAULTS[kind],))
+        names = self.values.get(kind) or (WORLDS[self.track] if kind == "world" else DEFAULTS[kind],)
         known = {name: parameters(registry.load(kind, name)) for name in names}
         swept = {key.partition(".")[2]: v for key, v in self.values.items() if key.startswith(f"{kind}.")}
         for key in swept:
@@ -102,14 +119,15 @@ class Words:
 
     def threats(self) -> list[ThreatModel]:
         """Every combination of the threat model's values."""
-        owned = parameters(ThreatModel)
+        model = THREATS[self.track]
+        owned = parameters(model)
         keys = [key for key in self.values if key.startswith("threat.")]
         names = [key.removeprefix("threat.") for key in keys]
         found = []
         for values in itertools.product(*(self.values[key] for key in keys)):
             arguments = _arguments("threat", "model", owned, dict(zip(names, values, strict=True)))
             try:
-                found.append(ThreatModel(**arguments))
+                found.append(model(**arguments))
             except ValueError as error:
                 raise UserError(str(error)) from error
         return found

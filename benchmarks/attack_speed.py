@@ -19,11 +19,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from attacks.zo import ZOSignSGD
-from bench.contracts import Attack, Policy
+from bench.driving import DrivingAttack, Policy
 from bench.pipeline import AttackModule
 from bench.process import settle
 from bench.scenario import Cell, SeedBlock
-from bench.threat import ThreatModel
+from bench.threat import ObservationThreat
 from bench.victims.networks import QPolicy
 from envs.highway.world import HighwayWorld
 
@@ -105,9 +105,9 @@ def _observations(world: HighwayWorld, episodes: int) -> Tensor:
     return observation
 
 
-def _batched(attack: Attack, policy: Policy, world: HighwayWorld, observation: Tensor) -> Callable[[], object]:
+def _batched(attack: DrivingAttack, policy: Policy, world: HighwayWorld, observation: Tensor) -> Callable[[], object]:
     """A step of the pipeline, with the oracle and everything it enforces."""
-    module = AttackModule(attack, policy, ThreatModel(queries=1_000_000), world.features, seed=0)
+    module = AttackModule(attack, policy, ObservationThreat(queries=1_000_000), world.features, seed=0)
     done = torch.zeros(len(observation), 1, dtype=torch.bool)
     step = TensorDict({"observation": observation, "done": done}, batch_size=[len(observation)])
     return lambda: module(step)

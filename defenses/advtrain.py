@@ -8,15 +8,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bench.contracts import AttackInLoop, Defense, Policy, Progress, TrainedPolicy, Victim, World
+from bench.contracts import Progress, Trained
+from bench.driving import AttackInLoop, DrivingDefense, DrivingVictim, DrivingWorld, Policy
 from bench.errors import UserError
-from bench.threat import Norm, Oracle, ThreatModel
+from bench.threat import Norm, ObservationThreat, Oracle
 from bench.victims import zoo
 from bench.words import configured
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdversarialTraining(Defense):
+class AdversarialTraining(DrivingDefense):
     """The victim learns while it is attacked (thesis Algorithm 5; Madry et al. 2018 for the principle).
 
     Each decision of the training is attacked, except that with probability `skip` the victim sees the truth. `skip=1` is the
@@ -66,18 +67,18 @@ class AdversarialTraining(Defense):
             raise ValueError(
                 f"ramp_from and ramp_to must be in order between 0 and 1, got {self.ramp_from} and {self.ramp_to}"
             )
-        ThreatModel(norm=self.norm, budget=self.budget)
+        ObservationThreat(norm=self.norm, budget=self.budget)
 
-    def zoo_name(self, victim: Victim) -> str:
+    def zoo_name(self, victim: DrivingVictim) -> str:
         return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"
 
-    def load(self, victim: Victim, seed: int) -> Policy:
+    def load(self, victim: DrivingVictim, seed: int) -> Policy:
         if victim.policy_type is None:
             raise UserError("adversarial training needs a victim that learns")
         made_by = {"victim": asdict(victim), "defense": asdict(self)}  # type: ignore[call-overload]
         return zoo.load(self.zoo_name(victim), seed, victim.policy_type, made_by=made_by)
 
-    def train(self, victim: Victim, world: World, *, seed: int, progress: Progress) -> TrainedPolicy:
+    def train(self, victim: DrivingVictim, world: DrivingWorld, *, seed: int, progress: Progress) -> Trained[Policy]:
         """Train the hardened policy of training seed `seed`: the victim's own training with the attack in its loop.
 
         Raises:
@@ -86,7 +87,7 @@ class AdversarialTraining(Defense):
         attack = configured("attack", self.attack, dict(_word(word) for word in self.attack_params.split())).component
         if victim.action_type not in attack.action_types:
             raise UserError(f"attack {self.attack!r} does not fit a victim with {victim.action_type} actions")
-        threat = ThreatModel(norm=self.norm, budget=self.budget)
+        threat = ObservationThreat(norm=self.norm, budget=self.budget)
         generator = torch.Generator().manual_seed(seed)
 
         def perturb(observation: Tensor, policy: Policy, scale: float) -> Tensor:
@@ -106,7 +107,7 @@ class AdversarialTraining(Defense):
         )
         trained = victim.train(world, seed=seed, attack=loop, progress=progress)
         made_by = {"defense": asdict(self), "attack": asdict(attack), "threat": asdict(threat)}
-        return TrainedPolicy(trained.policy, {**trained.card, **made_by})
+        return Trained(trained.network, {**trained.card, **made_by})
 
 
 def _word(word: str) -> tuple[str, str]:

@@ -15,7 +15,7 @@ from bench.scenario import Cell
 from bench.statistics import Interval
 from leaderboard.layout import STRIP, Column, Section, axis, fitted
 from leaderboard.pairs import BEST_BLIND, IDM, Pair
-from leaderboard.text import ATTACKED, BLIND, CLEAN, MISSING, estimate, number, share, strip, verdict
+from leaderboard.text import ATTACKED, BLIND, CLEAN, MISSING, arrow, estimate, number, share, strip, verdict
 
 
 def cell_by_cell(pair: Pair, console: Console) -> Table:
@@ -61,8 +61,8 @@ def _columns(pair: Pair) -> list[Column[_Part]]:
     for name in pair.references:
         columns.append(Column(titles.get(name, name), _reference(name), spare=0 if name == BEST_BLIND else 5))
     columns += [
-        Column(f"return\nof {MAX_RETURN:.0f}", lambda part: _arrow(_returns(part.clean), _returns(part.attacked))),
-        Column("crashed\n%", lambda part: _arrow(_crashes(part.clean), _crashes(part.attacked))),
+        Column(f"return\nof {MAX_RETURN:.0f}", lambda part: arrow(_returns(part.clean), _returns(part.attacked))),
+        Column("crashed\n%", lambda part: arrow(_crashes(part.clean), _crashes(part.attacked))),
     ]
     if pair.attacked:
         columns += [
@@ -94,12 +94,6 @@ def _returns(summary: Summary | None) -> str:
 
 def _crashes(summary: Summary | None) -> str:
     return f"{100 * summary.crash_rate.estimate:.0f}" if summary else ""
-
-
-def _arrow(clean: str, attacked: str) -> Text:
-    if not (clean and attacked):
-        return Text(clean or attacked)
-    return Text.assemble((clean, CLEAN), (" → ", "dim"), (attacked, ATTACKED))
 
 
 def _strip(part: _Part) -> Text:

@@ -68,9 +68,9 @@ def _table(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subjec
     return made
 
 
-def axis() -> str:
+def axis(measure: str = "safe progress") -> str:
     """The heading of a strip chart: 0 at its left end, 1 at its right."""
-    return "safe progress\n0" + "0.5".center(STRIP - 2) + "1"
+    return f"{measure}\n0" + "0.5".center(STRIP - 2) + "1"
 
 
 def _text(value: Text | str) -> Text:

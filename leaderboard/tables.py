@@ -9,6 +9,8 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.metrics import CONTROL_PERIOD_MS, step_mean
+from bench.results import track_of
+from leaderboard.approach_tables import approach_report
 from leaderboard.cells import cell_by_cell
 from leaderboard.overview import overview, size
 from leaderboard.pairs import Pair, read_pairs
@@ -19,11 +21,14 @@ def run_report(records: pa.Table, console: Console) -> None:
     """Print what the records of a run say.
 
     Args:
-        records: episode records (`bench.results.SCHEMA`), clean controls and reference drivers among them.
+        records: of either track (`bench.results.SCHEMAS`), clean controls and references among them.
         console: where to print; readable from 100 columns on; wider ones add columns.
     """
     if not records.num_rows:
         console.print("No records to report.")
+        return
+    if track_of(records.column_names) == "detection":
+        approach_report(records, console)
         return
     pairs = read_pairs(records)
     console.print(Padding(Text(size(pairs), style="bold"), (1, 1)))

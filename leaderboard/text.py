@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 from rich.text import Text
 
@@ -41,6 +42,13 @@ def _short(value: float, digits: int) -> str:
     """A bound without the zero before the point: `.58`."""
     written = f"{value:.{digits}f}"
     return written.replace("0.", ".", 1) if written.startswith(("0.", "-0.")) and digits else written
+
+
+def arrow(clean: str, attacked: str) -> Text:
+    """From the unattacked value to the attacked one; either may be empty."""
+    if not (clean and attacked):
+        return Text(clean or attacked)
+    return Text.assemble((clean, CLEAN), (" → ", "dim"), (attacked, ATTACKED))
 
 
 def change(found: Interval | None, *, digits: int = 2) -> Text:
@@ -87,7 +95,15 @@ def strip(points: Mapping[str, Interval | None], width: int) -> Text:
     return Text.assemble(*cells)
 
 
-def varying(pairs: Sequence[Pair], column: str) -> set[str]:
+class Identified(Protocol):
+    """A pair of either track."""
+
+    @property
+    def identity(self) -> Mapping[str, object]:
+        """Names and parameters of its components."""
+
+
+def varying(pairs: Sequence[Identified], column: str) -> set[str]:
     """The parameters of a component that the pairs do not all share, looking only at pairs with the same component."""
     by_name: dict[object, list[dict[str, object]]] = {}
     for pair in pairs:
@@ -101,7 +117,7 @@ def varying(pairs: Sequence[Pair], column: str) -> set[str]:
     }
 
 
-def component(pair: Pair, column: str, shown: set[str] | None = None) -> str:
+def component(pair: Identified, column: str, shown: set[str] | None = None) -> str:
     """A component's name with the parameters in `shown` (all of them by default)."""
     found = parameters(pair.identity[f"{column}_params"])
     words = [f"{name}={value}" for name, value in found.items() if shown is None or name in shown]

@@ -9,11 +9,11 @@ import pytest
 import torch
 from rerun.chunk import Chunk, RrdReader
 
-from bench.contracts import Features
+from bench.driving import Features
 from bench.recording import RerunLogger, save
 from bench.recording.episode import ACTIONS, Episode
 from bench.rollout import Trace
-from bench.threat import ThreatModel, project
+from bench.threat import ObservationThreat, project
 
 FEATURES = Features(
     names=("x", "y", "vx", "vy"), low=(-100.0, -20.0, -40.0, -20.0), high=(100.0, 20.0, 40.0, 20.0),
@@ -35,7 +35,7 @@ def made_up(steps: int = 20, *, attacked: bool = True, discrete: bool = True, cr
         observation = torch.rand(1, 1 + CARS, 5, generator=generator) * 1.6 - 0.8
         observation[..., 0] = 1.0
         observation[:, 1 + t % CARS :] = 0.0
-        radius = ThreatModel().radius(observation, FEATURES)
+        radius = ObservationThreat().radius(observation, FEATURES)
         perturbed = project(
             observation + 0.5 * torch.randn(observation.shape, generator=generator), observation, radius
         )

@@ -19,7 +19,7 @@ from bench.recording.episode import Episode
 from bench.recording.logger import RerunLogger
 
 if TYPE_CHECKING:
-    from bench.contracts import Features
+    from bench.driving import Features
     from bench.rollout import Trace
 
 __all__ = ["RerunLogger", "save"]

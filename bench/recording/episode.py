@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bench.contracts import Features
+from bench.driving import Features
 from bench.rollout import Trace
-from bench.threat import ThreatModel
+from bench.threat import ObservationThreat
 
 STEPS_PER_SECOND = 15.0
 ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
@@ -84,7 +84,7 @@ class Episode:
     def budget(self) -> dict[str, Array]:
         """[T] by feature: the largest deviation the threat model allows of any vehicle, in the feature's unit."""
         known = {name: self.meta[f"threat_{name}"] for name in ("norm", "budget") if f"threat_{name}" in self.meta}
-        threat = ThreatModel(**known)  # type: ignore[arg-type]
+        threat = ObservationThreat(**known)  # type: ignore[arg-type]
         radius = threat.radius(torch.as_tensor(self.steps["observation"]), self.features)[..., 1:]
         physical = (radius * self.features.half_range()).amax(1).double().numpy()
         return dict(zip(self.features.names, physical.T, strict=True))

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
-from bench.contracts import ActionType, AttackInLoop, Policy
+from bench.driving import ActionType, AttackInLoop, Policy
 from bench.victims.networks import ActorPolicy
 from bench.victims.training import CHUNK, Learner, LearningDriver, Phase, target_state
 

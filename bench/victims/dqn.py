@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
-from bench.contracts import ActionType, AttackInLoop, Policy
+from bench.driving import ActionType, AttackInLoop, Policy
 from bench.victims.networks import QPolicy
 from bench.victims.training import CHUNK, Learner, LearningDriver, Phase, target_state
 

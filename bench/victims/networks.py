@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from bench.contracts import Policy
+from bench.driving import Policy
 
 
 class Encoder(nn.Module):

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from bench.contracts import ActionType, Driver, Policy, Victim
+from bench.driving import ActionType, Driver, DrivingVictim, Policy
 
 LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
 """highway-env's discrete meta-actions."""
@@ -43,7 +43,7 @@ class _BlindPolicy(Policy):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Blind(Victim):
+class Blind(DrivingVictim):
     """A driver that ignores what it sees: a constant action, or the rightmost lane and then the brake.
 
     The best of these in a cell is the bar under attack: a victim below it would do better with its eyes shut.
@@ -101,7 +101,7 @@ class _RandomPolicy(Policy):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomDriver(Victim):
+class RandomDriver(DrivingVictim):
     """Uniformly random actions.
 
     Args:
@@ -120,7 +120,7 @@ class RandomDriver(Victim):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IDMDriver(Victim):
+class IDMDriver(DrivingVictim):
     """highway-env's own traffic driver at the wheel: IDM for speed, MOBIL for lanes (Treiber et al. 2000, Kesting et al. 2007).
 
     It reads the simulator's true state, not the observation, so that attacks and weather cannot touch it.

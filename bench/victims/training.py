@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, ExplorationType, MultiStepTransform, set_exploration_type
 
-from bench.contracts import AttackInLoop, Policy, Progress, TrainedPolicy, Victim, World
+from bench.contracts import Progress, Trained
+from bench.driving import AttackInLoop, DrivingVictim, DrivingWorld, Policy
 from bench.scenario import GRIDS, Cell, SeedBlock
 from bench.victims import zoo
 
@@ -104,7 +105,7 @@ class Learner(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningDriver(Victim):
+class LearningDriver(DrivingVictim):
     """What all trained drivers share.
 
     At 15 Hz single frames explore nothing, so a first phase holds each decision for `repeat` frames; but a lane change sent twice
@@ -181,8 +182,8 @@ class LearningDriver(Victim):
         """The algorithm on `env`, from fresh weights or from `attack.start`."""
 
     def train(
-        self, world: World, *, seed: int, attack: AttackInLoop | None = None, progress: Progress
-    ) -> TrainedPolicy:
+        self, world: DrivingWorld, *, seed: int, attack: AttackInLoop | None = None, progress: Progress
+    ) -> Trained[Policy]:
         """Train on all roads of the standard grid at once, and keep the best checkpoint."""
         torch.manual_seed(seed)
         started = time.process_time()
@@ -212,7 +213,7 @@ class LearningDriver(Victim):
         assert learner is not None
         card = {"victim": asdict(self), "seed": seed, "attacked_decisions": attacked, **best.card()}
         card["cpu_seconds"] = round(time.process_time() - started, 1)
-        return TrainedPolicy(best.restore(learner.averaged()), card)
+        return Trained(best.restore(learner.averaged()), card)
 
     def _due(self, share: float, offered: int, attacked: bool) -> bool:
         """Whether another checkpoint is due; they are spread over the last `fine` of the training."""
@@ -314,7 +315,7 @@ def target_state(params: TensorDictBase, module: nn.Module) -> dict[str, Tensor]
 
 @torch.no_grad()
 def selection_score(
-    policy: Policy, world: World, episodes: int, perturb: Callable[[Tensor], Tensor] | None = None
+    policy: Policy, world: DrivingWorld, episodes: int, perturb: Callable[[Tensor], Tensor] | None = None
 ) -> dict[str, float]:
     """Mean `safe_progress`, by road and over all, on the seeds that select checkpoints and are never reported.
 
@@ -350,7 +351,7 @@ def selection_score(
 class Best:
     """The best checkpoint so far: by its `selection_score`, or by the mean of that with and without the attack it trains on."""
 
-    world: World
+    world: DrivingWorld
     attack: AttackInLoop | None
     episodes: int
     score: float = -1.0

@@ -40,6 +40,7 @@ class YOLOv3TinyNetwork(Detector):
 
     def __init__(self) -> None:
         super().__init__()
+        self.shape: dict[str, object] = {}
         outputs = len(HEADS[0]) * (5 + len(self.names))
         widths = (3, 16, 32, 64, 128, 256)
         self.stem = nn.ModuleList(_leaky(a, b) for a, b in pairwise(widths))

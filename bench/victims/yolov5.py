@@ -117,7 +117,8 @@ class YOLOv5Network(Detector):
 
     def __init__(self, size: Size, names: tuple[str, ...] = coco.NAMES) -> None:
         super().__init__()
-        self.names = names
+        self.shape = {"size": size, "names": names}
+        self.names = tuple(names)
         depth, width = MULTIPLES[size]
         w64, w128, w256, w512, w1024 = (math.ceil(full * width / 8) * 8 for full in (64, 128, 256, 512, 1024))
         d3, d6, d9 = (max(round(full * depth), 1) for full in (3, 6, 9))

@@ -1,4 +1,4 @@
-"""The zoo: trained policies as safetensors with a card each, hash-checked when loaded. Nothing is unpickled."""
+"""The zoo: trained policies and detectors as safetensors with a card each, hash-checked when loaded. Nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -7,30 +7,35 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from platformdirs import user_data_path
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from bench.contracts import Policy
+from bench.driving import Policy
 from bench.errors import UserError
 from bench.files import whole
+from bench.vision import Detector
+
+Network = TypeVar("Network", Policy, Detector)
 
 SHIPPED = Path(__file__).parent / "policies"
 
 
 def own() -> Path:
-    """Where policies trained on this machine are kept: CAVBENCH_ZOO, or the user's data folder."""
+    """Where networks trained on this machine are kept: CAVBENCH_ZOO, or the user's data folder."""
     return Path(os.environ.get("CAVBENCH_ZOO") or user_data_path("cavbench") / "zoo")
 
 
-def save(policy: Policy, card: Mapping[str, object], *, name: str, seed: int, root: Path | None = None) -> Path:
-    """Write the weights and the card of a trained policy, atomically, and return the path of the weights.
+def save(
+    network: Policy | Detector, card: Mapping[str, object], *, name: str, seed: int, root: Path | None = None
+) -> Path:
+    """Write the weights and the card of a trained network, atomically, and return the path of the weights.
 
     Args:
-        policy: has an attribute `shape`, the keyword arguments of its class.
+        network: has an attribute `shape`, the keyword arguments of its class.
         card: what is worth knowing of the training; the hash of the weights and the shape are added.
         name: of the zoo entry, for instance `dqn-advtrain-skip0.3`.
         seed: training seed.
@@ -38,8 +43,8 @@ def save(policy: Policy, card: Mapping[str, object], *, name: str, seed: int, ro
     """
     folder = (root or own()) / name
     folder.mkdir(parents=True, exist_ok=True)
-    blob = save_tensors({key: value.contiguous() for key, value in policy.state_dict().items()})
-    full = {"name": name, **card, "shape": policy.shape, "sha256": hashlib.sha256(blob).hexdigest()}
+    blob = save_tensors({key: value.contiguous() for key, value in network.state_dict().items()})
+    full = {"name": name, **card, "shape": network.shape, "sha256": hashlib.sha256(blob).hexdigest()}
     path = folder / f"seed{seed}.safetensors"
     with whole(path) as file:
         file.write(blob)
@@ -61,13 +66,13 @@ def card(name: str, seed: int) -> dict[str, Any]:
         raise UserError(f"the card {path} cannot be read: {error}") from None
 
 
-def load(name: str, seed: int, kind: type[Policy], *, made_by: Mapping[str, Mapping[str, object]]) -> Policy:
-    """The policy of a zoo entry, frozen and in eval mode.
+def load(name: str, seed: int, kind: type[Network], *, made_by: Mapping[str, Mapping[str, object]]) -> Network:
+    """The network of a zoo entry, frozen and in eval mode.
 
     Args:
         name: of the entry.
         seed: training seed.
-        kind: class of the policy; built from the card's `shape`.
+        kind: class of the network; built from the card's `shape`.
         made_by: the parameters the card must have been made with, by component: what was asked for is what is loaded.
 
     Raises:
@@ -91,13 +96,13 @@ def load(name: str, seed: int, kind: type[Policy], *, made_by: Mapping[str, Mapp
             "the file was changed; restore it or train it again"
         )
     try:
-        policy = kind(**entry["shape"])
-        policy.load_state_dict(load_tensors(blob))
+        network = kind(**entry["shape"])
+        network.load_state_dict(load_tensors(blob))
     except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"the weights {path} do not fit {kind.__name__}: {reason}") from None
-    policy.weights_sha256 = found
-    return policy.requires_grad_(False).eval()
+    network.weights_sha256 = found
+    return network.requires_grad_(False).eval()
 
 
 def seeds(name: str) -> list[int]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, get_args
 
-from bench.contracts import ActionType, Driver, Features
+from bench.driving import ActionType, Driver, Features
 from bench.scenario import Cell
 
 Preset = Literal["standard", "thesis"]

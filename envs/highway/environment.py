@@ -36,7 +36,7 @@ def drawn_seed(environment_seed: int, episode: int, reset: int) -> int:
 
 
 class HighwayEnv(EnvBase):
-    """B episodes of highway driving as a TorchRL environment (keys and shapes: `bench.contracts.World`).
+    """B episodes of highway driving as a TorchRL environment (keys and shapes: `bench.driving.DrivingWorld`).
 
     Give `seed` (int64 [B]) in the tensordict of `reset` to choose the scenarios; otherwise they follow from `set_seed`.
     A finished episode stays where it is, with `done` set and reward 0, until it is reset.

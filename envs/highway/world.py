@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from bench.contracts import ActionType, Driver, Features, World
+from bench.driving import ActionType, Driver, DrivingWorld, Features
 from bench.scenario import Cell
 from envs.highway.config import (
     STANDARD_FEATURES,
@@ -24,7 +24,7 @@ Backend = Literal["batched", "reference"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class HighwayWorld(World):
+class HighwayWorld(DrivingWorld):
     """A straight highway with IDM/MOBIL traffic: highway-env 1.12.1's `highway-v0`, 15 Hz, 30 seconds.
 
     Args:
@@ -75,7 +75,7 @@ class HighwayWorld(World):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> HighwayConfig:
-        """The environment's full configuration; arguments as in `World.make`."""
+        """The environment's full configuration; arguments as in `DrivingWorld.make`."""
         thesis = self.preset == "thesis"
         rows = self.observed_vehicles if self.observed_vehicles is not None else (5 if thesis else 10)
         preset_speeds = THESIS_TARGET_SPEEDS if thesis else STANDARD_TARGET_SPEEDS
@@ -102,7 +102,7 @@ class HighwayWorld(World):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        """See `bench.contracts.World.make`."""
+        """See `bench.driving.DrivingWorld.make`."""
         config = self.config(cells, action_type=action_type, driver=driver, action_repeat=action_repeat)
         # Imported here: both load torchrl and numba or pygame, which listing components must not.
         if self.backend == "batched":

@@ -13,8 +13,8 @@ from attacks.noise import Noise
 from attacks.none import NoAttack
 from attacks.pgd import PGD
 from attacks.zo import ZOSignSGD
-from bench.contracts import ActionType, Attack
-from bench.threat import Norm, ThreatModel
+from bench.driving import ActionType, DrivingAttack
+from bench.threat import Norm, ObservationThreat
 from tests.attacks.victims import FEATURES, observations, perturb, victim
 
 OBJECTIVES = ("collision", "expected", "margin", "target")
@@ -48,9 +48,9 @@ norms: st.SearchStrategy[Norm] = st.sampled_from(("relative", "linf"))
 @settings(max_examples=80, deadline=None)
 @given(attacks, action_types, norms, st.floats(0, 0.5), st.integers(0, 99))
 def test_the_answer_is_within_the_perturbation_set(
-    attack: Attack, action_type: ActionType, norm: Norm, budget: float, seed: int
+    attack: DrivingAttack, action_type: ActionType, norm: Norm, budget: float, seed: int
 ) -> None:
-    threat, observation = ThreatModel(norm=norm, budget=budget), observations(6, seed)
+    threat, observation = ObservationThreat(norm=norm, budget=budget), observations(6, seed)
     shown, _ = perturb(attack, victim(action_type, seed), observation, threat, seed)
     radius = threat.radius(observation, FEATURES)
     assert shown.dtype == observation.dtype
@@ -65,16 +65,16 @@ def test_the_answer_is_within_the_perturbation_set(
 @settings(max_examples=80, deadline=None)
 @given(attacks, action_types, st.integers(0, 60), st.integers(0, 99))
 def test_no_attack_asks_more_than_its_query_budget(
-    attack: Attack, action_type: ActionType, queries: int, seed: int
+    attack: DrivingAttack, action_type: ActionType, queries: int, seed: int
 ) -> None:
-    threat = ThreatModel(budget=0.2, queries=queries)
+    threat = ObservationThreat(budget=0.2, queries=queries)
     _, spent = perturb(attack, victim(action_type, seed), observations(6, seed), threat, seed)
     assert int(spent.max()) <= queries
 
 
 @settings(max_examples=40, deadline=None)
 @given(attacks, action_types, st.integers(0, 99))
-def test_the_same_seed_gives_the_same_answer(attack: Attack, action_type: ActionType, seed: int) -> None:
+def test_the_same_seed_gives_the_same_answer(attack: DrivingAttack, action_type: ActionType, seed: int) -> None:
     policy, observation = victim(action_type), observations(6, seed)
     first, asked = perturb(attack, policy, observation, seed=seed)
     second, again = perturb(attack, policy, observation, seed=seed)
@@ -85,7 +85,7 @@ def test_the_same_seed_gives_the_same_answer(attack: Attack, action_type: Action
 @settings(max_examples=40, deadline=None)
 @given(st.one_of(zo, pgd), action_types, st.integers(0, 99))
 def test_an_episode_is_attacked_the_same_alone_or_in_a_batch(
-    attack: Attack, action_type: ActionType, seed: int
+    attack: DrivingAttack, action_type: ActionType, seed: int
 ) -> None:
     # At the clean action these have a kink or no slope: there rounding decides what the gradient is.
     kinked = isinstance(attack, PGD) and attack.objective in ("collision", "margin") and not attack.random_start
@@ -100,7 +100,7 @@ def test_an_episode_is_attacked_the_same_alone_or_in_a_batch(
 
 @pytest.mark.parametrize("action_type", ["discrete", "continuous"])
 @pytest.mark.parametrize("attack", [ZOSignSGD(), PGD(), Noise(), NoAttack()], ids=lambda a: type(a).__name__)
-def test_the_victim_and_the_observation_are_left_as_they_were(attack: Attack, action_type: ActionType) -> None:
+def test_the_victim_and_the_observation_are_left_as_they_were(attack: DrivingAttack, action_type: ActionType) -> None:
     policy, observation = victim(action_type), observations(6)
     weights, truth = deepcopy(policy.state_dict()), observation.clone()
     perturb(attack, policy, observation)
@@ -110,7 +110,7 @@ def test_the_victim_and_the_observation_are_left_as_they_were(attack: Attack, ac
 
 
 @pytest.mark.parametrize("attack", [ZOSignSGD(), PGD(), Noise(), NoAttack()], ids=lambda a: type(a).__name__)
-def test_an_empty_batch_is_no_work(attack: Attack) -> None:
+def test_an_empty_batch_is_no_work(attack: DrivingAttack) -> None:
     shown, spent = perturb(attack, victim("discrete"), observations(0))
     assert shown.shape == (0, 4, 5)
     assert spent.shape == (0,)
@@ -143,13 +143,13 @@ def test_an_empty_batch_is_no_work(attack: Attack) -> None:
         (Noise, {"distribution": "laplace"}),
     ],
 )
-def test_a_bad_parameter_is_named_in_one_line(kind: type[Attack], words: dict[str, object]) -> None:
+def test_a_bad_parameter_is_named_in_one_line(kind: type[DrivingAttack], words: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(words))) as error:
         kind(**words)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("attack", [PGD(objective="target", target_action=9), ZOSignSGD(braking_action=9)])
-def test_an_action_the_victim_does_not_have_is_refused(attack: Attack) -> None:
+def test_an_action_the_victim_does_not_have_is_refused(attack: DrivingAttack) -> None:
     with pytest.raises(ValueError, match="5 actions, got 9"):
         perturb(attack, victim("discrete"), observations(2))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from attacks.noise import Distribution, Noise
-from bench.threat import ThreatModel
+from bench.threat import ObservationThreat
 from tests.attacks.victims import FEATURES, observations, perturb, victim
 
 
@@ -22,7 +22,7 @@ def test_noise_asks_nothing(distribution: Distribution) -> None:
     [("uniform", 1.0, 0.577), ("uniform", 0.5, 0.289), ("gaussian", 0.25, 0.25), ("gaussian", 0.5, 0.480)],
 )
 def test_noise_is_as_wide_as_it_says(distribution: Distribution, scale: float, deviation: float) -> None:
-    threat = ThreatModel(norm="linf", budget=0.1)
+    threat = ObservationThreat(norm="linf", budget=0.1)
     # Far from the ends of the sensors' range, which cut noise off as well.
     observation = observations(2000) * torch.tensor([1.0, 0.5, 0.5, 0.5, 0.5])
     shown, _ = perturb(Noise(distribution=distribution, scale=scale), victim("discrete"), observation, threat)

@@ -11,8 +11,8 @@ from attacks.noise import Noise
 from attacks.none import NoAttack
 from attacks.objectives import Objective
 from attacks.pgd import PGD
-from bench.contracts import ActionType
-from bench.threat import ThreatModel, project
+from bench.driving import ActionType
+from bench.threat import ObservationThreat, project
 from tests.attacks.victims import FEATURES, Linear, left, loss_of, observations, perturb, victim
 
 OBJECTIVES: tuple[Objective, ...] = ("collision", "expected", "margin", "target")
@@ -21,7 +21,7 @@ OBJECTIVES: tuple[Objective, ...] = ("collision", "expected", "margin", "target"
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 999), st.sampled_from(OBJECTIVES))
 def test_one_whole_step_from_the_truth_is_fgsm(seed: int, objective: Objective) -> None:
-    threat, policy, observation = ThreatModel(budget=0.1), victim("discrete", seed), observations(8, seed)
+    threat, policy, observation = ObservationThreat(budget=0.1), victim("discrete", seed), observations(8, seed)
     leaf = observation.clone().requires_grad_(True)
     loss_of(policy, objective, observation)(policy.scores(leaf)).sum().backward()
     assert leaf.grad is not None
@@ -40,7 +40,7 @@ def test_pgd_finds_the_optimum_of_a_linear_victim(seed: int, random_start: bool)
     shown, _ = perturb(attack, policy, observation)
     action = policy.decide(observation)
     slope = policy.layer.weight[action] - policy.layer.weight[1 - action]
-    radius = ThreatModel(budget=0.2).radius(observation, FEATURES)
+    radius = ObservationThreat(budget=0.2).radius(observation, FEATURES)
     optimum = project(observation - radius * slope.view_as(observation).sign(), observation, radius)
     torch.testing.assert_close(shown, optimum)
 
@@ -74,7 +74,7 @@ def test_queries_are_the_clean_one_and_one_an_iterate(steps: int, restarts: int,
 @pytest.mark.parametrize("queries", [0, 1, 2])
 def test_without_queries_for_a_step_it_shows_the_truth(queries: int) -> None:
     observation = observations(4)
-    shown, _ = perturb(PGD(), victim("discrete"), observation, ThreatModel(queries=queries))
+    shown, _ = perturb(PGD(), victim("discrete"), observation, ObservationThreat(queries=queries))
     assert torch.equal(shown, observation)
 
 

@@ -14,8 +14,8 @@ from attacks.noise import Noise
 from attacks.none import NoAttack
 from attacks.objectives import Objective, distortion
 from attacks.zo import ZOObjective, ZOSignSGD, _directions
-from bench.contracts import ActionType, Policy
-from bench.threat import ThreatModel
+from bench.driving import ActionType, Policy
+from bench.threat import ObservationThreat
 from tests.attacks.victims import Linear, left, loss_of, observations, perturb, victim
 
 
@@ -48,13 +48,13 @@ def test_queries_are_directions_and_base_point_an_iteration(
 @given(st.integers(0, 80), st.booleans())
 def test_zo_stops_at_the_query_budget(queries: int, random_start: bool) -> None:
     attack = ZOSignSGD(steps=3, directions=20, early_stop=False, random_start=random_start)
-    _, spent = perturb(attack, victim("discrete"), observations(3), ThreatModel(queries=queries))
+    _, spent = perturb(attack, victim("discrete"), observations(3), ObservationThreat(queries=queries))
     assert spent.tolist() == [min(queries, 63 + random_start)] * 3 or int(spent.max()) == queries - 1
 
 
 @pytest.mark.parametrize("objective", ["collision", "expected", "margin", "target", "thesis"])
 def test_early_stop_saves_queries_and_meets_the_same_goals(objective: ZOObjective) -> None:
-    policy, observation, threat = victim("discrete"), observations(200), ThreatModel(norm="linf", budget=0.8)
+    policy, observation, threat = victim("discrete"), observations(200), ObservationThreat(norm="linf", budget=0.8)
     attack = ZOSignSGD(objective=objective, steps=5, directions=20)
     stopped, few = perturb(attack, policy, observation, threat)
     full, many = perturb(replace(attack, early_stop=False), policy, observation, threat)
@@ -98,7 +98,7 @@ def test_as_many_directions_as_entries_find_the_optimum_of_a_linear_victim(seed:
     policy = Linear(seed)
     # No entry is cut off by the sensors' range, and the set is the same for each, so the loss stays linear.
     observation = torch.cat((torch.ones(6, 4, 1), observations(6, seed)[..., 1:] * 0.5), -1)
-    threat = ThreatModel(norm="linf", budget=0.1)
+    threat = ObservationThreat(norm="linf", budget=0.1)
     attack = ZOSignSGD(steps=2, directions=16, smoothing=smoothing, objective="margin", early_stop=False)
     shown, _ = perturb(attack, policy, observation, threat)
     action = policy.decide(observation)

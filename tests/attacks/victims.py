@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from attacks.objectives import DiscreteLoss, Objective
-from bench.contracts import ActionType, Attack, Features, Policy
-from bench.threat import Oracle, ThreatModel
+from bench.driving import ActionType, DrivingAttack, Features, Policy
+from bench.threat import ObservationThreat, Oracle
 from bench.victims.networks import ActorPolicy, QPolicy
 
 FEATURES = Features(
@@ -53,17 +53,17 @@ def observations(count: int, seed: int = 0, rows: int = 4) -> Tensor:
 
 
 def open_oracle(
-    policy: Policy, attack: Attack, observation: Tensor, threat: ThreatModel | None = None, seed: int = 0
+    policy: Policy, attack: DrivingAttack, observation: Tensor, threat: ObservationThreat | None = None, seed: int = 0
 ) -> Oracle:
     """An oracle with a step begun on `observation`."""
-    threat = threat or ThreatModel(budget=0.2)
+    threat = threat or ObservationThreat(budget=0.2)
     oracle = Oracle(policy, threat, attack.access, FEATURES, torch.Generator().manual_seed(seed))
     oracle.begin_step(observation)
     return oracle
 
 
 def perturb(
-    attack: Attack, policy: Policy, observation: Tensor, threat: ThreatModel | None = None, seed: int = 0
+    attack: DrivingAttack, policy: Policy, observation: Tensor, threat: ObservationThreat | None = None, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
     """What the attack shows [B, V, F], and the queries it spent [B]."""
     oracle = open_oracle(policy, attack, observation, threat, seed)
@@ -77,7 +77,7 @@ def loss_of(policy: Policy, objective: Objective, observation: Tensor) -> Discre
     )
 
 
-def left(attack: Attack, policy: Policy, observation: Tensor, objective: Objective = "collision") -> Tensor:
+def left(attack: DrivingAttack, policy: Policy, observation: Tensor, objective: Objective = "collision") -> Tensor:
     """[B] what the attack leaves of the victim's decision, by the key that attacks compare points by; lower is stronger."""
     loss, scores = loss_of(policy, objective, observation), policy.scores(perturb(attack, policy, observation)[0])
     return loss.key(scores, loss(scores))

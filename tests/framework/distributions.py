@@ -6,11 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 
 TOY = Path(__file__).with_name("toy.py")
+TOY_CAMERA = TOY.with_name("toy_camera.py")
 TOY_POINTS = {
-    "cavbench.attacks": {"nudge": "toy_plugin:Nudge", "steer": "toy_plugin:Steer"},
-    "cavbench.defenses": {"guard": "toy_plugin:Guard"},
-    "cavbench.victims": {"toy": "toy_plugin:ToyVictim"},
-    "cavbench.worlds": {"toy": "toy_plugin:ToyWorld"},
+    "cavbench.attacks": {
+        "nudge": "toy_plugin:Nudge",
+        "steer": "toy_plugin:Steer",
+        "paint": "toy_camera_plugin:Paint",
+        "blank": "toy_camera_plugin:Blank",
+    },
+    "cavbench.defenses": {"guard": "toy_plugin:Guard", "harden": "toy_camera_plugin:Harden"},
+    "cavbench.victims": {"toy": "toy_plugin:ToyVictim", "red": "toy_camera_plugin:RedVictim"},
+    "cavbench.worlds": {"toy": "toy_plugin:ToyWorld", "red_street": "toy_camera_plugin:RedStreet"},
 }
 
 
@@ -30,5 +36,6 @@ def install(
 
 
 def install_toy(folder: Path) -> None:
-    """The plug-ins of `toy.py`, as the distribution cavbench-toy 1.0."""
-    install(folder, "cavbench-toy", TOY_POINTS, {"toy_plugin": TOY.read_text()})
+    """The plug-ins of `toy.py` and `toy_camera.py`, as the distribution cavbench-toy 1.0."""
+    modules = {"toy_plugin": TOY.read_text(), "toy_camera_plugin": TOY_CAMERA.read_text()}
+    install(folder, "cavbench-toy", TOY_POINTS, modules)

@@ -35,7 +35,7 @@ def test_a_components_page_says_what_it_does_and_what_its_parameters_are(bench: 
     for part in (
         "toy_plugin:Nudge, cavbench-toy 1.0",
         "Pushes everything by a random sign.",
-        "Needs access oblivious and discrete or continuous actions.",
+        "Track: driving. Needs access oblivious and discrete or continuous actions.",
         "attack.pause",
         "0.0",
         "seconds to sleep at every step.",

@@ -45,16 +45,20 @@ BROKEN = {
     "cannot be imported: ZeroDivisionError": "1 / 0\n",
     "is not a subclass of bench.contracts.Attack": "class Plugin: ...\n",
     "cannot be imported: AttributeError": "class Other: ...\n",
-    "does not implement perturb": (
+    "is of no track: derive it from a base class of bench.driving or bench.vision": (
         "from dataclasses import dataclass\nfrom bench.contracts import Attack\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(Attack): ...\n"
     ),
+    "does not implement perturb": (
+        "from dataclasses import dataclass\nfrom bench.driving import DrivingAttack\n"
+        "@dataclass(frozen=True, kw_only=True)\nclass Plugin(DrivingAttack): ...\n"
+    ),
     "is not a frozen dataclass": (
-        "from bench.contracts import Attack\nclass Plugin(Attack):\n    def perturb(self, observation, oracle): ...\n"
+        "from bench.driving import DrivingAttack\nclass Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
     ),
     "takes steps by position": (
-        "from dataclasses import dataclass\nfrom bench.contracts import Attack\n"
-        "@dataclass(frozen=True)\nclass Plugin(Attack):\n    steps: int = 1\n    def perturb(self, o, oracle): ...\n"
+        "from dataclasses import dataclass\nfrom bench.driving import DrivingAttack\n"
+        "@dataclass(frozen=True)\nclass Plugin(DrivingAttack):\n    steps: int = 1\n    def perturb(self, o, oracle): ...\n"
     ),
 }
 

@@ -12,7 +12,7 @@ from bench import results, runner
 from bench.config import run_config
 from bench.errors import UserError
 from bench.plan import plan
-from bench.unit import Unit
+from bench.runner import Work
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
@@ -25,19 +25,23 @@ class Silent:
     """A watcher that remembers, and can stop the run."""
 
     def __init__(self, stop_after: int | None = None) -> None:
-        self.done: list[Unit] = []
+        self.done: list[Work] = []
+        self.told: list[tuple[str, float, str]] = []
         self.warnings: list[str] = []
         self.stop_after = stop_after
 
     def begin(self, *, episodes: int, finished: int) -> None:
         self.episodes, self.there = episodes, finished
 
-    def working(self, units: Sequence[Unit]) -> None:
+    def working(self, works: Sequence[Work]) -> None:
         if len(self.done) == self.stop_after:
             raise KeyboardInterrupt
 
-    def finished(self, unit: Unit, wall_s: float) -> None:
-        self.done.append(unit)
+    def crafting(self, work: str, share: float, text: str) -> None:
+        self.told.append((work, share, text))
+
+    def finished(self, work: Work, wall_s: float) -> None:
+        self.done.append(work)
 
     def warn(self, line: str) -> None:
         self.warnings.append(line)

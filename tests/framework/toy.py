@@ -15,18 +15,16 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.contracts import (
-    Access,
+from bench.contracts import Access, Progress, Trained
+from bench.driving import (
     ActionType,
-    Attack,
-    Defense,
     Driver,
+    DrivingAttack,
+    DrivingDefense,
+    DrivingVictim,
+    DrivingWorld,
     Features,
     Policy,
-    Progress,
-    TrainedPolicy,
-    Victim,
-    World,
 )
 from bench.scenario import Cell
 from bench.threat import Oracle
@@ -89,7 +87,7 @@ class ToyEnv(EnvBase):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ToyWorld(World):
+class ToyWorld(DrivingWorld):
     """Ten steps of nothing much.
 
     Args:
@@ -124,7 +122,7 @@ class ToyPolicy(Policy):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ToyVictim(Victim):
+class ToyVictim(DrivingVictim):
     """A driver that learned from nobody.
 
     Args:
@@ -144,14 +142,14 @@ class ToyVictim(Victim):
     def load(self, seed: int) -> Policy:
         return ToyPolicy(self.actions, seed)
 
-    def train(self, world: World, *, seed: int, attack: object = None, progress: Progress) -> TrainedPolicy:
+    def train(self, world: DrivingWorld, *, seed: int, attack: object = None, progress: Progress) -> Trained[Policy]:
         progress(0.5, "half way")
         progress(1.0, "there")
-        return TrainedPolicy(ToyPolicy(self.actions, seed), {"world": type(world).__name__})
+        return Trained(ToyPolicy(self.actions, seed), {"world": type(world).__name__})
 
 
 @dataclass(frozen=True, kw_only=True)
-class Nudge(Attack):
+class Nudge(DrivingAttack):
     """Pushes everything by a random sign.
 
     Args:
@@ -180,7 +178,7 @@ class Nudge(Attack):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steer(Attack):
+class Steer(DrivingAttack):
     """Only for drivers that steer themselves, and only with their gradients."""
 
     access: ClassVar[Access] = "gradients"
@@ -192,7 +190,7 @@ class Steer(Attack):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Guard(Defense):
+class Guard(DrivingDefense):
     """Rounds what the victim sees.
 
     Args:
@@ -201,7 +199,7 @@ class Guard(Defense):
 
     digits: int
 
-    def load(self, victim: Victim, seed: int) -> Policy:
+    def load(self, victim: DrivingVictim, seed: int) -> Policy:
         return _Guarded(victim.load(seed), self.digits)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bench.contracts import Features, World
+from bench.driving import DrivingWorld, Features
 from bench.scenario import Cell
 from envs.highway.config import STANDARD_FEATURES, THESIS_FEATURES, HighwayConfig
 from envs.highway.world import HighwayWorld
@@ -63,7 +63,7 @@ def test_the_world_says_what_is_wrong_when_it_is_made(bad: dict[str, Any], messa
 
 def test_presets_are_the_projects_and_the_thesis() -> None:
     standard, thesis = HighwayWorld(), HighwayWorld(preset="thesis")
-    assert isinstance(standard, World)
+    assert isinstance(standard, DrivingWorld)
     assert standard.features == HighwayWorld.features == STANDARD_FEATURES
     assert thesis.features == THESIS_FEATURES
     cells = (Cell(lanes=3, density=1.0),)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
-from bench.contracts import ActionType, Driver
+from bench.driving import ActionType, Driver
 from bench.scenario import Cell, SeedBlock
 from envs.highway.world import Backend, HighwayWorld
 

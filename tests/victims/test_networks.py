@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.contracts import Policy
+from bench.driving import Policy
 from bench.victims.networks import ActorPolicy, QPolicy
 
 

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from bench import registry
-from bench.contracts import AttackInLoop, World
+from bench.driving import AttackInLoop, DrivingWorld
 from bench.victims import zoo
 from bench.victims.ddpg import DDPG
 from bench.victims.dqn import DQN
@@ -27,18 +27,18 @@ def silent(share: float, text: str) -> None:
 
 
 @pytest.fixture
-def world() -> World:
+def world() -> DrivingWorld:
     return registry.load("world", "highway")()
 
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
-def test_a_training_depends_on_its_seed_alone(victim: LearningDriver, world: World) -> None:
+def test_a_training_depends_on_its_seed_alone(victim: LearningDriver, world: DrivingWorld) -> None:
     first, again, other = (victim.train(world, seed=seed, progress=silent).policy.state_dict() for seed in (1, 1, 2))
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert not all(torch.equal(first[name], other[name]) for name in first)
 
 
-def test_the_card_says_what_was_trained_and_on_what_it_was_chosen(world: World) -> None:
+def test_the_card_says_what_was_trained_and_on_what_it_was_chosen(world: DrivingWorld) -> None:
     card = VICTIMS[0].train(world, seed=0, progress=silent).card
     assert card["victim"]["decisions"] == 160
     assert set(card["selection"]["safe_progress"]["clean"]) == {
@@ -47,7 +47,7 @@ def test_the_card_says_what_was_trained_and_on_what_it_was_chosen(world: World) 
     }
 
 
-def test_returns_end_where_the_episode_ends(world: World) -> None:
+def test_returns_end_where_the_episode_ends(world: DrivingWorld) -> None:
     victim = DQN(**SHORT | {"copies": 4, "crash_penalty": 1000.0})
     phase = victim.phases(None)[0]
     env = world.make(roads(4), action_type="discrete", action_repeat=phase.repeat)
@@ -67,7 +67,7 @@ def test_returns_end_where_the_episode_ends(world: World) -> None:
 
 
 @pytest.mark.parametrize("skip", [0.0, 0.5, 1.0])
-def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, world: World) -> None:
+def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, world: DrivingWorld) -> None:
     def attack(observation: torch.Tensor, policy: torch.nn.Module, scale: float) -> torch.Tensor:
         return observation
 
@@ -79,7 +79,7 @@ def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, w
 class Lesson:
     """A teacher, transitions shown otherwise than they were, and a learner that goes on from the teacher."""
 
-    def __init__(self, victim: LearningDriver, world: World) -> None:
+    def __init__(self, victim: LearningDriver, world: DrivingWorld) -> None:
         torch.manual_seed(0)
         discrete = victim.action_type == "discrete"
         shape = {"features": 5, "hidden": 8}
@@ -113,14 +113,16 @@ class Lesson:
 
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
-def test_consistency_brings_decisions_under_attack_to_those_on_the_truth(victim: LearningDriver, world: World) -> None:
+def test_consistency_brings_decisions_under_attack_to_those_on_the_truth(
+    victim: LearningDriver, world: DrivingWorld
+) -> None:
     lesson = Lesson(victim, world)
     wanted = lesson.decision(lesson.teacher.scores(lesson.truth))
     far, near = ((lesson.decided(consistency=weight) - wanted).square().mean() for weight in (0.0, 10.0))
     assert float(near) < 0.7 * float(far)
 
 
-def test_a_margin_makes_changes_of_lane_less_wanted(world: World) -> None:
+def test_a_margin_makes_changes_of_lane_less_wanted(world: DrivingWorld) -> None:
     lesson = Lesson(VICTIMS[0], world)
     spread = float(lesson.teacher.scores(lesson.truth).std(-1).mean())
     without, reluctant = (lesson.decided(consistency=10.0, margin=margin).mean(0) for margin in (0.0, spread))
@@ -130,11 +132,11 @@ def test_a_margin_makes_changes_of_lane_less_wanted(world: World) -> None:
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
 @pytest.mark.parametrize("start", ["trained", "scratch"])
 def test_adversarial_training_trains_saves_and_loads(
-    victim: LearningDriver, start: str, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    victim: LearningDriver, start: str, world: DrivingWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
     trained = victim.train(world, seed=0, progress=silent)
-    zoo.save(trained.policy, trained.card, name=victim.zoo_name(), seed=0)
+    zoo.save(trained.network, trained.card, name=victim.zoo_name(), seed=0)
     defense = AdversarialTraining(start=start, decisions=160, attack="zo", attack_params="steps=1 directions=2")
     hardened = defense.train(victim, world, seed=0, progress=silent)
     assert hardened.card["attacked_decisions"] > 0

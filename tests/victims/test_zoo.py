@@ -13,6 +13,7 @@ from bench.victims import zoo
 from bench.victims.ddpg import DDPG
 from bench.victims.dqn import DQN
 from bench.victims.networks import QPolicy
+from bench.victims.yolov5 import YOLOv5Network
 from defenses.advtrain import AdversarialTraining
 
 MADE_BY = {"victim": {"gamma": 0.9}}
@@ -83,3 +84,15 @@ def test_the_shipped_policies_are_those_of_the_default_recipes(seed: int, home: 
     for policy in (dqn.load(seed), *hardened):
         assert policy.decide(torch.zeros(2, 10, 5)).shape == (2,)
     assert ddpg.load(seed).decide(torch.zeros(2, 10, 5)).shape == (2, 2)
+
+
+@pytest.mark.usefixtures("home")
+def test_a_detector_is_kept_like_a_policy() -> None:
+    torch.manual_seed(0)
+    network = YOLOv5Network("n", ("stop sign", "car")).eval()
+    zoo.save(network, {"scenes": 3}, name="yolov5n", seed=0)
+    again = zoo.load("yolov5n", 0, YOLOv5Network, made_by={})
+    assert again.names == ("stop sign", "car")
+    assert again.weights_sha256 == zoo.card("yolov5n", 0)["sha256"]
+    picture = torch.rand(1, 3, 64, 64)
+    assert torch.equal(again(picture).scores, network(picture).scores)

@@ -1,0 +1,230 @@
+"""A run of the detection track: a patch is crafted once and kept, and the rest is as on the driving track."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+from safetensors import safe_open
+
+from bench import patches, plan, results, runner
+from bench.config import RunConfig, run_config, train_config
+from bench.errors import UserError
+from bench.replay import find, replay
+from bench.scenario import GRIDS
+from bench.tracks import names, tracks_of
+from bench.unit import Crafting
+from bench.victims import zoo
+from tests.framework.conftest import Said
+from tests.framework.test_cli import TOY, assert_one_line
+from tests.framework.test_runner import Silent
+
+pytestmark = pytest.mark.usefixtures("toy_folder")
+
+Bench = Callable[..., Said]
+SMALL = "attack=paint victim=red world=red_street lanes=3 density=1 weather=clear,fog seeds=0,1"
+BESIDE = ["created_at", "wall_s", "crafting_s"]
+
+
+def read(line: str) -> RunConfig:
+    return run_config(line.split())
+
+
+def run(out: Path, *more: str, watcher: Silent | None = None) -> tuple[pa.Table, Silent]:
+    words = dict(word.split("=", 1) for word in [*SMALL.split(), "workers=1", f"out={out}", *more])
+    watcher = watcher or Silent()
+    units = runner.run(run_config([f"{key}={value}" for key, value in words.items()]), watcher)
+    return results.read(out, units, track="detection"), watcher
+
+
+def crafted(watcher: Silent) -> list[Crafting]:
+    return [work for work in watcher.done if isinstance(work, Crafting)]
+
+
+def test_the_victim_decides_the_track_and_the_track_the_defaults() -> None:
+    config = read("attack=paint victim=red world=red_street")
+    (pair,) = config.pairs
+    assert (pair.threat.norm, pair.threat.budget, pair.threat.queries) == ("patch", 0.5, 20_000)
+    assert config.grid == GRIDS["approach-v1"]
+    assert read("victim=red world=red_street weather=night").grid.weather == ("night",)
+    with pytest.raises(UserError, match="unknown world 'camera'"):
+        read("victim=red") if "camera" not in names("world", "detection") else read("victim=red world=camera_")
+
+
+BAD = {
+    "attack=noise victim=red world=red_street": "attack 'noise' does not fit victim 'red' of the detection track; what fits:",
+    "attack=paint victim=toy world=toy": "attack 'paint' does not fit victim 'toy' of the driving track; what fits: noise",
+    "victim=red world=highway": "world 'highway' does not fit victim 'red' of the detection track; what fits: ",
+    "victim=toy,red": "victims 'toy' (driving) and 'red' (detection) are of different tracks",
+    "victim=red world=red_street threat.norm=linf": "unknown threat.norm 'linf'; known: patch",
+    "victim=red world=red_street threat.budget=1.5": "threat.budget must be in (0, 1]",
+    "attack=paint victim=red world=red_street threat.budget=0": "threat.budget must be in (0, 1]",
+    "attack=paint victim=red world=red_street threat.access=scores": "needs access 'gradients'",
+    "victim=toy world=toy threat.norm=patch": "unknown threat.norm 'patch'; known: relative, linf",
+}
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_what_does_not_fit_the_track_is_refused_in_one_line(line: str) -> None:
+    with pytest.raises(UserError) as raised:
+        read(line)
+    assert BAD[line] in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_the_track_of_a_component_is_read_from_its_source() -> None:
+    assert tracks_of("toy_camera_plugin:Paint") == ["detection"]
+    assert tracks_of("bench.victims.dqn:DQN") == ["driving"]
+    assert tracks_of("attacks.none:NoAttack") == ["detection", "driving"]
+    assert tracks_of("nowhere:Nothing") == []
+    assert {"none", "paint", "blank"} <= set(names("attack", "detection"))
+
+
+def test_a_patch_is_crafted_once_a_seed_and_shown_in_every_cell(tmp_path: Path) -> None:
+    records, watcher = run(tmp_path)
+    attacked = records.filter(pc.field("attack") == "paint")
+    assert len(crafted(watcher)) == 2
+    assert {work.training_seed for work in crafted(watcher)} == {0, 1}
+    assert watcher.told[-1][1] == 1.0
+    files = {path.stem for path in (tmp_path / "patches").iterdir()}
+    assert set(attacked["patch"].to_pylist()) == files
+    assert len(set(attacked["patch_sha256"].to_pylist())) == 2
+    assert set(attacked["queries"].to_pylist()) == set(attacked["gradients"].to_pylist()) == {4 * 12}
+    assert attacked.num_rows == 2 * 2 * 3
+    assert watcher.episodes == records.num_rows
+
+
+def test_a_detector_without_a_seed_is_scored_clean_once(tmp_path: Path) -> None:
+    records, _ = run(tmp_path)
+    clean = records.filter(pc.field("attack") == "none")
+    assert clean.num_rows == 2 * 3
+    assert set(clean["training_seed"].to_pylist()) == {0}
+    assert set(clean["patch"].to_pylist()) == set(clean["patch_sha256"].to_pylist()) == {""}
+    assert set(clean["threat_budget"].to_pylist()) == {0.0}
+
+
+def test_each_scenario_seed_has_its_place_and_every_frame_is_kept(tmp_path: Path) -> None:
+    records, _ = run(tmp_path)
+    for row in records.to_pylist():
+        assert row["location"] == ("front", "side", "back")[row["seed"] % 3]
+        assert row["frame_distance_m"] == sorted(row["frame_distance_m"], reverse=True)
+        assert len(row["frame_confidence"]) == len(row["frame_visible"]) == 10
+        assert row["confidence_mean"] == pytest.approx(sum(row["frame_confidence"]) / 10)
+
+
+def test_every_attack_is_held_against_patches_that_know_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plan, "REFERENCE_PATCHES", ("blank", "not_installed"))
+    units = plan.plan(read(SMALL))
+    blank = [unit for unit in units if unit.pair.attack.name == "blank"]
+    assert {unit.training_seed for unit in blank} == {0}
+    assert len(blank) == 2
+    assert {unit.pair.threat for unit in blank} == {units[0].pair.threat}
+    assert not [unit for unit in plan.plan(read(f"{SMALL} reference=false")) if unit.pair.attack.name == "blank"]
+    assert {unit.pair.attack.name for unit in plan.plan(read(SMALL.replace("paint", "none")))} == {"none"}
+
+
+def test_an_interrupted_run_loses_neither_patches_nor_cells(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "broken-off", watcher=Silent(stop_after=3))
+    kept = {path: path.read_bytes() for path in (tmp_path / "broken-off" / "patches").iterdir()}
+    assert len(kept) == 2
+    went_on, watcher = run(tmp_path / "broken-off")
+    assert not crafted(watcher)
+    assert watcher.there == 3
+    assert all(path.read_bytes() == blob for path, blob in kept.items())
+    whole, _ = run(tmp_path / "whole")
+    assert went_on.drop_columns(BESIDE).equals(whole.drop_columns(BESIDE))
+    again, watcher = run(tmp_path / "whole")
+    assert watcher.done == []
+    assert again.equals(whole)
+
+
+@pytest.mark.slow
+def test_results_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+    one, _ = run(tmp_path / "one")
+    three, watcher = run(tmp_path / "three", "workers=3")
+    assert len(crafted(watcher)) == 2
+    assert one.drop_columns(BESIDE).equals(three.drop_columns(BESIDE))
+
+
+def test_scoring_code_and_crafting_code_are_told_apart() -> None:
+    unit = next(unit for unit in plan.plan(read(SMALL)) if unit.crafting)
+    assert unit.crafting is not None
+    assert "bench.approach" in unit.modules
+    assert "bench.crafting" in unit.crafting.modules
+    assert "bench.approach" not in unit.crafting.modules
+
+
+@pytest.mark.parametrize(
+    ("mood", "part"),
+    [
+        ("crooked", "a patch must be [3, P, P] with P from 8 to 512, the attack made one of [3, 7, 8]"),
+        ("greedy", "the attack asked about 20004 pictures, the threat model allows 20000"),
+        ("tamper", "the attack changed the detector's weights"),
+        ("raise", "ZeroDivisionError: the attack is at a loss"),
+    ],
+)
+def test_a_patch_that_is_not_made_fairly_is_refused_in_one_line(tmp_path: Path, mood: str, part: str) -> None:
+    with pytest.raises(UserError) as raised:
+        run(tmp_path, f"attack.mood={mood}")
+    assert part in str(raised.value)
+    assert f"paint(mood={mood}) + none + red | patch, seed 0" in str(raised.value)
+
+
+def test_texels_are_brought_into_range_and_how_far_they_were_outside_is_kept(tmp_path: Path) -> None:
+    loud, _ = run(tmp_path, "attack.mood=loud", "weather=clear")
+    attacked = loud.filter(pc.field("attack") == "paint")
+    assert 0 < min(attacked["excess"].to_pylist()) <= max(attacked["excess"].to_pylist()) <= 1
+    with safe_open(patches.path_of(tmp_path, attacked["patch"][0].as_py()), "pt") as file:
+        texels = file.get_tensor("patch")
+    assert 0 <= float(texels.min()) < float(texels.max()) <= 1
+
+
+def test_a_hardened_detector_has_an_entry_a_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench) -> None:
+    monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
+    said = bench("train", "victim=red", "defense=harden", "world=red_street", "seeds=0,1")
+    assert said.code == 0, said.err
+    assert zoo.card("red-harden", 1)["scenes"] == 12
+    records, watcher = run(tmp_path, "defense=harden", "weather=clear")
+    assert len(crafted(watcher)) == 2
+    assert records.num_rows == 2 * 2 * 3
+    assert len(set(records["weights_sha256"].to_pylist())) == 2
+    with pytest.raises(UserError, match="defense 'harden' does not fit victim 'toy' of the driving track"):
+        train_config(["victim=toy", "defense=harden"])
+
+
+def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path, bench: Bench) -> None:
+    monkey = ("workers=1", "record=0", "reference=false", f"out={tmp_path}")
+    assert bench("run", *TOY, *monkey).code == 0
+    made = bench("run", *SMALL.split(), *monkey)
+    assert made.code == 0, made.err
+    assert "patch, seed 1" in made.err
+    assert "frames" in made.out
+    assert results.tracks(tmp_path) == ["driving", "detection"]
+    assert set(results.read(tmp_path)["victim"].to_pylist()) == {"toy"}
+    assert set(results.read(tmp_path, track="detection")["victim"].to_pylist()) == {"red"}
+    shown, report = bench("show", str(tmp_path)), bench("report", f"out={tmp_path}")
+    one = bench("show", "paint", "--out", str(tmp_path))
+    for said in (shown, report, one):
+        assert said.code == 0, said.err
+    assert "safe progress" in shown.out
+    assert "safe progress" in report.out
+    assert "safe progress" not in one.out
+    assert "patch 0.5, access gradients, 20000 queries" in one.out
+
+
+def test_a_replay_measures_what_the_record_says(tmp_path: Path, bench: Bench) -> None:
+    records, _ = run(tmp_path)
+    record = find(records, {"attack": "paint", "location": "back"})
+    assert replay(tmp_path, record).differences == ()
+    said = bench("view", "paint", "weather=fog", "--out", str(tmp_path))
+    assert said.code == 0, said.err
+    assert "Replayed bit for bit" in said.out
+    path = patches.path_of(tmp_path, record["patch"])
+    path.write_bytes(path.read_bytes()[:-4])
+    assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"the patch {path} is truncated")
+    path.unlink()
+    assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"the patch {path} is not there")

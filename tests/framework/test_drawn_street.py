@@ -1,0 +1,43 @@
+"""The whole way with a real detector: a patch is crafted on a drawn street and scored on approaches it never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+
+from bench import registry, results
+from bench.replay import find, replay
+from tests.framework.conftest import Said
+from tests.framework.distributions import install
+
+WORDS = ("victim=yolov3_tiny", "world=drawn", "lanes=3", "density=1", "episodes=2", "seeds=0")
+
+
+def mean(records: pa.Table, attack: str, weather: str, column: str = "confidence_mean") -> float:
+    kept = records.filter((pc.field("attack") == attack) & (pc.field("weather") == weather))
+    return float(pc.mean(kept[column].cast(pa.float64())).as_py())
+
+
+@pytest.mark.slow
+def test_a_patch_hides_a_sign_from_yolo_and_fog_alone_does_less(
+    bench: Callable[..., Said], plugins: Path, tmp_path: Path
+) -> None:
+    install(plugins, "drawn", {"cavbench.worlds": {"drawn": "tests.vision.drawn_street:DrawnStreet"}}, {})
+    registry.entries.cache_clear()
+    attack = ("attack=paint,blank", "attack.texels=32", "attack.steps=15")
+    said = bench("run", *attack, *WORDS, "weather=clear,fog", "workers=2", f"out={tmp_path}")
+    assert said.code == 0, said.err
+    assert "yolov3_tiny" in said.out
+    records = results.read(tmp_path, track="detection")
+    assert records.num_rows == 3 * 2 * 2
+    assert mean(records, "none", "clear") > 0.7
+    assert mean(records, "none", "clear", "ran") == 0
+    assert mean(records, "none", "fog") < mean(records, "none", "clear")
+    assert mean(records, "paint", "clear") < 0.5 * mean(records, "none", "clear")
+    assert mean(records, "paint", "clear") < mean(records, "blank", "clear")
+    assert set(records["weights_sha256"].to_pylist()) == {records["weights_sha256"][0].as_py()}
+    assert replay(tmp_path, find(records, {"attack": "paint", "weather": "fog"})).differences == ()

@@ -1,0 +1,172 @@
+"""A third party's plug-ins of the detection track: red squares, a detector of red, patches of every temper."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+
+from bench.contracts import Access, Progress, Trained
+from bench.patch import VisionOracle
+from bench.scenario import WEATHERS, Cell
+from bench.victims import zoo
+from bench.vision import (
+    Approach,
+    CameraWorld,
+    Detector,
+    DetectorDefense,
+    DetectorVictim,
+    PatchAttack,
+    Predictions,
+    Scenes,
+)
+
+SIDE, SIGN = 32, slice(8, 24)
+"""Of the pictures, and where the sign is in them, in both directions."""
+
+
+class RedScenes(Scenes):
+    """A red square that pales with the distance and the extinction of the air."""
+
+    size = (SIDE, SIDE)
+
+    def __init__(self, distance: Tensor, extinction_per_m: float = 0.0) -> None:
+        self.distance = distance
+        self.boxes = torch.tensor([[8.0, 8.0, 24.0, 24.0]]).expand(len(distance), 4)
+        self.visible = torch.ones(len(distance))
+        self.red = torch.exp(-(extinction_per_m + 0.01) * distance)
+
+    def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
+        face = torch.tensor([1.0, 0.0, 0.0])[:, None, None].expand(len(frames), 3, 16, 16)
+        if patches is not None:
+            side = round(16 * share)
+            edge = (16 - side) // 2
+            pasted = nn.functional.interpolate(patches, (side, side), mode="bilinear", antialias=True)
+            padding = (edge, 16 - side - edge) * 2
+            hole = nn.functional.pad(torch.ones(side, side), padding)
+            face = face * (1 - hole) + nn.functional.pad(pasted, padding)
+        pale = self.red[frames][:, None, None, None]
+        return nn.functional.pad(face * pale + 0.5 * (1 - pale), (8, 8, 8, 8), value=0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RedStreet(CameraWorld):
+    """Ten frames from 30 to 8 metres.
+
+    Args:
+        frames: of an approach.
+    """
+
+    locations: ClassVar[tuple[str, ...]] = ("front", "side", "back")
+    frames: int = 10
+
+    def training_scenes(self) -> Scenes:
+        return RedScenes(torch.linspace(8, 30, 12))
+
+    def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
+        def one(seed: int) -> Approach:
+            place = seed % len(self.locations)
+            nearer = 0.2 * place + 0.1 * cell.lanes + 0.05 * cell.density
+            extinction = WEATHERS[cell.weather].extinction_per_m
+            scenes = RedScenes(torch.linspace(30, 8, self.frames) - nearer, extinction)
+            return Approach(seed=seed, location=self.locations[place], scenes=scenes)
+
+        return [one(seed) for seed in seeds]
+
+
+class RedDetector(Detector):
+    """Two boxes, the sign's and a corner's; there is a stop sign where it is red."""
+
+    names = ("car", "stop sign")
+    stride = 8
+
+    def __init__(self, bias: float = -2.0) -> None:
+        super().__init__()
+        self.shape = {"bias": bias}
+        self.register_buffer("bias", torch.tensor(bias))
+
+    def predict(self, pictures: Tensor) -> Predictions:
+        boxes = torch.tensor([[8.0, 8.0, 24.0, 24.0], [0.0, 0.0, 8.0, 8.0]]).expand(len(pictures), 2, 4)
+        redness = pictures[:, 0] - pictures[:, 1:].mean(1)
+        red = torch.stack((redness[:, SIGN, SIGN].mean((1, 2)), redness[:, :8, :8].mean((1, 2))), 1)
+        classes = torch.tensor([0.1, 0.9]).expand(len(pictures), 2, 2)
+        return Predictions(boxes, torch.sigmoid(6 * red + self.bias), classes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RedVictim(DetectorVictim):
+    """Sees red."""
+
+    def zoo_name(self) -> str:
+        return "red"
+
+    def load(self, seed: int) -> Detector:
+        return RedDetector().requires_grad_(False).eval()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paint(PatchAttack):
+    """Signed gradient steps on the confidence, from random texels.
+
+    Args:
+        texels: side of the patch.
+        steps: of the descent.
+        pause: seconds to sleep at every step.
+        mood: what it does beside that.
+    """
+
+    access: ClassVar[Access] = "gradients"
+    texels: int = 8
+    steps: int = 4
+    pause: float = 0.0
+    mood: Literal["calm", "loud", "void", "crooked", "greedy", "tamper", "raise", "kill"] = "calm"
+
+    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor | None:
+        if self.mood == "raise":
+            raise ZeroDivisionError("the attack is at a loss")
+        if self.mood == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.mood == "tamper":
+            oracle._detector.bias -= 1
+        frames = torch.arange(len(scenes))
+        patch = torch.rand(1, 3, self.texels, self.texels, generator=oracle.generator)
+        for step in range(10**9 if self.mood == "greedy" else self.steps):
+            patch.requires_grad_(True)
+            seen = oracle.differentiable(scenes.render(frames, patch, oracle.threat.budget))
+            loss = seen.scores[..., oracle.label].mean()
+            (gradient,) = torch.autograd.grad(loss, patch)
+            patch = (patch - 0.2 * gradient.sign()).detach().clamp(0, 1)
+            time.sleep(self.pause)
+            progress((step + 1) / self.steps, f"loss {loss:.3f}")
+        answers = {"loud": patch[0] * 3 - 1, "void": patch[0] * torch.nan, "crooked": patch[0, :, 1:]}
+        return answers.get(self.mood, patch[0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blank(PatchAttack):
+    """A grey patch."""
+
+    access: ClassVar[Access] = "oblivious"
+    seeded: ClassVar[bool] = False
+
+    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
+        return torch.full((3, 8, 8), 0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Harden(DetectorDefense):
+    """Another bias, drawn from the seed."""
+
+    def zoo_name(self, victim: DetectorVictim) -> str:
+        return f"{victim.zoo_name()}-harden"
+
+    def train(self, victim: Any, world: Any, *, seed: int, progress: Progress) -> Trained[Detector]:
+        return Trained(RedDetector(bias=-1.0 - seed / 10), {"scenes": len(world.training_scenes())})
+
+    def load(self, victim: DetectorVictim, seed: int) -> Detector:
+        return zoo.load(self.zoo_name(victim), seed, RedDetector, made_by={})

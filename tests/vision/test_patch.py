@@ -1,0 +1,82 @@
+"""The door to a detector counts, refuses what is forbidden and lets gradients through; a patch is what can be printed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from bench.contracts import Access, QueryBudgetError
+from bench.errors import UserError
+from bench.patch import GREY, PatchThreat, VisionOracle
+from tests.framework.toy_camera import RedDetector
+
+
+def oracle(access: Access = "gradients", queries: int = 100) -> VisionOracle:
+    return VisionOracle(RedDetector(), PatchThreat(queries=queries), access, torch.Generator())
+
+
+def pictures(count: int) -> Tensor:
+    return torch.rand(count, 3, 32, 32, generator=torch.Generator().manual_seed(count))
+
+
+@given(asked=st.lists(st.tuples(st.integers(0, 9), st.booleans()), max_size=12), queries=st.integers(0, 40))
+@settings(deadline=None)
+def test_every_picture_is_a_query_and_none_is_answered_beyond_the_budget(
+    asked: list[tuple[int, bool]], queries: int
+) -> None:
+    door, spent = oracle(queries=queries), 0
+    for count, differentiable in asked:
+        ask = door.differentiable if differentiable else door.predict
+        if spent + count > queries:
+            with pytest.raises(QueryBudgetError, match=f"asked about {spent + count} pictures"):
+                ask(pictures(count))
+        else:
+            assert len(ask(pictures(count)).boxes) == count
+            spent += count
+        assert (door.spent, door.remaining) == (spent, queries - spent)
+
+
+@pytest.mark.parametrize(("access", "allowed"), [("oblivious", 0), ("decisions", 0), ("scores", 1), ("gradients", 2)])
+def test_what_the_access_forbids_is_refused(access: Access, allowed: int) -> None:
+    door = oracle(access)
+    for number, ask in enumerate((door.predict, door.differentiable)):
+        if number < allowed:
+            ask(pictures(1))
+        else:
+            with pytest.raises(UserError, match=f"declares that it needs '{access}' only"):
+                ask(pictures(1))
+    assert door.spent == allowed
+
+
+def test_a_gradient_comes_back_to_the_pixels_and_is_counted() -> None:
+    door, shown = oracle(), pictures(3).requires_grad_(True)
+    assert not door.predict(shown).scores.requires_grad
+    door.differentiable(shown).scores[..., door.label].sum().backward()
+    assert shown.grad is not None
+    assert shown.grad.abs().sum() > 0
+    assert (door.spent, door.backwards) == (6, 3)
+
+
+TEXELS = st.one_of(st.floats(-3, 4, width=32), st.sampled_from([torch.nan, torch.inf, -torch.inf]))
+
+
+@settings(deadline=None)
+@given(values=st.lists(TEXELS, min_size=12, max_size=12), side=st.sampled_from([8, 16, 100]))
+def test_texels_become_printable_and_their_excess_is_the_farthest_of_them(values: list[float], side: int) -> None:
+    given_ = torch.tensor(values).repeat(3 * side * side // 12 + 1)[: 3 * side * side].reshape(3, side, side)
+    patch, excess = PatchThreat().project(given_)
+    assert patch.shape == given_.shape
+    assert ((patch >= 0) & (patch <= 1)).all()
+    known = given_.isfinite()
+    assert torch.equal(patch[known], given_[known].clamp(0, 1))
+    assert (patch[~known] == GREY).all()
+    assert excess == pytest.approx(max([0.0, *(max(v - 1, -v) for v in given_[known].tolist())]))
+
+
+@pytest.mark.parametrize("shape", [(3, 7, 7), (3, 8, 9), (1, 8, 8), (8, 8), (1, 3, 8, 8), (3, 513, 513)])
+def test_what_is_no_patch_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(UserError, match="a patch must be"):
+        PatchThreat().project(torch.zeros(shape))
