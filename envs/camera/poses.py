@@ -87,7 +87,7 @@ def scored() -> tuple[Pose, ...]:
 @cache
 def training() -> tuple[Pose, ...]:
     """Views of the training places, at random distances and a little off the lane's middle and direction."""
-    poses = []
+    poses: list[Pose] = []
     for lighting in get_args(Lighting):
         for location in LOCATIONS.values():
             rng = np.random.default_rng([location.seed, get_args(Lighting).index(lighting)])

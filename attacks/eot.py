@@ -1,0 +1,145 @@
+"""A printed patch that hides a sign from a detector under whatever it is seen: expectation over transformation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from bench.contracts import Access, Progress
+from bench.vision import PatchAttack, Scenes
+
+if TYPE_CHECKING:
+    from bench.patch import VisionOracle
+
+SEEN = 0.5
+"""Frames in which less of the sign is to be seen teach nothing."""
+REPORT_EVERY = 5
+"""Steps between two words about the loss."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EOT(PatchAttack):
+    """Expectation over transformation (Athalye et al. 2018; thesis, Algorithm 3, Eq. 3.1 and 3.2).
+
+    Minimises, over views of the training places and random transformations of what the camera saw, the mean of the largest
+    objectness times class probability of a stop sign that the detector finds anywhere in a window around the sign, plus
+    `tv` times the patch's total variation. Adam, a cosine schedule, and the patch clamped to what can be printed. White box:
+    access `gradients`. Every transformation is switched off by 0.
+
+    Args:
+        texels: side of the patch in texels, from 8 to 512 (default 100, as in the thesis; 32 and 64 are its others).
+        steps: of the optimiser, at least 1 (default 150).
+        batch: views a step, at least 1 (default 8).
+        learning_rate: of Adam, above 0 (default 0.05).
+        tv: weight of the total variation: mean absolute difference of neighbouring texels, both ways (default 0.1).
+        window: side in pixels of the square around the sign that the detector is shown; a multiple of its stride (default 320).
+        rotation: largest, in degrees (default 8).
+        scale: largest change of size, as a share (default 0.3).
+        translation: largest shift, in shares of the window; without it the sign is in its middle (default 0.15).
+        perspective: distortion of the window's corners, in shares of half its side (default 0.15).
+        brightness, contrast, saturation: largest change, as a share (default 0.2 each).
+        hue: largest turn, in shares of the full circle, up to 0.5 (default 0.05).
+        noise: standard deviation of Gaussian noise on the sRGB scale (default 0.02).
+
+    Queries: steps * batch pictures.
+
+    Example:
+        >>> from attacks.eot import EOT
+        >>> without_colour = EOT(brightness=0, contrast=0, saturation=0, hue=0)
+    """
+
+    access: ClassVar[Access] = "gradients"
+
+    texels: int = 100
+    steps: int = 150
+    batch: int = 8
+    learning_rate: float = 0.05
+    tv: float = 0.1
+    window: int = 320
+    rotation: float = 8.0
+    scale: float = 0.3
+    translation: float = 0.15
+    perspective: float = 0.15
+    brightness: float = 0.2
+    contrast: float = 0.2
+    saturation: float = 0.2
+    hue: float = 0.05
+    noise: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not 8 <= self.texels <= 512:
+            raise ValueError(f"eot.texels must be between 8 and 512, got {self.texels}")
+        for name in ("steps", "batch", "window"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"eot.{name} must be at least 1, got {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"eot.learning_rate must be above 0, got {self.learning_rate}")
+        for name in ("tv", "noise"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"eot.{name} must be at least 0, got {getattr(self, name)}")
+        if not 0 <= self.rotation <= 180:
+            raise ValueError(f"eot.rotation must be between 0 and 180, got {self.rotation}")
+        for name in ("scale", "translation", "perspective", "brightness", "contrast", "saturation"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"eot.{name} must be in [0, 1), got {getattr(self, name)}")
+        if not 0 <= self.hue <= 0.5:
+            raise ValueError(f"eot.hue must be between 0 and 0.5, got {self.hue}")
+
+    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
+        seen = (scenes.visible >= SEEN).nonzero().squeeze(1)
+        patch = torch.rand(1, 3, self.texels, self.texels, generator=oracle.generator).requires_grad_(True)
+        adam = torch.optim.Adam([patch], lr=self.learning_rate)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.steps, self.learning_rate / 20)
+        transform = self._transformations()
+        for step in range(min(self.steps, oracle.remaining // self.batch)):
+            frames = seen[torch.randint(len(seen), (self.batch,), generator=oracle.generator)]
+            pictures = scenes.render(frames, patch, oracle.threat.budget)
+            windows = self._windows(pictures, scenes.boxes[frames], oracle.generator)
+            predictions = oracle.differentiable(transform(windows).clamp(0, 1))
+            found = (predictions.objectness * predictions.classes[..., oracle.label]).amax(-1).mean()
+            adam.zero_grad()
+            (found + self.tv * total_variation(patch)).backward()
+            adam.step()
+            schedule.step()
+            with torch.no_grad():
+                patch.clamp_(0, 1)
+            if step % REPORT_EVERY == 0:
+                progress(step / self.steps, f"stop sign {float(found):.2f}")
+        return patch.detach()[0]
+
+    def _windows(self, pictures: Tensor, boxes: Tensor, generator: torch.Generator) -> Tensor:
+        """[N, 3, window, window] around the signs, shifted by up to `translation`, as far as the picture goes."""
+        height, width = pictures.shape[2:]
+        side_y, side_x = min(self.window, height), min(self.window, width)
+        shift = (torch.rand(len(boxes), 2, generator=generator) * 2 - 1) * self.translation * self.window
+        middle = (boxes[:, :2] + boxes[:, 2:]) / 2 + shift
+        left = (middle[:, 0] - side_x / 2).round().long().clamp(0, width - side_x).tolist()
+        top = (middle[:, 1] - side_y / 2).round().long().clamp(0, height - side_y).tolist()
+        cut = [picture[:, y : y + side_y, x : x + side_x] for picture, x, y in zip(pictures, left, top, strict=True)]
+        return torch.stack(cut)
+
+    def _transformations(self) -> nn.Module:
+        """What the camera's picture goes through; kornia draws from torch's global generator, which the runner seeds."""
+        import kornia.augmentation as augmentation
+
+        steps: list[nn.Module] = []
+        if self.rotation or self.scale:
+            scale = (1 - self.scale, 1 + self.scale) if self.scale else None
+            steps.append(augmentation.RandomAffine(self.rotation, scale=scale, padding_mode="reflection", p=1.0))
+        if self.perspective:
+            steps.append(augmentation.RandomPerspective(self.perspective, p=1.0))
+        if self.brightness or self.contrast or self.saturation or self.hue:
+            jiggle = augmentation.ColorJiggle(self.brightness, self.contrast, self.saturation, self.hue, p=1.0)
+            steps.append(jiggle)
+        if self.noise:
+            steps.append(augmentation.RandomGaussianNoise(std=self.noise, p=1.0))
+        return nn.Sequential(*steps)
+
+
+def total_variation(patch: Tensor) -> Tensor:
+    """Mean absolute difference of neighbouring texels, down plus across, of patches [..., H, W]."""
+    down, across = patch.diff(dim=-2).abs(), patch.diff(dim=-1).abs()
+    return down.mean() + across.mean()

@@ -1,0 +1,36 @@
+"""A plain patch: the control that shows what covering the sign does by itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from bench.contracts import Access, Progress
+from bench.vision import PatchAttack, Scenes
+
+if TYPE_CHECKING:
+    from bench.patch import VisionOracle
+
+
+@dataclass(frozen=True, kw_only=True)
+class GreyPatch(PatchAttack):
+    """A sticker of one grey.
+
+    Args:
+        level: sRGB, in [0, 1] (default 0.5).
+    """
+
+    access: ClassVar[Access] = "oblivious"
+    seeded: ClassVar[bool] = False
+
+    level: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.level <= 1:
+            raise ValueError(f"grey_patch.level must be between 0 and 1, got {self.level}")
+
+    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
+        return torch.full((3, 8, 8), self.level)

@@ -1,0 +1,35 @@
+"""A patch of random colours: the control that every crafted patch is held against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from bench.contracts import Access, Progress
+from bench.vision import PatchAttack, Scenes
+
+if TYPE_CHECKING:
+    from bench.patch import VisionOracle
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoisePatch(PatchAttack):
+    """Texels drawn uniformly from all colours: how much of a patch's effect is that it covers the sign.
+
+    Args:
+        texels: side of the patch in texels, from 8 to 512 (default 100).
+    """
+
+    access: ClassVar[Access] = "oblivious"
+
+    texels: int = 100
+
+    def __post_init__(self) -> None:
+        if not 8 <= self.texels <= 512:
+            raise ValueError(f"noise_patch.texels must be between 8 and 512, got {self.texels}")
+
+    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
+        return torch.rand(3, self.texels, self.texels, generator=oracle.generator)

@@ -1,0 +1,49 @@
+"""JPEG compression before a detector."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from bench.vision import Detector, DetectorDefense, DetectorVictim
+from defenses.smoothing import Guarded
+
+
+class _Compressed(Guarded):
+    def __init__(self, inner: Detector, quality: int) -> None:
+        super().__init__(inner)
+        self.quality = quality
+
+    def transform(self, pictures: Tensor) -> Tensor:
+        coded = (pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).numpy()
+        through = np.stack([self._through(picture) for picture in coded])
+        return torch.from_numpy(through).permute(0, 3, 1, 2).to(pictures) / 255
+
+    def _through(self, picture: np.ndarray) -> np.ndarray:
+        """[H, W, 3] uint8 RGB, written as JPEG and read again."""
+        _, written = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.quality])
+        found = cv2.imdecode(written, cv2.IMREAD_COLOR)
+        assert found is not None
+        return np.ascontiguousarray(found[..., ::-1])
+
+
+@dataclass(frozen=True, kw_only=True)
+class JPEG(DetectorDefense):
+    """The detector sees the picture after JPEG compression (Das et al. 2018, "SHIELD").
+
+    Args:
+        quality: of the compression, from 1 to 100 (default 40).
+    """
+
+    quality: int = 40
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.quality <= 100:
+            raise ValueError(f"jpeg.quality must be between 1 and 100, got {self.quality}")
+
+    def load(self, victim: DetectorVictim, seed: int) -> Detector:
+        return _Compressed(victim.load(seed), self.quality)
