@@ -17,7 +17,7 @@ Image = NDArray[np.float32]
 
 EXPOSURE_S = 1 / 250
 """Of a frame, by day: how long a drop draws its streak."""
-NEAREST_M, FARTHEST_M = 0.3, 12.0
+NEAREST_M, FARTHEST_M = 0.3, 5.0
 """Between which drops are drawn one by one; those beyond are in the extinction."""
 SMALLEST_MM = 0.6
 """Diameter of the drops that are drawn."""
