@@ -88,6 +88,8 @@ def train(words: Words = None) -> None:
     config = train_config(words or [])
     victim, defense, world = (part.component for part in (config.victim, config.defense, config.world))
     hardens = config.defense.name != "none"
+    if not hardens and not victim.learns:
+        raise UserError(f"there is nothing to train: {config.victim.name} does not learn")
     try:
         name = defense.zoo_name(victim) if hardens else victim.zoo_name()
     except NotImplementedError as error:

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from bench import registry, results
 from bench.errors import UserError
-from bench.plan import REFERENCE_PATCHES
+from bench.patch import REFERENCE_PATCHES
 
 Report = Callable[[str, pa.Table], None]
 

@@ -50,7 +50,7 @@ class Victim(Component):
     learns: ClassVar[bool] = False
 
     def zoo_name(self) -> str:
-        """The name of this victim's entries in the zoo; only victims that learn have one."""
+        """The name of this victim's entries in the zoo, and the beginning of the name of what defences make of it."""
         raise NotImplementedError(f"{type(self).__name__} does not learn")
 
     @abstractmethod

@@ -15,6 +15,8 @@ from bench.vision import Detector, Predictions
 
 STOP_SIGN = "stop sign"
 """The class to hide, as detectors name it."""
+REFERENCE_PATCHES = ("noise_patch", "grey_patch")
+"""The attacks that every other is held against, where they are installed: patches that know nothing of the detector."""
 SIDES = range(8, 513)
 """Texels a patch may be wide and high."""
 GREY = 0.5

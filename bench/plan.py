@@ -12,13 +12,12 @@ from bench.driving import DrivingVictim
 from bench.fingerprint import canonical
 from bench.pair import UNATTACKED, Pair, choose
 from bench.parameters import parameters
+from bench.patch import REFERENCE_PATCHES
 from bench.scenario import Cell
 from bench.unit import Unit
 
 REFERENCES = ("blind", "random", "idm")
 """The drivers that every victim at the wheel is held against."""
-REFERENCE_PATCHES = ("noise_patch", "grey_patch")
-"""The attacks that every attacked detector is held against, where they are installed."""
 
 
 def plan(config: RunConfig) -> list[Unit]:

@@ -74,7 +74,7 @@ def _columns() -> list[Column[Line]]:
         Column("\n[95 %]", lambda line: _beyond(line, interval=True), "left", spare=7),
         Column("frames\nseen", lambda line: share(line.measured.detected.estimate)),
         Column("first\nseen m", lambda line: number(line.measured.first_seen_m.estimate, 1)),
-        Column("ran\n[95 %]", lambda line: percent(line.measured.ran), "left"),
+        Column("ran %\n[95 %]", lambda line: percent(line.measured.ran), "left"),
         Column("over-\nrun m", lambda line: number(line.measured.overrun_m, 1)),
         Column("false\nalarms", lambda line: number(line.measured.false_alarms, 2), spare=6),
         Column("pic-\ntures", lambda line: _cost(line, "queries"), spare=4),

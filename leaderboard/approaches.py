@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from bench.metrics import Episodes, difference, rate, unit_interval
-from bench.plan import REFERENCE_PATCHES
+from bench.patch import REFERENCE_PATCHES
 from bench.scenario import Cell
 from bench.statistics import Interval, interval
 from leaderboard.pairs import ATTACKER, DEFENDED, groups, newest

@@ -107,6 +107,9 @@ def _in_order(module: nn.Module) -> Iterator[Tensor | None]:
 class YOLOv3Tiny(DetectorVictim):
     """The smallest YOLOv3, with the weights its authors trained on COCO; they are fetched when first needed."""
 
+    def zoo_name(self) -> str:
+        return "yolov3_tiny"
+
     def load(self, seed: int) -> YOLOv3TinyNetwork:
         """The one detector there is, whatever the seed."""
         path = fetch.weights("yolov3_tiny")

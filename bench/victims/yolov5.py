@@ -180,6 +180,9 @@ class YOLOv5(DetectorVictim):
     size: Size = "n"
     path: str = ""
 
+    def zoo_name(self) -> str:
+        return f"yolov5{self.size}"
+
     def load(self, seed: int) -> YOLOv5Network:
         """The detector in the file, whatever the seed."""
         if not self.path:

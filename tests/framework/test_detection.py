@@ -228,3 +228,13 @@ def test_a_replay_measures_what_the_record_says(tmp_path: Path, bench: Bench) ->
     assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"the patch {path} is truncated")
     path.unlink()
     assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"the patch {path} is not there")
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_while_it_crafts_loses_no_patch_and_no_cell(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="a worker process died"):
+        run(tmp_path, "attack.mood=calm,kill", "workers=2", "seeds=0")
+    kept = set((tmp_path / "patches").iterdir())
+    records, watcher = run(tmp_path, "seeds=0")
+    assert len(crafted(watcher)) == 1 - len(kept)
+    assert records.num_rows == 2 * 2 * 3
