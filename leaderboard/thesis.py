@@ -230,7 +230,8 @@ def road_table(section: Mapping[str, Any], source: Source) -> tuple[Table, list[
 def _table(*headings: str) -> Table:
     made = Table(box=box.SIMPLE_HEAD, header_style="dim", padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
     for place, heading in enumerate(headings):
-        made.add_column(heading, no_wrap=place > 0, vertical="bottom")
+        # Where the terminal is narrow, an interval goes under its estimate; no label goes to pieces.
+        made.add_column(heading, min_width=0 if place else 11, vertical="bottom")
     return made
 
 
