@@ -149,7 +149,8 @@ def test_the_report_reads_published_records(monkeypatch: pytest.MonkeyPatch) -> 
     assert "†" in report().split("Table 4.2")[1]
 
 
-def test_a_trade_off_over_seeds_is_found() -> None:
+def test_a_trade_off_over_seeds_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thesis_records, "published", SCHEMA.empty_table)
     text = report(*skip_sweep({0.0: 0.2, 0.3: 0.4, 0.5: 0.6, 1.0: 0.9}, {0.0: 0.6, 0.3: 0.45, 0.5: 0.3, 1.0: 0.1}))
     assert "DQN: does the trade-off exist? Yes." in text
     assert "DDPG: does the trade-off exist? It cannot be said" in text
