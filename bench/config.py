@@ -18,9 +18,6 @@ from bench.registry import KINDS, Kind
 from bench.scenario import GRIDS, WEATHERS, Grid
 from bench.words import Words, configured
 
-STANDARD: dict[Track, str] = {"driving": "standard-v1", "detection": "approach-v1"}
-"""The grid that each track is scored on."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
@@ -136,9 +133,10 @@ def run_config(words: Sequence[str]) -> RunConfig:
     axes = {key: tuple(settings[key]) for key in ("lanes", "density", "weather") if settings[key] is not None}
     if settings["episodes"] is not None:
         axes["episodes"] = settings["episodes"]
-    name = settings["grid"] or STANDARD[given.track]
-    if name not in GRIDS:
-        raise UserError(registry.unknown(f"grid {name!r}", name, GRIDS))
+    known = [grid.name for grid in GRIDS.values() if grid.track == given.track]
+    name = settings["grid"] or known[0]
+    if name not in known:
+        raise UserError(registry.unknown(f"grid {name!r}", name, known))
     for weather in axes.get("weather", ()):
         check_weather(weather, given.track)
     with _one_line():

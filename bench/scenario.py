@@ -6,6 +6,10 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from bench.contracts import Track
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +105,7 @@ class Scenario(Cell):
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """A named, versioned list of scenarios: the product of lanes, density and weather, `episodes` seeds a cell."""
+    """A named, versioned list of scenarios of a track: the product of lanes, density and weather, `episodes` seeds a cell."""
 
     name: str
     lanes: tuple[int, ...]
@@ -109,6 +113,7 @@ class Grid:
     weather: tuple[str, ...]
     episodes: int
     first_seed: int = SeedBlock.REPORT
+    track: Track = "driving"
 
     def __post_init__(self) -> None:
         if not 1 <= self.episodes <= SeedBlock.SELECT - SeedBlock.REPORT:
@@ -157,5 +162,6 @@ GRIDS: dict[str, Grid] = {
         density=(1.0, 2.0),
         weather=("clear", "rain", "fog"),
         episodes=3,
+        track="detection",
     ),
 }

@@ -124,8 +124,8 @@ class Unit(_Work):
     @property
     def grid(self) -> str:
         """The named grid that has this cell and these seeds; `custom` if none has."""
-        named = (grid.name for grid in GRIDS.values() if self.cell in grid.cells() and self.seeds == grid.seeds())
-        return next(named, "custom")
+        own = (grid for grid in GRIDS.values() if grid.track == self.pair.track)
+        return next((grid.name for grid in own if self.cell in grid.cells() and self.seeds == grid.seeds()), "custom")
 
     def constants(self, wall_s: float) -> dict[str, object]:
         """What every record of the unit says: the columns IDENTITY (but `seed`) and PROVENANCE of `bench.results`."""

@@ -63,6 +63,7 @@ BAD = {
     "victim=red world=red_street threat.budget=1.5": "threat.budget must be in (0, 1]",
     "attack=paint victim=red world=red_street threat.budget=0": "threat.budget must be in (0, 1]",
     "attack=paint victim=red world=red_street threat.access=scores": "needs access 'gradients'",
+    "victim=toy world=toy grid=approach-v1": "unknown grid 'approach-v1'; known: standard-v1",
     "victim=toy world=toy threat.norm=patch": "unknown threat.norm 'patch'; known: relative, linf",
 }
 

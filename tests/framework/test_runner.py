@@ -162,5 +162,6 @@ def test_the_grid_of_a_record_is_named_only_where_it_is_the_whole_cell() -> None
     whole = plan(run_config(["victim=toy", "world=toy", "lanes=3"]))
     short = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=99"]))
     other = plan(run_config(["victim=toy", "world=toy", "lanes=2"]))
+    as_few_as_approaches = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=3"]))
     assert {unit.grid for unit in whole} == {"standard-v1"}
-    assert {unit.grid for unit in (*short, *other)} == {"custom"}
+    assert {unit.grid for unit in (*short, *other, *as_few_as_approaches)} == {"custom"}
