@@ -109,6 +109,33 @@ def train(words: Words = None) -> None:
 
 
 @app.command()
+def render(
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the frames; by default those that bench run uses.")
+    ] = None,
+    world: Annotated[str, typer.Option(help="The camera world.")] = "camera",
+) -> None:
+    """Render the frames of a camera world; hours of work, that goes on where it was broken off.
+
+    It needs the renderer: pip install 'cavbench[render]'. The frames of the standard grid ship with the project.
+    """
+    from bench.config import component
+    from bench.console import TrainingProgress
+    from bench.vision import CameraWorld
+
+    found = component("world", world, {})
+    if not isinstance(found, CameraWorld):
+        raise UserError(f"world {world!r} has no camera to render for")
+    with TrainingProgress(Console(stderr=True), f"render {world}") as progress:
+        try:
+            files = found.render(out, progress)
+        except NotImplementedError as error:
+            raise UserError(str(error)) from error
+    size = sum(file.stat().st_size for file in files) / 1e6
+    Console().print(Text(f"{len(files)} files, {size:.1f} MB, in {files[0].parent}"), soft_wrap=True)
+
+
+@app.command()
 def show(
     run: Annotated[str, typer.Argument(help="A results folder, or the name of a pair in it.")] = "results",
     out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
@@ -138,7 +165,7 @@ def view(
 
 @app.command()
 def report(words: Words = None) -> None:
-    """Print a report on all records of a results folder: bench report [NAME] [out=results], for instance thesis.
+    """Print a report on all records of a results folder: bench report NAME out=FOLDER, for instance thesis.
 
     Without a folder and without out=, a report sees no records; it may have published ones of its own.
     """

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
@@ -155,6 +156,15 @@ class CameraWorld(World):
             cell: lanes (how far the sign stands from the ego's), traffic density (cars, which may hide it), weather.
             seeds: scenario seeds.
         """
+
+    def render(self, out: Path | None, progress: Progress) -> list[Path]:
+        """Make the frames of this world anew, going on where it was broken off, and return the files.
+
+        Args:
+            out: folder for them; None for the world's own.
+            progress: called with the share done and what is being rendered.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has nothing to render")
 
 
 class DetectorVictim(Victim):
