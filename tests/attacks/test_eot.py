@@ -1,0 +1,132 @@
+"""EOT: what it minimises, what it draws, what it may spend."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from attacks.eot import EOT, total_variation
+from attacks.grey_patch import GreyPatch
+from attacks.noise_patch import NoisePatch
+from bench.patch import PatchThreat, VisionOracle
+from bench.vision import Detector, Scenes, confidence
+from tests.framework.toy_camera import RedDetector, RedScenes
+from tests.vision.drawn_street import DrawnStreet
+
+OFF = dict.fromkeys(
+    ["rotation", "scale", "translation", "perspective", "brightness", "contrast", "saturation", "hue", "noise"], 0.0
+)
+SCENES = RedScenes(torch.linspace(30, 8, 5))
+
+
+def crafted(
+    attack: EOT | NoisePatch | GreyPatch, seed: int = 0, queries: int = 20_000, detector: Detector | None = None
+) -> tuple[Tensor, VisionOracle]:
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    oracle = VisionOracle(detector or RedDetector(), PatchThreat(queries=queries), attack.access, generator)
+    scenes: Scenes = SCENES if detector is None else DrawnStreet().training_scenes()
+    return attack.craft(oracle, scenes, lambda share, text: None), oracle
+
+
+def red(patch: Tensor) -> float:
+    """Mean confidence with a patch on the sign."""
+    shown = SCENES.render(torch.arange(len(SCENES)), patch.unsqueeze(0), 0.5)
+    return float(confidence(RedDetector()(shown), 1, SCENES.boxes).mean())
+
+
+def test_the_patch_takes_nearly_all_that_can_be_taken() -> None:
+    """The toy looks for red, so the best patch is cyan."""
+    patch, oracle = crafted(EOT(texels=16, steps=40, batch=4, window=32))
+    assert patch.shape == (3, 16, 16)
+    assert 0 <= patch.min() <= patch.max() <= 1
+    assert (oracle.spent, oracle.backwards) == (160, 160)
+    best = red(torch.tensor([0.0, 1.0, 1.0])[:, None, None].expand(3, 8, 8))
+    controls = [red(crafted(control)[0]) for control in (NoisePatch(texels=16), GreyPatch())]
+    assert best <= red(patch) < best + 0.1 * (min(controls) - best)
+
+
+def test_a_seed_is_a_patch() -> None:
+    attack = EOT(texels=8, steps=3, batch=2, window=32)
+    first, again, other = (crafted(attack, seed)[0] for seed in (0, 0, 1))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_it_stops_where_the_queries_end() -> None:
+    _, oracle = crafted(EOT(texels=8, steps=100, batch=8, window=32), queries=30)
+    assert oracle.spent == 24
+
+
+@pytest.mark.parametrize("name", [*OFF, "all"])
+def test_each_transformation_can_be_switched_off(name: str) -> None:
+    attack = EOT(**(OFF if name == "all" else {name: 0.0}), window=32)  # type: ignore[arg-type]
+    windows = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    torch.manual_seed(0)
+    transformed = attack._transformations()(windows)
+    assert transformed.shape == windows.shape
+    assert torch.equal(transformed, windows) == (name == "all")
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    x=st.floats(0, 1200),
+    y=st.floats(0, 340),
+    side=st.floats(5, 100),
+    translation=st.floats(0, 0.3),
+    seed=st.integers(0, 99),
+)
+def test_the_window_shows_the_sign(x: float, y: float, side: float, translation: float, seed: int) -> None:
+    pictures = torch.zeros(1, 3, 384, 1248)
+    x0, y0 = int(x), int(y)
+    pictures[..., y0 : y0 + int(side), x0 : x0 + int(side)] = 1
+    box = torch.tensor([[x, y, min(x + side, 1248), min(y + side, 384)]])
+    generator = torch.Generator().manual_seed(seed)
+    window = EOT(translation=translation)._windows(pictures, box, generator)
+    assert window.shape == (1, 3, 320, 320)
+    assert window.sum() == pictures.sum()
+
+
+def test_total_variation_of_a_plain_patch_is_none_and_of_a_chessboard_is_most() -> None:
+    chessboard = (torch.arange(8)[:, None] + torch.arange(8)) % 2
+    assert total_variation(torch.full((1, 3, 8, 8), 0.3)) == 0
+    assert total_variation(chessboard.float().expand(1, 3, 8, 8)) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("texels", 7),
+        ("steps", 0),
+        ("learning_rate", 0.0),
+        ("tv", -1.0),
+        ("hue", 0.6),
+        ("scale", 1.0),
+        ("rotation", -1.0),
+    ],
+)
+def test_a_parameter_out_of_range_is_named(name: str, value: float) -> None:
+    assert name in {field.name for field in fields(EOT)}
+    with pytest.raises(ValueError, match=rf"eot\.{name} must be"):
+        EOT(**{name: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_a_real_detector_is_blinded() -> None:
+    """YOLOv3-tiny on a drawn street, on frames of its own choice: only that the loss reaches the patch through it all."""
+    from bench.victims.yolov3_tiny import YOLOv3Tiny
+
+    detector = YOLOv3Tiny().load(0)
+    scenes = DrawnStreet().training_scenes()
+    attack = EOT(texels=32, steps=30, batch=4)
+    found = []
+    for patch in (crafted(attack, detector=detector)[0], crafted(NoisePatch(texels=32), detector=detector)[0]):
+        with torch.no_grad():
+            shown = scenes.render(torch.arange(len(scenes)), patch.unsqueeze(0), 0.5)
+            found.append(float(confidence(detector(shown), detector.index("stop sign"), scenes.boxes).mean()))
+    assert found[0] < 0.5 * found[1]
