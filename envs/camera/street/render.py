@@ -241,9 +241,11 @@ def _shape(
 
 
 def _face(x: float) -> Mesh:
+    """The sign's face, with its texture's coordinates."""
     corners = sign.corners(x)
     fan = [[0, i, i + 1] for i in range(1, 7)]
-    return Mesh(corners.astype(np.float32), np.array(fan, np.uint32), np.zeros((8, 2), np.float32))
+    uv = (corners[:, ::2] - (x, sign.HEIGHT_M)) / sign.SIZE_M + 0.5
+    return Mesh(corners.astype(np.float32), np.array(fan, np.uint32), uv.astype(np.float32))
 
 
 def _sensor(camera: Camera, window: tuple[int, int, int, int] | None) -> dict[str, Any]:

@@ -1,0 +1,70 @@
+"""The path tracer: what is composited is what it would have traced."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("mitsuba", reason="the renderer is not installed: pip install 'cavbench[render]'")
+pytest.importorskip("pyoidn", reason="the denoiser is not installed: pip install 'cavbench[render]'")
+
+from envs.camera import sign
+from envs.camera.camera import Camera
+from envs.camera.frame import _texture_mean, filtered
+from envs.camera.street import layout, render
+from envs.camera.street.light import light
+
+CAMERA = Camera(y=-9.0, width=312, height=96, focal=180.0)
+LANES = 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def scalar() -> None:
+    """The variant that every machine has."""
+    render.variant.cache_clear()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MITSUBA_VARIANT", "scalar_rgb")
+        render.variant()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lighting", ["sun", "overcast"])
+def test_a_composite_is_what_a_direct_render_shows(lighting: str) -> None:
+    """A chessboard of black and white on the sign: the texture that tells most."""
+    place = layout.LOCATIONS["sun-behind-ego"]
+    parts = layout.street(place, lanes=LANES, density=1.0, distance=9.0, lights=False)
+    lit = light("sun" if lighting == "sun" else "overcast", place.sun_azimuth_deg)
+    x = layout.sign_x(LANES)
+    traced = render.trace(parts, lit, CAMERA, x, seed=0)
+    board = ((torch.arange(8)[:, None] + torch.arange(8)) % 2).float().expand(1, 3, 8, 8)
+    face = sign.painted(board, 0.5)[0]
+    x0, y0, x1, y1 = traced.crop
+    mean = _texture_mean(traced.crop, filtered(face, x1 - x0), CAMERA, x).permute(1, 2, 0).numpy()
+    composite = traced.black[y0:y1, x0:x1] + traced.gain * mean
+
+    mi = render._mitsuba()
+    scene = render._scene(parts, lit, CAMERA, x)
+    texture = render._bitmap(face.permute(1, 2, 0).numpy())
+    scene["sign"] = render._shape("sign", render._face(x), {"type": "diffuse", "reflectance": texture})
+    sensor = mi.load_dict(render._sensor(CAMERA, traced.crop))
+    path = mi.load_dict({"type": "path", "max_depth": render.BOUNCES})
+    direct = np.array(mi.render(mi.load_dict(scene), sensor=sensor, integrator=path, spp=256, seed=1))[..., :3]
+
+    error = np.abs(composite - direct)[traced.coverage > 0.99]
+    assert len(error) > 400
+    assert error.mean() < 0.03 * direct.max()
+
+
+@pytest.mark.slow
+def test_a_render_is_the_same_twice() -> None:
+    place = layout.LOCATIONS["sun-beside"]
+    small = Camera(y=-20.0, width=96, height=32, focal=55.0)
+    parts = layout.street(place, lanes=LANES, density=1.0, distance=20.0, lights=True)
+    first, again = (
+        render.trace(parts, light("night", place.sun_azimuth_deg), small, layout.sign_x(LANES), seed=3)
+        for _ in range(2)
+    )
+    assert np.array_equal(first.black, again.black)
+    assert np.array_equal(first.gain, again.gain)
+    assert first.gain.max() > 0
