@@ -14,6 +14,7 @@ from attacks.eot import EOT, total_variation
 from attacks.grey_patch import GreyPatch
 from attacks.noise_patch import NoisePatch
 from bench.patch import PatchThreat, VisionOracle
+from bench.victims.yolov3_tiny import YOLOv3TinyNetwork
 from bench.vision import Detector, Scenes, confidence
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.vision.drawn_street import DrawnStreet
@@ -117,11 +118,9 @@ def test_a_parameter_out_of_range_is_named(name: str, value: float) -> None:
 
 
 @pytest.mark.slow
-def test_a_real_detector_is_blinded() -> None:
-    """YOLOv3-tiny on a drawn street, on frames of its own choice: only that the loss reaches the patch through it all."""
-    from bench.victims.yolov3_tiny import YOLOv3Tiny
-
-    detector = YOLOv3Tiny().load(0)
+def test_a_real_detector_is_blinded(published: YOLOv3TinyNetwork) -> None:
+    """On the frames it was crafted on: only that the loss reaches the patch through it all."""
+    detector = published
     scenes = DrawnStreet().training_scenes()
     attack = EOT(texels=32, steps=30, batch=4)
     found = []

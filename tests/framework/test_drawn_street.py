@@ -11,6 +11,7 @@ import pytest
 
 from bench import registry, results
 from bench.replay import find, replay
+from bench.victims.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 
@@ -24,7 +25,7 @@ def mean(records: pa.Table, attack: str, weather: str, column: str = "confidence
 
 @pytest.mark.slow
 def test_a_patch_hides_a_sign_from_yolo_and_fog_alone_does_less(
-    bench: Callable[..., Said], plugins: Path, tmp_path: Path
+    bench: Callable[..., Said], plugins: Path, tmp_path: Path, published: YOLOv3TinyNetwork
 ) -> None:
     install(plugins, "drawn", {"cavbench.worlds": {"drawn": "tests.vision.drawn_street:DrawnStreet"}}, {})
     registry.entries.cache_clear()
@@ -33,7 +34,8 @@ def test_a_patch_hides_a_sign_from_yolo_and_fog_alone_does_less(
     assert said.code == 0, said.err
     assert "yolov3_tiny" in said.out
     records = results.read(tmp_path, track="detection")
-    assert records.num_rows == 3 * 2 * 2
+    assert set(records["attack"].to_pylist()) == {"none", "paint", "blank", "noise_patch", "grey_patch"}
+    assert records.num_rows == 5 * 2 * 2
     assert mean(records, "none", "clear") > 0.7
     assert mean(records, "none", "clear", "ran") == 0
     assert mean(records, "none", "fog") < mean(records, "none", "clear")

@@ -14,7 +14,7 @@ from torch.nn.functional import batch_norm, conv2d, interpolate, leaky_relu, max
 from bench import fetch
 from bench.errors import UserError
 from bench.victims import yolo
-from bench.victims.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork, read_darknet
+from bench.victims.yolov3_tiny import YOLOv3TinyNetwork, read_darknet
 from bench.vision import confidence, detections
 from tests.vision.pictures import stop_sign
 
@@ -120,16 +120,6 @@ def test_a_file_of_another_size_is_refused_in_one_line(path: Path, tmp_path: Pat
     other.write_bytes(blob[:change] if change < 0 else blob + b"\0" * change)
     with pytest.raises(UserError, match=f"have {BYTES + change} bytes, YOLOv3TinyNetwork needs {BYTES}$"):
         read(other)
-
-
-@pytest.fixture(scope="module")
-def published() -> YOLOv3TinyNetwork:
-    try:
-        return YOLOv3Tiny().load(0)
-    except UserError as error:
-        if "cannot be downloaded" not in str(error):
-            raise
-        pytest.skip(str(error))
 
 
 @pytest.mark.slow

@@ -1,0 +1,19 @@
+"""What tests of several folders need."""
+
+from __future__ import annotations
+
+import pytest
+
+from bench.errors import UserError
+from bench.victims.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
+
+
+@pytest.fixture(scope="session")
+def published() -> YOLOv3TinyNetwork:
+    """YOLOv3-tiny with its published weights, which are fetched if need be; without a network the test is skipped."""
+    try:
+        return YOLOv3Tiny().load(0)
+    except UserError as error:
+        if "cannot be downloaded" not in str(error):
+            raise
+        pytest.skip(str(error))
