@@ -97,12 +97,16 @@ def test_listing_names_imports_no_torch() -> None:
         assert name in ended.stdout
 
 
-def test_listing_names_takes_under_half_a_second() -> None:
-    def cpu_seconds() -> float:
+def test_listing_names_costs_little_more_than_a_command_line_that_does_nothing() -> None:
+    """About half a second; here against importing what prints it, for machines are not idle."""
+
+    def cpu_seconds(*command: str) -> float:
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run([*BENCH, "list"], capture_output=True, check=True)
+        subprocess.run(command, capture_output=True, check=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
-    # Processor time: what it takes on a machine that does nothing else.
-    assert min(cpu_seconds() for _ in range(4)) < 0.5
+    nothing = (sys.executable, "-c", "import typer, typer.main, rich.console, rich.table, importlib.metadata")
+    pairs = [(cpu_seconds(*BENCH, "list"), cpu_seconds(*nothing)) for _ in range(4)]
+    listing, idle = (min(seconds) for seconds in zip(*pairs, strict=True))
+    assert listing < 4 * idle, f"{listing:.2f} s against {idle:.2f} s"

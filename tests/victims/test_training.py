@@ -33,7 +33,7 @@ def world() -> DrivingWorld:
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
 def test_a_training_depends_on_its_seed_alone(victim: LearningDriver, world: DrivingWorld) -> None:
-    first, again, other = (victim.train(world, seed=seed, progress=silent).policy.state_dict() for seed in (1, 1, 2))
+    first, again, other = (victim.train(world, seed=seed, progress=silent).network.state_dict() for seed in (1, 1, 2))
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert not all(torch.equal(first[name], other[name]) for name in first)
 
@@ -140,8 +140,8 @@ def test_adversarial_training_trains_saves_and_loads(
     defense = AdversarialTraining(start=start, decisions=160, attack="zo", attack_params="steps=1 directions=2")
     hardened = defense.train(victim, world, seed=0, progress=silent)
     assert hardened.card["attacked_decisions"] > 0
-    zoo.save(hardened.policy, hardened.card, name=defense.zoo_name(victim), seed=0)
+    zoo.save(hardened.network, hardened.card, name=defense.zoo_name(victim), seed=0)
     loaded = defense.load(victim, 0)
     x = torch.rand(4, 10, 5)
-    torch.testing.assert_close(loaded.scores(x), hardened.policy.scores(x))
+    torch.testing.assert_close(loaded.scores(x), hardened.network.scores(x))
     assert not torch.equal(loaded.scores(x), victim.load(0).scores(x))
