@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from bench.contracts import Access, Progress
+from bench.patch import VisionOracle, check_texels
 from bench.vision import PatchAttack, Scenes
-
-if TYPE_CHECKING:
-    from bench.patch import VisionOracle
 
 SEEN = 0.5
 """Frames in which less of the sign is to be seen teach nothing."""
@@ -70,8 +68,7 @@ class EOT(PatchAttack):
     noise: float = 0.02
 
     def __post_init__(self) -> None:
-        if not 8 <= self.texels <= 512:
-            raise ValueError(f"eot.texels must be between 8 and 512, got {self.texels}")
+        check_texels("eot", self.texels)
         for name in ("steps", "batch", "window"):
             if getattr(self, name) < 1:
                 raise ValueError(f"eot.{name} must be at least 1, got {getattr(self, name)}")
@@ -99,7 +96,7 @@ class EOT(PatchAttack):
             pictures = scenes.render(frames, patch, oracle.threat.budget)
             windows = self._windows(pictures, scenes.boxes[frames], oracle.generator)
             predictions = oracle.differentiable(transform(windows).clamp(0, 1))
-            found = (predictions.objectness * predictions.classes[..., oracle.label]).amax(-1).mean()
+            found = predictions.scores_of(oracle.label).amax(-1).mean()
             adam.zero_grad()
             (found + self.tv * total_variation(patch)).backward()
             adam.step()

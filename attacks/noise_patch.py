@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from bench.contracts import Access, Progress
+from bench.patch import VisionOracle, check_texels
 from bench.vision import PatchAttack, Scenes
-
-if TYPE_CHECKING:
-    from bench.patch import VisionOracle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +26,7 @@ class NoisePatch(PatchAttack):
     texels: int = 100
 
     def __post_init__(self) -> None:
-        if not 8 <= self.texels <= 512:
-            raise ValueError(f"noise_patch.texels must be between 8 and 512, got {self.texels}")
+        check_texels("noise_patch", self.texels)
 
     def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
         return torch.rand(3, self.texels, self.texels, generator=oracle.generator)

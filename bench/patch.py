@@ -23,6 +23,12 @@ GREY = 0.5
 """What a texel that is no number becomes."""
 
 
+def check_texels(attack: str, texels: int) -> None:
+    """Raise ValueError unless a patch of an attack may be `texels` wide and high."""
+    if texels not in SIDES:
+        raise ValueError(f"{attack}.texels must be between {SIDES[0]} and {SIDES[-1]}, got {texels}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class PatchThreat(ThreatModel):
     """The threat model of the detection track.

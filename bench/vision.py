@@ -43,6 +43,10 @@ class Predictions:
         """[N, K, C] in [0, 1]: objectness times class probability (Redmon et al. 2016, Eq. 1)."""
         return self.objectness.unsqueeze(-1) * self.classes
 
+    def scores_of(self, label: int) -> Tensor:
+        """[N, K] the scores of one class, without those of the others."""
+        return self.objectness * self.classes[..., label]
+
 
 @dataclass(frozen=True)
 class Detections:
@@ -279,5 +283,5 @@ def confidence(predictions: Predictions, label: int, boxes: Tensor, *, iou: floa
         iou: how much a prediction must overlap the true box to count.
     """
     there = overlap(predictions.boxes, boxes.unsqueeze(1)) >= iou
-    scores = predictions.objectness * predictions.classes[..., label] * there
+    scores = predictions.scores_of(label) * there
     return nn.functional.pad(scores, (0, 1)).amax(-1)

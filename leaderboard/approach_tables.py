@@ -15,7 +15,7 @@ from rich.text import Text
 from bench import stopping
 from bench.statistics import Interval
 from leaderboard.approaches import NO_PATCH, Measured, Patched, read_patched
-from leaderboard.layout import STRIP, Column, Section, axis, fitted
+from leaderboard.layout import STRIP, Column, Section, axis, fitted, rows_by_weather
 from leaderboard.pairs import DEFENDED
 from leaderboard.text import (
     ATTACKED,
@@ -194,12 +194,8 @@ class Part:
 
 def _parts(pair: Patched) -> Iterator[Section[Part]]:
     """A row a cell, each weather with a row of its own; then each location, and all."""
-    groups = [(weather, list(cells)) for weather, cells in groupby(pair.own.cells, key=lambda cell: cell.weather)]
-    for weather, cells in groups:
-        whole = [Part(Text(weather, style="bold"), pair.only(cells=cells))] if len(cells) > 1 else []
-        indent = "  " if whole else f"{weather} "
-        rows = [Part(Text(f"{indent}{cell.lanes} × {cell.density:g}"), pair.only(cells=[cell])) for cell in cells]
-        yield Section([*whole, *rows])
+    for rows in rows_by_weather(pair.own.cells):
+        yield Section([Part(name, pair.only(cells=cells)) for name, cells in rows])
     if len(pair.locations) > 1:
         yield Section([Part(Text(place), pair.only(seeds=seeds)) for place, seeds in pair.locations.items()])
     if len(pair.own.cells) > 1 or len(pair.locations) > 1:

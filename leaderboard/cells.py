@@ -4,42 +4,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import groupby
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from bench.metrics import MAX_RETURN, Summary
-from bench.scenario import Cell
 from bench.statistics import Interval
-from leaderboard.layout import STRIP, Column, Section, axis, fitted
+from leaderboard.layout import STRIP, Column, Section, axis, fitted, rows_by_weather
 from leaderboard.pairs import BEST_BLIND, IDM, Pair
 from leaderboard.text import ATTACKED, BLIND, CLEAN, MISSING, arrow, estimate, number, share, strip, verdict
 
 
 def cell_by_cell(pair: Pair, console: Console) -> Table:
     """A row a cell; each weather and the whole grid have rows of their own."""
-    sections = []
-    for weather, group in groupby(pair.cells, key=lambda cell: cell.weather):
-        cells = list(group)
-        whole = [_Part(weather, pair.only(cells))] if len(cells) > 1 else []
-        indent = "  " if whole else f"{weather} "
-        sections.append(Section([*whole, *(_Part(f"{indent}{_road(cell)}", pair.only([cell])) for cell in cells)]))
+    sections = [
+        Section([_Part(name, pair.only(cells)) for name, cells in rows]) for rows in rows_by_weather(pair.cells)
+    ]
     if len(sections) > 1:
-        sections.append(Section([_Part("all", pair)]))
+        sections.append(Section([_Part(Text("all", style="bold"), pair)]))
     return fitted(_columns(pair), sections, console)
-
-
-def _road(cell: Cell) -> str:
-    return f"{cell.lanes} × {cell.density:g}"
 
 
 class _Part:
     """A named part of a pair."""
 
-    def __init__(self, name: str, pair: Pair) -> None:
-        self.name = Text(name, style="" if "×" in name else "bold")
+    def __init__(self, name: Text, pair: Pair) -> None:
+        self.name = name
         self.pair, self.clean, self.attacked = pair, pair.clean_summary, pair.attacked_summary
 
     def reference(self, name: str) -> Interval | None:

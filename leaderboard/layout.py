@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Generic, Literal, TypeVar
 
 from rich import box
@@ -11,6 +12,8 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
+
+from bench.scenario import Cell
 
 Subject = TypeVar("Subject")
 STRIP = 25
@@ -76,3 +79,14 @@ def axis(measure: str = "safe progress") -> str:
 def _text(value: Text | str) -> Text:
     """As it stands: a parameter like `speeds=[20]` is no markup."""
     return value if isinstance(value, Text) else Text(value)
+
+
+def rows_by_weather(cells: Iterable[Cell]) -> list[list[tuple[Text, list[Cell]]]]:
+    """The rows of each weather: one of its own where it has several cells, then a row a cell; with the cells each is of."""
+    found = []
+    for weather, group in groupby(cells, key=lambda cell: cell.weather):
+        own = list(group)
+        whole = [(Text(weather, style="bold"), own)] if len(own) > 1 else []
+        indent = "  " if whole else f"{weather} "
+        found.append([*whole, *((Text(f"{indent}{cell.lanes} × {cell.density:g}"), [cell]) for cell in own)])
+    return found

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from bench.stopping import SPEED_MPS
 from bench.vision import Scenes
-from envs.camera.street.layout import SPEED_MPS
 
 STOP_LINE_M = 0.65
 """Before the sign: the middle of the line on the road."""

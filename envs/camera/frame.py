@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.scenario import Weather
+from bench.stopping import SPEED_MPS
 from envs.camera import develop, sign
 from envs.camera.camera import Camera
 from envs.camera.poses import Pose
-from envs.camera.street.layout import SPEED_MPS, sign_x
+from envs.camera.street.layout import sign_x
 from envs.camera.street.light import lighting
 from envs.camera.street.render import Traced
 from envs.camera.weather import air

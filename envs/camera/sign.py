@@ -102,12 +102,19 @@ def painted(patches: Tensor | None, share: float) -> Tensor:
     plain = _reflectance().unsqueeze(0)
     if patches is None:
         return plain
-    side = max(1, round(share * TEXELS))
-    first = (TEXELS - side) // 2
+    middle = patch_texels(share)
+    side = middle.stop - middle.start
     printed = torch.nn.functional.interpolate(linear(patches), size=(side, side), mode="nearest-exact")
     faces = plain.repeat(len(patches), 1, 1, 1)
-    faces[:, :, first : first + side, first : first + side] = printed
+    faces[:, :, middle, middle] = printed
     return faces
+
+
+def patch_texels(share: float) -> slice:
+    """The rows, and columns, of the face that a patch covers whose side is `share` of the sign's."""
+    side = max(1, round(share * TEXELS))
+    first = (TEXELS - side) // 2
+    return slice(first, first + side)
 
 
 @cache

@@ -30,10 +30,10 @@ def stuck_on(patch: Tensor | None, share: float) -> NDArray[np.uint8]:
         raise UserError("CARLA gives no gradients: craft the patch in the embedded camera world, then score it here")
     face = torch.tensor(sign.face())
     if patch is not None:
-        side = round(share * sign.TEXELS)
-        start = (sign.TEXELS - side) // 2
+        middle = sign.patch_texels(share)
+        side = middle.stop - middle.start
         fitted = interpolate(patch[None].float().cpu(), (side, side), mode="bilinear", antialias=True)[0]
-        face[:, start : start + side, start : start + side] = fitted
+        face[:, middle, middle] = fitted
     return (face.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
 
 

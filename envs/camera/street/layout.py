@@ -12,6 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from bench.stopping import SPEED_MPS
 from envs.camera import sign
 from envs.camera.camera import Camera
 from envs.camera.street import material as m
@@ -23,14 +24,14 @@ from envs.camera.street.vehicles import LENGTH, PAINTS, Model, Part, vehicle
 LANE_M = 2.75
 LANES_TO_THE_LEFT = 2
 """Of the ego's: it keeps to the third lane from the left, so every lane more puts the sign a lane further away."""
+LEFT_EDGE = -LANE_M * (LANES_TO_THE_LEFT + 0.5)
+"""x of the left edge of the road in m."""
 VERGE_M = 1.1
 """From the kerb to the middle of the sign."""
 DISTANCES = tuple(float(distance) for distance in np.linspace(30.0, 8.0, 10))
 """Of the frames of an approach before the sign, in m."""
 MOST_HIDDEN = 4
 """Frames of an approach in which the traffic may hide the sign."""
-SPEED_MPS = 10.0
-"""The ego's, between the frames of an approach."""
 CROSSING = (2.5, 11.5)
 """The road that the sign gives way to, along y."""
 _NEAR, _FAR = -80.0, 260.0
@@ -101,7 +102,7 @@ def street(location: Location, *, lanes: int, density: float, distance: float, l
 @lru_cache(maxsize=4)
 def _standing(location: Location, lanes: int) -> tuple[Part, ...]:
     """What is the same in every frame of an approach."""
-    parts = _ground(location, lanes) + _post(lanes) + _beside(location, lanes) + _lamp_posts(lanes)
+    parts = _ground(location, lanes) + _post(lanes) + _beside(location, lanes) + _lamp_posts()
     return tuple(_merged(parts + _other_signs(location, lanes)))
 
 
@@ -173,7 +174,7 @@ def _ground(location: Location, lanes: int) -> list[Part]:
     road = Material("road", texture=textures.asphalt(rng))
     slab = Material("paving", texture=textures.concrete(rng))
     lawn = Material("matt", texture=textures.grass(rng))
-    left, right = -LANE_M * (LANES_TO_THE_LEFT + 0.5), right_edge(lanes)
+    left, right = LEFT_EDGE, right_edge(lanes)
     before, after = CROSSING
     parts = [
         (ground(-200, 200, _NEAR, _FAR, -0.03, 5), lawn),
@@ -215,9 +216,9 @@ def _post(lanes: int) -> list[Part]:
     ]
 
 
-def _lamp_posts(lanes: int) -> list[Part]:
+def _lamp_posts() -> list[Part]:
     """Beside the left kerb, every 34 m."""
-    x = -LANE_M * (LANES_TO_THE_LEFT + 0.5) - 0.9
+    x = LAMPS_X
     posts = [rod((x, y, 0), (x, y, LAMP_HEIGHT_M), 0.09, 0.05) for y in LAMPS_Y]
     arms = [rod((x, y, LAMP_HEIGHT_M), (x + 2.2, y, LAMP_HEIGHT_M + 0.2), 0.04) for y in LAMPS_Y]
     heads = [block(x + 1.6, x + 2.3, y - 0.14, y + 0.14, LAMP_HEIGHT_M + 0.12, LAMP_HEIGHT_M + 0.24) for y in LAMPS_Y]
@@ -227,7 +228,7 @@ def _lamp_posts(lanes: int) -> list[Part]:
 def _other_signs(location: Location, lanes: int) -> list[Part]:
     """Signs that are no stop signs: a speed limit, a warning and a direction, beside the road ahead and behind."""
     rng = np.random.default_rng([location.seed, 3])
-    left, right = -LANE_M * (LANES_TO_THE_LEFT + 0.5) - VERGE_M, right_edge(lanes) + VERGE_M
+    left, right = LEFT_EDGE - VERGE_M, right_edge(lanes) + VERGE_M
     white, red = Material("matt", (0.75, 0.75, 0.73)), Material("matt", (0.42, 0.02, 0.03))
     yellow, blue = Material("matt", (0.7, 0.42, 0.02)), Material("matt", (0.02, 0.08, 0.35))
     black = Material("matt", (0.02, 0.02, 0.02))
@@ -254,20 +255,21 @@ def _polygon(x: float, y: float, z: float, radius: float, sides: int) -> Mesh:
     return join([quad([(x, y, z), rim[i], rim[(i + 1) % sides], rim[(i + 1) % sides]]) for i in range(sides)])
 
 
+LAMPS_X = LEFT_EDGE - 0.9
 LAMP_HEIGHT_M = 8.0
 LAMPS_Y = (-48.0, -14.0, 20.0, 54.0, 88.0)
 
 
 def lamp_heads() -> list[tuple[float, float, float]]:
     """Where the street lamps shine from."""
-    x = -LANE_M * (LANES_TO_THE_LEFT + 0.5) - 0.9 + 1.95
+    x = LAMPS_X + 1.95
     return [(x, y, LAMP_HEIGHT_M + 0.1) for y in LAMPS_Y]
 
 
 def _beside(location: Location, lanes: int) -> list[Part]:
     """Houses, trees and the horizon."""
     rng = np.random.default_rng([location.seed, 2])
-    left, right = -LANE_M * (LANES_TO_THE_LEFT + 0.5) - 3.4, right_edge(lanes) + 3.4
+    left, right = LEFT_EDGE - 3.4, right_edge(lanes) + 3.4
     parts = _horizon(rng)
     if location.surrounding == "town":
         parts += _houses(rng, right, 1) + _houses(rng, left, -1)

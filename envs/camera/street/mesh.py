@@ -23,10 +23,6 @@ class Mesh:
         """The same, somewhere else."""
         return Mesh(self.vertices + np.array([x, y, z], np.float32), self.triangles, self.uv)
 
-    def turned(self) -> Mesh:
-        """The same, facing the other way along the road."""
-        return Mesh(self.vertices * np.array([-1, -1, 1], np.float32), self.triangles, self.uv)
-
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh of several."""
