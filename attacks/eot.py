@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bench.contracts import Access, Progress
 from bench.patch import VisionOracle, check_texels
@@ -86,16 +86,29 @@ class EOT(PatchAttack):
             raise ValueError(f"eot.hue must be between 0 and 0.5, got {self.hue}")
 
     def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
+        from attacks.transformations import Transformations
+
         seen = (scenes.visible >= SEEN).nonzero().squeeze(1)
         patch = torch.rand(1, 3, self.texels, self.texels, generator=oracle.generator).requires_grad_(True)
         adam = torch.optim.Adam([patch], lr=self.learning_rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.steps, self.learning_rate / 20)
-        transform = self._transformations()
+        size = min(self.window, scenes.size[0]), min(self.window, scenes.size[1])
+        reach = scenes.reach(oracle.threat.budget)
+        transform = Transformations(
+            rotation=self.rotation,
+            scale=self.scale,
+            perspective=self.perspective,
+            brightness=self.brightness,
+            contrast=self.contrast,
+            saturation=self.saturation,
+            hue=self.hue,
+            noise=self.noise,
+        )
         for step in range(min(self.steps, oracle.remaining // self.batch)):
             frames = seen[torch.randint(len(seen), (self.batch,), generator=oracle.generator)]
-            pictures = scenes.render(frames, patch, oracle.threat.budget)
-            windows = self._windows(pictures, scenes.boxes[frames], oracle.generator)
-            predictions = oracle.differentiable(transform(windows).clamp(0, 1))
+            corners = self._corners(scenes.boxes[frames], scenes.size, oracle.generator)
+            windows = scenes.windows(frames, patch, oracle.threat.budget, corners, size)
+            predictions = oracle.differentiable(transform(windows, reach[frames] - corners.repeat(1, 2)))
             found = predictions.scores_of(oracle.label).amax(-1).mean()
             adam.zero_grad()
             (found + self.tv * total_variation(patch)).backward()
@@ -107,33 +120,13 @@ class EOT(PatchAttack):
                 progress(step / self.steps, f"stop sign {float(found):.2f}")
         return patch.detach()[0]
 
-    def _windows(self, pictures: Tensor, boxes: Tensor, generator: torch.Generator) -> Tensor:
-        """[N, 3, window, window] around the signs, shifted by up to `translation`, as far as the picture goes."""
-        height, width = pictures.shape[2:]
-        side_y, side_x = min(self.window, height), min(self.window, width)
+    def _corners(self, boxes: Tensor, picture: tuple[int, int], generator: torch.Generator) -> Tensor:
+        """int64 [N, 2] column and row where windows around the signs begin, shifted by up to `translation`."""
+        limit = torch.tensor([picture[1], picture[0]])
+        side = limit.clamp(max=self.window)
         shift = (torch.rand(len(boxes), 2, generator=generator) * 2 - 1) * self.translation * self.window
         middle = (boxes[:, :2] + boxes[:, 2:]) / 2 + shift
-        left = (middle[:, 0] - side_x / 2).round().long().clamp(0, width - side_x).tolist()
-        top = (middle[:, 1] - side_y / 2).round().long().clamp(0, height - side_y).tolist()
-        cut = [picture[:, y : y + side_y, x : x + side_x] for picture, x, y in zip(pictures, left, top, strict=True)]
-        return torch.stack(cut)
-
-    def _transformations(self) -> nn.Module:
-        """What the camera's picture goes through; kornia draws from torch's global generator, which the runner seeds."""
-        import kornia.augmentation as augmentation
-
-        steps: list[nn.Module] = []
-        if self.rotation or self.scale:
-            scale = (1 - self.scale, 1 + self.scale) if self.scale else None
-            steps.append(augmentation.RandomAffine(self.rotation, scale=scale, padding_mode="reflection", p=1.0))
-        if self.perspective:
-            steps.append(augmentation.RandomPerspective(self.perspective, p=1.0))
-        if self.brightness or self.contrast or self.saturation or self.hue:
-            jiggle = augmentation.ColorJiggle(self.brightness, self.contrast, self.saturation, self.hue, p=1.0)
-            steps.append(jiggle)
-        if self.noise:
-            steps.append(augmentation.RandomGaussianNoise(std=self.noise, p=1.0))
-        return nn.Sequential(*steps)
+        return torch.minimum((middle - side / 2).round().long().clamp(min=0), limit - side)
 
 
 def total_variation(patch: Tensor) -> Tensor:

@@ -125,6 +125,25 @@ class Scenes(ABC):
             share: side of the patch in shares of the sign's, in (0, 1].
         """
 
+    def windows(
+        self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
+    ) -> Tensor:
+        """Parts [N, 3, h, w] of the pictures that `render` gives; a world that renders no more than these is faster.
+
+        Args:
+            frames, patches, share: as of `render`.
+            corners: int64 [N, 2], column and row of the first pixel of each.
+            size: height and width; every window is within its picture.
+        """
+        height, width = size
+        pictures = self.render(frames, patches, share)
+        cut = [p[:, y : y + height, x : x + width] for p, (x, y) in zip(pictures, corners.tolist(), strict=True)]
+        return torch.stack(cut)
+
+    def reach(self, share: float) -> Tensor:
+        """[M, 4] boxes around all that a patch changes: the sign's, unless a world knows a smaller or needs a larger one."""
+        return self.boxes
+
 
 @dataclass(frozen=True)
 class Approach:

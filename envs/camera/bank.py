@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cache
+from math import ceil, floor
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from bench.files import whole
 from bench.scenario import WEATHERS
 from bench.vision import Scenes
 from envs.camera import sign
-from envs.camera.frame import Frame, background, noise_level, signed
+from envs.camera.frame import Box, Frame, Plate, common, filtered, noise_level, opened, within
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
 
@@ -115,19 +116,51 @@ class BankScenes(Scenes):
         self.boxes = torch.from_numpy(np.array(boxes)).float()
         self.visible = torch.tensor([frame.visible for frame in self.frames])
         self.distance = torch.tensor([pose.distance for pose in self.poses])
+        self._plates: dict[int, Plate] = {}
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
-        faces = sign.painted(patches, share).expand(len(frames), -1, -1, -1)
-        return torch.stack([self._picture(int(number), face) for number, face in zip(frames, faces, strict=True)])
+        return self.windows(frames, patches, share, torch.zeros(len(frames), 2, dtype=torch.int64), self.size)
 
-    def _picture(self, number: int, face: Tensor) -> Tensor:
-        """[3, H, W] frame `number` with linear reflectances [3, S, S] on the sign."""
-        pose, frame = self.poses[number], self.frames[number]
-        picture = background(frame)
-        x0, y0, x1, y1 = frame.crop
-        if x1 > x0 and y1 > y0:
-            picture[:, y0:y1, x0:x1] = signed(frame, face, pose.camera, sign_x(pose.lanes))
-        grain = _grain(picture.shape[1] + GRAIN_SHIFT, picture.shape[2] + GRAIN_SHIFT)
-        down, right = pose.seed % GRAIN_SHIFT, pose.seed // GRAIN_SHIFT % GRAIN_SHIFT
-        noise = grain[:, down : down + picture.shape[1], right : right + picture.shape[2]]
-        return (picture + noise_level(WEATHERS[self.weathers[number]]) * noise).clamp(0, 1)
+    def windows(
+        self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
+    ) -> Tensor:
+        plates = [self._opened(number) for number in frames.tolist()]
+        faces: dict[int, tuple[Tensor, ...]] = {}
+        if patches is not None:
+            painted = sign.painted(patches, share)
+            faces = {side: filtered(painted, side).unbind() for side in {plate.detail for plate in plates}}
+        shown = []
+        for place, (number, plate, (x, y)) in enumerate(zip(frames.tolist(), plates, corners.tolist(), strict=True)):
+            window = (x, y, x + size[1], y + size[0])
+            picture = self._noisy(number, plate.window(window), window)
+            patched = common(window, plate.crop, _reach(self.poses[number], share))
+            if patches is not None and patched:
+                face = faces[plate.detail][place % len(patches)]
+                picture[within(patched, window)] = self._noisy(number, plate.signed(face, patched), patched)
+            shown.append(picture)
+        return torch.stack(shown)
+
+    def reach(self, share: float) -> Tensor:
+        return torch.tensor([_reach(pose, share) for pose in self.poses], dtype=torch.float32)
+
+    def _opened(self, number: int) -> Plate:
+        """The plate of a frame, kept for the next time: about 1.6 MB."""
+        if number not in self._plates:
+            pose = self.poses[number]
+            self._plates[number] = opened(self.frames[number], pose.camera, sign_x(pose.lanes))
+        return self._plates[number]
+
+    def _noisy(self, number: int, picture: Tensor, part: Box) -> Tensor:
+        """A part of a frame's picture with the sensor's noise."""
+        height, width = self.size
+        seed = self.poses[number].seed
+        down, right = seed % GRAIN_SHIFT, seed // GRAIN_SHIFT % GRAIN_SHIFT
+        grain = _grain(height + GRAIN_SHIFT, width + GRAIN_SHIFT)[within(part, (-right, -down, width, height))]
+        return picture.add_(grain, alpha=noise_level(WEATHERS[self.weathers[number]])).clamp_(0, 1)
+
+
+@cache
+def _reach(pose: Pose, share: float) -> Box:
+    """Around the pixels that a patch changes: those it covers, and one more where the texture's filter mixes it in."""
+    x0, y0, x1, y1 = sign.patch_box(share, sign_x(pose.lanes), pose.camera)
+    return floor(x0) - 1, floor(y0) - 1, ceil(x1) + 1, ceil(y1) + 1

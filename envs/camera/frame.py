@@ -7,6 +7,7 @@ texture is its mean over the part of a pixel's footprint that is sign.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from torch import Tensor
 from bench.scenario import Weather
 from bench.stopping import SPEED_MPS
 from envs.camera import develop, sign
-from envs.camera.camera import Camera
+from envs.camera.camera import Array, Camera
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
 from envs.camera.street.light import lighting
@@ -31,6 +32,9 @@ GAMMA = 2.2
 SUPERSAMPLING = 4
 """Samples along a pixel's side that a texture's mean is taken over."""
 
+Box = tuple[int, int, int, int]
+"""x0, y0, x1, y1 in pixels of the picture."""
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -38,14 +42,14 @@ class Frame:
 
     Args:
         picture: WebP of the developed frame with a black sign, without the sensor's noise.
-        crop: x0, y0, x1, y1 around the sign in pixels, within the picture; empty if the sign is outside.
+        crop: around the sign, within the picture; empty if the sign is outside.
         black, gain: uint8 [h, w, 3], coded as `GAMMA` says.
         scale: what codes of 255 stand for in black and gain.
         visible: share of the sign that is in the picture and not hidden, in [0, 1].
     """
 
     picture: NDArray[np.uint8]
-    crop: tuple[int, int, int, int]
+    crop: Box
     black: NDArray[np.uint8]
     gain: NDArray[np.uint8]
     scale: tuple[float, float]
@@ -80,53 +84,101 @@ def noise_level(weather: Weather) -> float:
     return develop.NOISE[lighting(weather)]
 
 
-def background(kept: Frame) -> Tensor:
-    """[3, H, W] the developed picture with a black sign."""
-    decoded = cv2.imdecode(kept.picture, cv2.IMREAD_COLOR)
-    assert decoded is not None
-    return torch.from_numpy(decoded[..., ::-1].copy()).permute(2, 0, 1).float() / 255
-
-
-def signed(kept: Frame, face: Tensor, camera: Camera, x: float) -> Tensor:
-    """[3, h, w] the developed crop with a texture on the sign, differentiable to it.
+@dataclass(frozen=True, eq=False)
+class Plate:
+    """A frame opened for patches: all of it that does not depend on them.
 
     Args:
-        kept: the frame; its crop must not be empty.
-        face: linear reflectances of the whole face [3, S, S].
-        camera: of the frame.
-        x: where the sign stands.
+        picture: uint8 [3, H, W], developed, with a black sign.
+        crop: of the frame.
+        black, gain: float32 [3, h, w] exposed light on the crop.
+        face_from_pixel: homography [3, 3] (`sign.pixel_to_face`).
     """
-    x0, _, x1, _ = kept.crop
+
+    picture: Tensor
+    crop: Box
+    black: Tensor
+    gain: Tensor
+    face_from_pixel: Array
+
+    @property
+    def detail(self) -> int:
+        """Side of the face's texture at which about `SUPERSAMPLING` texels fall on a pixel of the crop."""
+        side, width = sign.TEXELS, self.crop[2] - self.crop[0]
+        while side > 32 and side // 2 >= SUPERSAMPLING * width:
+            side //= 2
+        return side
+
+    @cached_property
+    def plain(self) -> Tensor:
+        """float32 [3, h, w] the crop, developed, with the sign's own face."""
+        return self.signed(filtered(sign.painted(None, 1.0), self.detail)[0], self.crop)
+
+    def signed(self, face: Tensor, part: Box) -> Tensor:
+        """[3, h, w] a part of the crop, developed, with a texture on the sign; differentiable to it.
+
+        Args:
+            face: linear reflectances of the whole face [3, S, S], S texels wide as `detail` says.
+            part: within the crop, not empty.
+        """
+        here = within(part, self.crop)
+        return develop.tone(self.black[here] + self.gain[here] * texture_mean(part, face, self.face_from_pixel))
+
+    def window(self, window: Box) -> Tensor:
+        """float32 [3, h, w] a part of the picture, with the sign's own face."""
+        picture = self.picture[within(window, (0, 0, 0, 0))] / 255
+        if part := common(window, self.crop):
+            picture[within(part, window)] = self.plain[within(part, self.crop)]
+        return picture
+
+
+def opened(kept: Frame, camera: Camera, x: float) -> Plate:
+    """The plate of a frame that a camera took, with the sign at `x`."""
+    picture = cv2.imdecode(kept.picture, cv2.IMREAD_COLOR_RGB)
+    assert picture is not None
     black, gain = (
         most * (torch.from_numpy(code).permute(2, 0, 1) / 255) ** GAMMA
         for code, most in zip((kept.black, kept.gain), kept.scale, strict=True)
     )
-    return develop.tone(black + gain * _texture_mean(kept.crop, filtered(face, x1 - x0), camera, x))
+    planes = torch.from_numpy(picture).permute(2, 0, 1).contiguous()
+    return Plate(planes, kept.crop, black, gain, sign.pixel_to_face(x, camera))
 
 
-def _texture_mean(crop: tuple[int, int, int, int], face: Tensor, camera: Camera, x: float) -> Tensor:
+def common(*boxes: Box) -> Box | None:
+    """The pixels that are in every box; None if there are none."""
+    x0, y0, x1, y1 = zip(*boxes, strict=True)
+    found = max(x0), max(y0), min(x1), min(y1)
+    return found if found[0] < found[2] and found[1] < found[3] else None
+
+
+def within(part: Box, whole: Box) -> tuple[slice, slice, slice]:
+    """Where the pixels of `part` are in a tensor [3, h, w] of those of `whole`."""
+    (x0, y0, x1, y1), (left, top, *_) = part, whole
+    return slice(None), slice(y0 - top, y1 - top), slice(x0 - left, x1 - left)
+
+
+def texture_mean(part: Box, face: Tensor, face_from_pixel: Array) -> Tensor:
     """[3, h, w] mean of the face's texture over the part of each pixel that is sign."""
-    x0, y0, x1, y1 = crop
+    x0, y0, x1, y1 = part
     step = 1 / SUPERSAMPLING
-    rows, columns = torch.arange(y0 + step / 2, y1, step), torch.arange(x0 + step / 2, x1, step)
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    homography = torch.from_numpy(sign.pixel_to_face(x, camera)).float()
-    place = torch.stack((u, v, torch.ones_like(u)), -1) @ homography.T
-    place = place[..., :2] / place[..., 2:]
-    inside = torch.from_numpy(sign.inside(place.numpy())).float()
-    found = torch.nn.functional.grid_sample(
-        face.unsqueeze(0), 2 * place.unsqueeze(0) - 1, mode="bilinear", padding_mode="border", align_corners=False
-    )
-    total = torch.nn.functional.avg_pool2d(found * inside, SUPERSAMPLING)
-    cover = torch.nn.functional.avg_pool2d(inside[None, None], SUPERSAMPLING)
+    u, v = (np.arange(low + step / 2, high, step, np.float32) for low, high in ((x0, x1), (y0, y1)))
+    across, down, scale = (a * u + (b * v + c)[:, None] for a, b, c in face_from_pixel.tolist())
+    place = np.stack((across / scale, down / scale), -1)
+    inside = sign.inside(place).reshape(len(v) // SUPERSAMPLING, SUPERSAMPLING, -1, SUPERSAMPLING)
+    cover = inside.mean((1, 3), np.float32, keepdims=True)
     # Where the tracer saw a corner of the sign and no sample hits it, the border's texel does.
-    anywhere = torch.nn.functional.avg_pool2d(found, SUPERSAMPLING)
-    return torch.where(cover > 0, total / cover.clamp(min=1e-6), anywhere)[0]
+    weight = np.where(cover > 0, inside / np.maximum(cover, 1e-6), np.float32(1)).reshape(len(v), len(u))
+    found = torch.nn.functional.grid_sample(
+        face.unsqueeze(0),
+        torch.from_numpy(2 * place - 1).unsqueeze(0),
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
+    )
+    return torch.nn.functional.avg_pool2d(found * torch.from_numpy(weight), SUPERSAMPLING)[0]
 
 
-def filtered(face: Tensor, width: float) -> Tensor:
-    """The linear face [3, S, S] averaged down so that about `SUPERSAMPLING` texels fall on a pixel of a sign `width` px wide."""
-    side = face.shape[-1]
-    while side > 32 and side // 2 >= SUPERSAMPLING * width:
-        side //= 2
-    return torch.nn.functional.avg_pool2d(face, face.shape[-1] // side) if side < face.shape[-1] else face
+def filtered(faces: Tensor, side: int) -> Tensor:
+    """Linear faces [N, 3, S, S] averaged down to `side` texels."""
+    step = faces.shape[-1] // side
+    return torch.nn.functional.avg_pool2d(faces, step) if step > 1 else faces

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import get_args
 
 import numpy as np
@@ -49,7 +49,7 @@ class Pose:
         """Where it is seen from."""
         return Camera(x=self.x, y=-self.distance, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg)
 
-    @property
+    @cached_property
     def seed(self) -> int:
         """Of everything random in its picture."""
         text = ",".join(f"{key}={value}" for key, value in asdict(self).items())

@@ -35,24 +35,37 @@ def corners(x: float) -> Array:
 
 def box(x: float, camera: Camera) -> Array:
     """[4] x0, y0, x1, y1 of the sign in pixels, not clipped to the picture."""
-    seen = camera.project(corners(x))
+    return _bounds(camera.project(corners(x)))
+
+
+def patch_box(share: float, x: float, camera: Camera) -> Array:
+    """[4] x0, y0, x1, y1 of a patch whose side is `share` of the sign's, in pixels, not clipped to the picture."""
+    return _bounds(camera.project(_square(share, x)))
+
+
+def _bounds(seen: Array) -> Array:
     return np.concatenate([seen.min(0), seen.max(0)])
+
+
+def _square(share: float, x: float) -> Array:
+    """[4, 3] corners of a square in the middle of the sign, its side `share` of the sign's: clockwise from the top left."""
+    half = share * SIZE_M / 2
+    return np.array(
+        [(x + half * across, 0, HEIGHT_M + half * up) for across, up in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
+    )
 
 
 def pixel_to_face(x: float, camera: Camera) -> Array:
     """[3, 3] homography from pixels to the face's texture: (0, 0) is its top left corner, (1, 1) its bottom right one."""
-    half = SIZE_M / 2
-    square = [(x - half, 0, HEIGHT_M + half), (x + half, 0, HEIGHT_M + half)]
-    square += [(x + half, 0, HEIGHT_M - half), (x - half, 0, HEIGHT_M - half)]
-    seen = camera.project(np.array(square)).astype(np.float32)
+    seen = camera.project(_square(1.0, x)).astype(np.float32)
     face = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
     return np.asarray(cv2.getPerspectiveTransform(seen, face), np.float64)
 
 
 def inside(face: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Which points [..., 2] of the texture's unit square are on the octagon."""
-    offset = np.abs(face - 0.5) * 2
-    return (offset.max(-1) <= 1) & (offset.sum(-1) <= np.sqrt(2))
+    across, down = (np.abs(2 * face[..., axis] - 1) for axis in (0, 1))
+    return (np.maximum(across, down) <= 1) & (across + down <= np.sqrt(2))
 
 
 @cache

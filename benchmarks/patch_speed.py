@@ -1,0 +1,119 @@
+"""What crafting a patch costs beside the detector's own passes, and how long scoring one takes. One command:
+
+    python benchmarks/patch_speed.py [--bank FOLDER] [--rounds 10] [--steps 4]
+
+Steps of `eot` at its defaults and as many forward and backward passes of the detector alone take turns, in one process and
+one thread; so do rendering the frames of an approach, and rendering and looking at them. Medians over the rounds, for a machine
+that does other things too; of "times", the median of what each round says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from attacks.eot import EOT
+from bench.approach import look
+from bench.errors import UserError
+from bench.patch import STOP_SIGN, PatchThreat, VisionOracle
+from bench.process import settle
+from bench.scenario import GRIDS
+from bench.victims.yolov3_tiny import YOLOv3Tiny
+from bench.vision import Detector, Scenes
+from envs.camera.world import StopSignApproach
+
+GRID, THREAT, WORKERS = GRIDS["approach-v1"], PatchThreat(), 2
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--bank", default="", help="folder of rendered frames (default: those that ship)")
+    parser.add_argument("--rounds", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=4, help="of the attack in a round")
+    words = parser.parse_args()
+    settle()
+    torch.manual_seed(0)
+    world, detector = StopSignApproach(bank=words.bank), YOLOv3Tiny().load(0)
+    try:
+        craft(detector, world.training_scenes(), words.rounds, words.steps)
+        score(detector, world, words.rounds)
+    except UserError as error:
+        raise SystemExit(str(error)) from None
+
+
+def craft(detector: Detector, scenes: Scenes, rounds: int, steps: int) -> None:
+    """Print what a step of `eot` costs, with its share of the first look at every frame."""
+    attack, generator = EOT(steps=steps), torch.Generator().manual_seed(0)
+    pictures = torch.rand(attack.batch, 3, attack.window, attack.window, generator=generator)
+    label = detector.index(STOP_SIGN)
+
+    def passes() -> None:
+        for _ in range(steps):
+            shown = pictures.clone().requires_grad_()
+            detector(shown).scores_of(label).amax(-1).mean().backward()
+
+    def step() -> None:
+        attack.craft(VisionOracle(detector, THREAT, attack.access, generator), scenes, lambda share, text: None)
+
+    def first_look() -> None:
+        for frame in torch.arange(len(scenes)).split(1):
+            scenes.render(frame, None, THREAT.budget)
+
+    first = seconds(first_look) / EOT.steps
+    alone, whole = turns(passes, step, rounds=rounds) / steps
+    whole += first[:, None]
+    print(f"a step of eot: yolov3_tiny, batch {attack.batch}, windows of {attack.window} x {attack.window}, one thread")
+    for clock, name in enumerate(("processor", "wall")):
+        times = np.median(whole[clock] / alone[clock])
+        print(
+            f"  {name:<10} detector {1000 * np.median(alone[clock]):5.0f} ms   step {1000 * np.median(whole[clock]):5.0f} ms   "
+            f"{times:.2f} times (goal: 1.3)"
+        )
+
+
+def score(detector: Detector, world: StopSignApproach, rounds: int) -> None:
+    """Print what a frame of an approach costs, and what that makes for the standard grid."""
+    texels = torch.rand(3, EOT.texels, EOT.texels)
+
+    def scenes() -> Scenes:
+        return world.approaches(GRID.cells()[0], GRID.seeds()[:1])[0].scenes
+
+    every = torch.arange(len(scenes()))
+    with torch.no_grad():
+        rendering, looking = turns(
+            lambda: scenes().render(every, texels.unsqueeze(0), THREAT.budget),
+            lambda: look(detector, scenes(), texels, THREAT.budget),
+            rounds=rounds,
+        ) / len(every)
+    height, width = scenes().size
+    frames = len(list(GRID.scenarios())) * len(every)
+    print(f"scoring a texture: yolov3_tiny, batch {len(every)}, pictures of {width} x {height}, one thread")
+    for clock, name in enumerate(("processor", "wall")):
+        seen = float(np.median(looking[clock]))
+        print(
+            f"  {name:<10} rendering {1000 * np.median(rendering[clock]):4.0f} ms a frame, with the detector {1000 * seen:4.0f} ms: "
+            f"{1 / seen:.1f} frames a second"
+        )
+        print(
+            f"  {'':<10} {GRID.name}, {frames} frames, {WORKERS} workers: {frames * seen / WORKERS:.0f} s (goal: 180 s)"
+        )
+
+
+def turns(*works: Callable[[], object], rounds: int) -> np.ndarray:
+    """[works, 2, rounds] seconds of each work, of the processor and on the wall, in turns; after one round to warm up."""
+    return np.array([[seconds(work) for work in works] for _ in range(rounds + 1)][1:]).transpose(1, 2, 0)
+
+
+def seconds(work: Callable[[], object]) -> np.ndarray:
+    """[2] of the processor and on the wall."""
+    start = np.array([time.process_time(), time.perf_counter()])
+    work()
+    return np.array([time.process_time(), time.perf_counter()]) - start
+
+
+if __name__ == "__main__":
+    main()
