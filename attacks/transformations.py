@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from kornia.augmentation import ColorJiggle, RandomAffine, RandomPerspective
 from kornia.enhance import adjust_brightness, adjust_contrast, adjust_saturation
+from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -51,16 +52,15 @@ class Transformations:
     def __call__(self, pictures: Tensor, boxes: Tensor) -> Tensor:
         """Pictures [N, 3, H, W] transformed, in [0, 1], differentiable to those of their pixels that are in `boxes` [N, 4]."""
         shape = pictures.shape
-        reach = covered(boxes, shape)
         for warp, beyond in self.warps:
             matrices = warp.compute_transformation(pictures, warp.forward_parameters(shape), warp.flags)
             grid = sources(matrices, shape)
-            reach = grid_sample(reach, grid, padding_mode=beyond, align_corners=False)
-            places = around(reach)
+            boxes = moved(mirrored(boxes, grid) if beyond == "reflection" else boxes[:, None], matrices, shape)
+            places = around(boxes, shape)
             whole = grid_sample(pictures.detach(), grid, padding_mode=beyond, align_corners=False)
             patched = grid_sample(pictures, grid[places], padding_mode=beyond, align_corners=False)
             pictures = put(whole, places, patched)
-        places = around(reach)
+        places = around(boxes, shape)
         whole, patched = pictures.detach(), cut(pictures, places)
         if self.jiggle:
             drawn = self.jiggle.forward_parameters(shape)
@@ -71,37 +71,58 @@ class Transformations:
         return put(whole.clamp(0, 1), places, patched.clamp(0, 1))
 
 
-def covered(boxes: Tensor, shape: torch.Size) -> Tensor:
-    """[N, 1, H, W] 1 for the pixels of pictures [N, C, H, W] that boxes [N, 4] touch, else 0."""
-    rows, columns = (torch.arange(side) for side in shape[2:])
-    x0, y0, x1, y1 = boxes[:, :, None].unbind(1)
-    down, across = (rows + 1 > y0) & (rows < y1), (columns + 1 > x0) & (columns < x1)
-    return (down[:, :, None] & across[:, None]).float()[:, None]
+def mirrored(boxes: Tensor, grid: Tensor) -> Tensor:
+    """Boxes [N, B, 4] where a box [N, 4] is seen in pictures that are reflected at their borders, as far as a grid reaches."""
+    height, width = grid.shape[1:3]
+    farthest = grid[:, [0, 0, -1, -1], [0, -1, 0, -1]].abs().max()
+    times = max(0, int(((farthest - 1) / 2).ceil()))
+
+    def images(edges: Tensor, side: int) -> Tensor:
+        flipped = edges.flip(-1)
+        copies = [(n + 1) * side - flipped if n % 2 else n * side + edges for n in range(-times, times + 1)]
+        return torch.stack(copies, 1)
+
+    x, y = images(boxes[:, 0::2], width), images(boxes[:, 1::2], height)
+    return torch.stack(torch.broadcast_tensors(x[:, :, None], y[:, None]), -1).flatten(-2).flatten(1, 2)
 
 
-def around(mask: Tensor) -> Places:
-    """Rectangles of one size around what is not 0 in masks [N, 1, H, W]."""
-    rows, columns = (_span(mask.amax((1, other)) > 0) for other in (3, 2))
-    return torch.arange(len(mask))[:, None, None], rows[:, :, None], columns[:, None]
+def moved(boxes: Tensor, matrices: Tensor, shape: torch.Size) -> Tensor:
+    """Boxes [N, 4] around all pixels that take from those in boxes [N, B, 4] when homographies [N, 3, 3] move the pictures."""
+    # A pixel takes from those less than 1 beside where it comes from; a homography's coordinates are 0 in a pixel's middle.
+    wider = boxes + torch.tensor([-1.0, -1.0, 0.0, 0.0])
+    corners = wider[..., [0, 1, 2, 1, 2, 3, 0, 3]].unflatten(-1, (-1, 2))
+    seen = transform_points(matrices, corners.flatten(1, 2)).unflatten(1, corners.shape[1:3])
+    end = torch.tensor([shape[3], shape[2]])
+    low, high = seen.amin(2).floor().clamp(min=0), (seen.amax(2).ceil() + 1).minimum(end)
+    there = (low < high).all(-1, keepdim=True)
+    return torch.cat((low.where(there, end).amin(1), high.where(there, 0).amax(1)), -1)
 
 
-def _span(there: Tensor) -> Tensor:
-    """[N, k] runs of places, of one length, that hold all that is True in masks [N, L]."""
-    length = there.shape[1]
-    first, last = there.int().argmax(1), length - 1 - there.flip(1).int().argmax(1)
-    longest = int((last - first).max().clamp(min=0)) + 1
-    return first.clamp(max=length - longest)[:, None] + torch.arange(longest)
+def around(boxes: Tensor, shape: torch.Size) -> Places:
+    """Rectangles of one size, within pictures [N, 3, H, W], around boxes [N, 4]."""
+    end = torch.tensor([shape[3], shape[2]])
+    low, high = (boxes[:, :2].floor().clamp(min=0), boxes[:, 2:].ceil().minimum(end))
+    size = (high - low).amax(0).clamp(min=1)
+    columns, rows = (
+        first[:, None] + torch.arange(int(count))
+        for first, count in zip(low.minimum(end - size).long().T, size, strict=True)
+    )
+    return torch.arange(len(boxes))[:, None, None], rows[:, :, None], columns[:, None]
 
 
 def cut(pictures: Tensor, places: Places) -> Tensor:
-    """[N, C, h, w] the pixels of pictures [N, C, H, W] at places."""
-    return pictures.movedim(1, -1)[places].movedim(-1, 1)
+    """[N, 3, h, w] the pixels of pictures [N, 3, H, W] at places."""
+    return pictures[_in_every_channel(places)]
 
 
 def put(pictures: Tensor, places: Places, part: Tensor) -> Tensor:
-    """The pictures [N, C, H, W], with `part` [N, C, h, w] written into them."""
-    pictures.movedim(1, -1)[places] = part.movedim(1, -1)
-    return pictures
+    """The pictures [N, 3, H, W], with `part` [N, 3, h, w] written into them."""
+    return pictures.index_put_(_in_every_channel(places), part)
+
+
+def _in_every_channel(places: Places) -> tuple[Tensor, ...]:
+    number, rows, columns = (place[:, None] for place in places)
+    return number, torch.arange(3)[:, None, None], rows, columns
 
 
 def sources(matrices: Tensor, shape: torch.Size) -> Tensor:
@@ -134,7 +155,10 @@ def recoloured(pictures: Tensor, drawn: dict[str, Tensor]) -> Tensor:
 
 
 def turned(pictures: Tensor, turn: Tensor) -> Tensor:
-    """Pictures [N, 3, H, W] with their hue (of HSV) turned by shares of the circle [N]: kornia's adjust_hue, several times faster."""
+    """Pictures [N, 3, H, W] with their hue (of HSV) turned by shares of the circle [N].
+
+    kornia's adjust_hue without the way through HSV, which takes five times as long.
+    """
     most, least = pictures.amax(1, keepdim=True), pictures.amin(1, keepdim=True)
     chroma = most - least
     red, green, blue = pictures.split(1, 1)

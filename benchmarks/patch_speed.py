@@ -27,6 +27,7 @@ from bench.vision import Detector, Scenes
 from envs.camera.world import StopSignApproach
 
 GRID, THREAT, WORKERS = GRIDS["approach-v1"], PatchThreat(), 2
+CLOCKS = ("processor", "wall")
 
 
 def main() -> None:
@@ -67,12 +68,9 @@ def craft(detector: Detector, scenes: Scenes, rounds: int, steps: int) -> None:
     alone, whole = turns(passes, step, rounds=rounds) / steps
     whole += first[:, None]
     print(f"a step of eot: yolov3_tiny, batch {attack.batch}, windows of {attack.window} x {attack.window}, one thread")
-    for clock, name in enumerate(("processor", "wall")):
-        times = np.median(whole[clock] / alone[clock])
-        print(
-            f"  {name:<10} detector {1000 * np.median(alone[clock]):5.0f} ms   step {1000 * np.median(whole[clock]):5.0f} ms   "
-            f"{times:.2f} times (goal: 1.3)"
-        )
+    for clock, name in enumerate(CLOCKS):
+        each, times = np.median((alone[clock], whole[clock]), 1) * 1000, np.median(whole[clock] / alone[clock])
+        print(f"  {name:<9}  detector {each[0]:5.0f} ms   step {each[1]:5.0f} ms   {times:.2f} times (goal: 1.3)")
 
 
 def score(detector: Detector, world: StopSignApproach, rounds: int) -> None:
@@ -92,15 +90,14 @@ def score(detector: Detector, world: StopSignApproach, rounds: int) -> None:
     height, width = scenes().size
     frames = len(list(GRID.scenarios())) * len(every)
     print(f"scoring a texture: yolov3_tiny, batch {len(every)}, pictures of {width} x {height}, one thread")
-    for clock, name in enumerate(("processor", "wall")):
-        seen = float(np.median(looking[clock]))
+    for clock, name in enumerate(CLOCKS):
+        rendered, seen = np.median((rendering[clock], looking[clock]), 1)
         print(
-            f"  {name:<10} rendering {1000 * np.median(rendering[clock]):4.0f} ms a frame, with the detector {1000 * seen:4.0f} ms: "
+            f"  {name:<9}  rendering {rendered * 1000:4.0f} ms   with the detector {seen * 1000:4.0f} ms a frame, "
             f"{1 / seen:.1f} frames a second"
         )
-        print(
-            f"  {'':<10} {GRID.name}, {frames} frames, {WORKERS} workers: {frames * seen / WORKERS:.0f} s (goal: 180 s)"
-        )
+        whole = frames * seen / WORKERS
+        print(f"             {GRID.name}: {frames} frames, {WORKERS} workers, {whole:.0f} s (goal: 180 s)")
 
 
 def turns(*works: Callable[[], object], rounds: int) -> np.ndarray:

@@ -21,7 +21,8 @@ from bench.files import whole
 from bench.scenario import WEATHERS
 from bench.vision import Scenes
 from envs.camera import sign
-from envs.camera.frame import Box, Frame, Plate, common, filtered, noise_level, opened, within
+from envs.camera.frame import Frame, noise_level
+from envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
 
@@ -124,34 +125,34 @@ class BankScenes(Scenes):
     def windows(
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
     ) -> Tensor:
-        plates = [self._opened(number) for number in frames.tolist()]
+        numbers = frames.tolist()
         faces: dict[int, tuple[Tensor, ...]] = {}
         if patches is not None:
             painted = sign.painted(patches, share)
-            faces = {side: filtered(painted, side).unbind() for side in {plate.detail for plate in plates}}
+            faces = {side: filtered(painted, side).unbind() for side in {detail(self._plate(n).crop) for n in numbers}}
         shown = []
-        for place, (number, plate, (x, y)) in enumerate(zip(frames.tolist(), plates, corners.tolist(), strict=True)):
-            window = (x, y, x + size[1], y + size[0])
-            picture = self._noisy(number, plate.window(window), window)
+        for place, (number, (x, y)) in enumerate(zip(numbers, corners.tolist(), strict=True)):
+            plate, window = self._plate(number), (x, y, x + size[1], y + size[0])
+            picture = self._add_noise(plate.cut(window), number, window)
             patched = common(window, plate.crop, _reach(self.poses[number], share))
             if patches is not None and patched:
-                face = faces[plate.detail][place % len(patches)]
-                picture[within(patched, window)] = self._noisy(number, plate.signed(face, patched), patched)
+                signed = plate.signed(faces[detail(plate.crop)][place % len(patches)], patched)
+                picture[within(patched, window)] = self._add_noise(signed, number, patched)
             shown.append(picture)
         return torch.stack(shown)
 
     def reach(self, share: float) -> Tensor:
         return torch.tensor([_reach(pose, share) for pose in self.poses], dtype=torch.float32)
 
-    def _opened(self, number: int) -> Plate:
-        """The plate of a frame, kept for the next time: about 1.6 MB."""
+    def _plate(self, number: int) -> Plate:
+        """Of a frame, kept as long as the scenes are: about 1.6 MB."""
         if number not in self._plates:
             pose = self.poses[number]
             self._plates[number] = opened(self.frames[number], pose.camera, sign_x(pose.lanes))
         return self._plates[number]
 
-    def _noisy(self, number: int, picture: Tensor, part: Box) -> Tensor:
-        """A part of a frame's picture with the sensor's noise."""
+    def _add_noise(self, picture: Tensor, number: int, part: Box) -> Tensor:
+        """Add the sensor's noise to a part [3, h, w] of a frame's picture, in place."""
         height, width = self.size
         seed = self.poses[number].seed
         down, right = seed % GRAIN_SHIFT, seed // GRAIN_SHIFT % GRAIN_SHIFT

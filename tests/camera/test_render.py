@@ -11,7 +11,7 @@ pytest.importorskip("pyoidn", reason="the denoiser is not installed: pip install
 
 from envs.camera import sign
 from envs.camera.camera import Camera
-from envs.camera.frame import _texture_mean, filtered
+from envs.camera.plate import detail, filtered, texture_mean
 from envs.camera.street import layout, render
 from envs.camera.street.light import light
 
@@ -38,14 +38,15 @@ def test_a_composite_is_what_a_direct_render_shows(lighting: str) -> None:
     x = layout.sign_x(LANES)
     traced = render.trace(parts, lit, CAMERA, x, seed=0)
     board = ((torch.arange(8)[:, None] + torch.arange(8)) % 2).float().expand(1, 3, 8, 8)
-    face = sign.painted(board, 0.5)[0]
+    faces = sign.painted(board, 0.5)
     x0, y0, x1, y1 = traced.crop
-    mean = _texture_mean(traced.crop, filtered(face, x1 - x0), CAMERA, x).permute(1, 2, 0).numpy()
+    face = filtered(faces, detail(traced.crop))[0]
+    mean = texture_mean(traced.crop, face, sign.pixel_to_face(x, CAMERA)).permute(1, 2, 0).numpy()
     composite = traced.black[y0:y1, x0:x1] + traced.gain * mean
 
     mi = render._mitsuba()
     scene = render._scene(parts, lit, CAMERA, x)
-    texture = render._bitmap(face.permute(1, 2, 0).numpy())
+    texture = render._bitmap(faces[0].permute(1, 2, 0).numpy())
     scene["sign"] = render._shape("sign", render._face(x), {"type": "diffuse", "reflectance": texture})
     sensor = mi.load_dict(render._sensor(CAMERA, traced.crop))
     path = mi.load_dict({"type": "path", "max_depth": render.BOUNCES})
