@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import rerun as rr
 import torch
 from numpy.typing import NDArray
 
@@ -53,6 +54,11 @@ class Episode:
 
     def __len__(self) -> int:
         return len(self.steps["running"])
+
+    def timelines(self) -> list[rr.TimeColumn]:
+        """`step`, and `time` in seconds."""
+        steps = np.arange(len(self))
+        return [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=steps / STEPS_PER_SECOND)]
 
     @property
     def discrete(self) -> bool:
