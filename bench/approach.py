@@ -87,10 +87,10 @@ def score(unit: Unit, patch: Patch | None, trace: Trace | None = None) -> Column
         _check(approaches, unit.seeds, type(world).__name__)
         texels, share = patch.texels if patch else None, unit.pair.threat.budget
         seen = [look(detector, approach.scenes, texels, share) for approach in approaches]
-        for place in trace.episodes if trace else ():
-            approach = approaches[place]
-            clean = look(detector, approach.scenes, None, share) if texels is not None else None
-            trace.sightings.append(Sighting(approach, patch, share, seen[place], clean))
+        if trace:
+            for place in trace.episodes:
+                clean = look(detector, approaches[place].scenes, None, share) if texels is not None else None
+                trace.sightings.append(Sighting(approaches[place], patch, share, seen[place], clean))
     crafted = patch or Patch(texels=None)
     constant = {
         "patch": unit.crafting.fingerprint if unit.crafting else "",

@@ -174,7 +174,9 @@ class VisionOracle:
         if self._reports % self._every == 0:
             texels = (255 * self.threat.project(patch)[0]).round().to(torch.uint8)
             if self._moments and texels.shape != self._moments[0][1].shape:
-                raise UserError(f"the attack reported patches of {self._moments[0][1].shape[1]} and {texels.shape[1]} texels")
+                raise UserError(
+                    f"the attack reported patches of {self._moments[0][1].shape[1]} and {texels.shape[1]} texels"
+                )
             values = {name: float(torch.as_tensor(value).detach()) for name, value in losses.items()}
             self._moments.append((self._reports, texels, values))
         if len(self._moments) > MOMENTS:

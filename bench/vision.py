@@ -218,7 +218,7 @@ class PatchAttack(Attack):
 
         Args:
             oracle: the only door to the detector; it holds the label to hide (`label`), the query budget (`remaining`) and the
-                random generator (`generator`).
+                random generator (`generator`), and can be shown how the patch comes about (`report`).
             scenes: to craft on.
             progress: told how far it is.
         """

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.recording import about, approach, blueprint, curves, scene
+from bench.recording import about, approach, approach_blueprint, blueprint, curves, scene
 from bench.recording.columns import Columns
 from bench.recording.episode import Episode
 from bench.recording.logger import RerunLogger
@@ -42,7 +42,7 @@ def save(trace: Trace, *, features: Features, meta: Mapping[str, object], path: 
     """
     episode = Episode.of(trace, features, meta)
     with _written(path, meta, blueprint.layout(episode)) as stream:
-        columns = Columns(stream, episode.timelines())
+        columns = Columns(stream, episode.timelines)
         columns.note("about", blueprint.page(episode))
         scene.log(episode, columns)
         curves.log(episode, columns)
@@ -56,7 +56,7 @@ def save_approach(sighting: Sighting, *, meta: Mapping[str, object], path: Path)
         meta: as for `save`.
         path: as for `save`.
     """
-    with _written(path, meta, approach.layout(sighting)) as stream:
+    with _written(path, meta, approach_blueprint.layout(sighting)) as stream:
         approach.log(sighting, meta, stream)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Literal
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 import torch
 from numpy.typing import NDArray
@@ -23,10 +25,10 @@ from bench.vision import Scenes
 
 COLOURS: dict[str, Colour] = {"with_patch": SHOWN, "without_patch": MEASURED}
 LOSS_COLOURS: tuple[Colour, ...] = (SHOWN, MEASURED, EGO, GREY)
-FRAME_QUALITY, PATCH_QUALITY = 60, 90
-"""As JPEG. The frames are most of the file."""
-FAINT = 60
-"""Opacity, of 255, of what stands behind or before the bars of a chart."""
+QUALITY = 60
+"""As JPEG of the frames, which are most of the file, and of the patch as it came about."""
+FAINT = 70
+"""Opacity, of 255, of what lies over the bars of a chart."""
 ROOM = 1.5
 """Height of a chart in its highest bars; its legend is above them."""
 
@@ -38,8 +40,7 @@ def log(sighting: Sighting, meta: Mapping[str, object], stream: rr.RecordingStre
     scenes = sighting.approach.scenes
     distance = scenes.distance.double().numpy()
     centimetres = -np.rint(100 * distance).astype(np.int64)
-    timelines = {"frame": np.arange(len(scenes)), "distance_cm": centimetres}
-    columns = Columns(stream, [rr.TimeColumn(name, sequence=values) for name, values in timelines.items()])
+    columns = Columns(stream, {"frame": np.arange(len(scenes)), "distance_cm": centimetres})
     columns.note("about", approach_blueprint.page(sighting, meta))
     for name, sight in sights(sighting).items():
         texels = sighting.texels if name == "with_patch" else None
@@ -53,7 +54,7 @@ def log(sighting: Sighting, meta: Mapping[str, object], stream: rr.RecordingStre
     )
     columns.fixed("confidence/threshold", threshold)
     if sighting.texels is not None:
-        columns.fixed("patch/scored", _image(sighting.texels, PATCH_QUALITY))
+        columns.fixed("patch/scored", rr.EncodedImage(contents=_coded(sighting.texels, "png"), media_type="image/png"))
     if sighting.patch and sighting.patch.evolution:
         _evolution(sighting.patch.evolution, stream)
 
@@ -62,7 +63,7 @@ def _frames(columns: Columns, path: str, scenes: Scenes, texels: Tensor | None, 
     patches = texels.unsqueeze(0) if texels is not None else None
     with torch.no_grad():
         pictures = [scenes.render(frame, patches, share)[0] for frame in torch.arange(len(scenes)).split(1)]
-    _images(columns, path, [_jpeg(picture, FRAME_QUALITY) for picture in pictures])
+    _images(columns, path, pictures)
 
 
 def _boxes(columns: Columns, path: str, true: Tensor, sight: Sight) -> None:
@@ -84,12 +85,12 @@ def _corners(boxes: Tensor, **more: object) -> rr.ComponentColumnList:
 def _evolution(evolution: Evolution, stream: rr.RecordingStream) -> None:
     """The patch as it came about: on a timeline of its own, in a strip, and its losses as a chart."""
     steps = evolution.steps.numpy()
-    columns = Columns(stream, [rr.TimeColumn("crafting_step", sequence=steps)])
+    columns = Columns(stream, {"crafting_step": steps})
     moments = evolution.texels / 255
     columns.fixed("patch/crafted", rr.EncodedImage.from_fields(draw_order=1.0))
-    _images(columns, "patch/crafted", [_jpeg(texels, PATCH_QUALITY) for texels in moments])
+    _images(columns, "patch/crafted", moments)
     strip = torch.cat([torch.nn.functional.pad(texels, (0, GAP, 0, 0)) for texels in moments], -1)
-    columns.fixed("evolution", _image(strip, PATCH_QUALITY))
+    columns.fixed("evolution", rr.EncodedImage(contents=_coded(strip, "jpeg"), media_type="image/jpeg"))
     side = moments.shape[-1]
     middles = [[place * (side + GAP) + side / 2, side + GAP] for place in range(len(steps))]
     first = next(iter(evolution.losses.values()), None)
@@ -102,7 +103,7 @@ def _evolution(evolution: Evolution, stream: rr.RecordingStream) -> None:
 
 
 def _chart(columns: Columns, path: str, x: Array, bars: Mapping[str, tuple[Array, Colour]]) -> None:
-    """Bars side by side at each x, whatever the timeline, and where on its own timeline the viewer is."""
+    """Bars side by side at each x, whatever the timeline, and a light on those of the row that the viewer is at."""
     gap = float(np.abs(np.diff(x)).min(initial=np.inf)) if len(x) > 1 else 1.0
     width = 0.8 * gap / len(bars)
     # An abscissa is where a bar begins.
@@ -110,24 +111,30 @@ def _chart(columns: Columns, path: str, x: Array, bars: Mapping[str, tuple[Array
         left = x - 0.4 * gap + place * width
         columns.fixed(f"{path}/{name}", rr.BarChart(values, abscissa=left, widths=np.full(len(x), width), color=colour))
     top = ROOM * max(float(values.max()) for values, _ in bars.values())
-    columns.fixed(f"{path}/now", rr.BarChart(np.full(len(x), top), abscissa=x - 0.5 * gap, color=(255, 255, 255, FAINT)))
-    # Of as many bars as there are steps, all but one are without width.
-    widths = rr.components.LengthBatch(gap * np.eye(len(x)).ravel())
-    lengths = np.full(len(x), len(x))
-    columns.send(f"{path}/now", [rr.ComponentColumn(rr.BarChart.descriptor_widths(), widths, lengths=lengths)])
+    now = rr.BarChart.columns(
+        values=_tensors(np.full(len(x), top)),
+        abscissa=_tensors(x - 0.5 * gap),
+        widths=np.full(len(x), gap),
+        color=np.array([(255, 255, 255, FAINT)] * len(x), np.uint8),
+    )
+    columns.send(f"{path}/now", now)
 
 
-def _images(columns: Columns, path: str, blobs: list[bytes]) -> None:
+def _tensors(values: Array) -> pa.Array:
+    """A column of tensors of one value each."""
+    return pa.concat_arrays([rr.components.TensorDataBatch(value[None]).as_arrow_array() for value in values])
+
+
+def _images(columns: Columns, path: str, pictures: Iterable[Tensor]) -> None:
+    """A picture [3, H, W] a row."""
+    blobs = [_coded(picture, "jpeg") for picture in pictures]
     columns.send(path, rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs)))
 
 
-def _image(picture: Tensor, quality: int) -> rr.EncodedImage:
-    return rr.EncodedImage(contents=_jpeg(picture, quality), media_type="image/jpeg")
-
-
-def _jpeg(picture: Tensor, quality: int) -> bytes:
-    """Of a picture [3, H, W] sRGB in [0, 1]."""
+def _coded(picture: Tensor, form: Literal["jpeg", "png"]) -> bytes:
+    """A picture [3, H, W] sRGB in [0, 1] as a file."""
     pixels = (255 * picture).round().to(torch.uint8).permute(1, 2, 0).numpy()
-    done, blob = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if form == "jpeg" else []
+    done, blob = cv2.imencode(f".{form}", pixels[..., ::-1], quality)
     assert done
     return bytes(blob)

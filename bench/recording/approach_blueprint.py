@@ -34,7 +34,7 @@ def layout(sighting: Sighting) -> rrb.Blueprint:
     if evolution:
         side = evolution.texels.shape[-1]
         first = next(iter(evolution.losses), "")
-        name = "How the patch came about: crafting step" + (f" and {first}" if first else "")
+        name = f"How the patch came about (crafting step{': ' + first if first else ''})"
         bounds = rrb.VisualBounds2D(
             x_range=(0, len(evolution.steps) * (side + GAP) - GAP), y_range=(-0.05 * side, 1.4 * side)
         )

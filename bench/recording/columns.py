@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,13 @@ class Columns:
 
     Args:
         stream: the recording.
-        index: the timelines.
+        timelines: by name, where each row is: integers, or seconds.
     """
 
-    def __init__(self, stream: rr.RecordingStream, index: Sequence[rr.TimeColumn]) -> None:
+    def __init__(self, stream: rr.RecordingStream, timelines: Mapping[str, NDArray[np.generic]]) -> None:
         self.stream = stream
-        self.index = index
+        kinds = {name: "sequence" if values.dtype.kind == "i" else "duration" for name, values in timelines.items()}
+        self.index = [rr.TimeColumn(name, **{kinds[name]: values}) for name, values in timelines.items()]
 
     def send(self, path: str, columns: Iterable[Any]) -> None:
         """One value a step, or one list of instances a step."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import rerun as rr
 import torch
 from numpy.typing import NDArray
 
@@ -55,10 +54,11 @@ class Episode:
     def __len__(self) -> int:
         return len(self.steps["running"])
 
-    def timelines(self) -> list[rr.TimeColumn]:
+    @property
+    def timelines(self) -> dict[str, NDArray[np.generic]]:
         """`step`, and `time` in seconds."""
         steps = np.arange(len(self))
-        return [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=steps / STEPS_PER_SECOND)]
+        return {"step": steps, "time": steps / STEPS_PER_SECOND}
 
     @property
     def discrete(self) -> bool:
