@@ -15,6 +15,7 @@ from bench.scenario import Cell
 from bench.vision import Approach, CameraWorld
 from envs.camera import bank, poses
 from envs.camera.bank import BankScenes
+from envs.camera.objects import NAMES
 from envs.camera.street.layout import LOCATIONS
 
 TRAINING_WEATHERS = ("clear", "rain", "fog")
@@ -29,6 +30,8 @@ class StopSignApproach(CameraWorld):
     """
 
     locations: ClassVar[tuple[str, ...]] = tuple(place.name for place in LOCATIONS.values() if not place.training)
+
+    classes: ClassVar[tuple[str, ...]] = NAMES
 
     bank: str = ""
 
