@@ -231,6 +231,12 @@ class YOLOv5(DetectorVictim):
     def load(self, seed: int) -> YOLOv5Network:
         """The detector in the file, or that of the zoo, whatever the seed."""
         if not self.path:
+            if self.trained not in zoo.seeds(self.zoo_name()):
+                train = f"bench train victim=yolov5 victim.size={self.size} seeds={self.trained}"
+                raise UserError(
+                    f"the zoo has no {self.zoo_name()!r} of training seed {self.trained}; `{train}` makes one, "
+                    f"and victim.path=yolov5{self.size}.pt names a file of yours"
+                )
             made_by = {"victim": self._recipe()}
             return yolo.frozen(zoo.load(self.zoo_name(), self.trained, YOLOv5Network, made_by=made_by))
         weights = yolov5_file.read(Path(self.path).expanduser())

@@ -54,7 +54,7 @@ def test_weights_that_do_not_fit_are_refused_in_one_line(saved: Path) -> None:
     entry = json.loads(card.read_text())
     entry["shape"]["hidden"] = 9
     card.write_text(json.dumps(entry))
-    with pytest.raises(UserError, match="do not fit QPolicy") as error:
+    with pytest.raises(UserError, match="do not fit 'tiny'") as error:
         zoo.load("tiny", 3, QPolicy, made_by=MADE_BY)
     assert "\n" not in str(error.value)
 
