@@ -62,6 +62,8 @@ class StopSignApproach(CameraWorld):
             for pose, frame in _read(self.folder, location, cell.weather)
             if (pose.lanes, pose.density) == (cell.lanes, cell.density)
         ]
+        if not frames:
+            raise UserError(f"there are no frames of {location} with {cell} in {self.folder}; `bench render` makes them")
         scenes = BankScenes(frames, [cell.weather] * len(frames))
         return Approach(seed=seed, location=location, scenes=scenes)
 
