@@ -14,13 +14,14 @@ from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import update_bn
 
 from bench.contracts import Progress, Trained
 from bench.errors import UserError
 from bench.victims import coco, yolo, yolov5_file, zoo
 from bench.victims.detection_loss import supervised
 from bench.victims.detector_training import descend
-from bench.victims.windows import Windows
+from bench.victims.windows import Views, Windows
 from bench.vision import CameraWorld, Detector, DetectorVictim, Predictions
 
 Size = Literal["n", "s", "m", "l", "x"]
@@ -114,6 +115,8 @@ ZOOM = (0.6, 1.2)
 """Sides of a training window: how much of a picture it shows, at least and at most."""
 AWAY = 0.3
 """Share of the training windows that are anywhere in the picture, and not about the sign."""
+CALIBRATION = 40
+"""Batches that the statistics of the normalisations are taken from in the end."""
 RARE = (-5.0, -1.5)
 """Bias of objectness and of classes in a network that has learned nothing: most predictions are of nothing (Lin et al. 2017)."""
 
@@ -265,14 +268,20 @@ class YOLOv5(DetectorVictim):
             generator = torch.Generator().manual_seed(seed)
             windows = Windows(scenes, self.window, zoom=ZOOM, away=AWAY, generator=generator)
 
-            def loss(update: int) -> Tensor:
+            def drawn() -> tuple[Views, Tensor]:
                 views = windows.draw(self.batch)
                 (shown,) = windows.lit(windows.cut(views))
+                return views, shown
+
+            def loss(update: int) -> Tensor:
+                views, shown = drawn()
                 return supervised(network(shown), *windows.objects(views, network.index))
 
             trained, seconds = descend(
                 network, loss, updates=self.updates, learning_rate=self.learning_rate, progress=progress
             )
+            # The statistics of the weights on the way are not those of their mean.
+            update_bn((drawn()[1] for _ in range(CALIBRATION)), trained)
         card = {"victim": self._recipe(), "frames": len(scenes), "training_cpu_s": round(seconds)}
         return Trained(trained.eval().requires_grad_(False), card)
 

@@ -63,7 +63,9 @@ class StopSignApproach(CameraWorld):
             if (pose.lanes, pose.density) == (cell.lanes, cell.density)
         ]
         if not frames:
-            raise UserError(f"there are no frames of {location} with {cell} in {self.folder}; `bench render` makes them")
+            raise UserError(
+                f"there are no frames of {location} with {cell} in {self.folder}; `bench render` makes them"
+            )
         scenes = BankScenes(frames, [cell.weather] * len(frames))
         return Approach(seed=seed, location=location, scenes=scenes)
 
