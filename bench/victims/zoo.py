@@ -35,7 +35,7 @@ def save(
     """Write the weights and the card of a trained network, atomically, and return the path of the weights.
 
     Args:
-        network: has an attribute `shape`, the keyword arguments of its class. A detector's weights are kept in half precision.
+        network: has an attribute `shape`, the keyword arguments of its class. A detector's kernels are kept in half precision.
         card: what is worth knowing of the training; the hash of the weights and the shape are added.
         name: of the zoo entry, for instance `dqn-advtrain-skip0.3`.
         seed: training seed.
@@ -45,7 +45,7 @@ def save(
     folder.mkdir(parents=True, exist_ok=True)
     state = {key: value.contiguous() for key, value in network.state_dict().items()}
     if isinstance(network, Detector):
-        state = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
+        state = {key: value.half() if value.ndim > 1 else value for key, value in state.items()}
     blob = save_tensors(state)
     full = {"name": name, **card, "shape": network.shape, "sha256": hashlib.sha256(blob).hexdigest()}
     path = folder / f"seed{seed}.safetensors"

@@ -66,8 +66,12 @@ def test_what_is_trained_is_found_in_the_zoo(tmp_path: Path, monkeypatch: pytest
     assert told[0].startswith("loss ")
     zoo.save(made.network, made.card, name=victim.zoo_name(), seed=4)
     loaded = YOLOv5(updates=3, batch=2, window=64, trained=4).load(0)
+    rounded = {
+        name: value.half().float() if value.ndim > 1 else value for name, value in made.network.state_dict().items()
+    }
+    made.network.load_state_dict(rounded)
     pictures = torch.rand(1, 3, 64, 64)
-    torch.testing.assert_close(loaded(pictures).scores, made.network(pictures).scores, rtol=0.02, atol=1e-3)
+    torch.testing.assert_close(loaded(pictures).scores, made.network(pictures).scores, rtol=1e-3, atol=1e-4)
     with pytest.raises(UserError, match=r"was made with victim\.updates=3, not 4"):
         YOLOv5(updates=4, batch=2, window=64, trained=4).load(0)
     with pytest.raises(UserError, match="is trained already"):
