@@ -11,9 +11,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench import stopping
-from bench.patch import STOP_SIGN, Patch
+from bench.patch import Patch
 from bench.unit import Unit
-from bench.vision import Approach, Detections, Detector, Predictions, Scenes, confidence, detections, overlap
+from bench.vision import (
+    STOP_SIGN,
+    Approach,
+    Detections,
+    Detector,
+    Predictions,
+    Scenes,
+    confidence,
+    detections,
+    overlap,
+)
 
 Columns = dict[str, NDArray[np.generic]]
 

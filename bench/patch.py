@@ -12,10 +12,8 @@ from torch import Tensor
 
 from bench.contracts import Access, QueryBudgetError, ThreatModel, permit
 from bench.errors import UserError
-from bench.vision import Detector, Predictions
+from bench.vision import STOP_SIGN, Detector, Predictions
 
-STOP_SIGN = "stop sign"
-"""The class to hide, as detectors name it."""
 REFERENCE_PATCHES = ("noise_patch", "grey_patch")
 """The attacks that every other is held against, where they are installed: patches that know nothing of the detector."""
 SIDES = range(8, 513)
