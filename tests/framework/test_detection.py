@@ -20,6 +20,7 @@ from bench.tracks import names, tracks_of
 from bench.unit import Crafting
 from bench.victims import zoo
 from tests.framework.conftest import Said
+from tests.framework.distributions import install
 from tests.framework.test_cli import TOY, assert_one_line
 from tests.framework.test_runner import Silent
 
@@ -203,7 +204,14 @@ def test_a_hardened_detector_has_an_entry_a_seed(tmp_path: Path, monkeypatch: py
         train_config(["victim=toy", "defense=harden"])
 
 
-def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path, bench: Bench) -> None:
+COUNT = """
+def count(records, console):
+    console.print({track: table.num_rows for track, table in records.items()})
+"""
+
+
+def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path, plugins: Path, bench: Bench) -> None:
+    install(plugins, "counting", {"cavbench.reports": {"count": "counting:count"}}, {"counting": COUNT})
     monkey = ("workers=1", "record=0", "reference=false", f"out={tmp_path}")
     assert bench("run", *TOY, *monkey).code == 0
     made = bench("run", *SMALL.split(), *monkey)
@@ -221,6 +229,8 @@ def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path,
     assert "safe progress" in report.out
     assert "safe progress" not in one.out
     assert "patch 0.5, access gradients, 20000 queries" in one.out
+    rows = {track: table.num_rows for track, table in results.read_all(tmp_path).items()}
+    assert bench("report", "count", f"out={tmp_path}").out == f"{rows}\n"
 
 
 def test_how_a_patch_came_about_is_kept_beside_it(tmp_path: Path) -> None:
