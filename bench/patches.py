@@ -83,5 +83,5 @@ def _tensors(evolution: Evolution | None) -> dict[str, Tensor]:
 def _evolution(tensors: dict[str, Tensor]) -> Evolution | None:
     if "moments" not in tensors:
         return None
-    losses = {name.removeprefix(LOSS): values for name, values in tensors.items() if name.startswith(LOSS)}
+    losses = {name.removeprefix(LOSS): tensors[name] for name in sorted(tensors) if name.startswith(LOSS)}
     return Evolution(tensors["steps"], tensors["moments"], losses)

@@ -130,7 +130,7 @@ def test_the_page_says_when_the_sign_is_confirmed_and_where_the_car_stops(path: 
     hidden, seen = page.split("**Without a patch**")
     assert "the sign is never confirmed" in hidden
     third = f"{SCENES.distance[2]:.1f}"
-    assert f"confirmed at {third} m, the car stops at the line" in seen
+    assert f"confirmed at {third} m, the car stops in time" in seen
 
 
 def test_a_recording_opens_with_a_layout_of_its_own(path: Path) -> None:

@@ -30,7 +30,7 @@ QUALITY = 60
 FAINT = 70
 """Opacity, of 255, of what lies over the bars of a chart."""
 ROOM = 1.5
-"""Height of a chart in its highest bars; its legend is above them."""
+"""Height of a chart in heights of its highest bar; the legend is above that."""
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def log(sighting: Sighting, meta: Mapping[str, object], stream: rr.RecordingStre
         _frames(columns, name, scenes, texels, sighting.share)
         _boxes(columns, name, scenes.boxes, sight)
     bars = {name: (sight.confidence.astype(np.float64), COLOURS[name]) for name, sight in sights(sighting).items()}
-    _chart(columns, "confidence", distance, bars)
+    _chart(columns, "confidence", distance, bars, highest=1.0)
     width = float(np.ptp(distance)) + 2
     threshold = rr.BarChart(
         [stopping.THRESHOLD], abscissa=[float(distance.min()) - 1], widths=[width], color=(*GREY, FAINT)
@@ -97,12 +97,13 @@ def _evolution(evolution: Evolution, stream: rr.RecordingStream) -> None:
     labels = [str(step) if first is None else f"{step}: {first[place]:.2f}" for place, step in enumerate(steps)]
     columns.fixed("evolution/steps", rr.Points2D(middles, labels=labels, radii=0.0, colors=[GREY], show_labels=True))
     losses = {name: values.double().nan_to_num().numpy() for name, values in evolution.losses.items()}
-    bars = {name: (losses[name], LOSS_COLOURS[n % len(LOSS_COLOURS)]) for n, name in enumerate(losses)}
-    if bars:
-        _chart(columns, "losses", steps.astype(np.float64), bars)
+    if losses:
+        bars = {name: (losses[name], LOSS_COLOURS[n % len(LOSS_COLOURS)]) for n, name in enumerate(losses)}
+        highest = max((value for values in losses.values() for value in values), key=abs)
+        _chart(columns, "losses", steps.astype(np.float64), bars, highest=highest)
 
 
-def _chart(columns: Columns, path: str, x: Array, bars: Mapping[str, tuple[Array, Colour]]) -> None:
+def _chart(columns: Columns, path: str, x: Array, bars: Mapping[str, tuple[Array, Colour]], *, highest: float) -> None:
     """Bars side by side at each x, whatever the timeline, and a light on those of the row that the viewer is at."""
     gap = float(np.abs(np.diff(x)).min(initial=np.inf)) if len(x) > 1 else 1.0
     width = 0.8 * gap / len(bars)
@@ -110,9 +111,8 @@ def _chart(columns: Columns, path: str, x: Array, bars: Mapping[str, tuple[Array
     for place, (name, (values, colour)) in enumerate(bars.items()):
         left = x - 0.4 * gap + place * width
         columns.fixed(f"{path}/{name}", rr.BarChart(values, abscissa=left, widths=np.full(len(x), width), color=colour))
-    top = ROOM * max(float(values.max()) for values, _ in bars.values())
     now = rr.BarChart.columns(
-        values=_tensors(np.full(len(x), top)),
+        values=_tensors(np.full(len(x), ROOM * highest)),
         abscissa=_tensors(x - 0.5 * gap),
         widths=np.full(len(x), gap),
         color=np.array([(255, 255, 255, FAINT)] * len(x), np.uint8),

@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 from bench.approach import Sight, Sighting, measured
 from bench.recording import about
 from bench.recording.blueprint import bare
+from bench.vision import Scenes
 
 NAMES = {"with_patch": "With the patch", "without_patch": "Without a patch"}
 FPS = 2.0
@@ -60,18 +61,18 @@ def _frame(sighting: Sighting, name: str) -> rrb.View:
     (left, top), (right, bottom) = (low - margin / 2).tolist(), (high + margin / 2).tolist()
     return rrb.Spatial2DView(
         origin=name,
-        name=f"{NAMES[name]}: {outcome(sighting, name)}",
+        name=f"{NAMES[name]}: {outcome(sights(sighting)[name], sighting.approach.scenes)}",
         visual_bounds=rrb.VisualBounds2D(x_range=(left, right), y_range=(top, bottom)),
     )
 
 
-def outcome(sighting: Sighting, name: str) -> str:
+def outcome(sight: Sight, scenes: Scenes) -> str:
     """When the sign is confirmed, and where the car stops."""
-    found = measured([sights(sighting)[name]], [sighting.approach.scenes])
+    found = measured([sight], [scenes])
     confirmed, overrun = float(found["confirmed_m"][0]), float(found["overrun_m"][0])
     if not confirmed:
         return "the sign is never confirmed, the car drives on"
-    stops = f"{overrun:.1f} m beyond the line" if overrun else "at the line"
+    stops = f"{overrun:.1f} m beyond the line" if overrun else "in time"
     return f"the sign is confirmed at {confirmed:.1f} m, the car stops {stops}"
 
 
@@ -82,7 +83,7 @@ def page(sighting: Sighting, meta: Mapping[str, object]) -> str:
         found = measured([sight], [sighting.approach.scenes])
         lines += [
             f"**{NAMES[name]}**",
-            f"- {outcome(sighting, name)}",
+            f"- {outcome(sight, sighting.approach.scenes)}",
             f"- mean confidence: {float(found['confidence_mean'][0]):.2f}",
             f"- false alarms a frame: {float(found['false_alarms'][0]):.1f}",
             "",

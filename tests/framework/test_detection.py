@@ -241,8 +241,8 @@ def test_how_a_patch_came_about_is_kept_beside_it(tmp_path: Path) -> None:
     assert evolution is not None
     assert evolution.steps.tolist() == [0, 1, 2, 3]
     assert evolution.texels.shape == (4, 3, 8, 8)
-    (losses,) = evolution.losses.values()
-    assert (losses.diff() < 0).all()
+    assert list(evolution.losses) == ["brightness", "score"]
+    assert (evolution.losses["score"].diff() < 0).all()
 
 
 def test_the_first_approaches_of_each_pair_that_was_asked_for_are_recorded(
