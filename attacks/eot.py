@@ -105,7 +105,7 @@ class EOT(PatchAttack):
             with torch.no_grad():
                 patch.clamp_(0, 1)
             if step % REPORT_EVERY == 0:
-                progress(step / self.steps, f"stop sign {float(found):.2f}")
+                progress(step / self.steps, f"stop sign {found.item():.2f}")
         return patch.detach()[0]
 
     def _windows(self, pictures: Tensor, boxes: Tensor, generator: torch.Generator) -> Tensor:
