@@ -10,6 +10,7 @@ import numpy as np
 from rich.text import Text
 
 from bench.metrics import shared
+from bench.patch import REFERENCE_PATCHES
 from bench.statistics import Array, interval
 from leaderboard.approaches import NO_PATCH
 from leaderboard.text import bounds, change
@@ -54,7 +55,9 @@ def configuration_claims(source: Source, places: Mapping[str, Place]) -> Iterato
     for detector in source.detectors:
         for claim in CLAIMS:
             answers = {
-                name: _trend(_left(source, detector, claim.rows, place), claim.expected, len(claim.rows))
+                name: _trend(
+                    _left(source, detector, claim.rows, place), claim.expected, f"all {len(claim.rows)} configurations"
+                )
                 for name, place in places.items()
             }
             yield _text(detector, claim.question, answers, f"{TREND}, {'one' if claim.expected else 'two'}-sided")
@@ -69,7 +72,7 @@ def location_claims(source: Source) -> Iterator[Text]:
         yield _text(detector, question, answers, INTERVALS)
         question = "is most lost where the sun shines on the sign, least where it is behind it?"
         answers = {
-            theirs: _trend(np.array(list(by_seed.values())), "falls", len(LOCATIONS))
+            theirs: _trend(np.array(list(by_seed.values())), "falls", f"all {len(LOCATIONS)} locations")
             for theirs, by_seed in lost.items()
         }
         yield _text(detector, question, answers, f"{TREND}, one-sided")
@@ -85,10 +88,10 @@ def _text(detector: Detector, question: str, answers: Mapping[str, Text], test: 
     return text.append(f" {test}.", style="dim")
 
 
-def _trend(scores: Array, expected: Direction | None, settings: int) -> Text:
-    """The answer from scores [R, S], patch seeds x settings in order."""
+def _trend(scores: Array, expected: Direction | None, needed: str) -> Text:
+    """The answer from scores [R, S], patch seeds x settings in order; `needed` says what those are."""
     if len(scores) < ENOUGH_SEEDS:
-        return _unknown(f"all {settings} settings", len(scores))
+        return _unknown(needed, len(scores))
     found = trend(scores)
     p = found.p if expected else min(1.0, 2 * found.p)
     direction = found.direction if p < LEVEL else "does not change detectably"
@@ -99,9 +102,9 @@ def _trend(scores: Array, expected: Direction | None, settings: int) -> Text:
     return Text.assemble((verdict, "bold"), f", it {direction} (p = {p:.2g}, Spearman {found.correlation:+.2f}).")
 
 
-def _unknown(what: str, seeds: int) -> Text:
+def _unknown(needed: str, seeds: int) -> Text:
     return Text(
-        f"It cannot be said: that takes {what} with at least {ENOUGH_SEEDS} patch seeds in common, {seeds} are recorded.",
+        f"It cannot be said: that takes {needed} with at least {ENOUGH_SEEDS} patch seeds in common, {seeds} are recorded.",
         style="yellow",
     )
 
@@ -137,8 +140,9 @@ def _lost(source: Source, detector: Detector, weather: str) -> dict[int, list[fl
 
 def _below(source: Source, detector: Detector, weather: str) -> Text:
     found = [source.find(detector, STANDARD, weather, location) for location in LOCATIONS.values()]
-    beyond = [each.beyond for each in found if each and each.beyond]
-    seeds = min((len(each.pair.own.runs) for each in found if each), default=0)
+    whole = [each for each in found if each and set(REFERENCE_PATCHES) <= set(each.pair.controls)]
+    seeds = min((len(each.pair.own.runs) for each in whole), default=0)
+    beyond = [each.beyond for each in whole if each.beyond]
     if len(beyond) < len(LOCATIONS) or seeds < ENOUGH_SEEDS:
         return _unknown(f"all {len(LOCATIONS)} locations and both controls", seeds)
     below, above = sum(one.high < 0 for one in beyond), sum(one.low > 0 for one in beyond)
