@@ -96,9 +96,10 @@ class EOT(PatchAttack):
             pictures = scenes.render(frames, patch, oracle.threat.budget)
             windows = self._windows(pictures, scenes.boxes[frames], oracle.generator)
             predictions = oracle.differentiable(transform(windows).clamp(0, 1))
-            found = predictions.scores_of(oracle.label).amax(-1).mean()
+            found, variation = predictions.scores_of(oracle.label).amax(-1).mean(), total_variation(patch)
+            oracle.report(patch[0], found=found, total_variation=variation)
             adam.zero_grad()
-            (found + self.tv * total_variation(patch)).backward()
+            (found + self.tv * variation).backward()
             adam.step()
             schedule.step()
             with torch.no_grad():

@@ -18,9 +18,10 @@ from torch import Tensor
 from bench.errors import UserError
 from bench.files import whole
 from bench.scenario import WEATHERS
-from bench.vision import Scenes
+from bench.vision import Objects, Scenes
 from envs.camera import sign
 from envs.camera.frame import Frame, background, noise_level, signed
+from envs.camera.objects import objects
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
 
@@ -115,6 +116,11 @@ class BankScenes(Scenes):
         self.boxes = torch.from_numpy(np.array(boxes)).float()
         self.visible = torch.tensor([frame.visible for frame in self.frames])
         self.distance = torch.tensor([pose.distance for pose in self.poses])
+
+    def objects(self, frame: int) -> Objects:
+        found = objects(self.poses[frame])
+        boxes = np.array([box for _, box in found]).reshape(-1, 4)
+        return Objects(torch.from_numpy(boxes).float(), tuple(name for name, _ in found))
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
         faces = sign.painted(patches, share).expand(len(frames), -1, -1, -1)
