@@ -25,7 +25,7 @@ def page(meta: Mapping[str, object], outcome: Iterable[str], *, queries: str = "
         outcome: lines of Markdown.
         queries: what the threat model's queries are counted over; nothing is said of the threat model without it.
     """
-    lines = [f"### {title(meta)}", "", *outcome, ""]
+    lines = [f"### {title(meta)}", "", *outcome, "", "---", ""]
     lines += [f"- **{kind}** {_component(meta, kind)}" for kind in ("victim", "defense", "attack") if kind in meta]
     if queries and "threat_norm" in meta:
         lines.append(
