@@ -6,7 +6,7 @@ import math
 import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import pyarrow as pa
@@ -154,6 +154,20 @@ class Source:
                 return found
         self._note(detector, row)
         return None
+
+    def find_all(
+        self, detector: Detector, rows: Iterable[str], weather: str, location: str | None = None
+    ) -> dict[str, Found | None]:
+        """`find` for the rows of a table: those that are there on the approaches that all of them have, where there are any."""
+        found = {row: self.find(detector, row, weather, location) for row in rows}
+        there = [each.pair.own for each in found.values() if each]
+        cells = set.intersection(*(set(own.cells) for own in there)) if there else set()
+        seeds = set.intersection(*(set(own.seeds) for own in there)) if there else set()
+        if not (cells and seeds):
+            return found
+        return {
+            row: each and replace(each, pair=each.pair.only(cells=cells, seeds=seeds)) for row, each in found.items()
+        }
 
     def _note(self, detector: Detector, row: str) -> None:
         """Note that a row, or a control of it, is missing; controls are part of every run."""

@@ -10,6 +10,7 @@ import pyarrow as pa
 from rich.console import Console
 from rich.text import Text
 
+from bench.scenario import GRIDS
 from leaderboard.approaches import NO_PATCH
 from leaderboard.layout import Column, Section, fitted
 from leaderboard.text import ATTACKED, BLIND, CLEAN, MISSING, bounds, change, estimate, share, signed
@@ -82,20 +83,21 @@ def static_table(section: Mapping[str, Any], source: Source) -> Made:
         Column("\nlabel", lambda line: line.thesis.get("label", ""), "left", spare=5),
     ]
     lines = []
-    for row in (*CONFIGURATIONS, *CONTROLS):
+    for row, found in _found(source, (*CONFIGURATIONS, *CONTROLS), "clear").items():
         printed = section["rows"].get(row, {})
         losses = {name: as_printed(printed.get(name), 4) for name in ("max_score", "tv_loss", "total_loss")}
         surest = {
             "confidence": as_printed(printed.get("confidence"), 3),
             "label": Text(printed.get("label", ""), THESIS),
         }
-        lines.append(Line(row, _found(source, row, "clear"), losses | surest))
+        lines.append(Line(row, found, losses | surest))
     note = Text(
         "Ours is no loss: the thesis' score is on the image that the patch was crafted on, which a patch without transformations "
         "fits best and which says nothing of other views. Beside it stands the confidence that the same configuration leaves on "
         "new approaches, clear weather, all three locations."
     )
-    return columns, _with_controls(lines), [note, *configuration_claims(source, {"": ("clear", None)})]
+    sections = _with_controls(lines)
+    return columns, sections, [note, *_roads(source, sections), *configuration_claims(source, {"": ("clear", None)})]
 
 
 def configuration_table(section: Mapping[str, Any], source: Source) -> Made:
@@ -104,14 +106,13 @@ def configuration_table(section: Mapping[str, Any], source: Source) -> Made:
     for theirs, ours in WEATHERS.items():
         printed = {row: values[theirs] for row, values in section["rows"].items()}
         lines = []
-        for row in (*CONFIGURATIONS, *CONTROLS):
+        for row, found in _found(source, (*CONFIGURATIONS, *CONTROLS), ours, LOCATIONS[1]).items():
             median = as_printed(section["rows"].get(row, {}).get(f"{theirs}_median"), 3)
-            found = _found(source, row, ours, LOCATIONS[1])
             lines.append(Line(row, found, _derived(printed, row) | {"median": median}))
         sections += _with_controls(lines, theirs)
     columns = [_label(), *_confidences(), _column("median", "median", spare=4)]
     places = {theirs: (ours, LOCATIONS[1]) for theirs, ours in WEATHERS.items()}
-    return columns, sections, list(configuration_claims(source, places))
+    return columns, sections, [*_roads(source, sections), *configuration_claims(source, places)]
 
 
 def location_table(section: Mapping[str, Any], source: Source) -> Made:
@@ -120,18 +121,33 @@ def location_table(section: Mapping[str, Any], source: Source) -> Made:
     for printed in section["rows"]:
         for theirs, ours in WEATHERS.items():
             confidences = {row: printed[row][theirs] for row in (STANDARD, "noise_patch", NO_PATCH)}
-            lines = [
-                Line(row, _found(source, row, ours, LOCATIONS[printed["location"]]), _derived(confidences, row))
-                for row in (STANDARD, *CONTROLS)
-            ]
+            rows = _found(source, (STANDARD, *CONTROLS), ours, LOCATIONS[printed["location"]])
+            lines = [Line(row, found, _derived(confidences, row)) for row, found in rows.items()]
             sections.append(Section(lines, Text(f"location {printed['location']}, {theirs}", style="bold")))
     places = [f"{row['location']}, the sun {row['light']}: {LOCATIONS[row['location']]}" for row in section["rows"]]
     note = Text(f"The thesis' locations and ours: {'; '.join(places)}.")
-    return [_label(), *_confidences()], sections, [note, *location_claims(source)]
+    return [_label(), *_confidences()], sections, [note, *_roads(source, sections), *location_claims(source)]
 
 
-def _found(source: Source, row: str, weather: str, location: str | None = None) -> list[Found | None]:
-    return [source.find(detector, row, weather, location) for detector in source.detectors]
+def _found(
+    source: Source, rows: Sequence[str], weather: str, location: str | None = None
+) -> dict[str, list[Found | None]]:
+    """What stands in each row, by detector."""
+    by_detector = [source.find_all(detector, rows, weather, location) for detector in source.detectors]
+    return {row: [found[row] for found in by_detector] for row in rows}
+
+
+def _roads(source: Source, sections: Sequence[Section[Line]]) -> Iterator[Text]:
+    """On which roads the numbers of a detector are, where those are not the standard ones."""
+    standard = frozenset((cell.lanes, cell.density) for cell in GRIDS["approach-v1"].cells())
+    for place, detector in enumerate(source.detectors):
+        found = [line.found[place] for section in sections for line in section.subjects]
+        roads = {frozenset((cell.lanes, cell.density) for cell in each.pair.own.cells) for each in found if each}
+        if roads - {standard}:
+            which = [", ".join(f"{lanes} × {density:g}" for lanes, density in sorted(some)) for some in roads]
+            yield Text(
+                f"{detector.victim}: on the roads {'; or '.join(sorted(which))} only (lanes × density).", style="yellow"
+            )
 
 
 def _derived(printed: Mapping[str, float], row: str) -> dict[str, Text | str]:

@@ -179,6 +179,20 @@ def test_a_location_has_its_own_approaches_and_all_have_all() -> None:
         assert {cell.weather for cell in found.pair.own.cells} == {"rain"}
 
 
+def test_the_rows_of_a_table_are_on_the_same_approaches() -> None:
+    whole = [approach(0.9), approach(0.6, attack="noise_patch"), approach(0.7, attack="grey_patch"), patch()]
+    part = [cell for cell in run_config(["victim=yolov3_tiny"]).grid.cells() if (cell.lanes, cell.density) == (4, 1)]
+    records = pa.concat_tables([*whole, patch("tv_3", cells=part)])
+    source = Source(records, NONE)
+    found = source.find_all(source.detectors[0], (STANDARD, "tv_3", "tv_5", NO_PATCH), "rain")
+    assert found["tv_5"] is None
+    assert {each.pair.own.cells for each in found.values() if each} == {(part[1],)}
+    assert part[1].weather == "rain"
+    first, second, third = report(records).split("Table 3.")[1:]
+    assert all("yolov3_tiny: on the roads 4 × 1 only" in table for table in (first, second))
+    assert "on the roads" not in third
+
+
 def test_a_smaller_patch_is_held_against_controls_of_its_own_size() -> None:
     noise = [approach(value, attack="noise_patch", budget=budget) for budget, value in ((0.5, 0.4), (0.16, 0.8))]
     source = Source(pa.concat_tables([approach(0.9), *noise, patch(left=0.3), patch("patch_32", 0.7)]), NONE)
