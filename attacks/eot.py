@@ -109,15 +109,16 @@ class EOT(PatchAttack):
             corners = self._corners(scenes.boxes[frames], scenes.size, oracle.generator)
             windows = scenes.windows(frames, patch, oracle.threat.budget, corners, size)
             predictions = oracle.differentiable(transform(windows, reach[frames] - corners.repeat(1, 2)))
-            found = predictions.scores_of(oracle.label).amax(-1).mean()
+            found, variation = predictions.scores_of(oracle.label).amax(-1).mean(), total_variation(patch)
+            oracle.report(patch[0], found=found, total_variation=variation)
             adam.zero_grad()
-            (found + self.tv * total_variation(patch)).backward()
+            (found + self.tv * variation).backward()
             adam.step()
             schedule.step()
             with torch.no_grad():
                 patch.clamp_(0, 1)
             if step % REPORT_EVERY == 0:
-                progress(step / self.steps, f"stop sign {float(found):.2f}")
+                progress(step / self.steps, f"stop sign {found.item():.2f}")
         return patch.detach()[0]
 
     def _corners(self, boxes: Tensor, picture: tuple[int, int], generator: torch.Generator) -> Tensor:

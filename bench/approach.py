@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -11,9 +11,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench import stopping
-from bench.patch import STOP_SIGN, Patch
+from bench.patch import Patch
 from bench.unit import Unit
-from bench.vision import Approach, Detector, Predictions, Scenes, confidence, detections, overlap
+from bench.vision import (
+    STOP_SIGN,
+    Approach,
+    Detections,
+    Detector,
+    Predictions,
+    Scenes,
+    confidence,
+    detections,
+    overlap,
+)
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -23,12 +33,58 @@ NMS_IOU, SAME_IOU = 0.45, 0.3
 """Of non-maximum suppression (YOLOv5's default), and from which a detection is of the sign itself (`vision.confidence`)."""
 
 
-def score(unit: Unit, patch: Patch | None) -> Columns:
+@dataclass(frozen=True)
+class Sight:
+    """What a detector says of the F frames of an approach.
+
+    Args:
+        confidence: float32 [F] in the sign at its true place, in [0, 1]; 0 where it has no box there.
+        found: the stop signs that it detects in each frame.
+    """
+
+    confidence: NDArray[np.float32]
+    found: Sequence[Detections]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """An approach as it was scored, and as it would have been without the patch.
+
+    Args:
+        approach: what was driven up to.
+        patch: what was on the sign; None leaves it alone.
+        share: side of the patch in shares of the sign's.
+        shown: what was scored.
+        clean: the same without the patch; None where there is none.
+    """
+
+    approach: Approach
+    patch: Patch | None
+    share: float
+    shown: Sight
+    clean: Sight | None
+
+    @property
+    def texels(self) -> Tensor | None:
+        """The patch, where there is one."""
+        return self.patch.texels if self.patch else None
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A few approaches of a unit, for recordings: `sightings` has one for each of `episodes`, which count its seeds."""
+
+    episodes: Sequence[int]
+    sightings: list[Sighting] = field(default_factory=list)
+
+
+def score(unit: Unit, patch: Patch | None, trace: Trace | None = None) -> Columns:
     """Do the work of a unit and return the measurements of its approaches, [A] each.
 
     Args:
         unit: what to drive up to.
         patch: what `unit.crafting` made; None where there is none.
+        trace: filled with what was seen on its episodes.
 
     Raises:
         ValueError: if the world does not give an approach a seed, all of one number of frames, farthest first.
@@ -39,11 +95,12 @@ def score(unit: Unit, patch: Patch | None) -> Columns:
         detector = defense.load(victim, unit.training_seed)
         approaches = world.approaches(unit.cell, unit.seeds)
         _check(approaches, unit.seeds, type(world).__name__)
-        texels = patch.texels if patch else None
-        seen = [look(detector, approach.scenes, texels, unit.pair.threat.budget) for approach in approaches]
-    frames = {
-        name: np.stack([getattr(approach.scenes, name) for approach in approaches]) for name in ("distance", "visible")
-    }
+        texels, share = patch.texels if patch else None, unit.pair.threat.budget
+        seen = [look(detector, approach.scenes, texels, share) for approach in approaches]
+        if trace:
+            for place in trace.episodes:
+                clean = look(detector, approaches[place].scenes, None, share) if texels is not None else None
+                trace.sightings.append(Sighting(approaches[place], patch, share, seen[place], clean))
     crafted = patch or Patch(texels=None)
     constant = {
         "patch": unit.crafting.fingerprint if unit.crafting else "",
@@ -57,19 +114,12 @@ def score(unit: Unit, patch: Patch | None) -> Columns:
         "seed": np.array(unit.seeds, np.int64),
         "location": np.array([approach.location for approach in approaches]),
         **{name: np.array([value] * len(approaches)) for name, value in constant.items()},
-        "false_alarms": np.array([alarms.mean() for _, alarms in seen]),
-        **measure(
-            np.stack([confidences for confidences, _ in seen]).astype(np.float64),
-            frames["distance"].astype(np.float64),
-            frames["visible"].astype(np.float64),
-        ),
+        **measured(seen, [approach.scenes for approach in approaches]),
     }
 
 
-def look(
-    detector: Detector, scenes: Scenes, texels: Tensor | None, share: float
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """What the detector says of each frame [F]: its confidence in the sign, and how many stop signs it sees elsewhere.
+def look(detector: Detector, scenes: Scenes, texels: Tensor | None, share: float) -> Sight:
+    """What the detector says of each frame.
 
     Args:
         detector: the (defended) victim.
@@ -79,22 +129,38 @@ def look(
     """
     label = detector.index(STOP_SIGN)
     patches = texels.unsqueeze(0) if texels is not None else None
-    confidences, alarms = [], []
+    confidences, found = [], []
     for frames in torch.arange(len(scenes)).split(BATCH):
         predictions = detector(scenes.render(frames, patches, share))
         boxes = scenes.boxes[frames].to(predictions.boxes)
         confidences.append(confidence(predictions, label, boxes, iou=SAME_IOU))
-        alarms.append(false_alarms(predictions, label, boxes))
-    return torch.cat(confidences).numpy(), torch.cat(alarms).numpy()
+        found += found_of(predictions, label)
+    return Sight(torch.cat(confidences).numpy(), found)
 
 
-def false_alarms(predictions: Predictions, label: int, boxes: Tensor) -> Tensor:
-    """[N] detections of a class that are not of the object at `boxes` [N, 4]."""
+def found_of(predictions: Predictions, label: int) -> list[Detections]:
+    """The objects of one class that are detected in each picture."""
     only = replace(predictions, classes=predictions.classes[..., label : label + 1])
-    found = detections(only, threshold=stopping.THRESHOLD, iou=NMS_IOU)
-    return torch.tensor(
-        [int((overlap(one.boxes, box) < SAME_IOU).sum()) for one, box in zip(found, boxes, strict=True)]
-    )
+    return detections(only, threshold=stopping.THRESHOLD, iou=NMS_IOU)
+
+
+def false_alarms(found: Sequence[Detections], boxes: Tensor) -> NDArray[np.int64]:
+    """[N] detections in each picture that are not of the object at `boxes` [N, 4]."""
+    return np.array([int((overlap(one.boxes, box) < SAME_IOU).sum()) for one, box in zip(found, boxes, strict=True)])
+
+
+def measured(seen: Sequence[Sight], scenes: Sequence[Scenes]) -> Columns:
+    """What is made of what was seen on A approaches, [A] each."""
+    frames = {name: np.stack([getattr(one, name) for one in scenes]) for name in ("distance", "visible")}
+    alarms = [false_alarms(sight.found, one.boxes).mean() for sight, one in zip(seen, scenes, strict=True)]
+    return {
+        "false_alarms": np.array(alarms),
+        **measure(
+            np.stack([sight.confidence for sight in seen]).astype(np.float64),
+            frames["distance"].astype(np.float64),
+            frames["visible"].astype(np.float64),
+        ),
+    }
 
 
 def measure(confidence: stopping.Array, distance_m: stopping.Array, visible: stopping.Array) -> Columns:

@@ -18,9 +18,11 @@ from rich.text import Text
 from bench.errors import UserError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     import pyarrow as pa
+
+    from bench.contracts import Track
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -180,12 +182,8 @@ def report(words: Words = None) -> None:
     name = names[0] if names else "run"
     function = _report(name)
     out = Path(folders[0] if folders else "results").expanduser()
-    if name == "run":
-        for track in results.tracks(out):
-            function(results.read(out, track=track), Console())
-        return
-    records = results.SCHEMA.empty_table() if not folders and not out.exists() else results.read(out)
-    function(records, Console())
+    none_asked_for = name != "run" and not folders and not out.exists()
+    function({} if none_asked_for else results.read_all(out), Console())
 
 
 @app.command()
@@ -201,14 +199,16 @@ def fetch(
     cli_fetch.print_fetched(names, Console()) if names else cli_fetch.print_downloads(Console())
 
 
-def _report(name: str) -> Callable[[pa.Table, Console], None]:
+def _report(name: str) -> Callable[[Mapping[Track, pa.Table], Console], None]:
     from bench import registry
 
     return registry.resolve(registry.REPORTS, name, "report")
 
 
 def _print_report(name: str, records: pa.Table) -> None:
-    _report(name)(records, Console())
+    from bench import results
+
+    _report(name)({results.track_of(records.column_names): records}, Console())
 
 
 def main() -> None:

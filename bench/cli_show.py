@@ -60,7 +60,7 @@ def located(run: str, out: Path) -> tuple[Path, str]:
 
 def records_of(folder: Path, pair: str = "") -> list[pa.Table]:
     """The records of each track in a folder; where a pair's name begins with `pair`, those of its track alone."""
-    found = [results.read(folder, track=track) for track in results.tracks(folder)]
+    found = list(results.read_all(folder).values())
     with_it = [records for records in found if pc.any(pc.starts_with(records["pair"], pair)).as_py()]
     return with_it[:1] if pair and with_it else found
 

@@ -68,7 +68,7 @@ def _example(folder: Path, pair: str | None, records: pa.Table) -> str:
     return f"bench view {first['pair']} {where} --out {folder}"
 
 
-def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Console) -> Path | None:
+def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Console) -> Path:
     from bench.replay import find, replay
 
     records = records_of(folder, beginning)[0]

@@ -33,4 +33,11 @@ def craft(crafting: Crafting, progress: Progress) -> Patch:
     if state_digest(detector) != before:
         raise UserError("the attack changed the detector's weights")
     texels, excess = threat.project(answer) if answer is not None else (None, 0.0)
-    return Patch(texels=texels, queries=oracle.spent, gradients=oracle.backwards, seconds=seconds, excess=excess)
+    return Patch(
+        texels=texels,
+        queries=oracle.spent,
+        gradients=oracle.backwards,
+        seconds=seconds,
+        excess=excess,
+        evolution=oracle.evolution,
+    )

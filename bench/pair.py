@@ -14,7 +14,7 @@ from bench.parameters import parameters
 from bench.patch import PatchThreat
 from bench.registry import Kind
 from bench.threat import ObservationThreat
-from bench.vision import PatchAttack
+from bench.vision import DetectorVictim, PatchAttack
 
 C = TypeVar("C", Attack, Defense, Victim, World)
 
@@ -132,7 +132,8 @@ class Pair:
         attack, victim = self.attack.component, self.victim.component
         if self.track == "driving":
             return victim.learns
-        return victim.learns or self.defense.component.trains or (isinstance(attack, PatchAttack) and attack.seeded)
+        assert isinstance(victim, DetectorVictim)
+        return victim.seeded or self.defense.component.trains or (isinstance(attack, PatchAttack) and attack.seeded)
 
     @property
     def is_clean(self) -> bool:

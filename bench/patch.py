@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,16 +12,16 @@ from torch import Tensor
 
 from bench.contracts import Access, QueryBudgetError, ThreatModel, permit
 from bench.errors import UserError
-from bench.vision import Detector, Predictions
+from bench.vision import STOP_SIGN, Detector, Predictions
 
-STOP_SIGN = "stop sign"
-"""The class to hide, as detectors name it."""
 REFERENCE_PATCHES = ("noise_patch", "grey_patch")
 """The attacks that every other is held against, where they are installed: patches that know nothing of the detector."""
 SIDES = range(8, 513)
 """Texels a patch may be wide and high."""
 GREY = 0.5
 """What a texel that is no number becomes."""
+MOMENTS = 20
+"""Most that are kept of how a patch came about."""
 
 
 def check_texels(attack: str, texels: int) -> None:
@@ -74,6 +75,21 @@ class PatchThreat(ThreatModel):
 
 
 @dataclass(frozen=True)
+class Evolution:
+    """How a patch came about: K moments of its crafting, at most `MOMENTS` and evenly apart.
+
+    Args:
+        steps: int64 [K], counted from 0.
+        texels: uint8 [K, 3, P, P] sRGB.
+        losses: float32 [K] by name; NaN where the attack did not say.
+    """
+
+    steps: Tensor
+    texels: Tensor
+    losses: Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
 class Patch:
     """A crafted patch and what it cost.
 
@@ -83,6 +99,7 @@ class Patch:
         gradients: pictures whose gradient was taken.
         seconds: wall time.
         excess: how far outside [0, 1] the attack's own texels were.
+        evolution: what the attack reported while it crafted; None where it reported nothing.
     """
 
     texels: Tensor | None
@@ -90,6 +107,7 @@ class Patch:
     gradients: int = 0
     seconds: float = 0.0
     excess: float = 0.0
+    evolution: Evolution | None = None
 
     @property
     def sha256(self) -> str:
@@ -117,6 +135,8 @@ class VisionOracle:
         self.label = detector.index(STOP_SIGN)
         self.stride = detector.stride
         self.spent = self.backwards = 0
+        self._reports, self._every = 0, 1
+        self._moments: list[tuple[int, Tensor, dict[str, float]]] = []
 
     @property
     def remaining(self) -> int:
@@ -136,6 +156,43 @@ class VisionOracle:
         if asked.requires_grad:
             asked.register_hook(self._came_back)
         return self._detector(asked)
+
+    def report(self, patch: Tensor, **losses: Tensor | float) -> None:
+        """Show how far the patch is, for recordings: `oracle.report(patch, found=loss)`, once a step of the crafting.
+
+        Optional, no query, and without effect on the result. A few of the steps are kept, evenly apart.
+
+        Args:
+            patch: [3, P, P] as `PatchAttack.craft` returns it, of one size throughout.
+            losses: what the patch of this step scores, by names of the attack's choosing.
+
+        Raises:
+            UserError: if the shape is another.
+        """
+        if self._reports % self._every == 0:
+            texels = (255 * self.threat.project(patch)[0]).round().to(torch.uint8)
+            if self._moments and texels.shape != self._moments[0][1].shape:
+                raise UserError(
+                    f"the attack reported patches of {self._moments[0][1].shape[1]} and {texels.shape[1]} texels"
+                )
+            values = {name: float(torch.as_tensor(value).detach()) for name, value in losses.items()}
+            self._moments.append((self._reports, texels, values))
+        if len(self._moments) > MOMENTS:
+            self._moments, self._every = self._moments[::2], 2 * self._every
+        self._reports += 1
+
+    @property
+    def evolution(self) -> Evolution | None:
+        """What was reported; None if nothing was."""
+        if not self._moments:
+            return None
+        steps, texels, losses = zip(*self._moments, strict=True)
+        names = dict.fromkeys(name for values in losses for name in values)
+        return Evolution(
+            steps=torch.tensor(steps),
+            texels=torch.stack(texels),
+            losses={name: torch.tensor([values.get(name, torch.nan) for values in losses]) for name in names},
+        )
 
     def _came_back(self, gradient: Tensor) -> None:
         self.backwards += len(gradient)

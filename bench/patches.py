@@ -1,20 +1,25 @@
-"""Crafted patches in a results folder: a safetensors file each, whole or not there, found by the fingerprint of its crafting."""
+"""Crafted patches in a results folder: a safetensors file each, whole or not there, found by the fingerprint of its crafting.
+
+Beside the patch a file holds how it came about, if its attack reported that: `steps`, `moments` and a `loss.NAME` each.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor
 
 from bench import files
 from bench.errors import UserError
 from bench.fingerprint import canonical
-from bench.patch import Patch
+from bench.patch import Evolution, Patch
 from bench.unit import Crafting
 
 FOLDER = "patches"
+MEASURED = ("queries", "gradients", "seconds", "excess")
+LOSS = "loss."
 
 
 def path_of(out: Path, fingerprint: str) -> Path:
@@ -25,11 +30,11 @@ def path_of(out: Path, fingerprint: str) -> Path:
 def write(out: Path, crafting: Crafting, patch: Patch) -> Path:
     """Write a patch, with what made it and what it cost, and return the file; it appears whole or not at all."""
     path = path_of(out, crafting.fingerprint)
-    measured = {name: value for name, value in asdict(patch).items() if name != "texels"}
+    measured = {name: repr(getattr(patch, name)) for name in MEASURED}
     tensors = {} if patch.texels is None else {"patch": patch.texels.contiguous()}
     blob = save(
-        tensors,
-        {"made_by": canonical(crafting.origin), "sha256": patch.sha256} | {k: repr(v) for k, v in measured.items()},
+        tensors | _tensors(patch.evolution),
+        {"made_by": canonical(crafting.origin), "sha256": patch.sha256} | measured,
     )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,12 +55,14 @@ def read(out: Path, fingerprint: str) -> Patch:
     try:
         with safe_open(path, "pt") as file:
             said = file.metadata()
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             patch = Patch(
-                texels=file.get_tensor("patch") if "patch" in file.keys() else None,  # noqa: SIM118
+                texels=tensors.get("patch"),
                 queries=int(said["queries"]),
                 gradients=int(said["gradients"]),
                 seconds=float(said["seconds"]),
                 excess=float(said["excess"]),
+                evolution=_evolution(tensors),
             )
     except FileNotFoundError:
         raise UserError(f"the patch {path} is not there; the same run again crafts it") from None
@@ -64,3 +71,17 @@ def read(out: Path, fingerprint: str) -> Patch:
     if patch.sha256 != said.get("sha256"):
         raise UserError(f"the patch {path} was changed; delete it and run again to craft it anew")
     return patch
+
+
+def _tensors(evolution: Evolution | None) -> dict[str, Tensor]:
+    if evolution is None:
+        return {}
+    losses = {LOSS + name: values for name, values in evolution.losses.items()}
+    return {"steps": evolution.steps, "moments": evolution.texels} | losses
+
+
+def _evolution(tensors: dict[str, Tensor]) -> Evolution | None:
+    if "moments" not in tensors:
+        return None
+    losses = {name.removeprefix(LOSS): tensors[name] for name in sorted(tensors) if name.startswith(LOSS)}
+    return Evolution(tensors["steps"], tensors["moments"], losses)

@@ -64,6 +64,12 @@ def names(kind: Kind) -> list[str]:
     return list(entries(GROUPS[kind]))
 
 
+def on_track(kind: Kind, name: str, track: str) -> str:
+    """What a name means on a track: NAME_TRACK where there is such a component, or else the name itself."""
+    own = f"{name}_{track}"
+    return own if own in entries(GROUPS[kind]) else name
+
+
 def problem(claims: tuple[Entry, ...]) -> str:
     """What is wrong with a name as far as can be said without importing it; empty if nothing."""
     if len(claims) == 1:

@@ -15,7 +15,6 @@ import pyarrow.compute as pc
 from bench import patches, registry, results
 from bench.errors import UserError
 from bench.pair import THREATS, Chosen, Pair, choose
-from bench.rollout import Trace
 from bench.runner import measured, recording_path, save_recordings
 from bench.scenario import Cell
 from bench.unit import Unit
@@ -29,12 +28,12 @@ class Replay:
     """What a replay made.
 
     Args:
-        path: of the recording; None for the detection track, which has none yet.
+        path: of the recording.
         changed: what has changed since the record was made (code, libraries, weights), in words; empty if nothing.
         differences: the measurements that came out otherwise than in the record.
     """
 
-    path: Path | None
+    path: Path
     changed: str
     differences: tuple[str, ...]
 
@@ -76,20 +75,17 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     track = results.track_of(record)
     before = results.read(out, [record["unit"]], track=track).sort_by("seed")
     unit = _unit(record, before["seed"].to_pylist())
-    driving = track == "driving"
-    trace = Trace(episodes=[unit.seeds.index(record["seed"])]) if driving else None
     patch = patches.read(out, record["patch"]) if record.get("patch") else None
     now = unit.constants(0.0)
-    after = results.table(now, measured(unit, patch, trace), track=track)
+    measurements, trace = measured(unit, patch, [unit.seeds.index(record["seed"])])
+    after = results.table(now, measurements, track=track)
     columns = [field.name for field in results.MEASUREMENTS[track] if field.name not in BESIDE]
     differences = tuple(name for name in columns if not _equal(before[name], after[name]))
-    path = None
-    if trace:
-        save_recordings(out, unit, trace)
-        path = recording_path(out, unit, record["seed"])
+    assert trace is not None
+    save_recordings(out, unit, trace)
     origin = ("weights_sha256", "code_digest", "libraries", "machine")
     changed = ", ".join(name for name in origin if now[name] != record[name])
-    return Replay(path, changed, differences)
+    return Replay(recording_path(out, unit, record["seed"]), changed, differences)
 
 
 def _unit(record: Mapping[str, Any], seeds: list[int]) -> Unit:

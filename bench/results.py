@@ -189,6 +189,15 @@ def tracks(out: Path) -> list[Track]:
     return [track for track in TRACKS if track in found]
 
 
+def read_all(out: Path) -> dict[Track, pa.Table]:
+    """The newest records of each track that a results folder has records of.
+
+    Raises:
+        UserError: if there are no records, or if a file is truncated or foreign.
+    """
+    return {track: read(out, track=track) for track in tracks(out)}
+
+
 def read(out: Path, units: Collection[str] | None = None, *, track: Track = "driving") -> pa.Table:
     """Records of one track as a table of its schema, ordered by pair, training seed, cell and scenario seed.
 

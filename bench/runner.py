@@ -22,8 +22,7 @@ from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Protocol
 
-from bench import patches, results
-from bench.approach import score
+from bench import approach, patches, results, rollout
 from bench.config import RunConfig
 from bench.crafting import craft
 from bench.drive import drive
@@ -31,13 +30,14 @@ from bench.errors import UserError
 from bench.patch import Patch
 from bench.plan import plan
 from bench.process import settle
-from bench.rollout import Columns, Trace
+from bench.rollout import Columns
 from bench.unit import Crafting, Unit
 
 NEWS_S = 1.0
 """Seconds between two looks at how far the patches are."""
 
 Work = Unit | Crafting
+Trace = rollout.Trace | approach.Trace
 
 
 class Watcher(Protocol):
@@ -117,31 +117,34 @@ def recording_path(out: Path, unit: Unit, seed: int) -> Path:
 
 def save_recordings(out: Path, unit: Unit, trace: Trace) -> None:
     """Save a recording of each episode of a trace of the unit."""
-    from bench.recording import save
+    from bench import recording
 
     *_, world = (part.component for part in unit.parts)
     for number, episode in enumerate(trace.episodes):
-        one = {name: [step[number : number + 1] for step in steps] for name, steps in trace.steps.items()}
         seed = unit.seeds[episode]
         path = recording_path(out, unit, seed)
         path.parent.mkdir(parents=True, exist_ok=True)
-        save(
-            Trace(episodes=[episode], steps=one),
-            features=world.features,
-            meta=unit.constants(0.0) | {"seed": seed},
-            path=path,
-        )
+        meta = unit.constants(0.0) | {"seed": seed}
+        if isinstance(trace, approach.Trace):
+            recording.save_approach(trace.sightings[number], meta=meta, path=path)
+        else:
+            one = {name: [step[number : number + 1] for step in steps] for name, steps in trace.steps.items()}
+            recording.save(rollout.Trace(episodes=[episode], steps=one), features=world.features, meta=meta, path=path)
 
 
-def measured(unit: Unit, patch: Patch | None, trace: Trace | None) -> Columns:
-    """Do the work of a unit and return its measurements, [B] each.
+def measured(unit: Unit, patch: Patch | None, record: Sequence[int]) -> tuple[Columns, Trace | None]:
+    """Do the work of a unit and return its measurements, [B] each, and what recordings need.
 
     Args:
         unit: what to measure.
         patch: what `unit.crafting` made, of the detection track.
-        trace: filled with every step of its episodes, of the driving track.
+        record: episodes to trace, by their place among the unit's.
     """
-    return drive(unit, trace) if unit.pair.track == "driving" else score(unit, patch)
+    if unit.pair.track == "driving":
+        driven = rollout.Trace(episodes=record) if record else None
+        return drive(unit, driven), driven
+    seen = approach.Trace(episodes=record) if record else None
+    return approach.score(unit, patch, seen), seen
 
 
 def _tasks(config: RunConfig, missing: Mapping[str, Unit], units: Iterable[Unit]) -> Iterator[Task]:
@@ -155,7 +158,7 @@ def _tasks(config: RunConfig, missing: Mapping[str, Unit], units: Iterable[Unit]
     yield from (Task(work=craftings[key], out=config.out) for key in craftings if key in absent)
     for unit in missing.values():
         shown = first[unit.pair.id]
-        wanted = unit.pair.id in asked and unit.training_seed == shown.training_seed and unit.pair.track == "driving"
+        wanted = unit.pair.id in asked and unit.training_seed == shown.training_seed
         episodes = config.record if config.record is not None else int(unit is shown)
         after = unit.crafting.fingerprint if unit.crafting else ""
         yield Task(work=unit, record=episodes if wanted else 0, out=config.out, after=after if after in absent else "")
@@ -252,15 +255,15 @@ def _begin_work(news: SimpleQueue[tuple[str, float, str]]) -> None:
 
 def _perform(task: Task, tell: Callable[[str, float, str], None] = _tell) -> Outcome:
     start = time.perf_counter()
-    trace = Trace(episodes=range(task.record)) if task.record else None
     columns: Columns = {}
+    trace: Trace | None = None
     try:
         if isinstance(task.work, Crafting):
             patches.write(task.out, task.work, craft(task.work, partial(tell, str(task.work))))
         else:
             crafting = task.work.crafting
             patch = patches.read(task.out, crafting.fingerprint) if crafting else None
-            columns = measured(task.work, patch, trace)
+            columns, trace = measured(task.work, patch, range(task.record))
     except UserError as error:
         raise UserError(f"{task.work}: {error}") from error
     # Third-party code may fail in any way; the person at the terminal is told which component did.

@@ -48,6 +48,18 @@ class Predictions:
         return self.objectness * self.classes[..., label]
 
 
+STOP_SIGN = "stop sign"
+"""The class to hide, as detectors name it."""
+
+
+@dataclass(frozen=True)
+class Objects:
+    """What there is to find in a picture: boxes [K, 4] in pixels, and the name of the class of each."""
+
+    boxes: Tensor
+    names: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Detections:
     """The objects found in one picture, best first: boxes [M, 4] in pixels, scores [M] in [0, 1], labels int64 [M]."""
@@ -115,6 +127,10 @@ class Scenes(ABC):
     def __len__(self) -> int:
         return len(self.boxes)
 
+    def objects(self, frame: int) -> Objects:
+        """What a detector that is trained on a frame should find in it: the sign, unless a world knows more."""
+        return Objects(self.boxes[frame : frame + 1], (STOP_SIGN,))
+
     @abstractmethod
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
         """Pictures [N, 3, H, W] sRGB in [0, 1], differentiable to the patches.
@@ -166,6 +182,8 @@ class CameraWorld(World):
     track: ClassVar[Track] = "detection"
     locations: ClassVar[tuple[str, ...]]
     """Names of the places; scenario seed s is driven at `locations[s % len(locations)]`."""
+    classes: ClassVar[tuple[str, ...]] = (STOP_SIGN,)
+    """Of what there is to find in its scenes (`Scenes.objects`)."""
 
     @abstractmethod
     def training_scenes(self) -> Scenes:
@@ -194,6 +212,8 @@ class DetectorVictim(Victim):
     """A kind of detector; the fields of the dataclass are its parameters."""
 
     track: ClassVar[Track] = "detection"
+    seeded: ClassVar[bool] = False
+    """Whether `load` gives another detector for another seed; one that does not leaves the seeds of a run to the patches."""
 
     @abstractmethod
     def load(self, seed: int) -> Detector:
@@ -237,7 +257,7 @@ class PatchAttack(Attack):
 
         Args:
             oracle: the only door to the detector; it holds the label to hide (`label`), the query budget (`remaining`) and the
-                random generator (`generator`).
+                random generator (`generator`), and can be shown how the patch comes about (`report`).
             scenes: to craft on.
             progress: told how far it is.
         """

@@ -101,6 +101,8 @@ class Words:
     def chosen(self, kind: Kind) -> list[Chosen[Any]]:
         """Every component of a kind that is asked for, with every combination of its parameters' values."""
         names = self.values.get(kind) or (WORLDS[self.track] if kind == "world" else DEFAULTS[kind],)
+        if kind != "victim":
+            names = tuple(registry.on_track(kind, name, self.track) for name in names)
         known = {name: parameters(registry.load(kind, name)) for name in names}
         swept = {key.partition(".")[2]: v for key, v in self.values.items() if key.startswith(f"{kind}.")}
         for key in swept:
@@ -144,6 +146,21 @@ def configured(kind: Kind, name: str, values: Mapping[str, str]) -> Chosen[Any]:
         if key.partition(".")[0] not in owned:
             raise UserError(registry.unknown(f"parameter {kind}.{key} of {name}", key, owned))
     return choose(kind, name, **_arguments(kind, name, owned, values))
+
+
+def parameter_words(text: str) -> dict[str, str]:
+    """Parameters in one value, as `attack_params` of adversarial training has them: "steps=3 restarts=2".
+
+    Raises:
+        UserError: if a word is not of that kind.
+    """
+    found = {}
+    for word in text.split():
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise UserError(f"attack_params takes words like steps=3, got {word!r}")
+        found[name] = value
+    return found
 
 
 def _parsed(words: Sequence[str]) -> list[Override]:

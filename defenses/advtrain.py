@@ -13,7 +13,7 @@ from bench.driving import AttackInLoop, DrivingDefense, DrivingVictim, DrivingWo
 from bench.errors import UserError
 from bench.threat import Norm, ObservationThreat, Oracle
 from bench.victims import zoo
-from bench.words import configured
+from bench.words import configured, parameter_words
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ class AdversarialTraining(DrivingDefense):
         Raises:
             UserError: if the attack does not fit the victim, or `start=trained` and the zoo has no such victim.
         """
-        attack = configured("attack", self.attack, dict(_word(word) for word in self.attack_params.split())).component
+        attack = configured("attack", self.attack, parameter_words(self.attack_params)).component
         if victim.action_type not in attack.action_types:
             raise UserError(f"attack {self.attack!r} does not fit a victim with {victim.action_type} actions")
         threat = ObservationThreat(norm=self.norm, budget=self.budget)
@@ -108,10 +108,3 @@ class AdversarialTraining(DrivingDefense):
         trained = victim.train(world, seed=seed, attack=loop, progress=progress)
         made_by = {"defense": asdict(self), "attack": asdict(attack), "threat": asdict(threat)}
         return Trained(trained.network, {**trained.card, **made_by})
-
-
-def _word(word: str) -> tuple[str, str]:
-    name, equals, value = word.partition("=")
-    if not equals:
-        raise UserError(f"attack_params takes words like steps=3, got {word!r}")
-    return name, value

@@ -2,7 +2,7 @@
 
     python -m leaderboard.published RESULTS leaderboard/data/NAME.parquet
 
-publishes the newest records of a results folder.
+publishes the newest records of a results folder; a file holds one track.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ import pyarrow.parquet as pq
 from rich.console import Console
 
 from bench import results
+from bench.contracts import Track
+from bench.errors import UserError
 from bench.files import whole
-from bench.results import SCHEMA
+from bench.results import SCHEMAS, track_of
 
 
-def published() -> pa.Table:
-    """Every record in `leaderboard/data/*.parquet`, an empty table if none is shipped."""
-    tables = []
+def published(track: Track) -> pa.Table:
+    """Every record of a track in `leaderboard/data/*.parquet`, an empty table if none is shipped."""
+    schema = SCHEMAS[track]
     with as_file(files("leaderboard") / "data") as folder:
-        for path in sorted(folder.glob("*.parquet")):
-            table = pq.read_table(path)
-            tables.append(table.select(SCHEMA.names).cast(SCHEMA))
-    return pa.concat_tables(tables) if tables else SCHEMA.empty_table()
+        paths = [path for path in sorted(folder.glob("*.parquet")) if track_of(pq.read_schema(path).names) == track]
+        tables = [pq.read_table(path).select(schema.names).cast(schema) for path in paths]
+    return pa.concat_tables([schema.empty_table(), *tables])
 
 
 def publish(folder: Path, file: Path) -> int:
@@ -39,8 +40,14 @@ def publish(folder: Path, file: Path) -> int:
 
     Returns:
         How many episodes that are.
+
+    Raises:
+        UserError: if the folder has records of no track, or of several.
     """
-    records = results.read(folder)
+    found = results.read_all(folder)
+    if len(found) > 1:
+        raise UserError(f"{folder} has records of the tracks {' and '.join(found)}; what is published has one")
+    (records,) = found.values()
     with whole(file) as made:
         pq.write_table(records, made, compression="zstd", compression_level=19)
     return int(records.num_rows)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import pyarrow as pa
 from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from bench.contracts import Track
 from bench.metrics import CONTROL_PERIOD_MS, step_mean
-from bench.results import track_of
 from leaderboard.approach_tables import approach_report
 from leaderboard.cells import cell_by_cell
 from leaderboard.overview import overview, size
@@ -17,19 +19,21 @@ from leaderboard.pairs import Pair, read_pairs
 from leaderboard.text import ATTACKED, BLIND, CLEAN, MARKS, component, number, threat
 
 
-def run_report(records: pa.Table, console: Console) -> None:
+def run_report(records: Mapping[Track, pa.Table], console: Console) -> None:
     """Print what the records of a run say.
 
     Args:
-        records: of either track (`bench.results.SCHEMAS`), clean controls and references among them.
+        records: by track (`bench.results.SCHEMAS`), clean controls and references among them.
         console: where to print; readable from 100 columns on; wider ones add columns.
     """
-    if not records.num_rows:
-        console.print("No records to report.")
-        return
-    if track_of(records.column_names) == "detection":
-        approach_report(records, console)
-        return
+    if "driving" in records:
+        driving_report(records["driving"], console)
+    if "detection" in records:
+        approach_report(records["detection"], console)
+
+
+def driving_report(records: pa.Table, console: Console) -> None:
+    """Print what the records of a run of the driving track say."""
     pairs = read_pairs(records)
     console.print(Padding(Text(size(pairs), style="bold"), (1, 1)))
     console.print(Padding(overview(pairs, console), (0, 1)))

@@ -55,17 +55,18 @@ def change(found: Interval | None, *, digits: int = 2) -> Text:
     """A signed difference; dim where its interval holds 0."""
     if found is None or math.isnan(found.estimate):
         return Text(MISSING, style="dim")
-    return Text(_signed(found.estimate, digits), style="dim" if 0 in found else "bold")
+    return Text(signed(found.estimate, digits), style="dim" if 0 in found else "bold")
 
 
 def bounds(found: Interval, *, digits: int = 2) -> Text:
     """The interval of a signed difference."""
     if math.isnan(found.low):
         return Text("")
-    return Text(f"{_signed(found.low, digits)}…{_signed(found.high, digits)}".replace("0.", "."), style="dim")
+    return Text(f"{signed(found.low, digits)}…{signed(found.high, digits)}".replace("0.", "."), style="dim")
 
 
-def _signed(value: float, digits: int) -> str:
+def signed(value: float, digits: int) -> str:
+    """A difference with its sign."""
     return f"{value:+.{digits}f}".replace("-", "−")
 
 

@@ -1,4 +1,4 @@
-"""Recordings of single episodes for the rerun viewer: what was measured, what the policy was shown, what it did.
+"""Recordings of single episodes for the rerun viewer: what was there, what the victim was shown, what came of it.
 
 A recording is a view of an episode, never its record: rerun reads the files of neighbouring versions only.
 """
@@ -7,22 +7,25 @@ from __future__ import annotations
 
 import os
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import rerun as rr
+import rerun.blueprint as rrb
 
-from bench.recording import blueprint, curves, scene
+from bench.recording import about, approach, approach_blueprint, blueprint, curves, scene
 from bench.recording.columns import Columns
 from bench.recording.episode import Episode
 from bench.recording.logger import RerunLogger
 
 if TYPE_CHECKING:
+    from bench.approach import Sighting
     from bench.driving import Features
     from bench.rollout import Trace
 
-__all__ = ["RerunLogger", "save"]
+__all__ = ["RerunLogger", "save", "save_approach"]
 
 
 def save(trace: Trace, *, features: Features, meta: Mapping[str, object], path: Path) -> None:
@@ -38,16 +41,35 @@ def save(trace: Trace, *, features: Features, meta: Mapping[str, object], path: 
         ValueError: unless the trace holds exactly one episode.
     """
     episode = Episode.of(trace, features, meta)
+    with _written(path, meta, blueprint.layout(episode)) as stream:
+        columns = Columns(stream, episode.timelines)
+        columns.note("about", blueprint.page(episode))
+        scene.log(episode, columns)
+        curves.log(episode, columns)
+
+
+def save_approach(sighting: Sighting, *, meta: Mapping[str, object], path: Path) -> None:
+    """Write the recording of one approach; the file appears whole or not at all.
+
+    Args:
+        sighting: what was seen on it.
+        meta: as for `save`.
+        path: as for `save`.
+    """
+    with _written(path, meta, approach_blueprint.layout(sighting)) as stream:
+        approach.log(sighting, meta, stream)
+
+
+@contextmanager
+def _written(path: Path, meta: Mapping[str, object], layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+    """A recording that is written aside, and renamed at the end; not at all if the block raises."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     name = uuid.uuid5(uuid.NAMESPACE_URL, f"{meta.get('unit', '')}/{meta.get('seed', '')}/{path.name}")
     try:
         with rr.RecordingStream("cavbench", recording_id=name) as stream:
-            stream.save(draft, default_blueprint=blueprint.layout(episode))
-            stream.send_recording_name(blueprint.title(episode))
-            columns = Columns(stream, len(episode))
-            columns.note("about", blueprint.about(episode))
-            scene.log(episode, columns)
-            curves.log(episode, columns)
+            stream.save(draft, default_blueprint=layout)
+            stream.send_recording_name(about.title(meta))
+            yield stream
             stream.flush()
         stream.disconnect()
         os.replace(draft, path)

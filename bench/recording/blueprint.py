@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-
 import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from bench.recording import scene
+from bench.recording import about, scene
 from bench.recording.curves import group
 from bench.recording.episode import STEPS_PER_SECOND, Episode
 
@@ -26,11 +23,16 @@ def layout(episode: Episode) -> rrb.Blueprint:
         shares.append(1.4 if episode.attacked else 1.0)
     rows.append(_curves(episode))
     shares.append(5.0)
+    return bare(rrb.Vertical(*rows, row_shares=shares), timeline="time", fps=STEPS_PER_SECOND)
+
+
+def bare(views: rrb.Container, *, timeline: str, fps: float) -> rrb.Blueprint:
+    """Nothing but these views, and under them a timeline that plays."""
     return rrb.Blueprint(
-        rrb.Vertical(*rows, row_shares=shares),
+        views,
         rrb.BlueprintPanel(state=rrb.PanelState.Hidden),
         rrb.SelectionPanel(state=rrb.PanelState.Hidden),
-        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline="time", fps=STEPS_PER_SECOND),
+        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=timeline, fps=fps),
         auto_views=False,
         auto_layout=False,
     )
@@ -54,7 +56,7 @@ def _decision(episode: Episode) -> str:
 
 def _curves(episode: Episode) -> rrb.Container:
     """Three columns of curves, and the page that says what they are of."""
-    about = rrb.TextDocumentView(origin="about", name="About")
+    words = rrb.TextDocumentView(origin="about", name="About")
     shown = _scores(episode, "scores/shown", " as shown to the policy" if episode.attacked else "")
     drive = rrb.Tabs(
         _plot("worth", "Reward", 0.0, 1.0),
@@ -62,7 +64,7 @@ def _curves(episode: Episode) -> rrb.Container:
         _plot("ttc", "TTC", 0.0, 20.0),
     )
     if not episode.attacked:
-        return rrb.Horizontal(drive, shown, about)
+        return rrb.Horizontal(drive, shown, words)
     moved = []
     for path in dict.fromkeys(group(unit) for unit in episode.features.units):
         own = [
@@ -75,7 +77,7 @@ def _curves(episode: Episode) -> rrb.Container:
     queries = _plot("queries", "Queries", 0.0, _top(episode.steps["queries"]))
     measured = _scores(episode, "scores/measured", " as measured", legend=False)
     curves = rrb.Grid(*moved, shown, drive, queries, measured, grid_columns=3)
-    return rrb.Horizontal(curves, about, column_shares=[4, 1])
+    return rrb.Horizontal(curves, words, column_shares=[4, 1])
 
 
 def _scores(episode: Episode, path: str, of: str, *, legend: bool = True) -> rrb.View:
@@ -103,33 +105,10 @@ def _plot(path: str, name: str, low: float, high: float, *, legend: bool = True)
     )
 
 
-def title(episode: Episode) -> str:
-    """One line: who drives, under which attack, where."""
-    meta = episode.meta
-    words = [str(meta.get("victim", "policy"))]
-    if meta.get("defense", "none") != "none":
-        words.append(f"+ {meta['defense']}")
-    words.append("without attack" if meta.get("attack", "none") == "none" else f"under {meta['attack']}")
-    if "lanes" in meta:
-        words.append(f"· {meta['lanes']} lanes × {float(str(meta['density'])):g}, {meta['weather']}")
-    return " ".join(words) + (f" · seed {meta['seed']}" if "seed" in meta else "")
-
-
-def about(episode: Episode) -> str:
-    """A page: components with their parameters, threat model, scenario, and what came of it."""
-    meta, steps = episode.meta, episode.steps
-    lines = [f"### {title(episode)}", ""]
-    kinds = [kind for kind in ("victim", "defense", "attack") if kind in meta]
-    lines += [f"- **{kind}** {meta[kind]} {_parameters(meta, kind)}" for kind in kinds]
-    if episode.attacked and "threat_norm" in meta:
-        lines.append(
-            f"- **threat model** {meta['threat_norm']} {meta['threat_budget']}, access {meta.get('threat_access', '?')}, "
-            f"at most {meta.get('threat_queries', '?')} queries a step"
-        )
-    if "training_seed" in meta:
-        lines.append(f"- **training seed** {meta['training_seed']}")
-    seconds = len(episode) / STEPS_PER_SECOND
-    lines += ["", f"**{episode.end}** after {len(episode)} steps ({seconds:.1f} s)"]
+def page(episode: Episode) -> str:
+    """What came of the episode, and who drove it under what."""
+    steps = episode.steps
+    lines = [f"**{episode.end}** after {len(episode)} steps ({len(episode) / STEPS_PER_SECOND:.1f} s)"]
     clean, taken = episode.choices
     if episode.discrete and episode.attacked:
         lines.append(f"- decisions changed: {100 * float((clean != taken).mean()):.0f} %")
@@ -137,9 +116,4 @@ def about(episode: Episode) -> str:
     lines.append(f"- return: {float(steps['reward'].sum()):.1f}")
     if episode.attacked:
         lines.append(f"- queries a step: {float(steps['queries'].mean()):.0f}")
-    return "\n".join(lines)
-
-
-def _parameters(meta: Mapping[str, object], kind: str) -> str:
-    found = json.loads(str(meta.get(f"{kind}_params") or "{}"))
-    return " ".join(f"`{name}={value}`" for name, value in found.items())
+    return about.page(episode.meta, lines, queries="a step" if episode.attacked else "")

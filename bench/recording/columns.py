@@ -1,31 +1,29 @@
-"""Whole columns at once to a rerun recording: one block an entity, over the timelines `step` and `time`."""
+"""Whole columns at once to a rerun recording: one block an entity, over timelines of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from bench.recording.episode import STEPS_PER_SECOND
-
 Colour = tuple[int, int, int]
 
 
 class Columns:
-    """Sends the columns of one episode.
+    """Sends columns of one length.
 
     Args:
         stream: the recording.
-        length: steps of the episode.
+        timelines: by name, where each row is: integers, or seconds.
     """
 
-    def __init__(self, stream: rr.RecordingStream, length: int) -> None:
+    def __init__(self, stream: rr.RecordingStream, timelines: Mapping[str, NDArray[np.generic]]) -> None:
         self.stream = stream
-        steps = np.arange(length)
-        self.index = [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=steps / STEPS_PER_SECOND)]
+        kinds = {name: "sequence" if values.dtype.kind == "i" else "duration" for name, values in timelines.items()}
+        self.index = [rr.TimeColumn(name, **{kinds[name]: values}) for name, values in timelines.items()]
 
     def send(self, path: str, columns: Iterable[Any]) -> None:
         """One value a step, or one list of instances a step."""

@@ -55,6 +55,12 @@ class Episode:
         return len(self.steps["running"])
 
     @property
+    def timelines(self) -> dict[str, NDArray[np.generic]]:
+        """`step`, and `time` in seconds."""
+        steps = np.arange(len(self))
+        return {"step": steps, "time": steps / STEPS_PER_SECOND}
+
+    @property
     def discrete(self) -> bool:
         """Whether the actions are lane-changing decisions, not accelerations and steering angles."""
         return bool(self.steps["action"].ndim == 1)

@@ -1,22 +1,28 @@
 """YOLOv5 in its sizes n to x (architecture of release 6.0 and later) as a plain graph, written from its published layer table.
 
-The weights that were published are AGPL-3.0 and not ours to hand on: a user's own file is read (`bench.victims.yolov5_file`).
+The weights that were published are AGPL-3.0 and not ours to hand on: a user's own file is read (`bench.victims.yolov5_file`), and
+one that is trained here is in the zoo.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from textwrap import shorten
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import update_bn
 
+from bench.contracts import Progress, Trained
 from bench.errors import UserError
-from bench.victims import coco, yolo, yolov5_file
-from bench.vision import Detector, DetectorVictim, Predictions
+from bench.victims import coco, yolo, yolov5_file, zoo
+from bench.victims.detection_loss import supervised
+from bench.victims.detector_training import descend
+from bench.victims.windows import Views, Windows
+from bench.vision import CameraWorld, Detector, DetectorVictim, Predictions
 
 Size = Literal["n", "s", "m", "l", "x"]
 MULTIPLES: dict[Size, tuple[float, float]] = {
@@ -105,6 +111,16 @@ def _place(raw: Tensor, cell: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
     return doubled[..., :2] - 0.5 + cell, doubled[..., 2:].square() * anchor
 
 
+ZOOM = (0.6, 1.2)
+"""Sides of a training window: how much of a picture it shows, at least and at most."""
+AWAY = 0.3
+"""Share of the training windows that are anywhere in the picture, and not about the sign."""
+CALIBRATION = 40
+"""Batches that the statistics of the normalisations are taken from in the end."""
+RARE = (-5.0, -1.5)
+"""Bias of objectness and of classes in a network that has learned nothing: most predictions are of nothing (Lin et al. 2017)."""
+
+
 class YOLOv5Network(Detector):
     """The graph. Layers are numbered as in the published table, so that its state dict has the names of the originals.
 
@@ -145,6 +161,15 @@ class YOLOv5Network(Detector):
         }
         self.model = nn.ModuleDict({str(number): layer for number, layer in layers.items()})
 
+    def expect_little(self) -> None:
+        """Make a network that has learned nothing say that there is next to nothing."""
+        detect = self.model["24"]
+        assert isinstance(detect, Detect)
+        for head in detect.m:
+            assert isinstance(head.bias, Tensor)
+            biases = head.bias.data.unflatten(0, (-1, 5 + len(self.names)))
+            biases[:, 4], biases[:, 5:] = RARE
+
     def predict(self, pictures: Tensor) -> Predictions:
         fine = self._through(pictures, 0, 1, 2, 3, 4)
         middle = self._through(fine, 5, 6)
@@ -170,23 +195,53 @@ def _doubled(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class YOLOv5(DetectorVictim):
-    """YOLOv5 in one of its sizes, with the weights of a file of yours.
+    """YOLOv5 in one of its sizes: trained on the camera world's training places, or with the weights of a file of yours.
 
     Args:
-        size: n, s, m, l or x: 1.9, 7.2, 21, 47 and 87 million parameters.
-        path: a `yolov5*.pt` of release 6.0 or later, or a .safetensors of ours.
+        size: n, s, m, l or x: 1.9, 7.2, 21, 47 and 87 million parameters. The n ships trained.
+        path: a `yolov5*.pt` of release 6.0 or later, or a .safetensors of ours; empty for the one of the zoo.
+        trained: which of the zoo's, by its training seed; the seeds of a run are those of the patches.
+        updates: of the weights, when it is trained.
+        batch: windows an update.
+        window: their side in pixels, a multiple of 32.
+        learning_rate: of AdamW, the highest.
     """
+
+    learns: ClassVar[bool] = True
 
     size: Size = "n"
     path: str = ""
+    trained: int = 0
+    updates: int = 1200
+    batch: int = 12
+    window: int = 320
+    learning_rate: float = 2e-3
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"yolov5.{name} must be at least 1, got {getattr(self, name)}")
+        if self.window < STRIDES[-1] or self.window % STRIDES[-1]:
+            raise ValueError(f"yolov5.window must be a multiple of {STRIDES[-1]}, got {self.window}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"yolov5.learning_rate must be above 0, got {self.learning_rate}")
+        if self.trained < 0:
+            raise ValueError(f"yolov5.trained must be at least 0, got {self.trained}")
 
     def zoo_name(self) -> str:
         return f"yolov5{self.size}"
 
     def load(self, seed: int) -> YOLOv5Network:
-        """The detector in the file, whatever the seed."""
+        """The detector in the file, or that of the zoo, whatever the seed."""
         if not self.path:
-            raise UserError(f"yolov5 comes without weights; victim.path=yolov5{self.size}.pt names a file of yours")
+            if self.trained not in zoo.seeds(self.zoo_name()):
+                train = f"bench train victim=yolov5 victim.size={self.size} seeds={self.trained}"
+                raise UserError(
+                    f"the zoo has no {self.zoo_name()!r} of training seed {self.trained}; `{train}` makes one, "
+                    f"and victim.path=yolov5{self.size}.pt names a file of yours"
+                )
+            made_by = {"victim": self._recipe()}
+            return yolo.frozen(zoo.load(self.zoo_name(), self.trained, YOLOv5Network, made_by=made_by))
         weights = yolov5_file.read(Path(self.path).expanduser())
         network = YOLOv5Network(self.size, weights.names)
         try:
@@ -196,3 +251,40 @@ class YOLOv5(DetectorVictim):
             raise UserError(f"{self.path} does not hold a YOLOv5{self.size} (victim.size): {reason}") from None
         network.weights_sha256 = weights.sha256
         return yolo.frozen(network)
+
+    def train(self, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
+        """Train a detector from nothing on windows of the training scenes, with all that there is to find in them.
+
+        Raises:
+            UserError: if there is a file: that is trained already.
+        """
+        if self.path:
+            raise UserError("victim.path names a detector that is trained already; leave it out to train one")
+        scenes = world.training_scenes()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            network = YOLOv5Network(self.size, world.classes).train()
+            network.expect_little()
+            generator = torch.Generator().manual_seed(seed)
+            windows = Windows(scenes, self.window, zoom=ZOOM, away=AWAY, generator=generator)
+
+            def drawn() -> tuple[Views, Tensor]:
+                views = windows.draw(self.batch)
+                (shown,) = windows.lit(windows.cut(views))
+                return views, shown
+
+            def loss(update: int) -> Tensor:
+                views, shown = drawn()
+                return supervised(network(shown), *windows.objects(views, network.index))
+
+            trained, seconds = descend(
+                network, loss, updates=self.updates, learning_rate=self.learning_rate, progress=progress
+            )
+            # The statistics of the weights on the way are not those of their mean.
+            update_bn((drawn()[1] for _ in range(CALIBRATION)), trained)
+        card = {"victim": self._recipe(), "frames": len(scenes), "training_cpu_s": round(seconds)}
+        return Trained(trained.eval().requires_grad_(False), card)
+
+    def _recipe(self) -> dict[str, object]:
+        """Its parameters but those that choose among what is trained."""
+        return {name: value for name, value in asdict(self).items() if name not in ("path", "trained")}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +19,7 @@ from bench.errors import UserError
 from bench.files import whole
 from bench.vision import Detector
 
-Network = TypeVar("Network", Policy, Detector)
+Network = TypeVar("Network", bound=Policy | Detector)
 
 SHIPPED = Path(__file__).parent / "policies"
 
@@ -35,7 +35,7 @@ def save(
     """Write the weights and the card of a trained network, atomically, and return the path of the weights.
 
     Args:
-        network: has an attribute `shape`, the keyword arguments of its class.
+        network: has an attribute `shape`, the keyword arguments of its class. A detector's kernels are kept in half precision.
         card: what is worth knowing of the training; the hash of the weights and the shape are added.
         name: of the zoo entry, for instance `dqn-advtrain-skip0.3`.
         seed: training seed.
@@ -43,7 +43,10 @@ def save(
     """
     folder = (root or own()) / name
     folder.mkdir(parents=True, exist_ok=True)
-    blob = save_tensors({key: value.contiguous() for key, value in network.state_dict().items()})
+    state = {key: value.contiguous() for key, value in network.state_dict().items()}
+    if isinstance(network, Detector):
+        state = {key: value.half() if value.ndim > 1 else value for key, value in state.items()}
+    blob = save_tensors(state)
     full = {"name": name, **card, "shape": network.shape, "sha256": hashlib.sha256(blob).hexdigest()}
     path = folder / f"seed{seed}.safetensors"
     with whole(path) as file:
@@ -66,13 +69,15 @@ def card(name: str, seed: int) -> dict[str, Any]:
         raise UserError(f"the card {path} cannot be read: {error}") from None
 
 
-def load(name: str, seed: int, kind: type[Network], *, made_by: Mapping[str, Mapping[str, object]]) -> Network:
+def load(
+    name: str, seed: int, build: Callable[..., Network], *, made_by: Mapping[str, Mapping[str, object]]
+) -> Network:
     """The network of a zoo entry, frozen and in eval mode.
 
     Args:
         name: of the entry.
         seed: training seed.
-        kind: class of the network; built from the card's `shape`.
+        build: makes the network that is filled with the weights, of the card's `shape`; its class, for instance.
         made_by: the parameters the card must have been made with, by component: what was asked for is what is loaded.
 
     Raises:
@@ -96,13 +101,14 @@ def load(name: str, seed: int, kind: type[Network], *, made_by: Mapping[str, Map
             "the file was changed; restore it or train it again"
         )
     try:
-        network = kind(**entry["shape"])
+        network: Network = build(**entry["shape"])
         network.load_state_dict(load_tensors(blob))
     except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
         reason = str(error).splitlines()[0]
-        raise UserError(f"the weights {path} do not fit {kind.__name__}: {reason}") from None
+        raise UserError(f"the weights {path} do not fit {name!r}: {reason}") from None
     network.weights_sha256 = found
-    return network.requires_grad_(False).eval()
+    network.requires_grad_(False).eval()
+    return network
 
 
 def seeds(name: str) -> list[int]:
@@ -117,5 +123,5 @@ def _find(name: str, seed: int) -> Path:
         if path.exists():
             return path
     known = seeds(name)
-    have = f"it has seeds {', '.join(map(str, known))}" if known else "it has no such policy"
+    have = f"it has seeds {', '.join(map(str, known))}" if known else "it has no such entry"
     raise UserError(f"the zoo has no {name!r} of training seed {seed} ({have}); `bench train` makes one")

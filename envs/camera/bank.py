@@ -19,9 +19,10 @@ from torch import Tensor
 from bench.errors import UserError
 from bench.files import whole
 from bench.scenario import WEATHERS
-from bench.vision import Scenes
+from bench.vision import Objects, Scenes
 from envs.camera import sign
 from envs.camera.frame import Frame, noise_level
+from envs.camera.objects import objects
 from envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
@@ -118,6 +119,11 @@ class BankScenes(Scenes):
         self.visible = torch.tensor([frame.visible for frame in self.frames])
         self.distance = torch.tensor([pose.distance for pose in self.poses])
         self._plates: dict[int, Plate] = {}
+
+    def objects(self, frame: int) -> Objects:
+        found = objects(self.poses[frame])
+        boxes = np.array([box for _, box in found]).reshape(-1, 4)
+        return Objects(torch.from_numpy(boxes).float(), tuple(name for name, _ in found))
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
         return self.windows(frames, patches, share, torch.zeros(len(frames), 2, dtype=torch.int64), self.size)

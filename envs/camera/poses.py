@@ -17,6 +17,8 @@ from envs.camera.street.light import Lighting
 LANES, DENSITIES = (3, 4, 5), (1.0, 2.0)
 TRAINING_VIEWS = 12
 """Of each training place under each lighting."""
+TRAINING_LIGHTINGS: tuple[Lighting, ...] = ("sun", "overcast")
+"""Those of the weathers of the standard grid."""
 LEAST_VISIBLE = 0.6
 """Share of the sign that a training view shows, about."""
 
@@ -88,9 +90,9 @@ def scored() -> tuple[Pose, ...]:
 def training() -> tuple[Pose, ...]:
     """Views of the training places, at random distances and a little off the lane's middle and direction."""
     poses: list[Pose] = []
-    for lighting in get_args(Lighting):
+    for number, lighting in enumerate(TRAINING_LIGHTINGS):
         for location in LOCATIONS.values():
-            rng = np.random.default_rng([location.seed, get_args(Lighting).index(lighting)])
+            rng = np.random.default_rng([location.seed, number])
             wanted = len(poses) + TRAINING_VIEWS * location.training
             while len(poses) < wanted:
                 pose = Pose(

@@ -15,6 +15,7 @@ from bench.scenario import Cell
 from bench.vision import Approach, CameraWorld
 from envs.camera import bank, poses
 from envs.camera.bank import BankScenes
+from envs.camera.objects import NAMES
 from envs.camera.street.layout import LOCATIONS
 
 TRAINING_WEATHERS = ("clear", "rain", "fog")
@@ -29,6 +30,8 @@ class StopSignApproach(CameraWorld):
     """
 
     locations: ClassVar[tuple[str, ...]] = tuple(place.name for place in LOCATIONS.values() if not place.training)
+
+    classes: ClassVar[tuple[str, ...]] = NAMES
 
     bank: str = ""
 
@@ -59,6 +62,10 @@ class StopSignApproach(CameraWorld):
             for pose, frame in _read(self.folder, location, cell.weather)
             if (pose.lanes, pose.density) == (cell.lanes, cell.density)
         ]
+        if not frames:
+            raise UserError(
+                f"there are no frames of {location} with {cell} in {self.folder}; `bench render` makes them"
+            )
         scenes = BankScenes(frames, [cell.weather] * len(frames))
         return Approach(seed=seed, location=location, scenes=scenes)
 

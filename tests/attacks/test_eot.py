@@ -59,6 +59,18 @@ def test_a_seed_is_a_patch() -> None:
     assert not torch.equal(first, other)
 
 
+def test_what_it_reports_is_its_losses_and_changes_no_patch(monkeypatch: pytest.MonkeyPatch) -> None:
+    attack = EOT(texels=8, steps=6, batch=2, window=32)
+    patch, oracle = crafted(attack)
+    reported = oracle.evolution
+    assert reported is not None
+    assert set(reported.losses) == {"found", "total_variation"}
+    variation = torch.stack([total_variation(texels / 255) for texels in reported.texels])
+    assert torch.allclose(reported.losses["total_variation"], variation, atol=0.01)
+    monkeypatch.setattr(VisionOracle, "report", lambda *_, **__: None)
+    assert torch.equal(crafted(attack)[0], patch)
+
+
 def test_it_stops_where_the_queries_end() -> None:
     _, oracle = crafted(EOT(texels=8, steps=100, batch=8, window=32), queries=30)
     assert oracle.spent == 24

@@ -11,6 +11,7 @@ import pytest
 from safetensors import safe_open
 
 from bench import patches, plan, results, runner
+from bench.cli_show import recordings
 from bench.config import RunConfig, run_config, train_config
 from bench.errors import UserError
 from bench.replay import find, replay
@@ -19,6 +20,7 @@ from bench.tracks import names, tracks_of
 from bench.unit import Crafting
 from bench.victims import zoo
 from tests.framework.conftest import Said
+from tests.framework.distributions import install
 from tests.framework.test_cli import TOY, assert_one_line
 from tests.framework.test_runner import Silent
 
@@ -34,7 +36,7 @@ def read(line: str) -> RunConfig:
 
 
 def run(out: Path, *more: str, watcher: Silent | None = None) -> tuple[pa.Table, Silent]:
-    words = dict(word.split("=", 1) for word in [*SMALL.split(), "workers=1", f"out={out}", *more])
+    words = dict(word.split("=", 1) for word in [*SMALL.split(), "workers=1", f"out={out}", "record=0", *more])
     watcher = watcher or Silent()
     units = runner.run(run_config([f"{key}={value}" for key, value in words.items()]), watcher)
     return results.read(out, units, track="detection"), watcher
@@ -202,7 +204,14 @@ def test_a_hardened_detector_has_an_entry_a_seed(tmp_path: Path, monkeypatch: py
         train_config(["victim=toy", "defense=harden"])
 
 
-def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path, bench: Bench) -> None:
+COUNT = """
+def count(records, console):
+    console.print({track: table.num_rows for track, table in records.items()})
+"""
+
+
+def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path, plugins: Path, bench: Bench) -> None:
+    install(plugins, "counting", {"cavbench.reports": {"count": "counting:count"}}, {"counting": COUNT})
     monkey = ("workers=1", "record=0", "reference=false", f"out={tmp_path}")
     assert bench("run", *TOY, *monkey).code == 0
     made = bench("run", *SMALL.split(), *monkey)
@@ -220,15 +229,48 @@ def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path,
     assert "safe progress" in report.out
     assert "safe progress" not in one.out
     assert "patch 0.5, access gradients, 20000 queries" in one.out
+    rows = {track: table.num_rows for track, table in results.read_all(tmp_path).items()}
+    assert bench("report", "count", f"out={tmp_path}").out == f"{rows}\n"
 
 
-def test_a_replay_measures_what_the_record_says(tmp_path: Path, bench: Bench) -> None:
+def test_how_a_patch_came_about_is_kept_beside_it(tmp_path: Path) -> None:
+    records, _ = run(tmp_path, "weather=clear", "seeds=0", "attack=paint,blank")
+    kept = {name: patches.read(tmp_path, find(records, {"attack": name})["patch"]) for name in ("paint", "blank")}
+    assert kept["blank"].evolution is None
+    evolution = kept["paint"].evolution
+    assert evolution is not None
+    assert evolution.steps.tolist() == [0, 1, 2, 3]
+    assert evolution.texels.shape == (4, 3, 8, 8)
+    assert list(evolution.losses) == ["brightness", "score"]
+    assert (evolution.losses["score"].diff() < 0).all()
+
+
+def test_the_first_approaches_of_each_pair_that_was_asked_for_are_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench
+) -> None:
+    monkeypatch.setattr(plan, "REFERENCE_PATCHES", ("blank",))
+    said = bench("run", *SMALL.split(), "workers=1", f"out={tmp_path}")
+    assert said.code == 0, said.err
+    assert "was not recorded" not in said.err
+    (path,) = recordings(tmp_path, None)
+    assert path.parent.name.startswith("paint-none-red-")
+    assert path.name == "3-lanes-density-1-clear-1000000.rrd"
+    assert f"bench view {path}" in bench("show", str(tmp_path)).out
+    run(tmp_path / "two", "attack=none", "record=2")
+    names = {path.name.removeprefix("3-lanes-density-1-") for path in recordings(tmp_path / "two", None)}
+    assert names == {f"{weather}-{seed}.rrd" for weather in ("clear", "fog") for seed in (1_000_000, 1_000_001)}
+
+
+def test_a_replay_measures_what_the_record_says_and_records_it(tmp_path: Path, bench: Bench) -> None:
     records, _ = run(tmp_path)
     record = find(records, {"attack": "paint", "location": "back"})
-    assert replay(tmp_path, record).differences == ()
-    said = bench("view", "paint", "weather=fog", "--out", str(tmp_path))
+    again = replay(tmp_path, record)
+    assert again.differences == ()
+    assert recordings(tmp_path, None) == [again.path]
+    said = bench("view", "paint", "weather=fog", "seed=1000001", "--out", str(tmp_path))
     assert said.code == 0, said.err
     assert "Replayed bit for bit" in said.out
+    assert "3-lanes-density-1-fog-1000001.rrd" in said.out.replace("\n", "")
     path = patches.path_of(tmp_path, record["patch"])
     path.write_bytes(path.read_bytes()[:-4])
     assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"the patch {path} is truncated")

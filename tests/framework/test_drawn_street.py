@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
@@ -14,6 +15,8 @@ from bench.replay import find, replay
 from bench.victims.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
+from tests.test_recording import read
+from tests.test_recording_approach import bars
 
 WORDS = ("victim=yolov3_tiny", "world=drawn", "lanes=3", "density=1", "episodes=2", "seeds=0")
 
@@ -42,4 +45,8 @@ def test_a_patch_hides_a_sign_from_yolo_and_fog_alone_does_less(
     assert mean(records, "paint", "clear") < 0.5 * mean(records, "none", "clear")
     assert mean(records, "paint", "clear") < mean(records, "blank", "clear")
     assert set(records["weights_sha256"].to_pylist()) == {records["weights_sha256"][0].as_py()}
-    assert replay(tmp_path, find(records, {"attack": "paint", "weather": "fog"})).differences == ()
+    record = find(records, {"attack": "paint", "weather": "fog"})
+    again = replay(tmp_path, record)
+    assert again.differences == ()
+    confidence = bars(read(again.path)["/confidence/with_patch"])
+    np.testing.assert_allclose(confidence, record["frame_confidence"])

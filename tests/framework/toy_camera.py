@@ -139,6 +139,7 @@ class Paint(PatchAttack):
             patch.requires_grad_(True)
             seen = oracle.differentiable(scenes.render(frames, patch, oracle.threat.budget))
             loss = seen.scores[..., oracle.label].mean()
+            oracle.report(patch[0], score=loss, brightness=patch.mean())
             (gradient,) = torch.autograd.grad(loss, patch)
             patch = (patch - 0.2 * gradient.sign()).detach().clamp(0, 1)
             time.sleep(self.pause)

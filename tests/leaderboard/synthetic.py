@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 
 import numpy as np
 import pyarrow as pa
 
-from bench.results import SCHEMA
+from bench.pair import choose
+from bench.results import SCHEMA, SCHEMAS
 from bench.scenario import GRIDS, Cell
 
 CLEAR = tuple(cell for cell in GRIDS["standard-v1"].cells() if cell.weather == "clear")
@@ -94,11 +95,86 @@ def drive(
         "created_at": datetime(2026, 1, 1, tzinfo=UTC),
         "wall_s": 1.0,
     }
+    return _table(SCHEMA, columns, count)
+
+
+def _table(schema: pa.Schema, columns: Mapping[str, object], count: int) -> pa.Table:
     arrays = []
-    for field in SCHEMA:
+    for field in schema:
         value = columns.get(field.name, "")
         arrays.append(pa.array(value if isinstance(value, list | np.ndarray) else [value] * count, field.type))
-    return pa.table(arrays, schema=SCHEMA)
+    return pa.table(arrays, schema=schema)
+
+
+LOCATIONS = ("sun-behind-ego", "sun-beside", "sun-behind-sign")
+
+
+def approach(
+    left: float | Callable[[str, str], float],
+    victim: str = "yolov3_tiny",
+    *,
+    attack: str = "none",
+    changes: Mapping[str, object] | None = None,
+    defense: str = "none",
+    victim_params: Mapping[str, object] | None = None,
+    world_params: Mapping[str, object] | None = None,
+    budget: float = 0.5,
+    cells: Iterable[Cell] = GRIDS["approach-v1"].cells(),
+    runs: Iterable[int] = (0, 1, 2),
+) -> pa.Table:
+    """Records of one patch, an approach a location and cell; `left` is the confidence it leaves, by weather and location."""
+    cells, runs = tuple(cells), tuple(runs) if attack not in ("none", "grey_patch") else (0,)
+    run, place, seed = (axis.ravel() for axis in np.meshgrid(runs, range(len(cells)), range(3), indexing="ij"))
+    weather = [cells[i].weather for i in place]
+    location = [LOCATIONS[(1_000_000 + i) % 3] for i in seed]
+    expected = np.array([left(*where) if callable(left) else left for where in zip(weather, location, strict=True)])
+    generator = np.random.default_rng([*(ord(letter) for letter in victim + attack), round(1000 * budget)])
+    confidence = np.clip(expected + generator.normal(0, 0.01, len(run)) + 0.01 * np.sin(7 * run), 0, 1)
+    frames = [[float(value)] * 10 for value in confidence]
+    attacked = attack != "none"
+    columns: dict[str, object] = {
+        "unit": "0" * 64,
+        "pair": f"{attack}-{defense}-{victim}",
+        "attack": attack,
+        "attack_params": choose("attack", attack, **(changes or {})).params,
+        "defense": defense,
+        "defense_params": "{}",
+        "victim": victim,
+        "victim_params": json.dumps(victim_params or {}),
+        "world": "camera",
+        "world_params": json.dumps(world_params or {"bank": ""}, separators=(",", ":")),
+        "sees": True,
+        "training_seed": run,
+        "threat_norm": "patch",
+        "threat_budget": budget if attacked else 0.0,
+        "threat_access": "gradients" if attacked else "oblivious",
+        "threat_queries": 20_000 if attacked else 0,
+        "grid": "approach-v1",
+        "lanes": np.array([cells[i].lanes for i in place]),
+        "density": np.array([cells[i].density for i in place]),
+        "weather": weather,
+        "seed": 1_000_000 + seed,
+        "location": location,
+        "confidence_mean": confidence,
+        "confidence_median": confidence,
+        "detection_rate": (confidence > 0.25).astype(float),
+        "first_seen_m": 30 * confidence,
+        "confirmed_m": 25 * confidence,
+        "overrun_m": 0.0,
+        "ran": confidence < 0.3,
+        "visible_share": 1.0,
+        "false_alarms": 0.0,
+        "queries": 1200.0 * (attack == "eot"),
+        "gradients": 1200.0 * (attack == "eot"),
+        "crafting_s": 1.0,
+        "excess": 0.0,
+        "frame_distance_m": [list(np.linspace(30, 8, 10)) for _ in run],
+        "frame_confidence": frames,
+        "frame_visible": [[1.0] * 10 for _ in run],
+        "created_at": datetime(2026, 1, 1, tzinfo=UTC),
+        "wall_s": 1.0,
+    }
+    return _table(SCHEMAS["detection"], columns, len(run))
 
 
 def reference_drivers(cells: Iterable[Cell] = CLEAR, episodes: int = 20) -> pa.Table:

@@ -1,4 +1,4 @@
-"""The thesis' tables beside ours."""
+"""Chapter 4 of the thesis beside ours, and what is published."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rich.console import Console
-from synthetic import CLEAR, drive, reference_drivers
+from synthetic import CLEAR, approach, drive, reference_drivers
 
 from bench import results
 from bench.config import run_config
-from bench.results import SCHEMA
+from bench.contracts import TRACKS, Track
+from bench.errors import UserError
+from bench.results import SCHEMA, SCHEMAS
 from leaderboard import thesis_records
 from leaderboard.published import publish, published
-from leaderboard.thesis import printed, thesis_report
+from leaderboard.thesis import thesis_report
+from leaderboard.thesis_numbers import printed
 from leaderboard.thesis_records import Source, Wanted
 from leaderboard.trend import trend
 
@@ -31,7 +34,7 @@ TARGET = {"objective": "target", "target_action": 3, "target_acceleration": 1.0,
 
 def report(*tables: pa.Table, width: int = 120) -> str:
     out = io.StringIO()
-    thesis_report(pa.concat_tables(tables) if tables else SCHEMA.empty_table(), Console(file=out, width=width))
+    thesis_report({"driving": pa.concat_tables(tables)} if tables else {}, Console(file=out, width=width))
     return out.getvalue()
 
 
@@ -67,17 +70,17 @@ def numbers_in(node: object) -> Iterator[float]:
 
 
 def test_every_printed_number_stands_in_the_report() -> None:
-    text = report()
-    found = list(numbers_in({**printed(), "skip_table": printed()["skip"]}))
+    text, numbers = report().split("Chapter 4")[1], printed()
+    found = list(numbers_in([numbers[name] for name in ("skip", "policies", "generalisation")]))
     assert len(found) == 6 + 8 + 12
     for number in found:
         assert f"{number:.2f}" in text
 
 
 def test_a_missing_number_is_a_dash_and_a_command_that_the_command_line_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thesis_records, "published", SCHEMA.empty_table)
+    monkeypatch.setattr(thesis_records, "published", lambda track: SCHEMAS[track].empty_table())
     text = report()
-    commands = re.findall(r"missing: (bench run .*)", text)
+    commands = re.findall(r"missing: (bench run .*)", text.split("Chapter 4")[1])
     assert "—" in text
     assert len(commands) >= 4
     for command in commands:
@@ -130,27 +133,40 @@ def test_published_records_fill_what_the_user_has_not_and_are_marked() -> None:
     assert (clean.shipped, under_attack.shipped) == (False, True)
 
 
-def test_published_records_have_the_schema_of_records() -> None:
-    assert published().schema.names == SCHEMA.names
+@pytest.mark.parametrize("track", TRACKS)
+def test_published_records_have_the_schema_of_records(track: Track) -> None:
+    assert published(track).schema.equals(SCHEMAS[track])
 
 
-def test_what_is_published_is_what_was_recorded(tmp_path: Path) -> None:
-    recorded = drive(cells=CLEAR)
+@pytest.mark.parametrize(
+    ("track", "recorded", "score"),
+    [("driving", drive(cells=CLEAR), "safe_progress"), ("detection", approach(0.9), "confidence_mean")],
+)
+def test_what_is_published_is_what_was_recorded(tmp_path: Path, track: Track, recorded: pa.Table, score: str) -> None:
     results.prepare(tmp_path)
     results.write(tmp_path, recorded)
     assert publish(tmp_path, tmp_path / "published.parquet") == recorded.num_rows
     shipped = pq.read_table(tmp_path / "published.parquet")
-    assert shipped.schema.equals(SCHEMA)
-    assert sorted(shipped["safe_progress"].to_pylist()) == sorted(recorded["safe_progress"].to_pylist())
+    assert shipped.schema.equals(SCHEMAS[track])
+    assert sorted(shipped[score].to_pylist()) == sorted(recorded[score].to_pylist())
+
+
+def test_records_of_two_tracks_are_not_published_as_one_file(tmp_path: Path) -> None:
+    results.prepare(tmp_path)
+    for unit, records in enumerate((drive(cells=CLEAR[:1]), approach(0.9))):
+        named = pa.array([str(unit) * 64] * records.num_rows)
+        results.write(tmp_path, records.set_column(0, records.schema.field(0), named))
+    with pytest.raises(UserError, match="driving and detection"):
+        publish(tmp_path, tmp_path / "published.parquet")
 
 
 def test_the_report_reads_published_records(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thesis_records, "published", lambda: drive(cells=CLEAR))
+    monkeypatch.setattr(thesis_records, "published", lambda track: drive(cells=CLEAR))
     assert "†" in report().split("Table 4.2")[1]
 
 
 def test_a_trade_off_over_seeds_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thesis_records, "published", SCHEMA.empty_table)
+    monkeypatch.setattr(thesis_records, "published", lambda track: SCHEMAS[track].empty_table())
     text = report(*skip_sweep({0.0: 0.2, 0.3: 0.4, 0.5: 0.6, 1.0: 0.9}, {0.0: 0.6, 0.3: 0.45, 0.5: 0.3, 1.0: 0.1}))
     assert "DQN: does the trade-off exist? Yes." in text
     assert "DDPG: does the trade-off exist? It cannot be said" in text
@@ -183,4 +199,5 @@ def test_no_number_is_cut_off(width: int) -> None:
     text = report(attacked("ddpg"), drive("ddpg", cells=CLEAR), attacked(), drive(cells=CLEAR), width=width)
     lines = [line for line in text.splitlines() if "missing:" not in line]
     assert max(map(len, lines)) <= width
-    assert "…" not in text
+    # An interval of numbers below 0 is written −.54…−.53.
+    assert not re.search(r"…(?![−+.\d])", text)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from bench import stopping
-from bench.approach import false_alarms, look, measure
+from bench.approach import false_alarms, found_of, look, measure
 from bench.vision import Predictions
 from tests.framework.toy_camera import RedDetector, RedScenes
 
@@ -75,14 +75,14 @@ def test_a_stop_sign_elsewhere_is_a_false_alarm_and_the_sign_itself_is_none() ->
     boxes = torch.tensor([[[0.0, 0, 10, 10], [1, 1, 11, 11], [40, 40, 60, 60], [80, 80, 90, 90]]])
     classes = torch.tensor([[[1.0, 0], [1, 0], [1, 0], [0, 1]]])
     predictions = Predictions(boxes, torch.full((1, 4), 0.9), classes)
-    assert false_alarms(predictions, 0, torch.tensor([[0.0, 0, 10, 10]])).tolist() == [1]
-    assert false_alarms(predictions, 0, torch.tensor([[200.0, 200, 210, 210]])).tolist() == [2]
+    found = found_of(predictions, 0)
+    assert false_alarms(found, torch.tensor([[0.0, 0, 10, 10]])).tolist() == [1]
+    assert false_alarms(found, torch.tensor([[200.0, 200, 210, 210]])).tolist() == [2]
 
 
 def test_a_patch_changes_what_is_seen_and_no_patch_is_the_sign_itself() -> None:
     scenes, detector = RedScenes(torch.linspace(30, 8, 10)), RedDetector()
-    clean, alarms = look(detector, scenes, None, 0.5)
-    patched, _ = look(detector, scenes, torch.zeros(3, 16, 16), 0.5)
-    assert (clean.shape, alarms.shape) == ((10,), (10,))
-    assert (patched < clean).all()
-    assert not alarms.any()
+    clean, patched = (look(detector, scenes, patch, 0.5) for patch in (None, torch.zeros(3, 16, 16)))
+    assert (clean.confidence.shape, len(clean.found)) == ((10,), 10)
+    assert (patched.confidence < clean.confidence).all()
+    assert not false_alarms(clean.found, scenes.boxes).any()

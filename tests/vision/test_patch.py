@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.contracts import Access, QueryBudgetError
 from bench.errors import UserError
-from bench.patch import GREY, PatchThreat, VisionOracle
+from bench.patch import GREY, MOMENTS, PatchThreat, VisionOracle
 from tests.framework.toy_camera import RedDetector
 
 
@@ -80,3 +80,35 @@ def test_texels_become_printable_and_their_excess_is_the_farthest_of_them(values
 def test_what_is_no_patch_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(UserError, match="a patch must be"):
         PatchThreat().project(torch.zeros(shape))
+
+
+@settings(deadline=None)
+@given(steps=st.integers(1, 500))
+def test_moments_of_a_crafting_are_few_and_evenly_apart(steps: int) -> None:
+    door = oracle("oblivious")
+    for step in range(steps):
+        more = {"odd": 1.0} if step % 2 else {}
+        door.report(
+            torch.full((3, 8, 8), step / steps), loss=torch.tensor(step, requires_grad=True, dtype=float), **more
+        )
+    kept = door.evolution
+    assert kept is not None
+    apart = kept.steps.diff().unique().tolist()
+    assert kept.steps[0] == 0
+    assert len(apart) <= 1
+    assert steps - kept.steps[-1] <= max(apart, default=1)
+    assert min(steps, MOMENTS // 2) <= len(kept.steps) <= MOMENTS
+    assert torch.equal(kept.losses["loss"], kept.steps.float())
+    assert torch.equal(kept.texels[:, 0, 0, 0], (255 * (kept.steps.float() / steps)).round().byte())
+    assert "odd" not in kept.losses or torch.equal(kept.losses["odd"].isnan(), kept.steps % 2 == 0)
+    assert door.spent == 0
+
+
+def test_reports_are_of_patches_of_one_size() -> None:
+    door = oracle("oblivious")
+    assert door.evolution is None
+    door.report(torch.zeros(3, 8, 8))
+    with pytest.raises(UserError, match="reported patches of 8 and 9 texels"):
+        door.report(torch.zeros(3, 9, 9))
+    with pytest.raises(UserError, match="a patch must be"):
+        door.report(torch.zeros(1, 3, 8, 8))

@@ -8,8 +8,12 @@ import pytest
 import torch
 
 from bench.errors import UserError
-from bench.victims import yolov5_file
+from bench.scenario import Cell
+from bench.victims import yolov5_file, zoo
 from bench.victims.yolov5 import MULTIPLES, Size, YOLOv5, YOLOv5Network
+from bench.vision import STOP_SIGN, confidence
+from envs.camera.world import StopSignApproach
+from tests.vision.drawn_street import DrawnStreet
 
 PUBLISHED = {"n": 1_872_157, "s": 7_235_389, "m": 21_190_557, "l": 46_563_709, "x": 86_749_405}
 
@@ -50,3 +54,42 @@ def test_another_size_than_the_files_is_refused_in_one_line(saved: tuple[YOLOv5N
 def test_without_a_file_it_says_how_to_name_one() -> None:
     with pytest.raises(UserError, match=r"victim\.path=yolov5m\.pt names a file of yours"):
         YOLOv5(size="m").load(0)
+
+
+def test_what_is_trained_is_found_in_the_zoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
+    victim = YOLOv5(updates=3, batch=2, window=64)
+    told: list[str] = []
+    made = victim.train(DrawnStreet(), seed=4, progress=lambda share, text: told.append(text))
+    assert made.network.names == (STOP_SIGN,)
+    assert made.card["frames"] == len(DrawnStreet().training_scenes())
+    assert told[0].startswith("loss ")
+    zoo.save(made.network, made.card, name=victim.zoo_name(), seed=4)
+    loaded = YOLOv5(updates=3, batch=2, window=64, trained=4).load(0)
+    rounded = {
+        name: value.half().float() if value.ndim > 1 else value for name, value in made.network.state_dict().items()
+    }
+    made.network.load_state_dict(rounded)
+    pictures = torch.rand(1, 3, 64, 64)
+    torch.testing.assert_close(loaded(pictures).scores, made.network(pictures).scores, rtol=1e-3, atol=1e-4)
+    with pytest.raises(UserError, match=r"was made with victim\.updates=3, not 4"):
+        YOLOv5(updates=4, batch=2, window=64, trained=4).load(0)
+    with pytest.raises(UserError, match="is trained already"):
+        YOLOv5(path="own.pt").train(DrawnStreet(), seed=0, progress=lambda share, text: None)
+
+
+@pytest.mark.parametrize("bad", [{"updates": 0}, {"window": 100}, {"learning_rate": 0.0}, {"trained": -1}])
+def test_a_recipe_out_of_range_is_named(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        YOLOv5(**bad)
+
+
+@pytest.mark.slow
+def test_the_one_that_ships_finds_signs_it_was_not_trained_on() -> None:
+    detector, world = YOLOv5().load(0), StopSignApproach()
+    for approach in world.approaches(Cell(lanes=3, density=1.0), range(3)):
+        frames = torch.arange(len(approach.scenes))
+        predictions = detector(approach.scenes.render(frames, None, 0.5))
+        seen = confidence(predictions, detector.index(STOP_SIGN), approach.scenes.boxes)
+        assert seen.mean() > 0.6
+        assert (seen[5:] > 0.5).all()

@@ -37,6 +37,7 @@ CROSSING = (2.5, 11.5)
 _NEAR, _FAR = -80.0, 260.0
 
 Surrounding = Literal["avenue", "town", "outskirts"]
+SignKind = Literal["limit", "warning", "direction"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,22 +226,37 @@ def _lamp_posts() -> list[Part]:
     return [(join(posts + arms), Material("metal", (0.3, 0.31, 0.32))), (join(heads), Material("matt", (0.2,) * 3))]
 
 
-def _other_signs(location: Location, lanes: int) -> list[Part]:
-    """Signs that are no stop signs: a speed limit, a warning and a direction, beside the road ahead and behind."""
+@dataclass(frozen=True)
+class OtherSign:
+    """A sign that is no stop sign: its kind, and where its middle is in m."""
+
+    kind: SignKind
+    x: float
+    y: float
+    z: float = 2.4
+
+
+def other_signs(location: Location, lanes: int) -> list[OtherSign]:
+    """A speed limit, a warning or a direction each, two beside the road ahead and one behind on its other side."""
     rng = np.random.default_rng([location.seed, 3])
     left, right = LEFT_EDGE - VERGE_M, right_edge(lanes) + VERGE_M
+    places = ((right, rng.uniform(24, 30)), (right, rng.uniform(48, 60)), (left, rng.uniform(-16, -10)))
+    return [OtherSign(get_args(SignKind)[rng.integers(3)], x, y) for x, y in places]
+
+
+def _other_signs(location: Location, lanes: int) -> list[Part]:
     white, red = Material("matt", (0.75, 0.75, 0.73)), Material("matt", (0.42, 0.02, 0.03))
     yellow, blue = Material("matt", (0.7, 0.42, 0.02)), Material("matt", (0.02, 0.08, 0.35))
     black = Material("matt", (0.02, 0.02, 0.02))
     parts: list[Part] = []
-    for x, y in ((right, rng.uniform(24, 30)), (right, rng.uniform(48, 60)), (left, rng.uniform(-16, -10))):
+    for other in other_signs(location, lanes):
+        x, y, z = other.x, other.y, other.z
         parts.append((rod((x, y + 0.05, 0), (x, y + 0.05, 2.6), 0.03), m.STEEL))
-        kind = rng.integers(3)
-        if kind == 0:
-            parts += [(_polygon(x, y, 2.4, 0.33, 32), red), (_polygon(x, y - 0.01, 2.4, 0.25, 32), white)]
+        if other.kind == "limit":
+            parts += [(_polygon(x, y, z, 0.33, 32), red), (_polygon(x, y - 0.01, z, 0.25, 32), white)]
             parts += [(block(x + dx, x + dx + 0.11, y - 0.03, y - 0.02, 2.28, 2.52), black) for dx in (-0.14, 0.03)]
-        elif kind == 1:
-            parts += [(_polygon(x, y, 2.4, 0.5, 4), black), (_polygon(x, y - 0.01, 2.4, 0.46, 4), yellow)]
+        elif other.kind == "warning":
+            parts += [(_polygon(x, y, z, 0.5, 4), black), (_polygon(x, y - 0.01, z, 0.46, 4), yellow)]
             parts.append((block(x - 0.04, x + 0.04, y - 0.03, y - 0.02, 2.22, 2.58), black))
         else:
             parts.append((block(x - 0.55, x + 0.55, y - 0.02, y, 2.15, 2.65), blue))

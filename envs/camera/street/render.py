@@ -132,6 +132,8 @@ def _retroreflected(camera: Camera, sign_x: float) -> NDArray[np.float32]:
         half = np.tan(np.deg2rad(lights.BEAM_FIELD_DEG / 2))
         column = int((ray[0] / ray[1] / half + 1) / 2 * beam.shape[1])
         row = int((1 - ray[2] / ray[1] / half * beam.shape[1] / beam.shape[0]) / 2 * beam.shape[0])
+        if not (0 <= row < beam.shape[0] and 0 <= column < beam.shape[1]):
+            continue  # beside the beam
         lux = lights.BEAM_PEAK_CD * beam[row, column] * ray[1] / np.linalg.norm(ray) ** 3
         cosine = ray @ line / np.linalg.norm(ray) / np.linalg.norm(line)
         angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))

@@ -1,0 +1,171 @@
+"""Adversarial training of a detector with a skip probability (thesis, Algorithm 5, for the patches of chapter 3)."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor
+
+from bench.contracts import Progress, Trained
+from bench.errors import UserError
+from bench.patch import PatchThreat, VisionOracle
+from bench.victims import zoo
+from bench.victims.detection_loss import missed, unlike
+from bench.victims.detector_training import descend
+from bench.victims.windows import Views, Windows
+from bench.vision import STOP_SIGN, CameraWorld, Detector, DetectorDefense, DetectorVictim, PatchAttack, Scenes
+from bench.words import configured, parameter_words
+
+AWAY = 0.2
+"""Share of the windows that are anywhere in the picture, and not about the sign."""
+SEEN = 0.5
+"""A sign that shows less is not one to be found."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectorAdversarialTraining(DetectorDefense):
+    """The detector goes on learning with patches on the signs (thesis Algorithm 5; Madry et al. 2018 for the principle).
+
+    In turns, a patch is crafted against the detector as it is, and the detector learns for a while on windows of the training
+    scenes whose signs wear the newest patches; with probability `skip` a sign is left as it is. It learns to find the sign in
+    spite of the patch, and to say of everything else what it said before, of the same window without a patch: no labels are
+    needed but the sign's box. `skip=1` is the control: the same training without a patch.
+
+    Args:
+        skip: probability that a window is shown without a patch, in [0, 1].
+        attack: any registered patch attack.
+        attack_params: its parameters, as on the command line but separated by spaces.
+        budget: side of the patches as a share of the sign's, in (0, 1].
+        rounds: how many patches are crafted.
+        updates: of the weights after each.
+        shown: how many of the newest patches are on the signs; half of the windows wear the very newest.
+        batch: windows an update.
+        window: their side in pixels, a multiple of the detector's stride.
+        learning_rate: of AdamW, the highest.
+        fidelity: weight of saying what it said before, beside that of finding the sign.
+        trained: which of the zoo's is loaded, by its training seed; the seeds of a run are those of the patches.
+    """
+
+    skip: float = 0.3
+    attack: str = "eot"
+    attack_params: str = "steps=40 batch=6 window=224 learning_rate=0.08"
+    budget: float = 0.5
+    rounds: int = 12
+    updates: int = 30
+    shown: int = 8
+    batch: int = 8
+    window: int = 224
+    learning_rate: float = 3e-4
+    fidelity: float = 0.3
+    trained: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.skip <= 1:
+            raise ValueError(f"skip must be between 0 and 1, got {self.skip}")
+        for name in ("rounds", "updates", "shown", "batch", "window"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate must be above 0, got {self.learning_rate}")
+        for name in ("fidelity", "trained"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
+        PatchThreat(budget=self.budget)
+
+    @property
+    def trains(self) -> bool:
+        return False
+
+    def zoo_name(self, victim: DetectorVictim) -> str:
+        return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"
+
+    def load(self, victim: DetectorVictim, seed: int) -> Detector:
+        own = {name: value for name, value in asdict(self).items() if name != "trained"}
+        made_by = {"victim": asdict(victim), "defense": own}  # type: ignore[call-overload]
+        return zoo.load(self.zoo_name(victim), self.trained, lambda **_: victim.load(seed), made_by=made_by)
+
+    def train(self, victim: DetectorVictim, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
+        """Train the hardened detector of training seed `seed`."""
+        attack = configured("attack", self.attack, parameter_words(self.attack_params)).component
+        if not isinstance(attack, PatchAttack):
+            raise UserError(
+                f"attack {self.attack!r} makes no patches: adversarial training of a detector needs one that does"
+            )
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            hardening = _Hardening(self, attack, victim.load(seed), world.training_scenes(), seed, progress)
+            detector, seconds = descend(
+                hardening.detector,
+                hardening.loss,
+                updates=self.rounds * self.updates,
+                learning_rate=self.learning_rate,
+                progress=progress,
+            )
+        made_by = {"victim": asdict(victim), "defense": asdict(self), "attack": asdict(attack)}  # type: ignore[call-overload]
+        return Trained(detector.requires_grad_(False), {**made_by, "training_cpu_s": round(seconds)})
+
+
+class _Hardening:
+    """The loss of each update, and the patches that are crafted on the way."""
+
+    def __init__(
+        self,
+        recipe: DetectorAdversarialTraining,
+        attack: PatchAttack,
+        detector: Detector,
+        scenes: Scenes,
+        seed: int,
+        progress: Progress,
+    ) -> None:
+        self.recipe, self.attack, self.scenes, self.progress = recipe, attack, scenes, progress
+        self.teacher, self.detector = detector, copy.deepcopy(detector).requires_grad_(True)
+        self.label = detector.index(STOP_SIGN)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.windows = Windows(scenes, recipe.window, away=AWAY, generator=self.generator)
+        self.patches: list[Tensor] = []
+
+    def loss(self, update: int) -> Tensor:
+        """Of one update; before the first of each round a patch is crafted."""
+        if update % self.recipe.updates == 0 and self.recipe.skip < 1:
+            self.patches = [*self.patches, self._crafted(update // self.recipe.updates)][-self.recipe.shown :]
+        views = self.windows.draw(self.recipe.batch)
+        plain = self.windows.cut(views)
+        shown = self._patched(views, plain)
+        shown, plain = self.windows.lit(shown, plain)
+        with torch.no_grad():
+            before = self.teacher(plain)
+        now = self.detector(shown)
+        boxes = views.boxes(self.scenes.boxes[views.frames], self.recipe.window)
+        there = (self.scenes.visible[views.frames] >= SEEN) & ((boxes >= 0) & (boxes <= self.recipe.window)).all(1)
+        return self.recipe.fidelity * unlike(now, before) + (missed(now, self.label, boxes) * there).mean()
+
+    def _crafted(self, number: int) -> Tensor:
+        """Patch `number`, against the detector as it is now."""
+
+        def tell(share: float, text: str) -> None:
+            self.progress(number / self.recipe.rounds, f"patch {number + 1}, {share:.0%}: {text}")
+
+        threat = PatchThreat(budget=self.recipe.budget)
+        oracle = VisionOracle(self.detector.requires_grad_(False), threat, self.attack.access, self.generator)
+        patch = self.attack.craft(oracle, self.scenes, tell)
+        self.detector.requires_grad_(True)
+        if patch is None:
+            raise UserError(f"attack {self.recipe.attack!r} makes no patch to train with")
+        return threat.project(patch)[0]
+
+    def _patched(self, views: Views, plain: Tensor) -> Tensor:
+        """The windows, with patches on the signs of those that are not skipped."""
+        attacked = torch.rand(len(plain), generator=self.generator) >= self.recipe.skip
+        if not attacked.any():
+            return plain
+        which = torch.randint(len(self.patches), (len(plain),), generator=self.generator)
+        which[::2] = len(self.patches) - 1
+        one = views[attacked]
+        patches = torch.stack([self.patches[number] for number in which[attacked]])
+        with torch.no_grad():
+            pictures = self.scenes.render(one.frames, patches, self.recipe.budget)
+        shown = plain.clone()
+        shown[attacked] = self.windows.cut(one, pictures)
+        return shown

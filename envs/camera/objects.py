@@ -1,0 +1,84 @@
+"""What there is to find in a frame beside its sign: vehicles and other signs, from their outlines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.vision import STOP_SIGN
+from envs.camera import sign
+from envs.camera.camera import Array
+from envs.camera.poses import Pose
+from envs.camera.street.layout import LOCATIONS, OtherSign, other_signs, sign_x, traffic
+from envs.camera.street.vehicles import PAINTS, Model, vehicle
+
+NAMES = (STOP_SIGN, "car", "truck", "traffic sign")
+"""Of the classes. Vans are trucks; signs that are no stop signs have a class of their own, so that they are told apart."""
+CLASSES: dict[Model, str] = {"saloon": "car", "hatchback": "car", "van": "truck", "lorry": "truck"}
+LEAST_VISIBLE, LEAST_PX = 0.3, 6
+"""What shows less of its outline, or is narrower or lower, is not there to be found."""
+AHEAD_M = 1.0
+"""What is not wholly so far ahead of the camera hides other things and is not there to be found."""
+
+
+@dataclass(frozen=True)
+class _Outlined:
+    name: str
+    outline: Array
+    depth: float
+
+
+def objects(pose: Pose) -> list[tuple[str, Array]]:
+    """Class and box [4] in pixels, clipped to the picture, of everything that is to be seen from a pose.
+
+    A thing counts where enough of its outline is in the picture and before all others.
+    """
+    camera = pose.camera
+    found = sorted(_outlined(pose), key=lambda one: -one.depth)
+    drawn = np.full((camera.height, camera.width), -1, np.int32)
+    hulls = [cv2.convexHull(one.outline.astype(np.float32)) for one in found]
+    for number, hull in enumerate(hulls):
+        cv2.fillConvexPoly(drawn, np.rint(hull).astype(np.int32), number)
+    seen = []
+    for number, (one, hull) in enumerate(zip(found, hulls, strict=True)):
+        low, high = hull[:, 0].min(0), hull[:, 0].max(0)
+        box = np.concatenate([low, high]).clip(0, [camera.width, camera.height] * 2).astype(np.float64)
+        visible = (drawn == number).sum() / max(cv2.contourArea(hull), 1.0)
+        if one.name and visible >= LEAST_VISIBLE and (box[2:] - box[:2]).min() >= LEAST_PX:
+            seen.append((one.name, box))
+    return seen
+
+
+def _outlined(pose: Pose) -> list[_Outlined]:
+    """Every vehicle and sign ahead of the camera; those that are partly beside it have no name."""
+    camera, location = pose.camera, LOCATIONS[pose.location]
+    found = [_Outlined(STOP_SIGN, camera.project(sign.corners(sign_x(pose.lanes))), -camera.y)]
+    for placed in traffic(location, pose.lanes, pose.density):
+        points = _points(placed.model) + np.array([placed.x, placed.later(pose.distance), 0])
+        nearest = camera.y + AHEAD_M
+        if points[:, 1].max() > nearest:
+            name = CLASSES[placed.model] if points[:, 1].min() > nearest else ""
+            points[:, 1] = points[:, 1].clip(nearest)
+            found.append(_Outlined(name, camera.project(points), points[:, 1].min() - camera.y))
+    found += [
+        _Outlined("traffic sign", camera.project(_corners(other)), other.y - camera.y)
+        for other in other_signs(location, pose.lanes)
+        if other.y > camera.y + AHEAD_M
+    ]
+    return found
+
+
+def _corners(other: OtherSign) -> Array:
+    """[4, 3] of the square or rectangle around a sign, in m."""
+    wide, high = {"limit": (0.33, 0.33), "warning": (0.5, 0.5), "direction": (0.55, 0.25)}[other.kind]
+    return np.array([(other.x + dx, other.y, other.z + dz) for dx in (-wide, wide) for dz in (-high, high)])
+
+
+@cache
+def _points(model: Model) -> NDArray[np.float32]:
+    """[N, 3] the vertices of a vehicle at the origin, in m."""
+    return np.concatenate([mesh.vertices for mesh, _ in vehicle(model, PAINTS[0])])

@@ -1,0 +1,42 @@
+"""What there is to find in a frame of the camera world."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from bench.vision import STOP_SIGN
+from envs.camera import sign
+from envs.camera.objects import NAMES, objects
+from envs.camera.poses import scored, training
+from envs.camera.street.layout import sign_x
+from tests.camera.scenes import scenes
+
+
+def test_every_training_view_holds_its_sign_and_other_things_beside() -> None:
+    named: set[str] = set()
+    for pose in training():
+        found = dict(reversed(objects(pose)))
+        limit = np.array([pose.camera.width, pose.camera.height] * 2)
+        assert np.allclose(found[STOP_SIGN], sign.box(sign_x(pose.lanes), pose.camera).clip(0, limit), atol=0.01)
+        for box in found.values():
+            assert (box[2:] - box[:2]).min() >= 6
+            assert (box >= 0).all()
+            assert (box <= limit).all()
+        named |= set(found)
+    assert named == set(NAMES)
+
+
+def test_a_hidden_sign_is_not_there_to_be_found() -> None:
+    """By traffic, or because the ego is so near that it is outside the picture."""
+    hidden = [pose for pose in scored() if pose.lighting == "sun" and STOP_SIGN not in dict(objects(pose))]
+    assert {pose.distance > 12 for pose in hidden} == {True, False}
+    assert len(hidden) < 30
+
+
+def test_scenes_hand_them_on() -> None:
+    street = scenes("fog")
+    found = street.objects(9)
+    assert found.names[0] in NAMES
+    assert found.boxes.shape == (len(found.names), 4)
+    assert torch.allclose(found.boxes[found.names.index(STOP_SIGN)], street.boxes[9], atol=0.01)

@@ -1,0 +1,111 @@
+"""Adversarial training of detectors: what it trains with, what it leaves alone, and what the one that ships withstands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from attacks.eot import EOT
+from bench.config import component, run_config
+from bench.errors import UserError
+from bench.patch import PatchThreat, VisionOracle
+from bench.victims import yolov5_file, zoo
+from bench.victims.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
+from bench.victims.yolov5 import YOLOv5, YOLOv5Network
+from bench.vision import STOP_SIGN, Detector, confidence
+from defenses.advtrain_detection import DetectorAdversarialTraining
+from envs.camera.world import StopSignApproach
+from tests.vision.drawn_street import DrawnStreet
+
+QUICK = {"rounds": 2, "updates": 2, "batch": 2, "attack_params": "steps=2 batch=2 window=224"}
+
+
+@pytest.fixture
+def victim(tmp_path: Path) -> YOLOv5:
+    """A small detector that has learned nothing."""
+    torch.manual_seed(0)
+    path = tmp_path / "own.safetensors"
+    yolov5_file.save(YOLOv5Network("n", (STOP_SIGN, "car")), path)
+    return YOLOv5(path=str(path))
+
+
+def trained(victim: YOLOv5, **params: object) -> tuple[Detector, list[str]]:
+    told: list[str] = []
+    defense = DetectorAdversarialTraining(**{**QUICK, **params})
+    made = defense.train(victim, DrawnStreet(), seed=0, progress=lambda share, text: told.append(text))
+    return made.network, told
+
+
+def test_it_hardens_the_detector_it_is_given_and_is_found_again_in_the_zoo(
+    victim: YOLOv5, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
+    before, pictures = victim.load(0), torch.rand(1, 3, 64, 64)
+    defense = DetectorAdversarialTraining(**QUICK)
+    made = defense.train(victim, DrawnStreet(), seed=0, progress=lambda share, text: None)
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(before.state_dict().values(), victim.load(0).state_dict().values(), strict=True)
+    )
+    zoo.save(made.network, made.card, name=defense.zoo_name(victim), seed=0)
+    again = defense.load(victim, 5)
+    torch.testing.assert_close(again(pictures).scores, made.network(pictures).scores, rtol=0.02, atol=1e-3)
+    assert not torch.equal(again(pictures).scores, before(pictures).scores)
+    assert not any(weight.requires_grad for weight in again.parameters())
+    with pytest.raises(UserError, match=r"was made with defense\.rounds=2, not 3"):
+        DetectorAdversarialTraining(**{**QUICK, "rounds": 3}).load(victim, 0)
+    with pytest.raises(UserError, match="`bench train` makes one"):
+        DetectorAdversarialTraining(**QUICK, trained=1).load(victim, 0)
+
+
+def test_a_seed_is_a_training_and_the_control_is_never_attacked(victim: YOLOv5) -> None:
+    (one, told), (again, _), (control, untold) = trained(victim), trained(victim), trained(victim, skip=1.0)
+    assert all(torch.equal(a, b) for a, b in zip(one.state_dict().values(), again.state_dict().values(), strict=True))
+    assert any(text.startswith("patch 2, ") for text in told)
+    assert not any(text.startswith("patch") for text in untold)
+    assert not torch.equal(one.state_dict()["model.24.m.0.weight"], control.state_dict()["model.24.m.0.weight"])
+
+
+def test_what_cannot_be_is_refused_in_one_line(victim: YOLOv5) -> None:
+    for bad in ({"skip": 1.5}, {"rounds": 0}, {"learning_rate": 0.0}, {"budget": 2.0}, {"fidelity": -1.0}):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            DetectorAdversarialTraining(**bad)
+    with pytest.raises(UserError, match="makes no patches"):
+        trained(victim, attack="zo", attack_params="")
+    with pytest.raises(UserError, match="attack_params takes words like steps=3, got 'steps'"):
+        trained(victim, attack_params="steps")
+
+
+def test_one_name_is_what_it_is_on_each_track() -> None:
+    driving = run_config(["defense=advtrain", "victim=dqn"]).pairs[0]
+    detection = run_config(["defense=advtrain", "victim=yolov3_tiny"]).pairs[0]
+    assert (driving.defense.name, detection.defense.name) == ("advtrain", "advtrain_detection")
+    assert component("defense", "advtrain_detection", {"skip": "0.5"}).skip == 0.5
+    with pytest.raises(UserError, match="does not fit victim 'dqn'"):
+        run_config(["defense=advtrain_detection", "victim=dqn"])
+
+
+@pytest.mark.slow
+def test_the_one_that_ships_withstands_what_blinds_the_other(published: YOLOv3TinyNetwork) -> None:
+    """Patches crafted against each of them on the training places, 30 steps."""
+    scenes = StopSignApproach().training_scenes()
+    hardened = DetectorAdversarialTraining().load(YOLOv3Tiny(), 0)
+    frames = (scenes.visible > 0.9).nonzero().squeeze(1)[::9]
+
+    def seen(detector: Detector, patch: Tensor | None) -> float:
+        with torch.no_grad():
+            patches = None if patch is None else patch[None]
+            predictions = detector(scenes.render(frames, patches, 0.5))
+            return float(confidence(predictions, detector.index(STOP_SIGN), scenes.boxes[frames]).mean())
+
+    left = {}
+    for name, detector in (("undefended", published), ("hardened", hardened)):
+        torch.manual_seed(0)
+        oracle = VisionOracle(detector, PatchThreat(), "gradients", torch.Generator().manual_seed(0))
+        attack = EOT(steps=30, batch=4, window=224, learning_rate=0.1)
+        left[name] = seen(detector, attack.craft(oracle, scenes, lambda share, text: None))
+    assert left["hardened"] > 0.8 > 0.5 > left["undefended"]
+    assert seen(hardened, None) > seen(published, None) - 0.05
