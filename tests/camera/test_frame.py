@@ -14,9 +14,12 @@ from bench.errors import UserError
 from bench.scenario import WEATHERS, Weather
 from envs.camera import bank, sign
 from envs.camera.frame import frame
+from envs.camera.plate import detail, filtered
 from envs.camera.poses import approach
 from envs.camera.weather import air, streaks
 from tests.camera.scenes import lit, scenes
+
+SCENES = scenes()
 
 
 def test_a_sign_is_where_its_box_is() -> None:
@@ -134,3 +137,33 @@ def test_the_face_is_red_with_white_letters() -> None:
     white = (face.min(0) > 0.8).mean()
     assert red > 0.5
     assert 0.1 < white < 0.4
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    frame=st.integers(0, 9),
+    x=st.integers(0, 1248 - 96),
+    y=st.integers(0, 384 - 64),
+    share=st.floats(0.1, 1.0),
+    patched=st.booleans(),
+)
+def test_a_window_is_a_part_of_the_picture(frame: int, x: int, y: int, share: float, patched: bool) -> None:
+    frames = torch.tensor([frame, 9])
+    patch = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(frame)) if patched else None
+    corners = torch.tensor([[x, y], [1248 - 96, 100]])
+    windows = SCENES.windows(frames, patch, share, corners, (64, 96))
+    whole = SCENES.render(frames, patch, share)
+    cut = torch.stack([p[:, y : y + 64, x : x + 96] for p, (x, y) in zip(whole, corners.tolist(), strict=True)])
+    torch.testing.assert_close(windows, cut, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
+def test_a_patch_reaches_no_farther_than_it_says(share: float) -> None:
+    for number, (x0, y0, x1, y1) in enumerate(SCENES.reach(share).int().tolist()):
+        plate = SCENES._plate(number)
+        faces = sign.painted(torch.rand(1, 3, 8, 8), share)
+        signed = plate.signed(filtered(faces, detail(plate.crop))[0], plate.crop)
+        rows, columns = (signed != plate.plain).any(0).nonzero().T
+        assert len(rows) > 0
+        assert x0 <= columns.min() + plate.crop[0] <= columns.max() + plate.crop[0] < x1
+        assert y0 <= rows.min() + plate.crop[1] <= rows.max() + plate.crop[1] < y1
