@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from envs.highway.compiled import inner
 from envs.highway.dynamics import VEHICLE_LENGTH, VEHICLE_WIDTH
 from envs.highway.state import Floats, Integers, Vehicle, Vehicles
 
@@ -15,13 +15,13 @@ SURELY = 1e-6
 """Margin in m that no rounding error reaches: pairs that are apart by more need no exact test."""
 
 
-@njit
+@inner
 def interval_distance(low_a: float, high_a: float, low_b: float, high_b: float) -> float:
     """utils.interval_distance: gap between two intervals, negative where they overlap."""
     return low_b - high_a if low_a < low_b else low_a - high_b
 
 
-@njit
+@inner
 def fill_corners(vehicle: Vehicle, corners: Floats) -> None:
     """RoadObject.polygon: write the rectangle's corners [5, 2], the first one again at the end."""
     cos, sin = vehicle.cos_heading, vehicle.sin_heading
@@ -32,7 +32,7 @@ def fill_corners(vehicle: Vehicle, corners: Floats) -> None:
         corners[corner, 1] = sin * along + cos * across + vehicle.y
 
 
-@njit
+@inner
 def project(corners: Floats, normal_x: float, normal_y: float) -> tuple[float, float]:
     """utils.project_polygon: least and greatest coordinate of the corners along a normal."""
     low, high = np.inf, -np.inf
@@ -42,13 +42,13 @@ def project(corners: Floats, normal_x: float, normal_y: float) -> tuple[float, f
     return low, high
 
 
-@njit
+@inner
 def centre(corners: Floats, axis: int) -> float:
     """Mean of the four corners along an axis, summed in numpy's order."""
     return (corners[0, axis] + corners[1, axis] + corners[2, axis] + corners[3, axis]) / 4
 
 
-@njit
+@inner
 def polygons_intersect(
     corners_a: Floats, corners_b: Floats, displacement_x: float, displacement_y: float
 ) -> tuple[bool, bool, float, float]:
@@ -89,7 +89,7 @@ def polygons_intersect(
     return intersecting, will_intersect, nearest * push_x, nearest * push_y
 
 
-@njit
+@inner
 def pass_side_by_side(first: Vehicle, second: Vehicle, displacement_x: float, displacement_y: float) -> bool:
     """Whether the first vehicle's long side surely parts the two, now and within the frame.
 
@@ -103,7 +103,7 @@ def pass_side_by_side(first: Vehicle, second: Vehicle, displacement_x: float, di
     return apart > reach + abs(normal_x * displacement_x + normal_y * displacement_y) + SURELY
 
 
-@njit
+@inner
 def set_impact(vehicle: Vehicle, pair: int, push_x: float, push_y: float) -> None:
     """In highway-env the last pair of a frame decides the impact; pairs come in any order here, so they are ranked."""
     if pair > vehicle.impact_pair:
@@ -112,7 +112,7 @@ def set_impact(vehicle: Vehicle, pair: int, push_x: float, push_y: float) -> Non
         vehicle.impact_pair = pair
 
 
-@njit
+@inner
 def collide(
     vehicles: Vehicles, first_number: int, second_number: int, dt: float, corners_a: Floats, corners_b: Floats
 ) -> None:
@@ -140,7 +140,7 @@ def collide(
         second.crashed = True
 
 
-@njit
+@inner
 def find_collisions(vehicles: Vehicles, order: Integers, dt: float, corners: Floats) -> None:
     """The second half of Road.step: every pair, but only those close enough along the road are looked at.
 

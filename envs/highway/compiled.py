@@ -1,6 +1,6 @@
 """How the engine's functions are compiled: numba, cached on disk where a disk allows it.
 
-Inner functions use plain `njit` and are compiled into the entry points; only entry points are cached.
+Inner functions are compiled into the entry points; only entry points are cached.
 """
 
 from __future__ import annotations
@@ -36,6 +36,14 @@ class _SourcesCache(FunctionCache):
             super().save_overload(sig, data)
         except OSError:
             return
+
+
+def inner(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function that only compiled code calls: without wrappers for other callers, in two thirds of the time.
+
+    Called from Python it ends the process; what both call is an `entry_point`.
+    """
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
 
 
 def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:

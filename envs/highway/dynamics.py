@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from envs.highway.compiled import inner
 from envs.highway.state import EgoKind, Vehicle
 
 DISCRETE, CONTINUOUS, IDM = int(EgoKind.DISCRETE), int(EgoKind.CONTINUOUS), int(EgoKind.IDM)
@@ -30,19 +30,19 @@ MAX_LANE_CHANGE_HEADING = np.pi / 4
 TWO_PI = 2 * np.pi
 
 
-@njit
+@inner
 def clip(value: float, low: float, high: float) -> float:
     """`value` limited to [low, high]."""
     return min(max(value, low), high)
 
 
-@njit
+@inner
 def linear_map(value: float, from_low: float, from_high: float, to_low: float, to_high: float) -> float:
     """highway_env.utils.lmap: `value` of [from_low, from_high] on [to_low, to_high], not clipped."""
     return to_low + (value - from_low) * (to_high - to_low) / (from_high - from_low)
 
 
-@njit
+@inner
 def not_zero(value: float) -> float:
     """highway_env.utils.not_zero: `value`, but at least 0.01 away from 0."""
     if abs(value) > 1e-2:
@@ -50,7 +50,7 @@ def not_zero(value: float) -> float:
     return 1e-2 if value >= 0 else -1e-2
 
 
-@njit
+@inner
 def wrap_to_pi(angle: float) -> float:
     """highway_env.utils.wrap_to_pi: `angle` in [-pi, pi)."""
     shifted = angle + np.pi
@@ -59,7 +59,7 @@ def wrap_to_pi(angle: float) -> float:
     return shifted - np.pi
 
 
-@njit
+@inner
 def closest_lane(x: float, y: float, heading: float, lanes: int) -> int:
     """RoadNetwork.get_closest_lane_index: only the two lanes around `y` can be closest; ties go to the lower one."""
     angle = abs(wrap_to_pi(heading))
@@ -71,21 +71,21 @@ def closest_lane(x: float, y: float, heading: float, lanes: int) -> int:
     return above if distance_above < distance_below else below
 
 
-@njit
+@inner
 def is_on_lane(vehicle: Vehicle, lane: int, margin: float) -> bool:
     """AbstractLane.on_lane: whether the vehicle's centre is on the lane, widened by `margin` m on both sides."""
     near = abs(vehicle.y - LANE_WIDTH * lane) <= LANE_WIDTH / 2 + margin
     return near and -VEHICLE_LENGTH <= vehicle.x < ROAD_LENGTH + VEHICLE_LENGTH
 
 
-@njit
+@inner
 def is_reachable(vehicle: Vehicle, lane: int) -> bool:
     """AbstractLane.is_reachable_from: whether a lane change to `lane` may begin here."""
     near = abs(vehicle.y - LANE_WIDTH * lane) <= 2 * LANE_WIDTH
     return near and 0 <= vehicle.x < ROAD_LENGTH + VEHICLE_LENGTH
 
 
-@njit
+@inner
 def update_direction(vehicle: Vehicle) -> None:
     """Keep the cosine and sine of the heading beside it."""
     if vehicle.heading == 0.0:
@@ -96,7 +96,7 @@ def update_direction(vehicle: Vehicle) -> None:
         vehicle.sin_heading = math.sin(vehicle.heading)
 
 
-@njit
+@inner
 def steering_control(vehicle: Vehicle, lane: int) -> float:
     """ControlledVehicle.steering_control: the steering angle in rad that leads to the centre of `lane`."""
     lateral = vehicle.y - LANE_WIDTH * lane
@@ -110,13 +110,13 @@ def steering_control(vehicle: Vehicle, lane: int) -> float:
     return clip(math.atan(2 * math.tan(slip_angle)), -MAX_STEERING, MAX_STEERING)
 
 
-@njit
+@inner
 def speed_control(vehicle: Vehicle) -> float:
     """ControlledVehicle.speed_control: the acceleration in m/s2 towards the target speed."""
     return GAIN_SPEED * (vehicle.target_speed - vehicle.speed)
 
 
-@njit
+@inner
 def clip_actions(vehicle: Vehicle) -> None:
     """Vehicle.clip_actions: a wreck brakes to a stop, and no one drives faster than 40 m/s."""
     if vehicle.crashed:
@@ -128,7 +128,7 @@ def clip_actions(vehicle: Vehicle) -> None:
         vehicle.acceleration = max(vehicle.acceleration, 1.0 * (-MAX_SPEED - vehicle.speed))
 
 
-@njit
+@inner
 def move(vehicle: Vehicle, lanes: int, dt: float) -> None:
     """Vehicle.step and IDMVehicle.step: one frame of the kinematic bicycle model, then the lane the vehicle is in."""
     vehicle.timer += dt

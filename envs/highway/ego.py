@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from envs.highway.compiled import inner
 from envs.highway.dynamics import (
     DISCRETE,
     IDM,
@@ -22,7 +22,7 @@ PROGRESS_LANE, PROGRESS_SPEED = 0.1, 0.4
 """Eq. 4.1's weights. `progress` keeps them where the reward is told others: it is a measure, not an incentive."""
 
 
-@njit
+@inner
 def nearest_target_speed(speed: float, target_speeds: Floats) -> int:
     """MDPVehicle.speed_to_index: the entry of the (uniform) table closest to a speed."""
     last = target_speeds.size - 1
@@ -30,7 +30,7 @@ def nearest_target_speed(speed: float, target_speeds: Floats) -> int:
     return int(clip(np.rint(share * last), 0.0, float(last)))
 
 
-@njit
+@inner
 def apply_meta_action(ego: Vehicle, action: int, lanes: int, target_speeds: Floats) -> None:
     """MDPVehicle.act: change the target speed or the target lane."""
     if action in (FASTER, SLOWER):
@@ -44,7 +44,7 @@ def apply_meta_action(ego: Vehicle, action: int, lanes: int, target_speeds: Floa
             ego.target_lane = lane
 
 
-@njit
+@inner
 def apply_action(ego: Vehicle, action: int, control: Floats, first: bool, lanes: int, parameters: Parameters) -> None:
     """Hand the decision to the ego; of a decision that is held, a lane change counts only the `first` time.
 
@@ -62,7 +62,7 @@ def apply_action(ego: Vehicle, action: int, control: Floats, first: bool, lanes:
         ego.steering = control[1]
 
 
-@njit
+@inner
 def speed_share(ego: Vehicle, parameters: Parameters) -> float:
     """Forward speed within the rewarded range, in [0, 1]."""
     forward = ego.speed * ego.cos_heading
@@ -70,14 +70,14 @@ def speed_share(ego: Vehicle, parameters: Parameters) -> float:
     return clip(linear_map(forward, low, high, 0.0, 1.0), 0.0, 1.0)
 
 
-@njit
+@inner
 def lane_share(ego: Vehicle, lanes: int, parameters: Parameters) -> float:
     """How far right, in [0, 1]: the target lane of a vehicle that has one, the current lane of a continuous ego."""
     lane = ego.target_lane if parameters.ego in (DISCRETE, IDM) else ego.lane
     return lane / max(lanes - 1, 1)
 
 
-@njit
+@inner
 def reward(ego: Vehicle, on_road: bool, lane: float, speed: float, parameters: Parameters) -> float:
     """HighwayEnv._reward from the shares `lane` and `speed`."""
     value = parameters.collision_reward * (1.0 if ego.crashed else 0.0)
@@ -89,7 +89,7 @@ def reward(ego: Vehicle, on_road: bool, lane: float, speed: float, parameters: P
     return value if on_road else value * 0.0
 
 
-@njit
+@inner
 def time_to_collision(vehicles: Vehicles, order: Integers) -> float:
     """Seconds until the ego's bumper meets that of the car ahead in its lane at their present speeds; inf if never."""
     place = 0
@@ -106,7 +106,7 @@ def time_to_collision(vehicles: Vehicles, order: Integers) -> float:
     return max(other.x - ego.x - VEHICLE_LENGTH, 0.0) / closing
 
 
-@njit
+@inner
 def score(vehicles: Vehicles, episode: Episode, parameters: Parameters) -> None:
     """Write what one decision brought into the episode's record; reward and progress are added up."""
     ego = vehicles[0]

@@ -8,12 +8,11 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bench.scenario import WEATHERS
 from envs.highway.collision import find_collisions
-from envs.highway.compiled import entry_point
+from envs.highway.compiled import entry_point, inner
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.dynamics import move
 from envs.highway.ego import apply_action, score, time_to_collision
@@ -59,7 +58,7 @@ REWARD, PROGRESS, SPEED, X, TTC = (int(number) for number in Number)
 DONE, TERMINATED, TRUNCATED, CRASHED, OFFROAD = (int(flag) for flag in Flag)
 
 
-@njit
+@inner
 def advance(
     vehicles: Vehicles, order: Integers, places: Integers, corners: Floats, lanes: int, parameters: Parameters
 ) -> None:
@@ -72,7 +71,7 @@ def advance(
         find_collisions(vehicles, order, parameters.dt, corners)
 
 
-@njit
+@inner
 def drive(
     vehicles: Vehicles,
     order: Integers,
@@ -96,7 +95,7 @@ def drive(
     episode.ttc = time_to_collision(vehicles, order)
 
 
-@njit
+@inner
 def report(ego: Vehicle, episode: Episode, numbers: NDArray[np.float32], flags: NDArray[np.bool_], number: int) -> None:
     """Copy an episode's record into column `number` of the outputs."""
     numbers[REWARD, number] = episode.reward

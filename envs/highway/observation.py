@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from envs.highway.compiled import inner
 from envs.highway.dynamics import VEHICLE_LENGTH, clip, linear_map
 from envs.highway.sensor import FEATURES, add_noise
 from envs.highway.state import Episode, Floats, Integers, Vehicle, Vehicles
 
 
-@njit
+@inner
 def is_seen(ego: Vehicle, other: Vehicle, sensor_range: float) -> bool:
     """Road.close_objects_to: within the sensor's range and not more than two lengths behind."""
     x, y = other.x - ego.x, other.y - ego.y
     return x > -2 * VEHICLE_LENGTH and math.sqrt(x * x + y * y) < sensor_range
 
 
-@njit
+@inner
 def nearest_vehicles(vehicles: Vehicles, order: Integers, sensor_range: float, rows: Integers) -> int:
     """Fill `rows` [V - 1] with the vehicles seen, nearest along the road first (ties: by number); returns how many."""
     ego = vehicles[0]
@@ -48,7 +48,7 @@ def nearest_vehicles(vehicles: Vehicles, order: Integers, sensor_range: float, r
     return found
 
 
-@njit
+@inner
 def measure(ego: Vehicle, other: Vehicle, relative: bool, measured: Floats) -> None:
     """Vehicle.to_dict: x, y, vx, vy of `other` into `measured` [4], less the ego's own if `relative`."""
     measured[0] = other.x
@@ -62,7 +62,7 @@ def measure(ego: Vehicle, other: Vehicle, relative: bool, measured: Floats) -> N
         measured[3] -= ego.speed * ego.sin_heading
 
 
-@njit
+@inner
 def write_row(measured: Floats, low: Floats, high: Floats, row: NDArray[np.float32]) -> None:
     """KinematicObservation.normalize_obs: one row [1 + 4], presence first, mapped to [-1, 1] and clipped."""
     row[0] = 1.0
@@ -71,7 +71,7 @@ def write_row(measured: Floats, low: Floats, high: Floats, row: NDArray[np.float
         row[1 + feature] = clip(scaled, -1.0, 1.0)
 
 
-@njit
+@inner
 def observe(
     vehicles: Vehicles,
     order: Integers,

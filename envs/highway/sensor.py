@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bench.scenario import Weather
+from envs.highway.compiled import entry_point, inner
 
 CLEAR_RANGE_M = 200.0
 """AbstractEnv.PERCEPTION_DISTANCE: 5 x the greatest speed."""
@@ -43,7 +43,7 @@ def noise_sigma(weather: Weather) -> float:
     return SIGMA_PER_MM_H * weather.precipitation_mm_h + SIGMA_PER_EXTINCTION * weather.extinction_per_m
 
 
-@njit
+@inner
 def mix(value: np.uint64) -> np.uint64:
     """Finaliser of splitmix64 (Steele, Lea and Flood 2014): a bijection on 64 bits that scatters counters."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -51,7 +51,7 @@ def mix(value: np.uint64) -> np.uint64:
     return value ^ (value >> np.uint64(31))
 
 
-@njit
+@inner
 def counter_hash(seed: int, step: int, vehicle: int, draw: int) -> np.uint64:
     """64 uniform bits for one counter; each part is mixed in on its own: neighbouring counters share nothing."""
     step_size = np.uint64(0x9E3779B97F4A7C15)
@@ -61,7 +61,7 @@ def counter_hash(seed: int, step: int, vehicle: int, draw: int) -> np.uint64:
     return mix((value ^ np.uint64(draw)) + step_size)
 
 
-@njit
+@inner
 def standard_normal(seed: int, step: int, vehicle: int, feature: int) -> float:
     """One standard normal number by Box and Muller's transform of two hashed uniforms."""
     radius_bits = counter_hash(seed, step, vehicle, 2 * feature) >> np.uint64(11)
@@ -71,7 +71,7 @@ def standard_normal(seed: int, step: int, vehicle: int, feature: int) -> float:
     return radius * math.cos(TWO_PI * np.float64(angle_bits) * UNIT_PER_BIT)
 
 
-@njit
+@entry_point
 def add_noise(measured: NDArray[np.float64], sigma: float, seed: int, step: int, vehicle: int) -> None:
     """Disturb one vehicle's measured x, y, vx, vy [4], in place and in physical units; sigma 0 leaves every bit."""
     if sigma > 0.0:

@@ -7,10 +7,9 @@ once and turned into the same numbers by the compiled code, which makes a reset 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from envs.highway.compiled import entry_point
+from envs.highway.compiled import entry_point, inner
 from envs.highway.dynamics import CONTINUOUS, IDM, LANE_WIDTH, SPEED_LIMIT, closest_lane, update_direction
 from envs.highway.ego import nearest_target_speed
 from envs.highway.state import Floats, Integers, Parameters, Vehicle, Vehicles
@@ -44,7 +43,7 @@ def lane_spacing(lanes: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.array([np.exp(-5 / 40 * int(lane)) for lane in lanes], dtype=np.float64)
 
 
-@njit
+@inner
 def next_double(words: Words, cursor: Integers) -> float:
     """Generator.random: 53 bits of the next word. `cursor` holds [next word, stored half word or -1]."""
     word = words[cursor[0]]
@@ -52,7 +51,7 @@ def next_double(words: Words, cursor: Integers) -> float:
     return np.float64(word >> np.uint64(11)) * UNIT_PER_BIT
 
 
-@njit
+@inner
 def next_half_word(words: Words, cursor: Integers) -> np.uint64:
     """PCG64's 32-bit output: the low half of a word now, its high half the next time."""
     if cursor[1] >= 0:
@@ -65,7 +64,7 @@ def next_half_word(words: Words, cursor: Integers) -> np.uint64:
     return word & LOW_HALF
 
 
-@njit
+@inner
 def next_below(words: Words, cursor: Integers, bound: int) -> np.int64:
     """Generator.integers(bound), and so Generator.choice(bound): Lemire's method on 32 bits."""
     limit = np.uint64(bound)
@@ -76,13 +75,13 @@ def next_below(words: Words, cursor: Integers, bound: int) -> np.int64:
     return np.int64(product >> np.uint64(32))
 
 
-@njit
+@inner
 def next_uniform(words: Words, cursor: Integers, low: float, high: float) -> float:
     """Generator.uniform(low, high)."""
     return low + (high - low) * next_double(words, cursor)
 
 
-@njit
+@inner
 def place_vehicle(vehicle: Vehicle, x: float, lane: int | np.int64, lanes: int, speed: float) -> None:
     """Put a vehicle on the centre of a lane, driving along it."""
     vehicle.x = x
@@ -101,7 +100,7 @@ def place_vehicle(vehicle: Vehicle, x: float, lane: int | np.int64, lanes: int, 
     update_direction(vehicle)
 
 
-@njit
+@inner
 def spawn_episode(
     vehicles: Vehicles,
     words: Words,

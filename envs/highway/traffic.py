@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from envs.highway.compiled import inner
 from envs.highway.dynamics import (
     CONTINUOUS,
     DISCRETE,
@@ -36,7 +35,7 @@ NEIGHBOUR_MARGIN = 1.0
 NO_ONE = -1
 
 
-@njit
+@inner
 def sort_by_position(vehicles: Vehicles, order: Integers) -> None:
     """Bring `order` [N] up to date, in place: insertion sort, for it is nearly sorted from the frame before."""
     for place in range(1, order.size):
@@ -49,7 +48,7 @@ def sort_by_position(vehicles: Vehicles, order: Integers) -> None:
         order[slot + 1] = moved
 
 
-@njit
+@inner
 def front_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> int:
     """Road.neighbour_vehicles: the nearest on `lane`, level with or ahead of the vehicle at `place` of `order`.
 
@@ -69,7 +68,7 @@ def front_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) ->
     return found
 
 
-@njit
+@inner
 def rear_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> int:
     """Road.neighbour_vehicles: the nearest on `lane` behind the vehicle at `place` of `order`.
 
@@ -86,7 +85,7 @@ def rear_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> 
     return found
 
 
-@njit
+@inner
 def desired_gap(vehicle: Vehicle, leader: Vehicle) -> float:
     """IDMVehicle.desired_gap in m; the difference of velocities is taken along the vehicle's own direction."""
     cos, sin = vehicle.cos_heading, vehicle.sin_heading
@@ -96,21 +95,21 @@ def desired_gap(vehicle: Vehicle, leader: Vehicle) -> float:
     return JAM_DISTANCE + vehicle.speed * TIME_GAP + vehicle.speed * closing / GAP_SCALE
 
 
-@njit
+@inner
 def free_acceleration(vehicle: Vehicle, target_speed: float, delta: float) -> float:
     """IDMVehicle.acceleration on an empty road, in m/s2."""
     wanted = abs(not_zero(clip(target_speed, 0.0, SPEED_LIMIT)))
     return COMFORT_ACCELERATION * (1 - math.pow(max(vehicle.speed, 0.0) / wanted, delta))
 
 
-@njit
+@inner
 def interaction(vehicle: Vehicle, leader: Vehicle) -> float:
     """What IDMVehicle.acceleration subtracts for the vehicle ahead, in m/s2."""
     ratio = desired_gap(vehicle, leader) / not_zero(leader.x - vehicle.x)
     return COMFORT_ACCELERATION * (ratio * ratio)
 
 
-@njit
+@inner
 def following_acceleration(vehicles: Vehicles, number: int, leader: int, free: float) -> float:
     """IDMVehicle.acceleration behind `leader` (or NO_ONE), in m/s2, given its value `free` on an empty road."""
     if leader < 0:
@@ -118,7 +117,7 @@ def following_acceleration(vehicles: Vehicles, number: int, leader: int, free: f
     return free - interaction(vehicles[number], vehicles[leader])
 
 
-@njit
+@inner
 def wants_lane(
     vehicles: Vehicles, order: Integers, place: int, lane: int, free: float, own_leader: int, ego: int
 ) -> bool:
@@ -143,7 +142,7 @@ def wants_lane(
     return not imposed - interaction(vehicles[follower], vehicles[number]) < -LANE_CHANGE_MAX_BRAKING_IMPOSED
 
 
-@njit
+@inner
 def must_abort(vehicles: Vehicles, number: int, ego: int) -> bool:
     """Whether someone just ahead is already changing to the same lane (IDMVehicle.change_lane_policy)."""
     vehicle = vehicles[number]
@@ -157,7 +156,7 @@ def must_abort(vehicles: Vehicles, number: int, ego: int) -> bool:
     return False
 
 
-@njit
+@inner
 def choose_lane(
     vehicles: Vehicles, order: Integers, place: int, lanes: int, free: float, leader: int, ego: int
 ) -> None:
@@ -175,7 +174,7 @@ def choose_lane(
             vehicle.target_lane = lane
 
 
-@njit
+@inner
 def drive_idm(vehicles: Vehicles, order: Integers, place: int, lanes: int, ego: int) -> None:
     """IDMVehicle.act: MOBIL for the lane, IDM for the acceleration (over both lanes during a change)."""
     number = order[place]
@@ -197,7 +196,7 @@ def drive_idm(vehicles: Vehicles, order: Integers, place: int, lanes: int, ego: 
     vehicle.acceleration = clip(acceleration, -MAX_ACCELERATION, MAX_ACCELERATION)
 
 
-@njit
+@inner
 def act(vehicles: Vehicles, order: Integers, places: Integers, lanes: int, ego: int) -> None:
     """Road.act: every vehicle decides, in highway-env's order, for each sees the target lanes chosen before it.
 
