@@ -13,8 +13,6 @@ from torchrl.envs import EnvBase
 from bench.stopping import SPEED_MPS
 from bench.vision import Scenes
 
-STOP_LINE_M = 0.65
-"""Before the sign: the middle of the line on the road."""
 HARDEST_MPS2 = 8.0
 """Full braking on a dry road."""
 
@@ -25,8 +23,8 @@ class ApproachEnv(EnvBase):
     The action is the braking in m/s2, float32 [B, 1] in [0, 8]. A step lasts as long as an unbraked car takes from one frame
     to the next. `observation` is what the camera shows, [B, 3, H, W]: the frame whose distance is nearest (the last one
     stays in view after it). `info` has the `distance` to the sign in m, the `speed` in m/s, the sign's `box` in pixels [B, 4]
-    and its `visible` share. An episode ends when the car stands or is past the stop line; the reward is 1 for standing
-    before it, else 0.
+    and its `visible` share. An episode ends when the car stands or is past the sign, which the stop line is level with
+    (`bench.stopping`); the reward is 1 for standing before it, else 0.
 
     Args:
         scenes: of each approach, farthest first, all of one size and at the same distances.
@@ -77,11 +75,11 @@ class ApproachEnv(EnvBase):
         driven = self.speed * seconds - braking * seconds.square() / 2
         self.distance = torch.where(running, self.distance - driven, self.distance)
         self.speed = torch.where(running, (self.speed - braking * seconds).clamp(min=0), self.speed)
-        stopped = running & (self.speed <= 1e-4) & (self.distance >= STOP_LINE_M)
+        stopped = running & (self.speed <= 1e-4) & (self.distance >= 0)
         return self._shown().set("reward", stopped.float())
 
     def _ended(self) -> Tensor:
-        return (self.speed <= 1e-4) | (self.distance < STOP_LINE_M)
+        return (self.speed <= 1e-4) | (self.distance < 0)
 
     def _shown(self) -> TensorDict:
         frames = (self.distance - self.distances).abs().argmin(-1)

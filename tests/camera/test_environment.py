@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from envs.camera.environment import STOP_LINE_M, ApproachEnv
+from envs.camera.environment import ApproachEnv
 from tests.camera.scenes import scenes
 
 
@@ -37,14 +37,14 @@ def test_without_braking_it_meets_every_frame_and_runs_the_sign(env: ApproachEnv
     assert seen[:10] == pytest.approx(env.distances.tolist(), abs=1e-3)
     assert bool(steps[-1]["done"].all())
     assert not any(step["reward"].any() for step in steps)
-    assert float(steps[-1]["info", "distance"].max()) < STOP_LINE_M
+    assert float(steps[-1]["info", "distance"].max()) < 0
 
 
 @pytest.mark.parametrize(("braking", "stops"), [(8.0, True), (2.0, True), (1.6, False)])
 def test_it_stops_within_the_distance_that_physics_gives(env: ApproachEnv, braking: float, stops: bool) -> None:
     steps = _driven(env, braking)
     rest = 30.0 - 10.0**2 / (2 * braking)
-    assert (rest > STOP_LINE_M) == stops
+    assert (rest > 0) == stops
     assert bool(steps[-1]["reward"].all()) == stops
     if stops:
         assert float(steps[-1]["info", "distance"][0]) == pytest.approx(rest, abs=1e-2)
