@@ -1,0 +1,43 @@
+"""The frames that ship: every approach of the grid, by day and by night, at places that no patch was crafted on."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bench.errors import UserError
+from bench.scenario import WEATHERS, Cell
+from envs.camera import poses
+from envs.camera.bank import SHIPPED
+from envs.camera.street.layout import LOCATIONS
+from envs.camera.world import StopSignApproach
+
+WORLD = StopSignApproach()
+
+
+@pytest.mark.parametrize("weather", WEATHERS)
+def test_every_approach_is_there(weather: str) -> None:
+    scored = {name for name, place in LOCATIONS.items() if not place.training}
+    for lanes in poses.LANES:
+        for density in poses.DENSITIES:
+            approaches = WORLD.approaches(Cell(lanes=lanes, density=density, weather=weather), range(3))
+            assert {approach.location for approach in approaches} == scored
+            for approach in approaches:
+                distance = approach.scenes.distance
+                assert torch.allclose(distance, torch.linspace(30, 8, 10), atol=0.01)
+                assert (approach.scenes.visible > 0).sum() >= 6
+
+
+def test_no_scored_place_is_for_crafting() -> None:
+    assert all(LOCATIONS[pose.location].training for pose in WORLD.training_scenes().poses)
+
+
+def test_all_of_it_is_under_80_mb() -> None:
+    assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 80e6
+
+
+def test_a_road_that_was_not_rendered_is_one_line() -> None:
+    with pytest.raises(
+        UserError, match=r"the camera world has no 6 lanes, density 1, clear: lanes must be one of 3, 4, 5"
+    ):
+        WORLD.approaches(Cell(lanes=6, density=1.0, weather="clear"), range(1))
