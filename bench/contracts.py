@@ -48,6 +48,8 @@ class Victim(Component):
     """What is attacked: how to load it and, if it learns, how to train it."""
 
     learns: ClassVar[bool] = False
+    answers: ClassVar[Access] = "gradients"
+    """The most that it can be asked: `scores` for one that computes outside of torch, and so has no gradient."""
 
     def zoo_name(self) -> str:
         """The name of this victim's entries in the zoo, and the beginning of the name of what defences make of it."""
