@@ -257,6 +257,11 @@ def main() -> None:
             raise
         reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
         sys.exit(_complain(reason))
+    # What nobody foresaw is mostly in a plug-in; its author is told how to see where.
+    except Exception as error:
+        if debug:
+            raise
+        sys.exit(_complain(f"{type(error).__name__}: {error} (--debug shows where)"))
     sys.exit(status or 0)
 
 

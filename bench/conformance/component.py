@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from bench import registry
-from bench.conformance.check import Check, Suite, one_line, require
+from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
 from bench.errors import UserError
 from bench.fingerprint import canonical
 from bench.parameters import description, parameters
@@ -41,13 +41,12 @@ class ComponentSuite(Suite):
         """Every parameter can be written on the command line and comes back as it was."""
         owned = parameters(type(self.component))
         written = {name: text for name in owned if (text := _text(getattr(self.component, name))) is not None}
-        needed = {name: text for name, text in written.items() if owned[name].required}
+        try:
+            made = configured(self.kind, self.name, written).component
+        except UserError as error:
+            hint = "types may be bool, int, float, str, Literal, None and tuples of them"
+            raise BrokenRuleError(f"{one_line(error)} ({hint})") from None
         for name, text in written.items():
-            try:
-                made = configured(self.kind, self.name, needed | {name: text}).component
-            except UserError as error:
-                hint = "types may be bool, int, float, str, Literal, None and tuples of them"
-                require(False, f"{self.kind}.{name} cannot be set on the command line ({hint}): {one_line(error)}")
             value, wanted = getattr(made, name), getattr(self.component, name)
             require(
                 type(value) is type(wanted) and value == wanted,

@@ -139,7 +139,9 @@ class PolicySuite(Suite):
         leaf = self._observations().requires_grad_(True)
         scores = self._ready().scores(leaf)
         require(scores.requires_grad, "its scores have no graph: no torch.no_grad in scores, no .detach, no NumPy")
-        (gradient,) = torch.autograd.grad(scores.sum(), leaf)
+        # Not their sum, which may be constant.
+        weighted = scores @ torch.linspace(1, 2, scores.shape[-1])
+        (gradient,) = torch.autograd.grad(weighted.sum(), leaf)
         require(bool(gradient.isfinite().all()), "its gradient is NaN or infinite somewhere")
         require(
             bool(gradient.any()),

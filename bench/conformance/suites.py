@@ -38,6 +38,10 @@ def examine(kind: Kind, name: str, values: Mapping[str, str] | None = None, vict
         except NotApplicableError as reason:
             yield Outcome(f"{prefix}behaviour", "skip", one_line(reason))
             continue
+        # Third-party code may fail in any way, while it is loaded too.
+        except Exception as error:
+            yield Outcome(f"{prefix}behaviour", "fail", f"{type(error).__name__}: {one_line(error)}")
+            continue
         for outcome in suite.outcomes():
             yield Outcome(f"{prefix}{outcome.check}", outcome.status, outcome.text)
 
