@@ -137,17 +137,26 @@ def _loaded(load: Callable[[int], object]) -> None:
         raise NotApplicableError(f"it cannot be loaded: {one_line(error)}") from None
 
 
-def _victim_for(defense: Any, victim: str, track: Track) -> Any:
+def _victim_for(defense: Any, name: str, track: Track) -> Any:
     """The victim that a defence is tried on: the one that is named, or the first that it can be loaded for."""
     reasons = []
-    for name in [victim] if victim else tracks.names("victim", track):
+    for target in [choose("victim", name).component] if name else _victims(track):
+        if track not in target.tracks():
+            raise NotApplicableError(f"victim {name!r} is of another track")
         try:
-            target = choose("victim", name).component
-            if track in target.tracks() and (track != "driving" or target.sees):
-                defense.load(target, 0)
-                return target
-            reasons.append(f"victim {name!r} does not fit it")
-        # A defence is its author's code; that it fails is what the checks are to say.
+            defense.load(target, 0)
+            return target
         except UserError as error:
             reasons.append(one_line(error))
     raise NotApplicableError(f"it can be loaded for no victim: {reasons[0] if reasons else 'none is installed'}")
+
+
+def _victims(track: Track) -> Iterator[Any]:
+    """Those of a track that look at something and need no words."""
+    for name in tracks.names("victim", track):
+        try:
+            target = choose("victim", name).component
+        except UserError:
+            continue
+        if getattr(target, "sees", True):
+            yield target

@@ -371,5 +371,5 @@ def test_bad_words_of_a_check_are_refused_in_one_line(bench: Bench, words: tuple
 def test_a_defence_is_tried_on_the_victim_that_is_named() -> None:
     outcomes: list[Any] = list(examine("defense", "none", victim="bad"))
     skipped = [outcome for outcome in outcomes if outcome.check == "detection: behaviour"]
-    assert "victim 'bad' does not fit it" in skipped[0].text
+    assert "victim 'bad' is of another track" in skipped[0].text
     assert all(outcome.status != "fail" for outcome in outcomes)
