@@ -30,7 +30,7 @@ def print_new(kind: str, name: str, words: Sequence[str], console: Console) -> N
     folder = scaffold.write(kind, name, track=track, folder=Path(out).expanduser() if out else None)
     console.print(Text(f"{folder} is written. Next, in the environment that cavbench is in:"), soft_wrap=True)
     lines = {
-        f"pip install -e {folder}": "bench finds it from now on, also after you edit it",
+        f"pip install -e '{folder}[test]'": "bench finds it from now on, also after you edit it",
         f"bench check {name}": "does it keep the rules?",
         f"python -m pytest {folder}": "its own test",
         scaffold.first_run(kind, name, track): "a first score, on a part of the grid",

@@ -46,7 +46,7 @@ def test_a_package_says_what_is_next(bench: Bench, tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     said = bench("new", "attack", "my_attack")
     assert said.code == 0, said.err
-    for part in ("pip install -e cavbench-my-attack", "bench check my_attack", "bench run attack=my_attack"):
+    for part in ("pip install -e 'cavbench-my-attack[test]'", "bench check my_attack", "bench run attack=my_attack"):
         assert part in said.out
     files = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
     assert files == [
