@@ -13,6 +13,7 @@ import pytest
 
 from bench import results, scaffold
 from tests.framework.conftest import Said, ran
+from tests.framework.distributions import pip_install
 from tests.framework.test_cli import assert_one_line
 
 Bench = Callable[..., Said]
@@ -37,8 +38,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def installed(written: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder that pip installed them to, outside of the environment of the tests."""
     site = tmp_path_factory.mktemp("site")
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target", site]
-    subprocess.run([*pip, *written], check=True, capture_output=True, text=True)
+    pip_install(site, *written)
     return site
 
 
