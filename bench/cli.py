@@ -1,4 +1,4 @@
-"""The command line: `bench run | train | list | show | view | report | fetch`.
+"""The command line: `bench run | train | list | new | check | show | view | report | fetch`.
 
 Commands import what they need when they are called, so that `bench list` and `--help` do not wait for torch.
 """
@@ -52,6 +52,41 @@ def list_components(
     from bench import cli_list
 
     cli_list.print_component(name, Console()) if name else cli_list.print_names(Console())
+
+
+@app.command()
+def new(
+    kind: Annotated[str, typer.Argument(help="attack, defense or victim.")],
+    name: Annotated[str, typer.Argument(help="What the command line shall call it, for instance my_attack.")],
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[track=…] [out=…]", help="track=detection; out=FOLDER for the package."),
+    ] = None,
+) -> None:
+    """Write a small plug-in package that installs, works and passes its test, to begin with.
+
+    For instance: bench new attack my_attack, or bench new defense my_defense track=detection
+    """
+    from bench import cli_new
+
+    cli_new.print_new(kind, name, words or [], Console())
+
+
+@app.command()
+def check(
+    name: Annotated[str, typer.Argument(help="A component, built in or a plug-in's.")],
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[KEY=VALUE]...", help="Its parameters, and victim=NAME that a defence is tried on."),
+    ] = None,
+) -> None:
+    """Check that a component keeps the rules of the benchmark, and say what to fix.
+
+    For instance: bench check my_attack attack.strength=2
+    """
+    from bench import cli_check
+
+    raise typer.Exit(cli_check.print_checks(name, words or [], Console()))
 
 
 @app.command()
@@ -222,6 +257,11 @@ def main() -> None:
             raise
         reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
         sys.exit(_complain(reason))
+    # What nobody foresaw is mostly in a plug-in; its author is told how to see where.
+    except Exception as error:
+        if debug:
+            raise
+        sys.exit(_complain(f"{type(error).__name__}: {error} (--debug shows where)"))
     sys.exit(status or 0)
 
 

@@ -48,6 +48,8 @@ class Victim(Component):
     """What is attacked: how to load it and, if it learns, how to train it."""
 
     learns: ClassVar[bool] = False
+    answers: ClassVar[Access] = "gradients"
+    """The most that it can be asked: `scores` for one that computes outside of torch, and so has no gradient."""
 
     def zoo_name(self) -> str:
         """The name of this victim's entries in the zoo, and the beginning of the name of what defences make of it."""
@@ -122,7 +124,12 @@ class ThreatModel:
 
     def allows(self, access: Access) -> bool:
         """Whether an attack that needs `access` fits this threat model."""
-        return get_args(Access).index(access) <= get_args(Access).index(self.access)
+        return permits(self.access, access)
+
+
+def permits(allowed: Access, access: Access) -> bool:
+    """Whether who may use `allowed` may use `access`."""
+    return get_args(Access).index(access) <= get_args(Access).index(allowed)
 
 
 def permit(asked: Access, declared: Access) -> None:
@@ -131,7 +138,7 @@ def permit(asked: Access, declared: Access) -> None:
     Raises:
         UserError: if it does.
     """
-    if get_args(Access).index(asked) > get_args(Access).index(declared):
+    if not permits(declared, asked):
         raise UserError(f"the attack asked for {asked!r}, but declares that it needs {declared!r} only")
 
 

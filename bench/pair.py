@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
+from torch import nn
+
 from bench import registry, tracks
-from bench.contracts import Attack, Defense, ThreatModel, Track, Victim, World
-from bench.driving import DrivingAttack, DrivingVictim
+from bench.contracts import Attack, Defense, ThreatModel, Track, Victim, World, permits
+from bench.driving import DrivingAttack, DrivingVictim, Policy
 from bench.errors import UserError
 from bench.fingerprint import canonical, digest, state_digest
 from bench.parameters import parameters
 from bench.patch import PatchThreat
 from bench.registry import Kind
 from bench.threat import ObservationThreat
-from bench.vision import DetectorVictim, PatchAttack
+from bench.vision import Detector, DetectorVictim, PatchAttack
 
 C = TypeVar("C", Attack, Defense, Victim, World)
 
@@ -24,6 +26,8 @@ UNATTACKED: dict[Track, ThreatModel] = {
     "detection": PatchThreat(budget=0.0, access="oblivious", queries=0),
 }
 """The threat model of every clean run, so that runs with different threats share it."""
+NETWORKS: dict[Track, type[nn.Module]] = {"driving": Policy, "detection": Detector}
+"""What victims and defences of a track load."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +67,10 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
         return Chosen(kind=kind, name=name, component=component(**params))
     except (ValueError, TypeError) as error:
         raise UserError(f"{kind} {name!r}: {str(error).splitlines()[0]}") from error
+    # A plug-in's own checks may fail in any other way.
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise UserError(f"{kind} {name!r} cannot be made: {reason} (--debug shows where)") from error
 
 
 def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:
@@ -102,6 +110,11 @@ class Pair:
             raise UserError(f"a {type(self.threat).__name__} is no threat model of the {self.track} track")
         if isinstance(victim, DrivingVictim):
             self._check_driving(victim)
+        if not permits(victim.answers, attack.access):
+            raise UserError(
+                f"attack {self.attack.name!r} needs access {attack.access!r}, victim {self.victim.name!r} answers "
+                f"{victim.answers!r} at most: it is a black box"
+            )
         if not self.threat.allows(attack.access):
             raise UserError(
                 f"attack {self.attack.name!r} needs access {attack.access!r}, the threat model allows "
@@ -160,9 +173,21 @@ class Pair:
         """The hash that the defended network carries of its weights or, where it carries none, the hash of what it has.
 
         Raises:
-            UserError: if it cannot be loaded.
+            UserError: if it cannot be loaded, or is no network of the track.
         """
-        network = self.defense.component.load(self.victim.component, training_seed)
+        try:
+            network = self.defense.component.load(self.victim.component, training_seed)
+        except UserError:
+            raise
+        # Third-party code may fail in any way; the person at the terminal is told which component did.
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            raise UserError(
+                f"{self.defense} + {self.victim} cannot be loaded: {reason} (--debug shows where)"
+            ) from error
+        if not isinstance(network, NETWORKS[self.track]):
+            wanted = NETWORKS[self.track].__name__
+            raise UserError(f"{self.defense} + {self.victim} is a {type(network).__name__} where a {wanted} is needed")
         carried = str(getattr(network, "weights_sha256", ""))
         return carried if carried or not network.state_dict() else state_digest(network)
 

@@ -52,7 +52,8 @@ def parameters(component: type) -> dict[str, Parameter]:
     """
     try:
         hints = typing.get_type_hints(component)
-    except NameError as error:
+    # An annotation is evaluated, and may be any expression.
+    except Exception as error:
         raise UserError(f"the parameters of {component.__qualname__} cannot be read: {error}") from error
     meanings: dict[str, str] = {}
     for base in reversed(component.__mro__):

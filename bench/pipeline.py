@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from bench.driving import DrivingAttack, Features, Policy
+from bench.errors import UserError
 from bench.threat import ObservationThreat, Oracle
 
 
@@ -54,14 +55,17 @@ class AttackModule(TensorDictModuleBase):
     def _attack(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         start = time.perf_counter()
         self.oracle.begin_step(observation)
-        answer = self.attack.perturb(observation, self.oracle).detach()
-        if answer.shape != observation.shape:
-            raise ValueError(
-                f"{type(self.attack).__name__}.perturb returned shape {tuple(answer.shape)}, not {tuple(observation.shape)}"
-            )
+        answer = self.attack.perturb(observation, self.oracle)
+        if not isinstance(answer, Tensor) or answer.shape != observation.shape:
+            found = f"shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else f"a {type(answer).__name__}"
+            raise UserError(f"{type(self.attack).__name__}.perturb returned {found}, not {tuple(observation.shape)}")
+        answer = answer.detach()
         shown = self.oracle.project(answer)
         self.milliseconds = (time.perf_counter() - start) * 1000
-        return shown, self.oracle.spent, (answer - shown).abs().flatten(1).amax(1)
+        excess = (answer - shown).abs().flatten(1).amax(1)
+        if not bool(excess.isfinite().all()):
+            raise UserError(f"{type(self.attack).__name__}.perturb returned numbers that are NaN or infinite")
+        return shown, self.oracle.spent, excess
 
 
 class PolicyModule(TensorDictModuleBase):

@@ -106,8 +106,8 @@ def resolve(group: str, name: str, noun: str) -> Any:
     point = metadata.EntryPoint(name=name, value=entry.target, group=group)
     try:
         return point.load()
-    # A plug-in may fail in any way while it is imported, and must not take the others with it.
-    except Exception as error:
+    # A plug-in may fail in any way while it is imported, end the program too, and must not take the others with it.
+    except (Exception, SystemExit) as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         where = f"{noun} {name!r} ({entry.target} of {entry.shipped_by})"
         raise UserError(f"{where} cannot be imported: {reason}") from error
@@ -138,6 +138,9 @@ def load(kind: Kind, name: str) -> type[Any]:
     if positional := [field.name for field in fields(component) if field.init and not field.kw_only]:
         taken = ", ".join(positional)
         raise UserError(f"{where} takes {taken} by position: write @dataclass(frozen=True, kw_only=True)")
+    if kind == "attack" and getattr(component, "access", None) not in get_args(contracts.Access):
+        levels = ", ".join(get_args(contracts.Access))
+        raise UserError(f"{where} must say what it needs: access: ClassVar[Access] = one of {levels}")
     return component
 
 

@@ -229,7 +229,11 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
         raise UserError(f"{kind} {name!r} needs {', '.join(missing)}")
     if not given:
         return {}
-    ConfigStore.instance().store(group=kind, name=name, node=_schema(owned))
+    try:
+        ConfigStore.instance().store(group=kind, name=name, node=_schema(owned))
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"the parameters of {kind} {name!r} cannot be set on the command line: {reason}") from error
     composed = _composed([f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())])[kind]
     arguments = OmegaConf.to_object(composed)
     values = {item: getattr(arguments, item) for item in owned}

@@ -46,4 +46,4 @@ class JPEG(DetectorDefense):
             raise ValueError(f"jpeg.quality must be between 1 and 100, got {self.quality}")
 
     def load(self, victim: DetectorVictim, seed: int) -> Detector:
-        return _Compressed(victim.load(seed), self.quality)
+        return _Compressed(victim.load(seed), self.quality).eval()

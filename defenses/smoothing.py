@@ -59,4 +59,4 @@ class MedianSmoothing(DetectorDefense):
             raise ValueError(f"median.size must be odd and between 3 and 11, got {self.size}")
 
     def load(self, victim: DetectorVictim, seed: int) -> Detector:
-        return _Median(victim.load(seed), self.size)
+        return _Median(victim.load(seed), self.size).eval()

@@ -64,10 +64,10 @@ class Blind(DrivingVictim):
 
     def load(self, seed: int) -> Policy:
         if self.policy in CONTINUOUS:
-            return _BlindPolicy(torch.tensor(CONTINUOUS[self.policy]), "continuous")
+            return _BlindPolicy(torch.tensor(CONTINUOUS[self.policy]), "continuous").eval()
         if self.policy == "right_then_slower":
-            return _BlindPolicy(torch.tensor(SLOWER), "discrete", lane_changes=RIGHT_STEPS)
-        return _BlindPolicy(torch.tensor(DISCRETE[self.policy]), "discrete")
+            return _BlindPolicy(torch.tensor(SLOWER), "discrete", lane_changes=RIGHT_STEPS).eval()
+        return _BlindPolicy(torch.tensor(DISCRETE[self.policy]), "discrete").eval()
 
 
 RIGHT_STEPS = 60
@@ -116,7 +116,7 @@ class RandomDriver(DrivingVictim):
         return self.actions
 
     def load(self, seed: int) -> Policy:
-        return _RandomPolicy(self.actions)
+        return _RandomPolicy(self.actions).eval()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,4 +133,4 @@ class IDMDriver(DrivingVictim):
         return "discrete"
 
     def load(self, seed: int) -> Policy:
-        return _BlindPolicy(torch.tensor(IDLE), "discrete", driver="idm")
+        return _BlindPolicy(torch.tensor(IDLE), "discrete", driver="idm").eval()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -33,6 +35,12 @@ def install(
     (info / "entry_points.txt").write_text("\n".join(groups))
     for module, text in modules.items():
         (folder / f"{module}.py").write_text(text)
+
+
+def pip_install(folder: Path, *packages: Path) -> None:
+    """Let pip install packages to `folder`, outside of the environment of the tests and without a network."""
+    pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target", folder)
+    subprocess.run([*pip, *packages], check=True, capture_output=True, text=True)
 
 
 def install_toy(folder: Path) -> None:

@@ -1,0 +1,68 @@
+"""`bench check`: the rules of the benchmark, one line each, and what to fix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bench import registry
+from bench.errors import UserError
+from bench.registry import KINDS
+
+MARKS = {"pass": ("✓", "green"), "fail": ("✗ fix", "bold red"), "skip": ("– skipped", "dim")}
+
+
+def print_checks(name: str, words: Sequence[str], console: Console) -> int:
+    """Carry out the checks of every component of this name, print them, and return 1 if any failed, else 0.
+
+    Raises:
+        UserError: if no component has the name, its plug-in is broken, or a word cannot be read.
+    """
+    from bench.conformance import examine
+    from bench.process import settle
+
+    settle()
+    given = dict(_read(word) for word in words)
+    kinds = [kind for kind in KINDS if name in registry.names(kind)]
+    if not kinds:
+        every = sorted({known for kind in KINDS for known in registry.names(kind)})
+        raise UserError(registry.unknown(f"component {name!r}", name, every))
+    failed = 0
+    for kind in kinds:
+        own = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{kind}.")}
+        strange = [key for key in given if key != "victim" and key.partition(".")[0] not in kinds]
+        if strange:
+            raise UserError(
+                registry.unknown(f"key {strange[0]!r}", strange[0], [*(f"{kind}.…" for kind in kinds), "victim"])
+            )
+        entry = registry.find(registry.GROUPS[kind], name, kind)
+        console.print(
+            Text.assemble((f"{kind} ", "dim"), (name, "bold"), (f"   {entry.target}, {entry.shipped_by}", "dim"))
+        )
+        table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+        table.add_column(no_wrap=True)
+        table.add_column(no_wrap=True)
+        table.add_column(ratio=1)
+        counts = dict.fromkeys(MARKS, 0)
+        for outcome in examine(kind, name, own, given.get("victim", "")):
+            mark, style = MARKS[outcome.status]
+            counts[outcome.status] += 1
+            text = Text(outcome.text, style="" if outcome.status == "fail" else "dim")
+            table.add_row(outcome.check, Text(mark, style=style), text)
+        console.print(table)
+        told = f"{counts['pass']} passed, {counts['fail']} to fix, {counts['skip']} skipped"
+        console.print(Text(told + "\n", style="bold red" if counts["fail"] else "green"))
+        failed += counts["fail"]
+    return int(failed > 0)
+
+
+def _read(word: str) -> tuple[str, str]:
+    key, equals, value = word.partition("=")
+    if not (equals and value and (key == "victim" or "." in key)):
+        raise UserError(
+            f"cannot read {word!r}: write attack.steps=50 for a parameter, or victim=NAME to try a defence on"
+        )
+    return key, value

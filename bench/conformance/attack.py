@@ -1,0 +1,190 @@
+"""The rules for attacks on drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
+from bench.conformance.randomness import stir_others
+from bench.conformance.traffic import observations, victim
+from bench.contracts import QueryBudgetError
+from bench.driving import ActionType, DrivingAttack, Features, Policy
+from bench.errors import UserError
+from bench.fingerprint import state_digest
+from bench.threat import ObservationThreat, Oracle
+
+EPISODES = 6
+BUDGETS = (0, 1, 2, 7, 50, 1000)
+"""Queries a step that an attack must get by with."""
+WITHIN = 1e-5
+"""On the normalised scale; what an answer may be outside the set by rounding."""
+
+
+class AttackSuite(Suite):
+    """Of a `DrivingAttack`, on networks with random weights.
+
+    Args:
+        name: of the component.
+        component: the attack.
+        features: of the observations.
+    """
+
+    component: DrivingAttack
+
+    def __init__(self, name: str, component: Any, features: Features) -> None:
+        super().__init__(name, component)
+        self.features = features
+
+    def checks(self) -> Mapping[str, Check]:
+        return {
+            "shape, type and device": self.same_shape,
+            "finite numbers": self.finite,
+            "empty batch": self.nothing_to_do,
+            "batching": self.neighbours_do_not_matter,
+            "determinism": self.same_seed_same_answer,
+            "threat model": self.within_the_set,
+            "query budget": self.within_the_budget,
+            "victim left alone": self.leaves_the_victim,
+        }
+
+    def same_shape(self) -> None:
+        """[B, V, F] in, the same out, in the precision given."""
+        for action_type in self.component.action_types:
+            for dtype in (torch.float32, torch.float64):
+                policy, observation = self._victim(action_type).to(dtype), self._observations().to(dtype)
+                answer, _ = self._answer(policy, observation)
+                require(isinstance(answer, Tensor), f"perturb returned a {type(answer).__name__}, not a tensor")
+                require(
+                    answer.shape == observation.shape,
+                    f"perturb returned shape {list(answer.shape)} for {list(observation.shape)}: return [B, V, F]",
+                )
+                require(
+                    (answer.dtype, answer.device) == (dtype, observation.device),
+                    f"perturb returned {answer.dtype} on {answer.device} for {dtype} on {observation.device}: "
+                    "make new tensors with observation.new_zeros or torch.zeros_like",
+                )
+                require(not answer.requires_grad, "the answer carries a graph: return answer.detach()")
+
+    def finite(self) -> None:
+        """No NaN and no infinity."""
+        for action_type in self.component.action_types:
+            answer, _ = self._answer(self._victim(action_type), self._observations())
+            broken = int((~answer.isfinite()).sum())
+            require(not broken, f"{broken} of {answer.numel()} numbers of the answer are NaN or infinite")
+
+    def nothing_to_do(self) -> None:
+        """No episode is running any more."""
+        for action_type in self.component.action_types:
+            answer, _ = self._answer(self._victim(action_type), self._observations()[:0])
+            require(
+                answer.shape[0] == 0,
+                f"perturb returned {answer.shape[0]} observations for none: if not len(observation): return observation",
+            )
+
+    def neighbours_do_not_matter(self) -> None:
+        """The same episode among others gets the same answer; in double precision, so that rounding decides no sign."""
+        for action_type in self.component.action_types:
+            policy = self._victim(action_type).double()
+            among, others = self._observations(0).double(), self._observations(1).double()
+            others[0] = among[0]
+            for threat in (self._threat(), self._threat(queries=30)):
+                first, second = (self._answer(policy, batch, threat)[0] for batch in (among, others))
+                require(
+                    torch.allclose(first[0], second[0], atol=1e-9),
+                    "an episode's answer changes with the other episodes of the batch: take means, norms, best points and "
+                    "random numbers episode by episode, not over the batch",
+                )
+
+    def same_seed_same_answer(self) -> None:
+        """Only the run's generator decides what is drawn, and nothing is kept from step to step."""
+        for action_type in self.component.action_types:
+            policy, observation = self._victim(action_type), self._observations()
+            answers = []
+            for seed in (1, 2):
+                with torch.random.fork_rng(devices=[]):
+                    torch.manual_seed(seed)
+                    stir_others(seed)
+                    answers.append(self._answer(policy, observation)[0])
+            require(
+                torch.equal(*answers),
+                "the same seed gave two answers: draw with generator=oracle.generator, keep no state between steps",
+            )
+
+    def within_the_set(self) -> str:
+        """What is outside is projected by the oracle, and recorded."""
+        outside = 0.0
+        for action_type in self.component.action_types:
+            for threat in (self._threat(), self._threat(norm="linf", budget=0.2), self._threat(budget=0.0)):
+                policy, observation = self._victim(action_type), self._observations()
+                answer, oracle = self._answer(policy, observation, threat)
+                shown = oracle.project(answer)
+                radius = threat.radius(observation, self.features)
+                require(
+                    bool(((shown - observation).abs() <= radius + WITHIN).all()),
+                    "what the oracle projected is outside the set: perturb must not change oracle.radius or its set",
+                )
+                outside = max(outside, float((answer - shown).abs().max()))
+        if outside > WITHIN:
+            return f"up to {outside:.2g} outside, projected by the oracle: return oracle.project(answer) to choose how"
+        return ""
+
+    def within_the_budget(self) -> str:
+        """However few queries there are, it does with them, and its own count is the oracle's."""
+        most = 0
+        for action_type in self.component.action_types:
+            policy, observation = self._victim(action_type), self._observations()
+            for queries in BUDGETS:
+                try:
+                    _, oracle = self._answer(policy, observation, self._threat(queries=queries))
+                except QueryBudgetError as error:
+                    raise BrokenRuleError(
+                        f"{one_line(error)}: look at oracle.remaining before asking, and return what is best so far"
+                    ) from None
+                most = max(most, int(oracle.spent.max()))
+        return f"{most} of 1000 queries a step"
+
+    def leaves_the_victim(self) -> None:
+        """Weights, mode and gradients of the victim, and the true observation, are as they were."""
+        for action_type in self.component.action_types:
+            policy, observation = self._victim(action_type), self._observations()
+            before, truth = (state_digest(policy), _marks(policy)), observation.clone()
+            self._answer(policy, observation)
+            require(state_digest(policy) == before[0], "the victim's weights changed: perturb may only ask the oracle")
+            require(
+                _marks(policy) == before[1], "the victim's mode or gradients changed: perturb may only ask the oracle"
+            )
+            require(torch.equal(observation, truth), "the true observation was changed in place: work on a clone")
+
+    def _victim(self, action_type: ActionType) -> Policy:
+        return victim(action_type, self.features)
+
+    def _observations(self, seed: int = 0) -> Tensor:
+        return observations(EPISODES, features=self.features, seed=seed)
+
+    def _threat(self, **values: Any) -> ObservationThreat:
+        return ObservationThreat(**values)
+
+    def _answer(
+        self, policy: Policy, observation: Tensor, threat: ObservationThreat | None = None
+    ) -> tuple[Tensor, Oracle]:
+        threat = threat or self._threat()
+        oracle = Oracle(policy, threat, self.component.access, self.features, torch.Generator().manual_seed(0))
+        oracle.begin_step(observation)
+        try:
+            with torch.no_grad():
+                return self.component.perturb(observation, oracle), oracle
+        except QueryBudgetError:
+            raise
+        except UserError as error:
+            raise BrokenRuleError(one_line(error)) from None
+
+
+def _marks(policy: Policy) -> object:
+    return [
+        (name, weight.requires_grad, deepcopy(weight.grad)) for name, weight in policy.named_parameters()
+    ], policy.training

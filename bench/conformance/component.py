@@ -1,0 +1,90 @@
+"""What holds for every component: it is documented, can be set on the command line, and travels to worker processes."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping
+from typing import Any
+
+from bench import registry
+from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
+from bench.errors import UserError
+from bench.fingerprint import canonical
+from bench.parameters import description, parameters
+from bench.registry import Kind
+from bench.words import configured
+
+
+class ComponentSuite(Suite):
+    """Of any kind and track."""
+
+    def __init__(self, name: str, component: Any, kind: Kind) -> None:
+        super().__init__(name, component)
+        self.kind = kind
+
+    def checks(self) -> Mapping[str, Check]:
+        return {
+            "docs": self.documented,
+            "command line": self.set_by_words,
+            "worker processes": self.picklable,
+            "version": self.versioned,
+        }
+
+    def documented(self) -> None:
+        """`bench list NAME` has something to say."""
+        kind = type(self.component)
+        require(description(kind), f"{kind.__name__} has no docstring: say what it does in a sentence")
+        silent = [parameter.name for parameter in parameters(kind).values() if not parameter.meaning]
+        require(not silent, f"say in the docstring's `Args:` what these mean: {', '.join(silent)}")
+
+    def set_by_words(self) -> str:
+        """Every parameter can be written on the command line and comes back as it was."""
+        owned = parameters(type(self.component))
+        written = {name: text for name in owned if (text := _text(getattr(self.component, name))) is not None}
+        try:
+            made = configured(self.kind, self.name, written).component
+        except UserError as error:
+            hint = "types may be bool, int, float, str, Literal, None and tuples of them"
+            raise BrokenRuleError(f"{one_line(error)} ({hint})") from None
+        for name, text in written.items():
+            value, wanted = getattr(made, name), getattr(self.component, name)
+            require(
+                type(value) is type(wanted) and value == wanted,
+                f"{self.kind}.{name}={text} comes back as {value!r}: its type annotation does not fit its value {wanted!r}",
+            )
+        return f"{len(written)} of {len(owned)} parameters" if len(written) < len(owned) else ""
+
+    def picklable(self) -> None:
+        """What a worker process is sent is what it gets."""
+        try:
+            copy = pickle.loads(pickle.dumps(self.component))
+        except (pickle.PicklingError, TypeError, AttributeError) as error:
+            require(False, f"keep plain values in its fields, and make the rest where it is used: {one_line(error)}")
+        require(copy == self.component, "a pickled copy is not equal: give its fields types that compare by value")
+        require(
+            canonical(copy) == canonical(self.component),
+            "a pickled copy has another fingerprint: a field is written with its address in memory",
+        )
+
+    def versioned(self) -> str:
+        """Records name the package and its version."""
+        shipped_by = registry.find(registry.GROUPS[self.kind], self.name, self.kind).shipped_by
+        require("unknown" not in shipped_by, "its package has no version: install it with pip")
+        return f"records say {shipped_by}"
+
+
+def _text(value: object) -> str | None:
+    """A value as it is written on the command line; None for those that cannot be."""
+    match value:
+        case bool():
+            return str(value).lower()
+        case None:
+            return "null"
+        case tuple() | list():
+            texts = [_text(item) for item in value]
+            return None if None in texts else f"[{','.join(filter(None, texts))}]"
+        case str():
+            quoted = value.replace("\\", "\\\\").replace('"', '\\"')
+            return f'"{quoted}"'
+        case _:
+            return str(value)

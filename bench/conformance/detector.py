@@ -1,0 +1,131 @@
+"""The rules for detectors, as victims are loaded and as defences make them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.conformance.check import Check, NotApplicableError, Suite, require
+from bench.conformance.street import Street
+from bench.fingerprint import state_digest
+from bench.vision import STOP_SIGN, Detector, DetectorVictim
+
+PICTURES = 3
+
+
+class DetectorSuite(Suite):
+    """Of what a `DetectorVictim` or a `DetectorDefense` loads.
+
+    Args:
+        name: of the component.
+        component: the victim or the defence.
+        victim: the victim itself, or the one that the defence is tried on.
+        load: gives the detector anew.
+    """
+
+    def __init__(self, name: str, component: Any, victim: DetectorVictim, load: Callable[[], Detector]) -> None:
+        super().__init__(name, component)
+        self.victim, self.load = victim, load
+
+    def checks(self) -> Mapping[str, Check]:
+        return {
+            "ready to look": self.frozen,
+            "shape and range": self.predicts,
+            "batching": self.neighbours_do_not_matter,
+            "determinism": self.same_picture_same_answer,
+            "sees": self.looks,
+            "gradient": self.differentiable,
+            "weights left alone": self.keeps_weights,
+        }
+
+    def frozen(self) -> None:
+        """Eval mode, no gradients on weights, and a stop sign among its classes."""
+        detector = self.load()
+        require(
+            isinstance(detector, Detector), f"load returned a {type(detector).__name__}, not a bench.vision.Detector"
+        )
+        require(not detector.training, "it is in training mode: load must return detector.eval()")
+        require(
+            not any(weight.requires_grad for weight in detector.parameters()),
+            "its weights take gradients: load must return detector.requires_grad_(False)",
+        )
+        require(STOP_SIGN in detector.names, f"none of its classes is {STOP_SIGN!r}, which is what attacks hide")
+        require(isinstance(detector.stride, int) and detector.stride > 0, "stride must be a whole number of pixels")
+
+    def predicts(self) -> None:
+        """Boxes and probabilities of the shapes and ranges that `Predictions` says."""
+        detector, pictures = self.load(), self._pictures()
+        found = detector(pictures)
+        boxes, objectness, classes = found.boxes, found.objectness, found.classes
+        count = boxes.shape[1]
+        wanted = ((PICTURES, count, 4), (PICTURES, count), (PICTURES, count, len(detector.names)))
+        shapes = tuple(tuple(part.shape) for part in (boxes, objectness, classes))
+        require(shapes == wanted, f"boxes, objectness and classes are {shapes}, not {wanted}")
+        require(bool(boxes.isfinite().all()), "some boxes are NaN or infinite")
+        require(bool((boxes[..., 2:] >= boxes[..., :2]).all()), "some boxes end before they begin: [x1, y1, x2, y2]")
+        for name, part in (("objectness", objectness), ("classes", classes)):
+            require(
+                bool(((part >= 0) & (part <= 1)).all()), f"{name} has numbers outside [0, 1]: they are probabilities"
+            )
+
+    def neighbours_do_not_matter(self) -> None:
+        """Every picture of a batch is looked at by itself."""
+        detector, among = self.load(), self._pictures()
+        others = among.flip(0).clone()
+        others[0] = among[0]
+        first, second = detector(among).scores[0], detector(others).scores[0]
+        require(
+            torch.allclose(first, second, rtol=1e-3, atol=1e-5),
+            "what it finds in a picture changes with the others of the batch: is a batch normalisation in training mode?",
+        )
+
+    def same_picture_same_answer(self) -> None:
+        """Loaded twice and asked twice, it says the same."""
+        pictures, detector = self._pictures(), self.load()
+        first = detector(pictures).scores
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(1)
+            second, again = detector(pictures).scores, self.load()(pictures).scores
+        require(torch.equal(first, second), "asked twice about a picture, it says two things")
+        require(torch.equal(first, again), "two loads with the same seed say two things")
+
+    def looks(self) -> None:
+        """What it says depends on the picture."""
+        scores = self.load()(self._pictures()).scores
+        require(not torch.equal(scores[0], scores[1]), "it says the same of two pictures")
+
+    def differentiable(self) -> None:
+        """White-box attacks find a way back to the pixels."""
+        if self.victim.answers != "gradients":
+            raise NotApplicableError(f"it answers {self.victim.answers} at most: gradient attacks are refused")
+        leaf, detector = self._pictures().requires_grad_(True), self.load()
+        scores = detector(leaf).scores_of(detector.index(STOP_SIGN))
+        require(scores.requires_grad, "its scores have no graph: no torch.no_grad in predict, no .detach, no NumPy")
+        (gradient,) = torch.autograd.grad(scores.sum(), leaf)
+        require(bool(gradient.isfinite().all()), "its gradient is NaN or infinite somewhere")
+        require(
+            bool(gradient.any()),
+            "its gradient is 0 everywhere, a wall that proves nothing: let it pass straight through (Athalye et al. 2018)",
+        )
+
+    def keeps_weights(self) -> None:
+        """Loading and asking change nothing."""
+        detector, pictures = self.load(), self._pictures()
+        before, shown = (state_digest(detector), state_digest(self.victim.load(0))), pictures.clone()
+        detector(pictures)
+        self.load()
+        require(state_digest(detector) == before[0], "its weights changed while it was asked")
+        require(state_digest(self.victim.load(0)) == before[1], "loading it changed the victim's own weights")
+        require(torch.equal(pictures, shown), "the pictures were changed in place")
+
+    def _pictures(self) -> Tensor:
+        """Three of the street with a random veil, padded to what the stride needs."""
+        scenes, stride = Street(), self.load().stride
+        pictures = scenes.render(torch.arange(PICTURES), None, 1.0)
+        side = -(-max(scenes.size) // stride) * stride
+        veil = torch.rand(PICTURES, 3, side, side, generator=torch.Generator().manual_seed(0))
+        wide = torch.nn.functional.pad(pictures, (0, side - scenes.size[1], 0, side - scenes.size[0]), value=0.5)
+        return 0.8 * wide + 0.2 * veil

@@ -1,0 +1,133 @@
+"""Every kind of bad plug-in ends a command in one line that names it, and breaks no other component."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.framework.conftest import Said
+from tests.framework.distributions import install
+from tests.framework.test_check import CROOKED, POINTS
+from tests.framework.test_cli import assert_one_line
+
+Bench = Callable[..., Said]
+RUN = ("lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0", "workers=1", "record=0", "reference=false")
+TOY = ("world=toy", *RUN)
+
+HEAD = """
+from dataclasses import dataclass
+from typing import ClassVar
+from bench.contracts import Access, Attack
+from bench.driving import DrivingAttack
+"""
+GOOD = """
+@dataclass(frozen=True, kw_only=True)
+class Plugin(DrivingAttack):
+    access: ClassVar[Access] = "oblivious"
+    def perturb(self, observation, oracle):
+        return observation
+"""
+CANNOT_BE_LOADED = {
+    "a module that is not there": ("", "cannot be imported: ModuleNotFoundError"),
+    "an error while it is imported": ("1 / 0\n", "cannot be imported: ZeroDivisionError: division by zero"),
+    "a syntax error": ("def\n", "cannot be imported: SyntaxError"),
+    "one that ends the program": ("import sys; sys.exit(3)\n", "cannot be imported: SystemExit: 3"),
+    "no such class": ("class Other: ...\n", "cannot be imported: AttributeError"),
+    "another base class": ("class Plugin: ...\n", "is not a subclass of bench.contracts.Attack"),
+    "an instance": (f"{HEAD}{GOOD}Plugin = Plugin()\n", "is not a subclass of bench.contracts.Attack"),
+    "another kind": (
+        "from bench.driving import DrivingDefense\nclass Plugin(DrivingDefense): ...\n",
+        "is not a subclass of bench.contracts.Attack",
+    ),
+    "no track": (f"{HEAD}{GOOD}".replace("(DrivingAttack)", "(Attack)"), "is of no track"),
+    "an abstract method": (f"{HEAD}{GOOD}".replace("def perturb", "def disturb"), "does not implement perturb"),
+    "no dataclass": (
+        f"{HEAD}{GOOD}".replace("@dataclass(frozen=True, kw_only=True)", ""),
+        "is not a frozen dataclass",
+    ),
+    "a mutable dataclass": (f"{HEAD}{GOOD}".replace("frozen=True, ", ""), "is not a frozen dataclass"),
+    "no access": (
+        f"{HEAD}{GOOD}".replace('    access: ClassVar[Access] = "oblivious"\n', ""),
+        "must say what it needs: access: ClassVar[Access] = one of oblivious, decisions, scores, gradients",
+    ),
+    "an access that there is not": (f"{HEAD}{GOOD}".replace("oblivious", "everything"), "must say what it needs"),
+    "a type that is not there": (
+        f"from __future__ import annotations\n{HEAD}{GOOD}    speed: Metres = 1\n",
+        "the parameters of Plugin cannot be read: name 'Metres' is not defined",
+    ),
+    "a type of no word": (
+        f"{HEAD}{GOOD}    shape: complex = 1j\n",
+        "the parameters of attack 'wrong' cannot be set on the command line",
+    ),
+    "a check that fails itself": (
+        f"{HEAD}{GOOD}    def __post_init__(self):\n        [][0]\n",
+        "attack 'wrong' cannot be made: IndexError: list index out of range",
+    ),
+    "a default that is refused": (
+        f"{HEAD}{GOOD}    def __post_init__(self):\n        raise ValueError('speed must be above 0')\n",
+        "attack 'wrong': speed must be above 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", CANNOT_BE_LOADED)
+def test_a_plugin_that_cannot_be_loaded_is_named_and_breaks_no_other(
+    bench: Bench, plugins: Path, tmp_path: Path, what: str
+) -> None:
+    source, part = CANNOT_BE_LOADED[what]
+    module = f"broken_{list(CANNOT_BE_LOADED).index(what)}"
+    modules = {module: source} if source else {}
+    install(plugins, "broken-pack", {"cavbench.attacks": {"wrong": f"{module}:Plugin"}}, modules)
+    words = ("attack.shape=2",) if "shape" in source else ()
+    assert_one_line(bench("run", "attack=wrong", *words, "victim=toy", *TOY, f"out={tmp_path / 'out'}"), part)
+    assert not (tmp_path / "out").exists()
+    assert "wrong" in bench("list").out
+    assert bench("list", "noise").code == 0
+
+
+def test_a_name_that_is_taken_is_named_with_both_packages(bench: Bench, plugins: Path, tmp_path: Path) -> None:
+    install(plugins, "rival", {"cavbench.attacks": {"noise": "rival:Plugin"}}, {"rival": HEAD + GOOD})
+    for command in (
+        ("run", "attack=noise", "victim=toy", *TOY, f"out={tmp_path}"),
+        ("list", "noise"),
+        ("check", "noise"),
+    ):
+        assert_one_line(bench(*command), "'noise' is shipped by cavbench", "and by rival 1.0; uninstall one")
+    listed = bench("list")
+    assert listed.code == 0
+    assert "and by rival 1.0; uninstall one" in listed.out
+
+
+FAILS_AT_WORK = {
+    ("attack=crooked", "attack.rule=shape"): "Crooked.perturb returned shape (2, 2, 2), not (2, 2, 3)",
+    ("attack=crooked", "attack.rule=nothing"): "Crooked.perturb returned a NoneType, not (2, 2, 3)",
+    ("attack=crooked", "attack.rule=nan"): "Crooked.perturb returned numbers that are NaN or infinite",
+    ("attack=crooked", "attack.rule=raise"): "ZeroDivisionError: at a loss (--debug shows where)",
+    ("attack=crooked", "attack.rule=access"): "the attack asked for 'gradients', but declares that it needs 'scores'",
+    (
+        "attack=crooked",
+        "attack.rule=greedy",
+        "threat.queries=2",
+    ): "asked for 3 queries in a step, the threat model allows 2",
+    ("attack=crooked", "threat.access=oblivious"): "attack 'crooked' needs access 'scores', the threat model allows",
+    ("victim=bad", "victim.rule=nothing"): "none + bad(rule=nothing) is a NoneType where a Policy is needed",
+    ("victim=bad", "victim.rule=raise"): "none + bad(rule=raise) cannot be loaded: ZeroDivisionError: at a loss",
+}
+
+
+@pytest.mark.parametrize("words", FAILS_AT_WORK, ids=" ".join)
+def test_a_plugin_that_fails_at_work_is_named_and_the_records_of_others_are_kept(
+    bench: Bench, plugins: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    install(plugins, "crooked-pack", POINTS, {"crooked": CROOKED})
+    assert bench("run", "attack=nudge", "victim=toy", *TOY, f"out={tmp_path}").code == 0
+    kept = {path: path.read_bytes() for path in tmp_path.rglob("*.parquet")}
+    victim = () if any(word.startswith("victim") for word in words) else ("victim=toy",)
+    said = bench("run", *words, *victim, *TOY, f"out={tmp_path}")
+    assert said.code != 0
+    assert said.err.strip().splitlines()[-1].startswith("error: ")
+    assert FAILS_AT_WORK[words] in said.err
+    assert "Traceback" not in said.err
+    assert all(path.read_bytes() == blob for path, blob in kept.items())

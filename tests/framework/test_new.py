@@ -1,0 +1,115 @@
+"""`bench new`: what it writes installs, keeps the rules, passes its own test and can be scored."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bench import results, scaffold
+from tests.framework.conftest import Said, ran
+from tests.framework.distributions import pip_install
+from tests.framework.test_cli import assert_one_line
+
+Bench = Callable[..., Said]
+EVERY = list(itertools.product(("attack", "defense", "victim"), ("driving", "detection")))
+
+
+def name_of(kind: str, track: str) -> str:
+    return f"my_{kind}_{track}"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A package of each kind and track, as `bench new` writes it."""
+    folder = tmp_path_factory.mktemp("packages")
+    return [
+        scaffold.write(kind, name_of(kind, track), track=track, folder=folder / name_of(kind, track))
+        for kind, track in EVERY
+    ]
+
+
+@pytest.fixture(scope="module")
+def installed(written: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that pip installed them to, outside of the environment of the tests."""
+    site = tmp_path_factory.mktemp("site")
+    pip_install(site, *written)
+    return site
+
+
+def test_a_package_says_what_is_next(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = bench("new", "attack", "my_attack")
+    assert said.code == 0, said.err
+    for part in ("pip install -e 'cavbench-my-attack[test]'", "bench check my_attack", "bench run attack=my_attack"):
+        assert part in said.out
+    files = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
+    assert files == [
+        "cavbench-my-attack/README.md",
+        "cavbench-my-attack/cavbench_my_attack.py",
+        "cavbench-my-attack/pyproject.toml",
+        "cavbench-my-attack/tests/test_my_attack.py",
+    ]
+
+
+def test_what_is_there_is_not_overwritten(bench: Bench, tmp_path: Path) -> None:
+    out = f"out={tmp_path / 'package'}"
+    assert bench("new", "attack", "my_attack", out).code == 0
+    module = tmp_path / "package" / "cavbench_my_attack.py"
+    module.write_text("mine")
+    assert_one_line(bench("new", "attack", "my_attack", out), "is there already and not empty", "out=")
+    assert module.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("attack", "zo"), "attack 'zo' is shipped by cavbench"),
+        (("attack", "MyAttack"), "'MyAttack' is no name for an attack: write lower-case words joined by _"),
+        (("attack", "my-attack"), "'my-attack' is no name for an attack"),
+        (("defense", "class"), "'class' is no name for a defence"),
+        (("victim", "a" * 41), "at most 40 characters"),
+        (("atack", "my_attack"), "unknown kind 'atack'; did you mean 'attack'?"),
+        (("world", "my_world"), "unknown kind 'world'; known: attack, defense, victim"),
+        (("attack", "my_attack", "track=street"), "unknown track 'street'; known: driving, detection"),
+        (("attack", "my_attack", "trak=driving"), "unknown word 'trak=driving'"),
+        (("attack", "my_attack", "out=/proc/none/here"), "cannot be written"),
+    ],
+)
+def test_bad_words_are_refused_in_one_line_and_nothing_is_written(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], part: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert_one_line(bench("new", *words), part)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_every_package_passes_its_own_tests(written: list[Path], installed: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": str(installed), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", "--import-mode=importlib", *written]
+    ended = subprocess.run(command, cwd=installed, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stdout
+    assert f"{2 * len(written)} passed" in ended.stdout
+
+
+@pytest.mark.slow
+def test_an_installed_package_is_listed_checked_and_scored_in_workers(installed: Path, tmp_path: Path) -> None:
+    (line,) = [line for line in ran(installed, "list").out.splitlines() if "my_attack_driving" in line]
+    assert line.split() == ["my_attack_driving", "driving", "cavbench-my-attack-driving", "0.1.0"]
+    checked = ran(installed, "check", "my_attack_driving", "attack.strength=2")
+    assert checked.code == 0, checked.out
+    assert "0 to fix" in checked.out
+    words = ("attack=my_attack_driving", "attack.strength=2", "lanes=3,4", "density=1", "weather=clear", "episodes=2")
+    said = ran(installed, "run", *words, "seeds=0", "workers=2", "reference=false", "record=0", f"out={tmp_path}")
+    assert said.code == 0, said.err
+    rows = [row for row in results.read(tmp_path).to_pylist() if row["attack"] == "my_attack_driving"]
+    assert len(rows) == 4
+    assert all('"strength":2.0' in row["attack_params"] for row in rows)
+    assert {row["attack_shipped_by"] for row in rows} == {"cavbench-my-attack-driving 0.1.0"}
+    assert all(row["queries"] > 1 and row["linf_max"] > 0 for row in rows)
