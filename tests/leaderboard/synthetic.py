@@ -101,7 +101,7 @@ def drive(
 def _table(schema: pa.Schema, columns: Mapping[str, object], count: int) -> pa.Table:
     arrays = []
     for field in schema:
-        value = columns.get(field.name, "")
+        value = columns.get(field.name, None if field.nullable else "")
         arrays.append(pa.array(value if isinstance(value, list | np.ndarray) else [value] * count, field.type))
     return pa.table(arrays, schema=schema)
 
