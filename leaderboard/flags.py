@@ -84,12 +84,14 @@ Finding = tuple[bool | None, str]
 
 
 def unattacked(of: Subject) -> Finding:
+    """Fires where every attack that was run asked the victim nothing: such a score is one under noise."""
     if of.strongest("answers", "gradients", "unknown"):
         return False, f"{sum(entry.knowledge != 'nothing' for entry in of.entries)} attacks asked the victim."
     return True, "No attack that asks the victim anything was run: this is a score under noise."
 
 
 def masked_gradients(of: Subject) -> Finding:
+    """Fires where an attack without gradients leaves less than the best one with them: gradients that mislead are no defence."""
     white, black = of.strongest("gradients"), of.strongest("answers", "nothing")
     if any(entry.knowledge == "unknown" for entry in of.entries):
         return None, "Not measured: these records are older than the count of gradients."
@@ -103,6 +105,7 @@ def masked_gradients(of: Subject) -> Finding:
 
 
 def noise(of: Subject) -> Finding:
+    """Fires where the best attack takes no more than one that asks nothing: the attack is weak, or the victim draws."""
     quiet, asking = of.strongest("nothing"), of.strongest("answers", "gradients", "unknown")
     if quiet is None or asking is None:
         return None, f"Not measured: no {'noise' if quiet is None else 'attack beside noise'} was run."
@@ -116,6 +119,7 @@ def noise(of: Subject) -> Finding:
 
 
 def blind(of: Subject) -> Finding:
+    """Fires where the score under attack is not significantly above that of the best policy that ignores its input."""
     if of.lead is None:
         none = "a detector has no blind policy" if of.track == "detection" else "the blind policies were not driven"
         return None, f"Not measured: {none}."
@@ -123,6 +127,7 @@ def blind(of: Subject) -> Finding:
 
 
 def ignores_input(of: Subject) -> Finding:
+    """Fires where the victim answers the same on another input in at least 99 % of probes."""
     share = of.shares("same_answer")
     if math.isnan(share):
         return None, "Not measured: these records are older than the probes of the input."
@@ -131,6 +136,7 @@ def ignores_input(of: Subject) -> Finding:
 
 
 def zero_gradients(of: Subject) -> Finding:
+    """Fires where at least half of the gradients that an attack took were zero everywhere."""
     shares = [share for entry in of.entries if not math.isnan(share := entry.mean("zero_gradients"))]
     if not shares:
         return None, "Not measured: no attack took gradients, or the records are older than their count."
@@ -138,6 +144,7 @@ def zero_gradients(of: Subject) -> Finding:
 
 
 def one_draw(of: Subject) -> Finding:
+    """Fires where the victim answers otherwise when asked again, and no attack asked about each observation twice."""
     redrawn = of.shares("redrawn")
     if math.isnan(redrawn):
         return None, "Not measured: these records are older than the probes of randomness."
@@ -151,6 +158,7 @@ def one_draw(of: Subject) -> Finding:
 
 
 def no_fall(of: Subject) -> Finding:
+    """Fires where the largest perturbation budget takes no more than the smallest, by the same attack."""
     found = []
     for family in _families(of.others, vary=("threat_budget",)):
         small, large = family[0], family[-1]
@@ -167,6 +175,7 @@ def no_fall(of: Subject) -> Finding:
 
 
 def not_flattened(of: Subject) -> Finding:
+    """Fires where the last increase of an attack's steps, restarts or queries still took more than 0.02."""
     found = [
         (family[-1].score.estimate, family[-2], family[-1], change)
         for family in efforts(of.entries)
@@ -183,6 +192,7 @@ def not_flattened(of: Subject) -> Finding:
 
 
 def too_little(of: Subject) -> Finding:
+    """Fires below 3 seeds, 20 scenarios a cell (3 approaches), or where cells of the standard grid are missing."""
     runs, _, episodes = of.scores.shape
     weights = {value for entry in of.entries for value in pc.unique(entry.own.table["weights_sha256"]).to_pylist()}
     seeded = of.track == "detection" or bool(weights - {""})

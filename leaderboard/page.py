@@ -1,0 +1,222 @@
+"""`bench report html=PAGE`: the leaderboards as one HTML file that opens from disk, and as JSON and CSV beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import jinja2
+import pyarrow as pa
+import pyarrow.compute as pc
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from bench import results
+from bench.contracts import TRACKS, Track
+from bench.errors import UserError
+from bench.files import whole
+from leaderboard.document import document, table
+from leaderboard.entries import MEASUREMENTS
+from leaderboard.flags import FLAGS
+from leaderboard.layout import STRIP, Column, Section, axis, fitted
+from leaderboard.overview import NAMES
+from leaderboard.published import published
+from leaderboard.ranking import Board, Row, read_boards
+from leaderboard.text import ATTACKED, BLIND, CLEAN, component, estimate, strip, varying, verdict
+from leaderboard.thesis_numbers import THESIS
+
+NAME = "leaderboard.html"
+
+
+def leaderboard_report(records: Mapping[Track, pa.Table], console: Console) -> None:
+    """Print the ranking of every threat model, with the flags that have fired.
+
+    Args:
+        records: by track (`bench.results.SCHEMAS`).
+        console: where to print.
+    """
+    print_boards(read_boards(records)[0], console)
+
+
+def write(out: Path | None, page: Path, console: Console) -> None:
+    """Write the page, the JSON and the CSV of a results folder, and print the ranking.
+
+    Args:
+        out: results folder; None takes the records that are published with the package.
+        page: where to write; in a folder it is called `leaderboard.html`.
+        console: where to print.
+
+    Raises:
+        UserError: if there are no records, or nothing can be written.
+    """
+    page = page / NAME if page.is_dir() else page
+    measurements = {name for names in MEASUREMENTS.values() for name in names}
+    records = {track: published(track) for track in TRACKS} if out is None else results.read_compact(out, measurements)
+    boards, entries = read_boards(records)
+    made = document(boards, entries, out)
+    texts = {
+        page.with_suffix(".json"): json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
+        page.with_suffix(".csv"): table(made),
+        page: html(made, records, _link(out, page)),
+    }
+    try:
+        page.parent.mkdir(parents=True, exist_ok=True)
+        for path, text in texts.items():
+            with whole(path) as file:
+                file.write(text.encode())
+    except OSError as error:
+        raise UserError(f"the page {page} cannot be written: {error.strerror}") from error
+    print_boards(boards, console)
+    for path in sorted(texts):
+        console.print(Text(f" {path} ({path.stat().st_size / 1e6:.2f} MB)"), soft_wrap=True)
+
+
+def html(made: Mapping[str, Any], records: Mapping[Track, pa.Table], recordings: str) -> str:
+    """The page of a document.
+
+    Args:
+        made: by `document`.
+        records: for the tables of the thesis.
+        recordings: the way from the page to the results folder.
+    """
+    site = files("leaderboard") / "site"
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
+    template = environment.from_string((site / "page.html").read_text(encoding="utf-8"))
+    # "<" would end the element that the data stand in.
+    data = json.dumps({**made, "recordings": recordings}, separators=(",", ":"), allow_nan=False).replace(
+        "<", "\\u003c"
+    )
+    return template.render(
+        css=jinja2.utils.markupsafe.Markup((site / "page.css").read_text(encoding="utf-8")),
+        js=jinja2.utils.markupsafe.Markup((site / "page.js").read_text(encoding="utf-8")),
+        data=jinja2.utils.markupsafe.Markup(data),
+        made=made["made"][:10],
+        version=made["cavbench"],
+        episodes=f"{sum(len(part) for part in records.values()):,}",
+        tracks=[track for track in TRACKS if any(board["track"] == track for board in made["boards"])],
+        flags=[{"title": title, "meaning": find.__doc__} for title, find in FLAGS.values()],
+        thesis=list(_chapters(records)),
+    )
+
+
+def _link(out: Path | None, page: Path) -> str:
+    """The way from the page to the results folder, as the beginning of a link."""
+    if out is None:
+        return ""
+    return quote(Path(os.path.relpath(out.resolve(), page.resolve().parent)).as_posix()) + "/"
+
+
+def _chapters(records: Mapping[Track, pa.Table]) -> Iterator[dict[str, Any]]:
+    """The tables of the thesis beside ours."""
+    from leaderboard import thesis_driving, thesis_patches
+    from leaderboard.thesis_numbers import printed
+
+    numbers = printed()
+    own = {track: _plain(records, track) for track in TRACKS}
+    chapters = (
+        ("Chapter 3", thesis_patches.heading(), thesis_patches.tables(numbers, own["detection"], Console(width=400))),
+        ("Chapter 4", thesis_driving.heading(numbers["max_reward"]), thesis_driving.tables(numbers, own["driving"])),
+    )
+    for name, heading, tables in chapters:
+        yield {
+            "name": name,
+            "heading": heading.plain,
+            "tables": [
+                {
+                    "title": beside.section["title"],
+                    **_cells(beside.table),
+                    "notes": [
+                        *(note.plain for note in beside.notes),
+                        *(f"Thesis: {check}" for check in beside.section["check"]),
+                        *(f"Missing: {command}" for command in beside.missing),
+                    ],
+                }
+                for beside in tables
+            ],
+        }
+
+
+def _plain(records: Mapping[Track, pa.Table], track: Track) -> pa.Table:
+    """The records that the thesis has a number for, with their text as text."""
+    found = records.get(track)
+    if found is None:
+        return results.SCHEMAS[track].empty_table()
+    if track == "driving":
+        clear, unattacked = pc.equal(found["weather"], "clear"), pc.equal(found["attack"], "none")
+        found = found.filter(pc.and_(clear, pc.or_(unattacked, pc.equal(found["threat_norm"], "linf"))))
+    texts = [field for field in found.schema if pa.types.is_dictionary(field.type)]
+    for field in texts:
+        place = found.schema.get_field_index(field.name)
+        found = found.set_column(place, field.name, found[field.name].cast(field.type.value_type))
+    return found
+
+
+def _cells(made: Table) -> dict[str, Any]:
+    """The headings and the cells of a terminal's table."""
+
+    def cell(value: object) -> dict[str, object]:
+        text = value if isinstance(value, Text) else Text(str(value))
+        styles = {str(text.style), *(str(span.style) for span in text.spans)}
+        return {"text": text.plain, "theirs": THESIS in styles}
+
+    rows = [[cell(value) for value in row] for row in zip(*(column.cells for column in made.columns), strict=True)]
+    return {
+        "headings": [str(column.header) for column in made.columns],
+        "rows": [{"cells": row, "title": not any(one["text"] for one in row[1:])} for row in rows],
+    }
+
+
+def print_boards(boards: Sequence[Board], console: Console) -> None:
+    """Print the leaderboard of each threat model."""
+    for board in boards:
+        norm, budget, access, queries = board.threat
+        title = Text.assemble(
+            (board.track, "bold"), f" in {board.world[0]}, {norm} {budget:g}, access {access}, {queries} queries"
+        )
+        console.print(Padding(title, (1, 1)))
+        console.print(Padding(fitted(_columns(board), [Section(board.rows)], console), (0, 1)))
+        for name, drive in board.references.items():
+            score = estimate(_reference(drive), style=BLIND)
+            console.print(Padding(Text.assemble(f"{NAMES.get(name, name)}: ", score), (0, 3)))
+        for row, flag in ((row, flag) for row in board.rows for flag in row.flags if flag.fired):
+            who = f"{row.identity['defense']} {row.identity['victim']}: {FLAGS[flag.name][0]}. "
+            console.print(Padding(Text.assemble(("flag ", "yellow"), who, (flag.reason, "dim")), (0, 1)))
+    console.print()
+
+
+def _reference(drive: Any) -> Any:
+    from bench.metrics import unit_interval
+
+    return unit_interval(drive.column("safe_progress"))
+
+
+def _columns(board: Board) -> list[Column[Row]]:
+    shown = {kind: varying([row.entries[0] for row in board.rows], kind) for kind in ("attack", "defense", "victim")}
+    measure = "safe progress" if board.track == "driving" else "confidence"
+    columns: list[Column[Row]] = [
+        Column("rank", lambda row: str(row.group)),
+        Column("defence", lambda row: component(row.entries[0], "defense", shown["defense"]), "left"),
+        Column("victim", lambda row: component(row.entries[0], "victim", shown["victim"]), "left"),
+        Column(f"{measure}\nworst [95 %]", lambda row: estimate(row.worst.score, style=ATTACKED), "left"),
+        Column("\nclean", lambda row: estimate(row.clean, style=CLEAN), "left", spare=3),
+    ]
+    if board.track == "driving":
+        columns.append(Column("beats\nblind", lambda row: verdict(row.worst.lead)))
+    return [
+        *columns,
+        Column("strongest\nattack", lambda row: str(row.identity["attack"]), "left"),
+        Column("flags", _fired),
+        Column(axis(measure), lambda row: strip({ATTACKED: row.worst.score, CLEAN: row.clean}, STRIP), "left", spare=9),
+    ]
+
+
+def _fired(row: Row) -> Text:
+    count = sum(bool(flag.fired) for flag in row.flags)
+    return Text(str(count), style="yellow") if count else Text("")
