@@ -58,7 +58,7 @@ class Episodes:
         driven = place >= 0
         if driven.sum() < records.num_rows:
             raise ValueError("a scenario is there twice: these are the records of more than one pair")
-        every_run = driven.any(2).all(0)
+        every_run: NDArray[np.bool_] = np.asarray(driven.any(2).all(0))
         if not every_run.any():
             raise ValueError("the training seeds have no cell in common")
         every_cell = driven[:, every_run].all((0, 1))
@@ -132,7 +132,7 @@ class Episodes:
         }
         for name, values in labels.items():
             field = table.schema.field(name)
-            table = table.set_column(table.schema.get_field_index(name), field, pa.array(values, field.type))
+            table = table.set_column(table.schema.get_field_index(name), field, pa.array(values.tolist(), field.type))
         return Episodes.arrange(table)
 
 

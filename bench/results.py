@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from bench import files
 from bench.contracts import TRACKS, Track
 from bench.errors import UserError
+from bench.scenario import WEATHERS
 
 FOLDER = "episodes"
 
@@ -280,17 +281,15 @@ def _read_compact(out: Path, paths: list[Path], track: Track, measurements: Coll
         measured = connection.sql(f"select hash(unit) as code, seed, {_quoted(apart)} from records").to_arrow_table()
         each = ", ".join(f'any_value("{name}") as "{name}"' for name in shared)
         units = connection.sql(f"select hash(unit) as code, {each} from records group by all").to_arrow_table()
-        newest = connection.sql(f"select code from units {_NEWEST_UNITS}").to_arrow_table()["code"].to_numpy()
-    codes = units["code"].to_numpy()
-    units = units.filter(pa.array(np.isin(codes, newest)))
-    codes = units["code"].to_numpy()
-    order = np.argsort(codes)
-    own = measured["code"].to_numpy()
-    place = np.minimum(np.searchsorted(codes, own, sorter=order), len(codes) - 1)
-    rows = pa.array(order[place])
-    kept = pa.array(codes[order[place]] == own)
+        units = connection.sql(f"from units {_NEWEST_UNITS} {_UNIT_ORDER}").to_arrow_table()
+    codes, own = units["code"].to_numpy(), measured["code"].to_numpy()
+    by_code = np.argsort(codes)
+    place = by_code[np.minimum(np.searchsorted(codes, own, sorter=by_code), len(codes) - 1)]
+    place[codes[place] != own] = len(codes)
+    order = np.lexsort((measured["seed"].to_numpy(), place))[: int((place < len(codes)).sum())]
+    rows, taken = pa.array(place[order]), pa.array(order)
     columns = {
-        name: _taken(units[name], rows).filter(kept) if name in shared else measured[name].filter(kept).combine_chunks()
+        name: _taken(units[name], rows) if name in shared else measured[name].combine_chunks().take(taken)
         for name in SCHEMAS[track].names
         if name in shared or name in measured.column_names
     }
@@ -303,18 +302,6 @@ def _taken(column: pa.ChunkedArray, rows: pa.Array) -> pa.Array:
         return column.combine_chunks().take(rows)
     encoded = column.combine_chunks().dictionary_encode()
     return pa.DictionaryArray.from_arrays(encoded.indices.take(rows), encoded.dictionary)
-
-
-def compact(records: pa.Table) -> pa.Table:
-    """Records with their text as dictionaries, in one chunk, and without the columns that hold lists."""
-    columns = {}
-    for name in records.column_names:
-        column = records[name].combine_chunks()
-        if pa.types.is_string(column.type):
-            column = column.dictionary_encode()
-        if not pa.types.is_list(column.type):
-            columns[name] = column
-    return pa.table(columns)
 
 
 @contextmanager
@@ -376,6 +363,7 @@ _NEWEST_UNITS = """
         partition by pair, training_seed order by created_at desc, unit)
 """
 """The same of units; of a scenario that two of them drove, `leaderboard.pairs.newest` keeps the last."""
+_UNIT_ORDER = f" order by pair, training_seed, list_position({list(WEATHERS)}, weather), lanes, density, created_at"
 _ORDER = " order by pair, training_seed, weather, lanes, density, seed"
 
 

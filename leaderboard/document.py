@@ -90,7 +90,7 @@ def _curve(family: Sequence[Entry], kind: str, keys: Mapping[int, int]) -> dict[
         "points": [
             {
                 "x": entry.queries if kind == "queries" else entry.identity["threat_budget"],
-                **_interval(entry.score),
+                **(_interval(entry.score) or {}),
                 "pair": keys[id(entry)],
             }
             for entry in family

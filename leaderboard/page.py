@@ -22,8 +22,9 @@ from bench import results
 from bench.contracts import TRACKS, Track
 from bench.errors import UserError
 from bench.files import whole
+from bench.metrics import unit_interval
 from leaderboard.document import document, table
-from leaderboard.entries import MEASUREMENTS
+from leaderboard.entries import MEASUREMENTS, METRICS
 from leaderboard.flags import FLAGS
 from leaderboard.layout import STRIP, Column, Section, axis, fitted
 from leaderboard.overview import NAMES
@@ -144,17 +145,22 @@ def _chapters(records: Mapping[Track, pa.Table]) -> Iterator[dict[str, Any]]:
 
 
 def _plain(records: Mapping[Track, pa.Table], track: Track) -> pa.Table:
-    """The records that the thesis has a number for, with their text as text."""
+    """The records that the thesis has a number for; its chapters read text as text, or as dictionaries where there is more of it."""
     found = records.get(track)
     if found is None:
         return results.SCHEMAS[track].empty_table()
     if track == "driving":
-        clear, unattacked = pc.equal(found["weather"], "clear"), pc.equal(found["attack"], "none")
-        found = found.filter(pc.and_(clear, pc.or_(unattacked, pc.equal(found["threat_norm"], "linf"))))
-    texts = [field for field in found.schema if pa.types.is_dictionary(field.type)]
-    for field in texts:
-        place = found.schema.get_field_index(field.name)
-        found = found.set_column(place, field.name, found[field.name].cast(field.type.value_type))
+        alike = pc.and_(
+            pc.equal(found["weather"], "clear"),
+            pc.is_in(found["attack"].cast(pa.string()), pa.array(["none", "zo", "noise"])),
+        )
+        return found.filter(
+            pc.and_(alike, pc.or_(pc.equal(found["attack"], "none"), pc.equal(found["threat_norm"], "linf")))
+        )
+    for field in found.schema:
+        if pa.types.is_dictionary(field.type):
+            place = found.schema.get_field_index(field.name)
+            found = found.set_column(place, field.name, found[field.name].cast(field.type.value_type))
     return found
 
 
@@ -183,18 +189,21 @@ def print_boards(boards: Sequence[Board], console: Console) -> None:
         console.print(Padding(title, (1, 1)))
         console.print(Padding(fitted(_columns(board), [Section(board.rows)], console), (0, 1)))
         for name, drive in board.references.items():
-            score = estimate(_reference(drive), style=BLIND)
+            score = estimate(unit_interval(drive.column(METRICS[board.track])), style=BLIND)
             console.print(Padding(Text.assemble(f"{NAMES.get(name, name)}: ", score), (0, 3)))
-        for row, flag in ((row, flag) for row in board.rows for flag in row.flags if flag.fired):
-            who = f"{row.identity['defense']} {row.identity['victim']}: {FLAGS[flag.name][0]}. "
-            console.print(Padding(Text.assemble(("flag ", "yellow"), who, (flag.reason, "dim")), (0, 1)))
+        for row in board.rows:
+            if row.flagged:
+                titles = "; ".join(FLAGS[flag.name][0] for flag in row.flags if flag.fired)
+                console.print(
+                    Padding(Text.assemble(("flagged ", "yellow"), f"{_name(row, board)}: ", (titles, "dim")), (0, 1))
+                )
     console.print()
 
 
-def _reference(drive: Any) -> Any:
-    from bench.metrics import unit_interval
-
-    return unit_interval(drive.column("safe_progress"))
+def _name(row: Row, board: Board) -> str:
+    kinds = ("defense", "victim")
+    entries = [one.entries[0] for one in board.rows]
+    return " ".join(component(row.entries[0], kind, varying(entries, kind)) for kind in kinds)
 
 
 def _columns(board: Board) -> list[Column[Row]]:

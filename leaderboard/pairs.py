@@ -124,7 +124,8 @@ def read_pairs(records: pa.Table) -> list[Pair]:
 def newest(records: pa.Table, identity: tuple[str, ...] = (*DEFENDED, *ATTACKER, "grid")) -> pa.Table:
     """The last record of each scenario, in the order given."""
     codes = _codes(records, (*identity, *SCENARIO))
-    if len(np.unique(codes)) == len(codes):
+    rising = np.sort(codes)
+    if (rising[1:] > rising[:-1]).all():
         return records
     created = records["created_at"].cast(pa.int64()).to_numpy()
     order = np.lexsort((np.arange(len(codes)), created, codes))
@@ -140,12 +141,14 @@ def groups(
     if not kept.num_rows:
         return
     codes = _codes(kept, columns)
-    order = np.argsort(codes, kind="stable")
-    ends = np.flatnonzero(np.append(codes[order][1:] != codes[order][:-1], True)) + 1
-    parts = sorted(np.split(order, ends[:-1]), key=lambda rows: rows[0])
-    for rows in parts:
-        together = len(rows) == rows[-1] - rows[0] + 1
-        part = kept.slice(rows[0], len(rows)) if together else kept.take(pa.array(rows))
+    starts = np.flatnonzero(np.append(True, codes[1:] != codes[:-1]))
+    together: dict[int, list[NDArray[np.int64]]] = {}
+    for start, end in zip(starts, [*starts[1:], len(codes)], strict=True):
+        together.setdefault(int(codes[start]), []).append(np.arange(start, end))
+    for stretches in together.values():
+        first = stretches[0]
+        alone = len(stretches) == 1
+        part = kept.slice(first[0], len(first)) if alone else kept.take(pa.array(np.concatenate(stretches)))
         yield part.select(columns).slice(0, 1).to_pylist()[0], part
 
 
