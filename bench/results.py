@@ -133,7 +133,7 @@ PROBES: tuple[pa.Field, ...] = (
     _probe("gradient_queries", "gradients the attack took: a step, mean; or of a patch", "gradients"),
     _probe("zero_gradients", "of the gradients the attack took, those that were 0 everywhere"),
     _probe("redrawn", "probes on which the victim, asked the same twice, scored it otherwise: it draws"),
-    _probe("same_answer", "probes on which another episode's observation (a grey picture) got the same answer"),
+    _probe("same_answer", "probes on which another episode's observation (a grey picture) got the same scores"),
     _probe("draws", "how often the attack asked about each observation, where the victim draws", "queries"),
 )
 """What the flags of a leaderboard are measured by; null where nothing was measured, as in records older than these columns."""

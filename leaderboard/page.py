@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from importlib.resources import files
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -15,7 +17,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from rich.console import Console
 from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 
 from bench import results
@@ -23,6 +24,8 @@ from bench.contracts import TRACKS, Track
 from bench.errors import UserError
 from bench.files import whole
 from bench.metrics import unit_interval
+from bench.process import settle
+from leaderboard import thesis_page
 from leaderboard.document import document, table
 from leaderboard.entries import MEASUREMENTS, METRICS
 from leaderboard.flags import FLAGS
@@ -31,7 +34,6 @@ from leaderboard.overview import NAMES
 from leaderboard.published import published
 from leaderboard.ranking import Board, Row, read_boards
 from leaderboard.text import ATTACKED, BLIND, CLEAN, component, estimate, strip, varying, verdict
-from leaderboard.thesis_numbers import THESIS
 
 NAME = "leaderboard.html"
 
@@ -58,15 +60,18 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         UserError: if there are no records, or nothing can be written.
     """
     page = page / NAME if page.is_dir() else page
-    measurements = {name for names in MEASUREMENTS.values() for name in names}
-    records = {track: published(track) for track in TRACKS} if out is None else results.read_compact(out, measurements)
-    boards, entries = read_boards(records)
-    made = document(boards, entries, out)
-    texts = {
-        page.with_suffix(".json"): json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
-        page.with_suffix(".csv"): table(made),
-        page: html(made, records, _link(out, page)),
-    }
+    # The thesis' tables need torch, which takes seconds to import: a process of their own does that meanwhile.
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=settle) as beside:
+        beside.submit(thesis_page.prepare)
+        records = {track: published(track) for track in TRACKS} if out is None else _read(out)
+        thesis = beside.submit(thesis_page.chapters, {track: _for_thesis(records, track) for track in TRACKS})
+        boards, entries = read_boards(records)
+        made = document(boards, entries, out)
+        texts = {
+            page.with_suffix(".json"): json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
+            page.with_suffix(".csv"): table(made),
+            page: html(made, sum(map(len, records.values())), thesis.result(), _link(out, page)),
+        }
     try:
         page.parent.mkdir(parents=True, exist_ok=True)
         for path, text in texts.items():
@@ -79,12 +84,17 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         console.print(Text(f" {path} ({path.stat().st_size / 1e6:.2f} MB)"), soft_wrap=True)
 
 
-def html(made: Mapping[str, Any], records: Mapping[Track, pa.Table], recordings: str) -> str:
+def _read(out: Path) -> dict[Track, pa.Table]:
+    return results.read_compact(out, {name for names in MEASUREMENTS.values() for name in names})
+
+
+def html(made: Mapping[str, Any], episodes: int, thesis: Sequence[thesis_page.Chapter], recordings: str) -> str:
     """The page of a document.
 
     Args:
         made: by `document`.
-        records: for the tables of the thesis.
+        episodes: how many it is made of.
+        thesis: its tables beside ours.
         recordings: the way from the page to the results folder.
     """
     site = files("leaderboard") / "site"
@@ -100,10 +110,10 @@ def html(made: Mapping[str, Any], records: Mapping[Track, pa.Table], recordings:
         data=jinja2.utils.markupsafe.Markup(data),
         made=made["made"][:10],
         version=made["cavbench"],
-        episodes=f"{sum(len(part) for part in records.values()):,}",
+        episodes=f"{episodes:,}",
         tracks=[track for track in TRACKS if any(board["track"] == track for board in made["boards"])],
         flags=[{"title": title, "meaning": find.__doc__} for title, find in FLAGS.values()],
-        thesis=list(_chapters(records)),
+        thesis=thesis,
     )
 
 
@@ -114,38 +124,8 @@ def _link(out: Path | None, page: Path) -> str:
     return quote(Path(os.path.relpath(out.resolve(), page.resolve().parent)).as_posix()) + "/"
 
 
-def _chapters(records: Mapping[Track, pa.Table]) -> Iterator[dict[str, Any]]:
-    """The tables of the thesis beside ours."""
-    from leaderboard import thesis_driving, thesis_patches
-    from leaderboard.thesis_numbers import printed
-
-    numbers = printed()
-    own = {track: _plain(records, track) for track in TRACKS}
-    chapters = (
-        ("Chapter 3", thesis_patches.heading(), thesis_patches.tables(numbers, own["detection"], Console(width=400))),
-        ("Chapter 4", thesis_driving.heading(numbers["max_reward"]), thesis_driving.tables(numbers, own["driving"])),
-    )
-    for name, heading, tables in chapters:
-        yield {
-            "name": name,
-            "heading": heading.plain,
-            "tables": [
-                {
-                    "title": beside.section["title"],
-                    **_cells(beside.table),
-                    "notes": [
-                        *(note.plain for note in beside.notes),
-                        *(f"Thesis: {check}" for check in beside.section["check"]),
-                        *(f"Missing: {command}" for command in beside.missing),
-                    ],
-                }
-                for beside in tables
-            ],
-        }
-
-
-def _plain(records: Mapping[Track, pa.Table], track: Track) -> pa.Table:
-    """The records that the thesis has a number for; its chapters read text as text, or as dictionaries where there is more of it."""
+def _for_thesis(records: Mapping[Track, pa.Table], track: Track) -> pa.Table:
+    """The records that the thesis has a number for; those of detection with their text as text."""
     found = records.get(track)
     if found is None:
         return results.SCHEMAS[track].empty_table()
@@ -162,21 +142,6 @@ def _plain(records: Mapping[Track, pa.Table], track: Track) -> pa.Table:
             place = found.schema.get_field_index(field.name)
             found = found.set_column(place, field.name, found[field.name].cast(field.type.value_type))
     return found
-
-
-def _cells(made: Table) -> dict[str, Any]:
-    """The headings and the cells of a terminal's table."""
-
-    def cell(value: object) -> dict[str, object]:
-        text = value if isinstance(value, Text) else Text(str(value))
-        styles = {str(text.style), *(str(span.style) for span in text.spans)}
-        return {"text": text.plain, "theirs": THESIS in styles}
-
-    rows = [[cell(value) for value in row] for row in zip(*(column.cells for column in made.columns), strict=True)]
-    return {
-        "headings": [str(column.header) for column in made.columns],
-        "rows": [{"cells": row, "title": not any(one["text"] for one in row[1:])} for row in rows],
-    }
 
 
 def print_boards(boards: Sequence[Board], console: Console) -> None:

@@ -24,15 +24,22 @@ def driving() -> pa.Table:
     }
     tables = [reference_drivers(episodes=20)]
     for (victim, defense), (clean, left) in skills.items():
-        own = {"defense": defense, "defense_params": {"skip": 0.5} if defense == "advtrain" else {}, "weights": "ab" * 32}
+        own = {
+            "defense": defense,
+            "defense_params": {"skip": 0.5} if defense == "advtrain" else {},
+            "weights": "ab" * 32,
+        }
         tables.append(probed(drive(victim, skill=clean, **own), **SEEN))  # type: ignore[arg-type]
         tables.append(probed(drive(victim, attack="noise", skill=clean - 0.05, **own), gradient_queries=0.0, **SEEN))
         white = left + 0.1 if defense == "masked" else left - 0.05
-        tables.append(probed(drive(victim, attack="pgd", attack_params={"steps": 10}, skill=white, **own), **PGD, **SEEN))
+        tables.append(
+            probed(drive(victim, attack="pgd", attack_params={"steps": 10}, skill=white, **own), **PGD, **SEEN)
+        )
         for steps, budget, skill in ((4, 0.1, left), (1, 0.1, left + 0.08), (4, 0.05, left + 0.15)):
             zo = drive(victim, attack="zo", attack_params={"steps": steps}, skill=skill, threat=("relative", budget),
                        queries=11.0 * steps, **own)  # fmt: skip
-            tables.append(probed(zo, gradient_queries=0.0, **SEEN))
+            name = f"zo-{defense}-{victim}" + ("" if (steps, budget) == (4, 0.1) else f"-{steps}-{budget}")
+            tables.append(probed(zo, pair=name, gradient_queries=0.0, **SEEN))
     return pa.concat_tables(tables)
 
 

@@ -52,7 +52,9 @@ def drive(
     steps = np.where(crashed, generator.integers(30, 450, count), 450)
     speed = 20 + 10 * at_cell
     columns: dict[str, object] = {
-        "unit": _units(attack, attack_params, defense, defense_params, victim, victim_params, threat, run=run, place=place),
+        "unit": _units(
+            attack, attack_params, defense, defense_params, victim, victim_params, threat, run=run, place=place
+        ),
         "pair": f"{attack}-{defense}-{victim}",
         "attack": attack,
         "attack_params": json.dumps(attack_params or {}, sort_keys=True),
@@ -101,7 +103,7 @@ def drive(
     return _table(SCHEMA, columns, count)
 
 
-def probed(records: pa.Table, **columns: float) -> pa.Table:
+def probed(records: pa.Table, **columns: float | str) -> pa.Table:
     """The same records with what a run measures for flags; a column it has already is replaced."""
     for name, value in columns.items():
         field = records.schema.field(name)
