@@ -29,6 +29,8 @@ Columns = dict[str, NDArray[np.generic]]
 
 BATCH = 16
 """Frames looked at at once."""
+SAME_CONFIDENCE = 0.01
+"""Confidences no farther apart than this are the same answer."""
 NMS_IOU, SAME_IOU = 0.45, 0.3
 """Of non-maximum suppression (YOLOv5's default), and from which a detection is of the sign itself (`vision.confidence`)."""
 
@@ -109,6 +111,10 @@ def score(unit: Unit, patch: Patch | None, trace: Trace | None = None) -> Column
         "gradients": crafted.gradients,
         "crafting_s": crafted.seconds,
         "excess": crafted.excess,
+        "gradient_queries": float(crafted.gradients),
+        "zero_gradients": crafted.zero_gradients / crafted.gradients if crafted.gradients else np.nan,
+        "draws": np.nan,
+        **probed(detector, approaches[0].scenes),
     }
     return {
         "seed": np.array(unit.seeds, np.int64),
@@ -136,6 +142,17 @@ def look(detector: Detector, scenes: Scenes, texels: Tensor | None, share: float
         confidences.append(confidence(predictions, label, boxes, iou=SAME_IOU))
         found += found_of(predictions, label)
     return Sight(torch.cat(confidences).numpy(), found)
+
+
+@torch.no_grad()
+def probed(detector: Detector, scenes: Scenes) -> dict[str, float]:
+    """Whether a detector says the same of the nearest frame twice, and of a grey picture what it says of that frame."""
+    label, last = detector.index(STOP_SIGN), torch.tensor([len(scenes) - 1])
+    picture, box = scenes.render(last, None, 0.0), scenes.boxes[last]
+    with torch.random.fork_rng(devices=[]):
+        asked = [detector(each) for each in (picture, picture, torch.full_like(picture, 0.5))]
+    first, again, grey = (confidence(each, label, box.to(each.boxes), iou=SAME_IOU) for each in asked)
+    return {"redrawn": float(first != again), "same_answer": float((first - grey).abs() <= SAME_CONFIDENCE)}
 
 
 def found_of(predictions: Predictions, label: int) -> list[Detections]:

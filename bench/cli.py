@@ -204,21 +204,12 @@ def view(
 def report(words: Words = None) -> None:
     """Print a report on all records of a results folder: bench report NAME out=FOLDER, for instance thesis.
 
-    Without a folder and without out=, a report sees no records; it may have published ones of its own.
+    With html=PAGE it writes the leaderboards as one HTML file that opens from disk, with JSON and CSV beside it. Without a folder
+    and without out=, a report sees no records; it may have published ones of its own.
     """
-    from bench import results
+    from bench import cli_report
 
-    folders = [word.removeprefix("out=") for word in words or [] if word.startswith("out=")]
-    names = [word for word in words or [] if not word.startswith("out=")]
-    if len(names) > 1 or len(folders) > 1:
-        raise UserError(
-            "bench report takes one report and one out=folder, for instance: bench report thesis out=results"
-        )
-    name = names[0] if names else "run"
-    function = _report(name)
-    out = Path(folders[0] if folders else "results").expanduser()
-    none_asked_for = name != "run" and not folders and not out.exists()
-    function({} if none_asked_for else results.read_all(out), Console())
+    cli_report.print_report(words or [], Console())
 
 
 @app.command()

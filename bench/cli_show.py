@@ -16,8 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from bench import registry, results
+from bench.contracts import REFERENCE_PATCHES
 from bench.errors import UserError
-from bench.patch import REFERENCE_PATCHES
 
 Report = Callable[[str, pa.Table], None]
 

@@ -12,19 +12,23 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Literal, TypeVar, get_args
-
-from torch import nn
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 from bench.errors import UserError
 
+if TYPE_CHECKING:
+    # Reports read records and need no torch, which takes seconds to import.
+    from torch import nn
+
 Track = Literal["driving", "detection"]
 TRACKS: tuple[Track, ...] = get_args(Track)
+REFERENCE_PATCHES = ("noise_patch", "grey_patch")
+"""The attacks on detectors that every other is held against, where they are installed: patches that know nothing."""
 Access = Literal["oblivious", "decisions", "scores", "gradients"]
 """What an attacker may ask of the victim, in rising order."""
 Progress = Callable[[float, str], None]
 """Called with the share done in [0, 1] and a short text; the command line draws the bar."""
-Network = TypeVar("Network", bound=nn.Module)
+Network = TypeVar("Network", bound="nn.Module")
 
 
 class Component(ABC):

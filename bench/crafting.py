@@ -37,6 +37,7 @@ def craft(crafting: Crafting, progress: Progress) -> Patch:
         texels=texels,
         queries=oracle.spent,
         gradients=oracle.backwards,
+        zero_gradients=oracle.zeros,
         seconds=seconds,
         excess=excess,
         evolution=oracle.evolution,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from bench.scenario import WEATHERS, Cell
 from bench.statistics import Array, Interval, interval, wilson
@@ -49,21 +50,29 @@ class Episodes:
         """
         if not records.num_rows:
             raise ValueError("no records to measure")
-        keys = _keys(records)
-        if len(set(keys)) < len(keys):
+        runs, run = np.unique(_numbers(records["training_seed"]), return_inverse=True)
+        seeds, seed = np.unique(_numbers(records["seed"]), return_inverse=True)
+        cells, cell = _cells(records)
+        place = np.full((len(runs), len(cells), len(seeds)), -1)
+        place[run, cell, seed] = np.arange(records.num_rows)
+        driven = place >= 0
+        if driven.sum() < records.num_rows:
             raise ValueError("a scenario is there twice: these are the records of more than one pair")
-        by_run: dict[int, set[Cell]] = {}
-        by_square: dict[tuple[int, Cell], set[int]] = {}
-        for run, cell, seed in keys:
-            by_run.setdefault(run, set()).add(cell)
-            by_square.setdefault((run, cell), set()).add(seed)
-        cells = set.intersection(*by_run.values())
-        if not cells:
+        every_run: NDArray[np.bool_] = np.asarray(driven.any(2).all(0))
+        if not every_run.any():
             raise ValueError("the training seeds have no cell in common")
-        seeds = set.intersection(*(found for (_, cell), found in by_square.items() if cell in cells))
-        if not seeds:
+        every_cell = driven[:, every_run].all((0, 1))
+        if not every_cell.any():
             raise ValueError("the cells have no scenario seed in common")
-        return _arranged(records, keys, set(by_run), cells, seeds)
+        rows = place[:, every_run][..., every_cell].ravel()
+        whole = len(rows) == records.num_rows and bool((rows[1:] > rows[:-1]).all())
+        return Episodes(
+            table=records if whole else records.take(pa.array(rows)),
+            runs=tuple(runs.tolist()),
+            cells=tuple(one for one, kept in zip(cells, every_run, strict=True) if kept),
+            seeds=tuple(seeds[every_cell].tolist()),
+            left_out=records.num_rows - len(rows),
+        )
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -123,7 +132,7 @@ class Episodes:
         }
         for name, values in labels.items():
             field = table.schema.field(name)
-            table = table.set_column(table.schema.get_field_index(name), field, pa.array(values, field.type))
+            table = table.set_column(table.schema.get_field_index(name), field, pa.array(values.tolist(), field.type))
         return Episodes.arrange(table)
 
 
@@ -132,33 +141,23 @@ def _places(own: Sequence[object], wanted: Collection[object] | None) -> list[in
     return [place for place, value in enumerate(own) if kept is None or value in kept]
 
 
-def _keys(records: pa.Table) -> list[tuple[int, Cell, int]]:
-    """Run, cell and scenario seed of each record."""
-    columns = ("training_seed", "lanes", "density", "weather", "seed")
-    known: dict[tuple[int, float, str], Cell] = {}
-    keys = []
-    for run, lanes, density, weather, seed in zip(*(records[name].to_pylist() for name in columns), strict=True):
-        square = (lanes, density, weather)
-        if square not in known:
-            known[square] = Cell(lanes=lanes, density=density, weather=weather)
-        keys.append((run, known[square], seed))
-    return keys
+def _numbers(column: pa.ChunkedArray) -> NDArray[np.generic]:
+    return np.asarray(column.to_numpy(zero_copy_only=False))
 
 
-def _arranged(
-    records: pa.Table, keys: Sequence[tuple[int, Cell, int]], runs: set[int], cells: set[Cell], seeds: set[int]
-) -> Episodes:
+def _cells(records: pa.Table) -> tuple[list[Cell], NDArray[np.int64]]:
+    """The cells of some records, by weather, lanes, density, and the place of each record's."""
+    weather = pa.chunked_array(records["weather"].chunks).combine_chunks()
+    weather = weather if pa.types.is_dictionary(weather.type) else weather.dictionary_encode()
+    names = weather.dictionary.to_pylist()
     order = list(WEATHERS)
-    ordered_cells = sorted(cells, key=lambda cell: (order.index(cell.weather), cell.lanes, cell.density))
-    place = {key: row for row, key in enumerate(keys)}
-    rows = [place[run, cell, seed] for run in sorted(runs) for cell in ordered_cells for seed in sorted(seeds)]
-    return Episodes(
-        table=records.take(pa.array(rows, pa.int64())),
-        runs=tuple(sorted(runs)),
-        cells=tuple(ordered_cells),
-        seeds=tuple(sorted(seeds)),
-        left_out=records.num_rows - len(rows),
-    )
+    rank = np.array([order.index(name) for name in names])[weather.indices.to_numpy()]
+    keys = np.stack((rank, _numbers(records["lanes"]), _numbers(records["density"])), 1)
+    distinct, place = np.unique(keys, axis=0, return_inverse=True)
+    cells = [
+        Cell(weather=order[int(kind)], lanes=int(lanes), density=density) for kind, lanes, density in distinct.tolist()
+    ]
+    return cells, place.reshape(-1)
 
 
 def shared(first: Episodes, second: Episodes) -> tuple[Episodes, Episodes]:
@@ -167,6 +166,8 @@ def shared(first: Episodes, second: Episodes) -> tuple[Episodes, Episodes]:
     Raises:
         ValueError: if they have nothing in common.
     """
+    if (first.runs, first.cells, first.seeds) == (second.runs, second.cells, second.seeds):
+        return first, second
     runs, cells, seeds = (set(getattr(first, name)) & set(getattr(second, name)) for name in ("runs", "cells", "seeds"))
     return first.only(runs=runs, cells=cells, seeds=seeds), second.only(runs=runs, cells=cells, seeds=seeds)
 

@@ -14,8 +14,6 @@ from bench.contracts import Access, QueryBudgetError, ThreatModel, permit
 from bench.errors import UserError
 from bench.vision import STOP_SIGN, Detector, Predictions
 
-REFERENCE_PATCHES = ("noise_patch", "grey_patch")
-"""The attacks that every other is held against, where they are installed: patches that know nothing of the detector."""
 SIDES = range(8, 513)
 """Texels a patch may be wide and high."""
 GREY = 0.5
@@ -97,6 +95,7 @@ class Patch:
         texels: float32 [3, P, P] sRGB in [0, 1]; None leaves the sign alone.
         queries: pictures the detector was asked about.
         gradients: pictures whose gradient was taken.
+        zero_gradients: those of them whose gradient was 0 everywhere.
         seconds: wall time.
         excess: how far outside [0, 1] the attack's own texels were.
         evolution: what the attack reported while it crafted; None where it reported nothing.
@@ -105,6 +104,7 @@ class Patch:
     texels: Tensor | None
     queries: int = 0
     gradients: int = 0
+    zero_gradients: int = 0
     seconds: float = 0.0
     excess: float = 0.0
     evolution: Evolution | None = None
@@ -118,7 +118,7 @@ class Patch:
 class VisionOracle:
     """The only door to the (defended) detector while a patch is crafted. A picture asked about is a query.
 
-    `spent` counts the pictures asked about, `backwards` those whose gradient was taken.
+    `spent` counts the pictures asked about, `backwards` those whose gradient was taken, `zeros` those where it was 0 everywhere.
 
     Args:
         detector: the victim.
@@ -134,7 +134,7 @@ class VisionOracle:
         self.generator = generator
         self.label = detector.index(STOP_SIGN)
         self.stride = detector.stride
-        self.spent = self.backwards = 0
+        self.spent = self.backwards = self.zeros = 0
         self._reports, self._every = 0, 1
         self._moments: list[tuple[int, Tensor, dict[str, float]]] = []
 
@@ -196,6 +196,7 @@ class VisionOracle:
 
     def _came_back(self, gradient: Tensor) -> None:
         self.backwards += len(gradient)
+        self.zeros += int((gradient == 0).flatten(1).all(1).sum())
 
     def _spend(self, pictures: int, access: Access) -> None:
         permit(access, self._access)

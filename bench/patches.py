@@ -18,7 +18,7 @@ from bench.patch import Evolution, Patch
 from bench.unit import Crafting
 
 FOLDER = "patches"
-MEASURED = ("queries", "gradients", "seconds", "excess")
+MEASURED = ("queries", "gradients", "zero_gradients", "seconds", "excess")
 LOSS = "loss."
 
 
@@ -60,6 +60,7 @@ def read(out: Path, fingerprint: str) -> Patch:
                 texels=tensors.get("patch"),
                 queries=int(said["queries"]),
                 gradients=int(said["gradients"]),
+                zero_gradients=int(said["zero_gradients"]),
                 seconds=float(said["seconds"]),
                 excess=float(said["excess"]),
                 evolution=_evolution(tensors),

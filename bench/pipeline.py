@@ -18,7 +18,8 @@ class AttackModule(TensorDictModuleBase):
     """Reads `observation` [B, V, F], writes what the victim is shown to `perturbed`, projected onto the perturbation set.
 
     Also writes, for each episode of the batch: `queries` int64 [B] spent in the step, `excess` float [B] (how far outside the
-    set the attack's own answer was, L-inf on the normalised scale), and keeps `milliseconds`, the attack's own wall time of
+    set the attack's own answer was, L-inf on the normalised scale), `gradients` and `zero_gradients` int64 [B] (gradients taken
+    in the step, and those that were 0), and keeps `milliseconds`, the attack's own wall time of
     the last call. Episodes whose `done` is set are neither attacked nor counted.
 
     Args:
@@ -34,7 +35,7 @@ class AttackModule(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys = ["observation"]
-        self.out_keys = ["perturbed", "queries", "excess"]
+        self.out_keys = ["perturbed", "queries", "excess", "gradients", "zero_gradients"]
         self.attack = attack
         generator = torch.Generator().manual_seed(seed)
         self.oracle = Oracle(policy, threat, attack.access, features, generator)
@@ -44,13 +45,15 @@ class AttackModule(TensorDictModuleBase):
         observation = tensordict.get("observation")
         done = tensordict.get("done", None)
         perturbed = observation.clone()
-        queries = torch.zeros(observation.shape[0], dtype=torch.int64)
+        queries, gradients, zero_gradients = torch.zeros(3, observation.shape[0], dtype=torch.int64)
         excess = torch.zeros(observation.shape[0])
         rows = torch.arange(observation.shape[0]) if done is None else (~done.reshape(-1)).nonzero().squeeze(-1)
         if rows.numel():
             shown, spent, outside = self._attack(observation[rows])
             perturbed[rows], queries[rows], excess[rows] = shown, spent, outside
-        return tensordict.update({"perturbed": perturbed, "queries": queries, "excess": excess})
+            gradients[rows], zero_gradients[rows] = self.oracle.gradients, self.oracle.zero_gradients
+        counts = {"queries": queries, "gradients": gradients, "zero_gradients": zero_gradients}
+        return tensordict.update({"perturbed": perturbed, "excess": excess} | counts)
 
     def _attack(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         start = time.perf_counter()

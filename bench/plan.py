@@ -8,11 +8,11 @@ from dataclasses import replace
 
 from bench import registry
 from bench.config import RunConfig
+from bench.contracts import REFERENCE_PATCHES
 from bench.driving import DrivingVictim
 from bench.fingerprint import canonical
 from bench.pair import UNATTACKED, Pair, choose
 from bench.parameters import parameters
-from bench.patch import REFERENCE_PATCHES
 from bench.scenario import Cell
 from bench.unit import Unit
 

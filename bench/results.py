@@ -5,8 +5,10 @@ A file appears whole or not at all, so a killed run leaves only finished units b
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import duckdb
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 from bench import files
 from bench.contracts import TRACKS, Track
 from bench.errors import UserError
+from bench.scenario import WEATHERS
 
 FOLDER = "episodes"
 
@@ -121,11 +124,29 @@ PROVENANCE: tuple[pa.Field, ...] = (
 )
 """What produced it, where and when."""
 
+
+def _probe(name: str, meaning: str, unit: str = "share, 0 to 1") -> pa.Field:
+    return _field(name, _float, meaning, unit).with_nullable(True)
+
+
+PROBES: tuple[pa.Field, ...] = (
+    _probe("gradient_queries", "gradients the attack took: a step, mean; or of a patch", "gradients"),
+    _probe("zero_gradients", "of the gradients the attack took, those that were 0 everywhere"),
+    _probe("redrawn", "probes on which the victim, asked the same twice, scored it otherwise: it draws"),
+    _probe("same_answer", "probes on which another episode's observation (a grey picture) got the same scores"),
+    _probe("draws", "how often the attack asked about each observation, where the victim draws", "queries"),
+)
+"""What the flags of a leaderboard are measured by; null where nothing was measured, as in records older than these columns."""
+
 SCHEMAS: dict[Track, pa.Schema] = {
-    track: pa.schema((*IDENTITY, *measured, *PROVENANCE), metadata={"cavbench": "1"})
+    track: pa.schema((*IDENTITY, *measured, *PROVENANCE, *PROBES), metadata={"cavbench": "1"})
     for track, measured in MEASUREMENTS.items()
 }
-"""The columns of a record of each track; each field's metadata says its unit and its meaning."""
+"""The columns of a record of each track; each field's metadata says its unit and its meaning. New ones come last."""
+_OLDER: dict[Track, pa.Schema] = {
+    track: pa.schema(list(schema)[: -len(PROBES)], metadata=schema.metadata) for track, schema in SCHEMAS.items()
+}
+"""Those of records that are older than `PROBES`; they are read with nulls."""
 SCHEMA = SCHEMAS["driving"]
 
 
@@ -172,9 +193,17 @@ def write(out: Path, records: pa.Table) -> Path:
     return path
 
 
+def upgraded(records: pa.Table, track: Track) -> pa.Table:
+    """Records of any age with the columns of today, null where they were not measured."""
+    for field in PROBES:
+        if field.name not in records.column_names:
+            records = records.append_column(field, pa.nulls(records.num_rows, field.type))
+    return records.select(SCHEMAS[track].names).cast(SCHEMAS[track])
+
+
 def track_of(columns: Collection[str]) -> Track:
     """The track whose records have these columns."""
-    return next(track for track in TRACKS if set(SCHEMAS[track].names) == set(columns))
+    return next(track for track in TRACKS if set(_OLDER[track].names) <= set(columns))
 
 
 def tracks(out: Path) -> list[Track]:
@@ -217,14 +246,109 @@ def read(out: Path, units: Collection[str] | None = None, *, track: Track = "dri
     paths = [path for path in paths if _check(path) == track]
     if not paths:
         raise UserError(_NOTHING.format(out=out))
-    query = "from read_parquet(?)" + (_NEWEST if units is None else "") + _ORDER
+    query = "from records" + (_NEWEST if units is None else "") + _ORDER
+    with _records(out, paths, track) as connection:
+        return connection.sql(query).to_arrow_table().cast(SCHEMAS[track])
+
+
+def read_compact(out: Path, measurements: Collection[str]) -> dict[Track, pa.Table]:
+    """The newest records of each track as `read` would choose them, small enough for a million: for leaderboards.
+
+    Text columns are dictionaries. Of the measurements only those asked for are there, and `PROBES`.
+
+    Args:
+        out: results folder.
+        measurements: names of columns in `MEASUREMENTS` that hold no lists.
+
+    Raises:
+        UserError: if there are no records, or if a file is truncated or foreign.
+    """
+    paths: dict[Track, list[Path]] = {}
+    for path in sorted((out / FOLDER).glob("[!.]*.parquet")):
+        paths.setdefault(_glance(path), []).append(path)
+    if not paths:
+        raise UserError(_NOTHING.format(out=out))
+    return {track: _read_compact(out, paths[track], track, measurements) for track in TRACKS if track in paths}
+
+
+def _read_compact(out: Path, paths: list[Path], track: Track, measurements: Collection[str]) -> pa.Table:
+    """Units and episodes apart, as what a unit's episodes share is most of a record; then put together again."""
+    wanted = [field.name for field in MEASUREMENTS[track] if field.name in measurements]
+    apart = [*wanted, *(field.name for field in PROBES)]
+    shared = [field.name for field in (*IDENTITY, *PROVENANCE) if field.name != "seed"]
+    with _records(out, paths, track) as connection:
+        connection.sql("set preserve_insertion_order = false")
+        measured = connection.sql(f"select hash(unit) as code, seed, {_quoted(apart)} from records").to_arrow_table()
+        each = ", ".join(f'any_value("{name}") as "{name}"' for name in shared)
+        units = connection.sql(f"select hash(unit) as code, {each} from records group by all").to_arrow_table()
+        units = connection.sql(f"from units {_NEWEST_UNITS} {_UNIT_ORDER}").to_arrow_table()
+    codes, own = units["code"].to_numpy(), measured["code"].to_numpy()
+    by_code = np.argsort(codes)
+    place = by_code[np.minimum(np.searchsorted(codes, own, sorter=by_code), len(codes) - 1)]
+    place[codes[place] != own] = len(codes)
+    order = np.lexsort((measured["seed"].to_numpy(), place))[: int((place < len(codes)).sum())]
+    rows, taken = pa.array(place[order]), pa.array(order)
+    columns = {
+        name: _taken(units[name], rows) if name in shared else measured[name].combine_chunks().take(taken)
+        for name in SCHEMAS[track].names
+        if name in shared or name in measured.column_names
+    }
+    return pa.table(columns)
+
+
+def _taken(column: pa.ChunkedArray, rows: pa.Array) -> pa.Array:
+    """A unit's value for each of its episodes; text stays a dictionary."""
+    if not pa.types.is_string(column.type):
+        return column.combine_chunks().take(rows)
+    encoded = column.combine_chunks().dictionary_encode()
+    return pa.DictionaryArray.from_arrays(encoded.indices.take(rows), encoded.dictionary)
+
+
+@contextmanager
+def _records(out: Path, paths: Sequence[Path], track: Track) -> Iterator[duckdb.DuckDBPyConnection]:
+    """A connection whose view `records` is what is in files of one track; a file that cannot be read is named."""
+    generations: dict[bool, list[str]] = {}
+    for path in paths:
+        generations.setdefault(b"same_answer" in _footer(path), []).append(str(path))
+    nulls = ", ".join(f'null::double as "{field.name}"' for field in PROBES)
+    parts = []
+    for newer, files_of in generations.items():
+        named = ", ".join("'" + path.replace("'", "''") + "'" for path in files_of)
+        columns = _quoted(SCHEMAS[track].names if newer else _OLDER[track].names)
+        parts.append(f"select {columns}{'' if newer else ', ' + nulls} from read_parquet([{named}])")
     try:
         with duckdb.connect() as connection:
-            return connection.sql(query, params=[[str(path) for path in paths]]).to_arrow_table().cast(SCHEMAS[track])
+            connection.sql("create view records as " + " union all by name ".join(parts))
+            yield connection
     except duckdb.Error as error:
         for path in paths:
             _check(path, thoroughly=True)
         raise UserError(f"the records in {out} cannot be read: {str(error).splitlines()[0]}") from error
+
+
+def _quoted(names: Iterable[str]) -> str:
+    return ", ".join(f'"{name}"' for name in names)
+
+
+def _footer(path: Path) -> bytes:
+    """The end of a Parquet file, where its columns are named; reading it in full takes ten times as long."""
+    try:
+        with path.open("rb") as file:
+            file.seek(-8, os.SEEK_END)
+            size = int.from_bytes(file.read(4), "little")
+            file.seek(-8 - size, os.SEEK_END)
+            return file.read(size)
+    except OSError:
+        return b""
+
+
+def _glance(path: Path) -> Track:
+    """The track of a record by its footer; one that seems foreign is looked at in full, and refused."""
+    footer = _footer(path)
+    for track in TRACKS:
+        if all(field.name.encode() in footer for field in MEASUREMENTS[track]):
+            return track
+    return _check(path)
 
 
 _NOTHING = "there are no records in {out}; `bench run out={out}` makes some"
@@ -234,6 +358,12 @@ _NEWEST = """
     and row_number() over (
         partition by pair, training_seed, lanes, density, weather, seed order by created_at desc, unit) = 1
 """
+_NEWEST_UNITS = """
+    qualify (code_digest, weights_sha256) = first_value((code_digest, weights_sha256)) over (
+        partition by pair, training_seed order by created_at desc, unit)
+"""
+"""The same of units; of a scenario that two of them drove, `leaderboard.pairs.newest` keeps the last."""
+_UNIT_ORDER = f" order by pair, training_seed, list_position({list(WEATHERS)}, weather), lanes, density, created_at"
 _ORDER = " order by pair, training_seed, weather, lanes, density, seed"
 
 
@@ -245,7 +375,7 @@ def _check(path: Path, *, thoroughly: bool = False) -> Track:
         reason = "not there" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
         raise UserError(f"the record {path} is {reason}; delete it and run again to make it anew") from None
     for track in TRACKS:
-        if schema.equals(SCHEMAS[track]):
+        if schema.equals(SCHEMAS[track]) or schema.equals(_OLDER[track]):
             return track
     raise UserError(f"the record {path} has other columns than this version writes; use another folder with out=")
 
@@ -264,5 +394,5 @@ def table(
     columns = []
     for column in SCHEMAS[track]:
         values = [constants[column.name]] * rows if column.name in constants else measured[column.name].tolist()
-        columns.append(pa.array(values, column.type))
+        columns.append(pa.array(values, column.type, from_pandas=column.nullable))
     return pa.Table.from_arrays(columns, schema=SCHEMAS[track])

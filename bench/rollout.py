@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from bench.driving import DrivingAttack, Features, Policy
 from bench.pipeline import AttackModule, PolicyModule
+from bench.probes import EVERY, Probe
 from bench.threat import ObservationThreat
 
 CHANGED = 0.1
@@ -66,20 +67,25 @@ def rollout(
     """
     attacker = AttackModule(attack, policy, threat, features, seed=attack_seed)
     pipeline = PolicyModule(policy, in_key="perturbed")
-    meter = _Meter(len(seeds), policy, features)
+    meter, probe = _Meter(len(seeds), policy, features), Probe(len(seeds), policy)
     seed_tensor = torch.as_tensor(list(seeds), dtype=torch.int64)
     policy.reset(seed_tensor)
     with torch.no_grad():
         td = env.reset(TensorDict({"seed": seed_tensor}, batch_size=env.batch_size))
-        for _ in range(max_steps):
+        for step in range(max_steps):
+            running = ~td["done"].squeeze(-1)
+            probing = step % EVERY == 0
+            attacker.oracle.asked = [] if probing and probe.look(td["observation"], running) else None
             pipeline(attacker(td))
+            if attacker.oracle.asked:
+                probe.count_draws(attacker.oracle.asked, running)
             before, td = td, env.step(td)["next"]
             meter.step(before, td, attacker.milliseconds)
             if trace is not None:
                 trace.append(_traced(before, td, policy))
             if bool(td["done"].all()):
                 break
-    return {"seed": seed_tensor.numpy(), **meter.columns(max_steps)}
+    return {"seed": seed_tensor.numpy(), **meter.columns(max_steps), **probe.columns()}
 
 
 def _traced(before: TensorDictBase, after: TensorDictBase, policy: Policy) -> dict[str, Tensor]:
@@ -115,6 +121,7 @@ class _Meter:
         self.min_ttc = np.full(batch, np.inf, np.float32)
         self.crashed, self.offroad = np.zeros(batch, np.bool_), np.zeros(batch, np.bool_)
         self.start_x, self.end_x = np.full(batch, np.nan, np.float32), np.zeros(batch, np.float32)
+        self.gradients, self.zero_gradients = np.zeros(batch), np.zeros(batch)
         self.queries: list[NDArray[np.int64]] = []
         self.actions: list[NDArray[np.int64]] = []
 
@@ -145,6 +152,8 @@ class _Meter:
         self.offroad |= info["offroad"] & running
         np.copyto(self.start_x, info["x"], where=np.isnan(self.start_x))
         np.copyto(self.end_x, info["x"], where=running)
+        self.gradients += before["gradients"].numpy()
+        self.zero_gradients += before["zero_gradients"].numpy()
         self.queries.append(np.where(running, before["queries"].numpy(), -1))
         if self.policy.action_type == "discrete":
             self.actions.append(np.where(running, before["action"].numpy(), -1))
@@ -186,6 +195,8 @@ class _Meter:
             "excess_max": self.excess_max.astype(np.float64),
             **{name: sums[name] / steps for name in self.SUMS[3:]},
             "action_counts": self._action_counts(),
+            "gradient_queries": self.gradients / steps,
+            "zero_gradients": np.where(self.gradients > 0, self.zero_gradients / np.maximum(self.gradients, 1), np.nan),
         }
 
     def _action_counts(self) -> NDArray[np.generic]:

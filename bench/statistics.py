@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ Array = NDArray[np.float64]
 REPLICATES = 2000
 """Bootstrap draws: another generator seed then moves the ends of an interval by about 2 % of its width."""
 CONFIDENCE = 0.95
+_TAILS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
 
 
 @dataclass(frozen=True)
@@ -66,11 +68,37 @@ def interval(scores: Array, *, seed: int = 0, replicates: int = REPLICATES) -> I
         return Interval(estimate, np.nan, np.nan)
     generator = np.random.default_rng(seed)
     if runs > 1:
-        drawn = generator.integers(runs, size=(replicates, runs, tasks))
-        draws = scores.mean(2)[drawn, np.arange(tasks)].reshape(replicates, -1)
+        drawn = _drawn(runs, tasks, seed, replicates)
+        draws = scores.mean(2).ravel()[drawn].reshape(replicates, -1)
     else:
         draws = np.stack([_episode_means(task, generator, replicates) for task in scores[0]], 1)
     return _percentiles(estimate, iqm(draws, axis=1))
+
+
+def task_intervals(scores: Array, *, seed: int = 0, replicates: int = REPLICATES) -> list[Interval]:
+    """`interval` of each task by itself, all in one pass.
+
+    Args:
+        scores: [R, C, E], as there.
+        seed: of the bootstrap's own generator.
+        replicates: bootstrap draws.
+    """
+    _check(scores)
+    runs, tasks, _ = scores.shape
+    if runs == 1:
+        return [interval(scores[:, [task]], seed=seed, replicates=replicates) for task in range(tasks)]
+    drawn = _drawn(runs, 1, seed, replicates)[..., 0]
+    means = scores.mean(2)
+    estimates, (low, high) = iqm(means, 0), np.quantile(iqm(means[drawn], 1), _TAILS, axis=0)
+    bounds = np.minimum(low, estimates), np.maximum(high, estimates)
+    return [Interval(*map(float, each)) for each in zip(estimates, *bounds, strict=True)]
+
+
+@cache
+def _drawn(runs: int, tasks: int, seed: int, replicates: int) -> NDArray[np.int64]:
+    """[replicates, R, C] the flat places in [R, C] of the runs that are drawn in each task."""
+    drawn = np.random.default_rng(seed).integers(runs, size=(replicates, runs, tasks))
+    return drawn * tasks + np.arange(tasks)
 
 
 def _episode_means(values: Array, generator: np.random.Generator, replicates: int) -> Array:
@@ -83,8 +111,7 @@ def _percentiles(estimate: float, draws: Array) -> Interval:
     """The percentile interval; widened to hold the estimate, which a skewed bootstrap of a trimmed mean can miss by a
     hair.
     """
-    tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(draws, (tail, 1 - tail))
+    low, high = np.quantile(draws, _TAILS)
     return Interval(estimate, min(float(low), estimate), max(float(high), estimate))
 
 

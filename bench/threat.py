@@ -94,7 +94,8 @@ class Oracle:
     """The only door to the victim. It refuses what the access level forbids, counts every query, and stops at the budget.
 
     A batch of queries has shape [..., B, V, F], B the running episodes (or those of `rows`); one evaluation of one episode's
-    observation is one query, a gradient is one query too.
+    observation is one query, a gradient is one query too. `gradients` counts those of a step, `zero_gradients` those that were 0
+    everywhere; `asked`, where it is a list, keeps what was asked.
 
     Args:
         policy: the victim.
@@ -119,7 +120,8 @@ class Oracle:
         self.radius = torch.empty(0)
         self._set = self._subset = (torch.empty(0), torch.empty(0), torch.empty(0))
         self._rows: Tensor | None = None
-        self.spent = torch.empty(0, dtype=torch.int64)
+        self.spent = self.gradients = self.zero_gradients = torch.empty(0, dtype=torch.int64)
+        self.asked: list[tuple[Tensor | None, Tensor]] | None = None
 
     def begin_step(self, observation: Tensor, scale: float = 1.0) -> None:
         """Open a step on the true observations [B, V, F]: the perturbation set follows them, the query counters start at 0."""
@@ -127,7 +129,7 @@ class Oracle:
         self.radius = self.threat.radius(observation, self.features, scale)
         self._set = self._subset = (observation, *_bounds(observation, self.radius))
         self._rows = None
-        self.spent = torch.zeros(observation.shape[0], dtype=torch.int64)
+        self.spent, self.gradients, self.zero_gradients = torch.zeros(3, observation.shape[0], dtype=torch.int64)
 
     @property
     def remaining(self) -> Tensor:
@@ -156,12 +158,19 @@ class Oracle:
     def gradient(
         self, observation: Tensor, loss: Callable[[Tensor], Tensor], rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The loss [..., B] of the victim's scores and its gradient [..., B, V, F] in the observation; needs `gradients`."""
+        """The loss [..., B] of the victim's scores and its gradient [..., B, V, F] in the observation; needs `gradients`.
+
+        A victim that lets none through has a gradient of 0.
+        """
         self._spend(observation, rows, "gradients")
         leaf = observation.detach().requires_grad_(True)
         with torch.enable_grad():
             value = loss(self._policy.scores(leaf))
-            (gradient,) = torch.autograd.grad(value.sum(), leaf)
+            found = torch.autograd.grad(value.sum(), leaf, allow_unused=True) if value.requires_grad else (None,)
+        gradient = torch.zeros_like(observation) if found[0] is None else found[0]
+        zero = (gradient == 0).flatten(-2).all(-1)
+        self._count(self.gradients, torch.ones_like(zero), rows)
+        self._count(self.zero_gradients, zero, rows)
         return value.detach(), gradient
 
     def value(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -179,8 +188,16 @@ class Oracle:
         answer = torch.cat([ask(part) for part in flat.split(CHUNK)]) if len(flat) else ask(flat)
         return answer.unflatten(0, observation.shape[:-2])
 
+    @staticmethod
+    def _count(counter: Tensor, counted: Tensor, rows: Tensor | None) -> None:
+        """Add what was counted [..., B] of the running episodes, or of those of `rows`."""
+        each = counted.long().flatten(0, -2).sum(0) if counted.ndim > 1 else counted.long()
+        counter.index_add_(0, torch.arange(len(counter)) if rows is None else rows, each)
+
     def _spend(self, observation: Tensor, rows: Tensor | None, access: Access) -> None:
         permit(access, self._access)
+        if self.asked is not None:
+            self.asked.append((rows, observation.detach()))
         each = observation.shape[:-3].numel()
         if rows is None:
             self.spent += each

@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from bench.contracts import REFERENCE_PATCHES
 from bench.metrics import Episodes, difference, rate, unit_interval
-from bench.patch import REFERENCE_PATCHES
 from bench.scenario import Cell
 from bench.statistics import Interval, interval
 from leaderboard.pairs import ATTACKER, DEFENDED, groups, newest

@@ -7,14 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from bench.metrics import Episodes, Summary, difference, shared, summarise, unit_interval
 from bench.scenario import Cell
-from bench.statistics import Interval
+from bench.statistics import Interval, iqm
 
 DEFENDED = ("defense", "defense_params", "victim", "victim_params", "world", "world_params")
 """What drives: the columns that a clean control shares with the attacked episodes."""
@@ -111,24 +111,26 @@ def read_pairs(records: pa.Table) -> list[Pair]:
     attacked = [group for group in groups(records, (*DEFENDED, *ATTACKER, "grid")) if group[0]["attack"] != "none"]
     clean = groups(records, DEFENDED, pc.equal(records["attack"], "none"))
     controls = {_drives(identity): Episodes.arrange(newest(rows, DEFENDED)) for identity, rows in clean}
-    pairs = [_pair(identity, rows, controls) for identity, rows in attacked]
+    known: dict[tuple[object, ...], dict[str, Episodes]] = {}
+    pairs = [_pair(identity, rows, controls, known) for identity, rows in attacked]
     used = {_drives(pair.identity) for pair in pairs}
     alone = [drives for drives, drive in controls.items() if drives not in used and drive.table["sees"][0].as_py()]
     if not pairs and not alone:
         alone = list(controls)
-    pairs += [_pair(_first(controls[drives]), None, controls) for drives in alone]
+    pairs += [_pair(_first(controls[drives]), None, controls, known) for drives in alone]
     return sorted(pairs, key=_rank)
 
 
 def newest(records: pa.Table, identity: tuple[str, ...] = (*DEFENDED, *ATTACKER, "grid")) -> pa.Table:
     """The last record of each scenario, in the order given."""
-    keys = ", ".join((*identity, *SCENARIO))
-    numbered = records.append_column("row", pa.array(np.arange(records.num_rows)))
-    with duckdb.connect() as connection:
-        connection.register("numbered", numbered)
-        last = connection.execute(f"SELECT arg_max(row, (created_at, row)) AS row FROM numbered GROUP BY {keys}")
-        rows = np.sort(np.asarray(last.fetchnumpy()["row"], dtype=np.int64))
-    return records.take(pa.array(rows))
+    codes = _codes(records, (*identity, *SCENARIO))
+    rising = np.sort(codes)
+    if (rising[1:] > rising[:-1]).all():
+        return records
+    created = records["created_at"].cast(pa.int64()).to_numpy()
+    order = np.lexsort((np.arange(len(codes)), created, codes))
+    last = np.append(codes[order][1:] != codes[order][:-1], True)
+    return records.take(pa.array(np.sort(order[last])))
 
 
 def groups(
@@ -136,11 +138,33 @@ def groups(
 ) -> Iterator[tuple[dict[str, object], pa.Table]]:
     """The records that share the values of `columns`, in the order of their first appearance."""
     kept = records if keep is None else records.filter(keep)
-    for identity in kept.select(columns).group_by(list(columns), use_threads=False).aggregate([]).to_pylist():
-        mask = np.ones(kept.num_rows, bool)
-        for name, value in identity.items():
-            mask &= pc.equal(kept[name], pa.scalar(value, kept.schema.field(name).type)).to_numpy()
-        yield identity, kept.filter(pa.array(mask))
+    if not kept.num_rows:
+        return
+    codes = _codes(kept, columns)
+    starts = np.flatnonzero(np.append(True, codes[1:] != codes[:-1]))
+    together: dict[int, list[NDArray[np.int64]]] = {}
+    for start, end in zip(starts, [*starts[1:], len(codes)], strict=True):
+        together.setdefault(int(codes[start]), []).append(np.arange(start, end))
+    for stretches in together.values():
+        first = stretches[0]
+        alone = len(stretches) == 1
+        part = kept.slice(first[0], len(first)) if alone else kept.take(pa.array(np.concatenate(stretches)))
+        yield part.select(columns).slice(0, 1).to_pylist()[0], part
+
+
+def _codes(records: pa.Table, columns: Sequence[str]) -> NDArray[np.int64]:
+    """A number for each record, the same for those that share the values of `columns`."""
+    codes = np.zeros(records.num_rows, np.int64)
+    kinds = 1
+    for name in columns:
+        column = records[name].combine_chunks()
+        column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+        more = len(column.dictionary)
+        if kinds * more > 2**62:
+            distinct, codes = np.unique(codes, return_inverse=True)
+            kinds = len(distinct)
+        codes, kinds = codes * more + column.indices.to_numpy(), kinds * more
+    return codes
 
 
 def _drives(identity: Mapping[str, object]) -> tuple[object, ...]:
@@ -153,8 +177,12 @@ def _first(drive: Episodes) -> dict[str, object]:
 
 
 def _pair(
-    identity: Mapping[str, object], rows: pa.Table | None, controls: Mapping[tuple[object, ...], Episodes]
+    identity: Mapping[str, object],
+    rows: pa.Table | None,
+    controls: Mapping[tuple[object, ...], Episodes],
+    known: dict[tuple[object, ...], dict[str, Episodes]],
 ) -> Pair:
+    """One pair; `known` remembers the reference drivers of the same scenarios."""
     clean = controls.get(_drives(identity))
     attacked = Episodes.arrange(rows) if rows is not None else None
     if attacked and clean:
@@ -164,7 +192,11 @@ def _pair(
             clean = None
     driven = attacked or clean
     assert driven is not None
-    return Pair(identity, attacked, clean, references(driven, controls.values()))
+    own = _first(driven)
+    key = (*(own[name] for name in ("world", "world_params", "action_type")), driven.runs, driven.cells, driven.seeds)
+    if key not in known:
+        known[key] = references(driven, controls.values())
+    return Pair(identity, attacked, clean, known[key])
 
 
 def references(driven: Episodes, controls: Iterable[Episodes]) -> dict[str, Episodes]:
@@ -219,8 +251,7 @@ def _cell_by_cell(candidate: Episodes, driven: Episodes) -> Iterator[tuple[Cell,
 def _rank(pair: Pair) -> tuple[object, ...]:
     """By world, victim and defence (`none` first), then the strongest attack first."""
     text = {name: str(value) for name, value in pair.identity.items()}
-    summary = pair.attacked_summary
-    score = summary.safe_progress.estimate if summary else -1.0
+    score = float(iqm(pair.attacked.column("safe_progress").mean(2))) if pair.attacked else -1.0
     return (
         *(text[name] for name in ("world", "world_params", "victim", "victim_params")),
         text["defense"] != "none",

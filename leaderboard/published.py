@@ -27,7 +27,7 @@ def published(track: Track) -> pa.Table:
     schema = SCHEMAS[track]
     with as_file(files("leaderboard") / "data") as folder:
         paths = [path for path in sorted(folder.glob("*.parquet")) if track_of(pq.read_schema(path).names) == track]
-        tables = [pq.read_table(path).select(schema.names).cast(schema) for path in paths]
+        tables = [results.upgraded(pq.read_table(path), track) for path in paths]
     return pa.concat_tables([schema.empty_table(), *tables])
 
 

@@ -9,7 +9,6 @@ from typing import Protocol
 from rich.text import Text
 
 from bench.statistics import Interval
-from bench.threat import FLOORS
 from leaderboard.pairs import Pair, parameters
 
 MISSING = "—"
@@ -132,6 +131,9 @@ def threat(pair: Pair) -> str:
         return "nothing is attacked"
     budget = float(str(identity["threat_budget"]))
     if identity["threat_norm"] == "relative":
+        # Imported here: with torch, that takes seconds, and a leaderboard writes no such sentence.
+        from bench.threat import FLOORS
+
         floors = ", ".join(f"{name} {floor * budget / 0.1:g} {_unit(name)}" for name, floor in FLOORS.items())
         bounds = f"each measured value may be off by {100 * budget:g} % of itself, or by its floor ({floors})"
     else:

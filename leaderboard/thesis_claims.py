@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from rich.text import Text
 
+from bench.contracts import REFERENCE_PATCHES
 from bench.metrics import shared
-from bench.patch import REFERENCE_PATCHES
 from bench.statistics import Array, interval
 from leaderboard.approaches import NO_PATCH
 from leaderboard.text import bounds, change

@@ -12,9 +12,10 @@ from functools import cache
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from bench.contracts import REFERENCE_PATCHES
 from bench.fingerprint import canonical
 from bench.pair import choose
-from bench.patch import REFERENCE_PATCHES, PatchThreat
+from bench.patch import PatchThreat
 from bench.statistics import Interval
 from leaderboard.approaches import NO_PATCH, Patched, read_patched
 from leaderboard.pairs import groups, parameters

@@ -16,7 +16,7 @@ from bench.config import run_config
 from bench.drive import drive
 from bench.errors import UserError
 from bench.plan import plan
-from bench.results import MEASUREMENTS, SCHEMA
+from bench.results import MEASUREMENTS, PROBES, SCHEMA
 from bench.unit import Unit
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
@@ -39,7 +39,8 @@ def written(units: list[Unit], tmp_path: Path) -> Path:
 
 
 def test_a_rollout_measures_exactly_what_the_schema_says(units: list[Unit]) -> None:
-    assert set(drive(units[0])) == {field.name for field in MEASUREMENTS["driving"]} | {"seed"}
+    measured = {field.name for field in (*MEASUREMENTS["driving"], *PROBES)} | {"seed"}
+    assert set(drive(units[0])) == measured
     assert all(field.metadata[b"meaning"] for field in SCHEMA)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
@@ -33,6 +34,7 @@ def drive(
     action_type: str = "discrete",
     grid: str = "standard-v1",
     queries: float = 0.0,
+    weights: str = "",
 ) -> pa.Table:
     """Records of one (attack, defence, victim); `skill` in [0, 1] sets how far it gets and how seldom it crashes."""
     cells = tuple(cells)
@@ -50,7 +52,9 @@ def drive(
     steps = np.where(crashed, generator.integers(30, 450, count), 450)
     speed = 20 + 10 * at_cell
     columns: dict[str, object] = {
-        "unit": "0" * 64,
+        "unit": _units(
+            attack, attack_params, defense, defense_params, victim, victim_params, threat, run=run, place=place
+        ),
         "pair": f"{attack}-{defense}-{victim}",
         "attack": attack,
         "attack_params": json.dumps(attack_params or {}, sort_keys=True),
@@ -91,6 +95,7 @@ def drive(
         "linf_mps": 1.1 * attacked,
         "excess_max": 0.0,
         "attack_ms": 0.02 * queries,
+        "weights_sha256": weights,
         "action_counts": [[n, 0, 0, 0, 0] if action_type == "discrete" else [] for n in steps],
         "created_at": datetime(2026, 1, 1, tzinfo=UTC),
         "wall_s": 1.0,
@@ -98,10 +103,24 @@ def drive(
     return _table(SCHEMA, columns, count)
 
 
+def probed(records: pa.Table, **columns: float | str) -> pa.Table:
+    """The same records with what a run measures for flags; a column it has already is replaced."""
+    for name, value in columns.items():
+        field = records.schema.field(name)
+        values = pa.array([value] * records.num_rows, field.type)
+        records = records.set_column(records.schema.get_field_index(name), field, values)
+    return records
+
+
+def _units(*identity: object, run: np.ndarray, place: np.ndarray) -> list[str]:
+    """A fingerprint a unit: a pair, a training seed and a cell."""
+    return [hashlib.sha256(repr((identity, *key)).encode()).hexdigest() for key in zip(run, place, strict=True)]
+
+
 def _table(schema: pa.Schema, columns: Mapping[str, object], count: int) -> pa.Table:
     arrays = []
     for field in schema:
-        value = columns.get(field.name, "")
+        value = columns.get(field.name, None if field.nullable else "")
         arrays.append(pa.array(value if isinstance(value, list | np.ndarray) else [value] * count, field.type))
     return pa.table(arrays, schema=schema)
 
@@ -133,7 +152,7 @@ def approach(
     frames = [[float(value)] * 10 for value in confidence]
     attacked = attack != "none"
     columns: dict[str, object] = {
-        "unit": "0" * 64,
+        "unit": _units(attack, changes, defense, victim, victim_params, budget, run=run, place=place),
         "pair": f"{attack}-{defense}-{victim}",
         "attack": attack,
         "attack_params": choose("attack", attack, **(changes or {})).params,

@@ -1,0 +1,223 @@
+"""The honest ranking: of each defended victim the worst attack counts, cell by cell; flagged rows come last."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import get_args
+
+import numpy as np
+import pyarrow as pa
+
+from bench.contracts import TRACKS, Access, Track
+from bench.metrics import Episodes, unit_interval
+from bench.scenario import WEATHERS, Cell
+from bench.statistics import Array, Interval, interval
+from leaderboard.entries import Entry, read_entries
+from leaderboard.flags import Flag, Subject, flags
+
+THREAT = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
+
+
+@dataclass(frozen=True, eq=False)
+class Worst:
+    """What is left of a defended victim where in every cell the strongest attack counts.
+
+    Args:
+        scores: [R, C, E] of the ranking metric.
+        runs: training or patch seeds.
+        cells: [C].
+        attacks: the strongest attack of each cell.
+        blind: [C, E] of the best blind policy on the same scenarios; NaN where it was not driven.
+    """
+
+    scores: Array
+    runs: tuple[int, ...]
+    cells: tuple[Cell, ...]
+    attacks: tuple[Entry, ...]
+    blind: Array
+
+    @cached_property
+    def score(self) -> Interval:
+        """Over all runs and cells."""
+        return unit_interval(self.scores)
+
+    @cached_property
+    def lead(self) -> Interval | None:
+        """Minus the best blind policy of the cell, paired scenario by scenario, in the cells where that was driven."""
+        known = np.isfinite(self.blind).all(1)
+        return interval((self.scores - self.blind)[:, known]) if known.any() else None
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A defended victim on a leaderboard.
+
+    Args:
+        entries: the attacks that count, the strongest first.
+        worst: what they leave.
+        clean: without an attack; None where that was not driven.
+        flags: each with its measurement, fired or not.
+        group: rank group, from 1; rows of a group cannot be told from its first. Flagged rows follow the others.
+    """
+
+    entries: tuple[Entry, ...]
+    worst: Worst
+    clean: Interval | None
+    flags: tuple[Flag, ...]
+    group: int = 0
+
+    @property
+    def identity(self) -> Mapping[str, object]:
+        """Of what is defended, and of its strongest attack."""
+        return self.entries[0].identity
+
+    @property
+    def flagged(self) -> bool:
+        """Whether any flag has fired."""
+        return any(flag.fired for flag in self.flags)
+
+
+@dataclass(frozen=True, eq=False)
+class Board:
+    """The leaderboard of a threat model in a world.
+
+    Args:
+        track: of its victims.
+        world: name and parameters.
+        threat: the values of `THREAT`.
+        rows: best first; flagged ones last.
+        references: drivers that learn nothing, by name.
+    """
+
+    track: Track
+    world: tuple[str, str]
+    threat: tuple[str, float, str, int]
+    rows: tuple[Row, ...]
+    references: Mapping[str, Episodes] = field(default_factory=dict)
+
+
+def boards(entries: Sequence[Entry]) -> list[Board]:
+    """A leaderboard for every threat model in which something was attacked."""
+    attacked = [entry for entry in entries if entry.attacked]
+    keys = sorted({_key(entry) for entry in attacked}, key=_board_rank)
+    return [_board(key, attacked) for key in keys]
+
+
+Key = tuple[Track, str, str, str, float, str, int]
+
+
+def _key(entry: Entry) -> Key:
+    identity = entry.identity
+    return (entry.track, *(identity[name] for name in ("world", "world_params", *THREAT)))  # type: ignore[return-value]
+
+
+def _board_rank(key: Key) -> tuple[object, ...]:
+    """Driving first, then by world; the standard norm first, the largest budget and the most access first."""
+    track, world, params, norm, budget, access, queries = key
+    return TRACKS.index(track), world, params, norm != "relative", norm, -budget, -_access(access), -queries
+
+
+def _access(name: str) -> int:
+    known: tuple[str, ...] = get_args(Access)
+    return known.index(name) if name in known else len(known)
+
+
+def _board(key: Key, attacked: Sequence[Entry]) -> Board:
+    track, world, world_params, *threat = key
+    allowed = [entry for entry in attacked if _within(entry, key)]
+    rows = []
+    for defended in dict.fromkeys(entry.defended for entry in attacked if _key(entry) == key):
+        own = [entry for entry in allowed if entry.defended == defended]
+        found = worst(own)
+        own.sort(key=lambda entry: entry.score.estimate)
+        others = [
+            entry for entry in attacked if entry.defended == defended and entry.identity["threat_norm"] == threat[0]
+        ]
+        clean = next((entry.clean_score for entry in own if entry.clean_score), None)
+        subject = Subject(track, own, others, found.scores, found.runs, found.cells, found.lead)
+        rows.append(Row(tuple(own), found, clean, tuple(flags(subject))))
+    return Board(track, (world, world_params), tuple(threat), tuple(ranked(rows)), _references(allowed))  # type: ignore[arg-type]
+
+
+def _within(entry: Entry, key: Key) -> bool:
+    """Whether the threat model allows what an attack did: it had no more knowledge, budget and queries."""
+    track, world, world_params, norm, budget, access, queries = key
+    identity = entry.identity
+    return (
+        (entry.track, identity["world"], identity["world_params"], identity["threat_norm"])
+        == (track, world, world_params, norm)
+        and float(str(identity["threat_budget"])) <= budget
+        and _access(str(identity["threat_access"])) <= _access(access)
+        and int(str(identity["threat_queries"])) <= queries
+    )
+
+
+def worst(entries: Sequence[Entry]) -> Worst:
+    """Of each cell the attack that leaves least, on the runs that all attacks share.
+
+    An attack that shares no run with those that were driven more is left out.
+    """
+    kept: list[Entry] = []
+    shared: set[int] = set()
+    for entry in sorted(entries, key=lambda entry: (entry.stands_for_all, -entry.own.table.num_rows)):
+        own = shared if kept and entry.stands_for_all else set(entry.own.runs)
+        if not kept or shared & own:
+            shared = shared & own if kept else own
+            kept.append(entry)
+    runs = tuple(sorted(shared))
+    order = list(WEATHERS)
+    cells = sorted(
+        {cell for entry in kept for cell in entry.own.cells},
+        key=lambda cell: (order.index(cell.weather), cell.lanes, cell.density),
+    )
+    chosen = [_strongest(kept, cell, runs) for cell in cells]
+    fewest = min(scores.shape[1] for _, scores, _ in chosen)
+    return Worst(
+        scores=np.stack([scores[:, :fewest] for _, scores, _ in chosen], 1),
+        runs=runs,
+        cells=tuple(cells),
+        attacks=tuple(entry for entry, _, _ in chosen),
+        blind=np.stack([blind[:fewest] for _, _, blind in chosen]),
+    )
+
+
+def _strongest(entries: Iterable[Entry], cell: Cell, runs: Sequence[int]) -> tuple[Entry, Array, Array]:
+    """The attack that leaves least in a cell, what it leaves [R, E], and what the best blind policy gets there [E]."""
+    found = []
+    for entry in entries:
+        if cell in entry.own.cells:
+            place = entry.own.cells.index(cell)
+            rows = [0] * len(runs) if entry.stands_for_all else [entry.own.runs.index(run) for run in runs]
+            found.append((entry, entry.scores[rows, place]))
+    entry, scores = min(found, key=lambda pair: float(pair[1].mean()))
+    blind = entry.blind
+    if blind is None or cell not in blind.cells or blind.seeds != entry.own.seeds:
+        return entry, scores, np.full(scores.shape[1], np.nan)
+    return entry, scores, blind.column(entry.metric)[0, blind.cells.index(cell)]
+
+
+def ranked(rows: Iterable[Row]) -> Iterator[Row]:
+    """Best first, flagged ones last, in groups: a group's rows have intervals that overlap that of its first."""
+    ordered = sorted(rows, key=lambda row: (row.flagged, -row.worst.score.estimate))
+    group, leader = 0, None
+    for row in ordered:
+        if leader is None or row.flagged != leader.flagged or row.worst.score.high < leader.worst.score.low:
+            group, leader = group + 1, row
+        yield replace(row, group=group)
+
+
+def _references(entries: Sequence[Entry]) -> dict[str, Episodes]:
+    """Those of the entry that was driven most; they have no training seeds, so one run says it all."""
+    with_them = [entry for entry in entries if entry.references]
+    if not with_them:
+        return {}
+    found = max(with_them, key=lambda entry: entry.own.table.num_rows).references
+    return {name: drive.only(runs=drive.runs[:1]) for name, drive in found.items()}
+
+
+def read_boards(records: Mapping[Track, pa.Table]) -> tuple[list[Board], list[Entry]]:
+    """The leaderboards that records make, and all that was driven."""
+    entries = read_entries(records)
+    return boards(entries), entries

@@ -1,0 +1,397 @@
+"use strict";
+const data = JSON.parse(document.getElementById("data").textContent);
+const at = (id) => document.getElementById(id);
+const pairs = new Map(data.pairs.map((pair) => [pair.key, pair]));
+const AXES = ["weather", "lanes", "density"];
+const state = { track: null, board: 0, sort: {}, shown: null };
+
+/* ---- elements: text goes in as text, never as markup ---- */
+function el(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (value !== false && value != null) made.setAttribute(name, value === true ? "" : value);
+  }
+  made.append(...children.filter((child) => child != null));
+  return made;
+}
+const fixed = (value, digits = 2) => (value == null ? "—" : value.toFixed(digits).replace("-", "−"));
+const short = (value) => fixed(value).replace(/^(−?)0\./, "$1.");
+const bounds = (found) => (found && found.low != null ? `${short(found.low)}–${short(found.high)}` : "");
+const signed = (found) => (found == null ? "—" : (found.estimate > 0 ? "+" : "") + fixed(found.estimate));
+const percent = (found) => (found == null ? "—" : `${Math.round(100 * found.estimate)} %`);
+function estimate(found) {
+  return found == null ? ["—"] : [el("b", {}, fixed(found.estimate)), " ", el("small", {}, bounds(found))];
+}
+
+/* ---- statistics: those of bench/statistics.py, for the cells that are left ---- */
+function iqm(values) {
+  const ordered = Float64Array.from(values).sort();
+  const cut = Math.floor(ordered.length / 4);
+  let sum = 0;
+  for (let i = cut; i < ordered.length - cut; i++) sum += ordered[i];
+  return sum / (ordered.length - 2 * cut);
+}
+function generator(seed) {
+  return () => {
+    seed = (seed + 0x6d2b79f5) | 0;
+    let t = Math.imul(seed ^ (seed >>> 15), 1 | seed);
+    t = (t + Math.imul(t ^ (t >>> 7), 61 | t)) ^ t;
+    return ((t ^ (t >>> 14)) >>> 0) / 4294967296;
+  };
+}
+function wilson(rate, trials) {
+  const z2 = 3.8414588206941236;
+  const centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials);
+  const half = (Math.sqrt(z2 * ((rate * (1 - rate)) / trials + z2 / (4 * trials * trials)))) / (1 + z2 / trials);
+  return { estimate: rate, low: Math.max(0, Math.min(centre - half, rate)), high: Math.min(1, Math.max(centre + half, rate)) };
+}
+function interval(cells, scenarios) {
+  const values = cells.flatMap((cell) => cell.runs);
+  const found = iqm(values);
+  if (values.every((value) => value === values[0]) && (values[0] === 0 || values[0] === 1)) return wilson(values[0], values.length * scenarios);
+  const random = generator(1);
+  const normal = () => Math.sqrt(-2 * Math.log(1 - random())) * Math.cos(2 * Math.PI * random());
+  const draws = [];
+  for (let replicate = 0; replicate < 500; replicate++) {
+    draws.push(iqm(cells.flatMap(({ runs, error }) =>
+      runs.length > 1 ? runs.map(() => runs[Math.floor(random() * runs.length)]) : [runs[0] + (error ?? 0) * normal()])));
+  }
+  draws.sort((a, b) => a - b);
+  return { estimate: found, low: Math.min(draws[12], found), high: Math.max(draws[487], found) };
+}
+function kept(cells) {
+  return cells.filter((cell) => AXES.every((axis) => state[axis].has(cell[axis])));
+}
+function over(cells, whole, scenarios) {
+  const left = kept(cells);
+  if (!left.length) return null;
+  return left.length === cells.length ? whole : interval(left, scenarios);
+}
+function ranked(rows) {
+  const ordered = [...rows].sort((a, b) => a.row.flagged - b.row.flagged || b.score.estimate - a.score.estimate);
+  let group = 0, leader = null;
+  for (const one of ordered) {
+    if (!leader || one.row.flagged !== leader.row.flagged || one.score.high < leader.score.low) { group++; leader = one; }
+    one.group = group;
+  }
+  return ordered;
+}
+
+/* ---- tables: columns say what a row shows, sorts by and copies ---- */
+function strip(score, blind) {
+  if (!score) return "";
+  const place = (value) => `${(100 * Math.max(0, Math.min(1, value))).toFixed(1)}%`;
+  const made = el("span", { class: "strip", "aria-hidden": "true" });
+  const bar = el("i"), dot = el("b");
+  bar.style.left = place(score.low ?? score.estimate);
+  bar.style.right = `calc(100% - ${place(score.high ?? score.estimate)})`;
+  dot.style.left = place(score.estimate);
+  made.append(bar, dot);
+  if (blind != null) { const line = el("u"); line.style.left = place(blind); made.append(line); }
+  return made;
+}
+function cardLink(pair, text) {
+  return el("a", { href: `#pair-${pair.key}` }, text);
+}
+function draw(id, columns, rows, classes) {
+  const table = at(id), sort = state.sort[id];
+  const ordered = [...rows];
+  if (sort) {
+    const column = columns.find((one) => one.name === sort.name);
+    const rank = (value) => (value == null ? -Infinity : value);
+    if (column) ordered.sort((a, b) => {
+      const [x, y] = [rank(column.value(a)), rank(column.value(b))];
+      return (x < y ? -1 : x > y ? 1 : 0) * (sort.down ? -1 : 1);
+    });
+  }
+  const focused = document.activeElement?.dataset?.column;
+  const head = el("tr", {}, ...columns.map((column) => {
+    const own = sort?.name === column.name ? (sort.down ? "descending" : "ascending") : "none";
+    const cell = el("th", { scope: "col", class: column.number ? "number" : null });
+    if (column.value) {
+      cell.setAttribute("aria-sort", own);
+      cell.append(el("button", { type: "button", "data-column": `${id} ${column.name}`, onclick: () => {
+        const same = state.sort[id]?.name === column.name;
+        state.sort[id] = { name: column.name, down: same ? !state.sort[id].down : Boolean(column.number) };
+        render();
+      } }, column.name));
+    } else cell.append(column.name);
+    return cell;
+  }));
+  const body = ordered.map((row, place) => {
+    const grouped = classes?.(row, ordered[place - 1], !sort) ?? "";
+    return el("tr", { class: grouped || null }, ...columns.map((column) =>
+      el("td", { class: [column.number && "number", column.class].filter(Boolean).join(" ") || null }, ...[column.show(row)].flat())));
+  });
+  table.replaceChildren(el("thead", {}, head), el("tbody", {}, ...body));
+  table.copied = () => [columns.filter((c) => c.value).map((c) => c.name), ...ordered.map((row) => columns.filter((c) => c.value).map((c) => (c.copy ?? c.value)(row)))];
+  if (focused?.startsWith(`${id} `)) table.querySelector(`[data-column="${CSS.escape(focused)}"]`)?.focus();
+}
+const shortest = (value) => (typeof value === "number" ? Number(value.toFixed(4)).toString() : value == null ? "" : String(value));
+function csv(lines) {
+  return lines.map((line) => line.map((value) => {
+    const text = shortest(value);
+    return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+  }).join(",")).join("\n") + "\n";
+}
+function latex(lines) {
+  const escape = (value) => (typeof value === "number" ? value.toFixed(Number.isInteger(value) ? 0 : 2) : shortest(value))
+    .replaceAll("\\", "\\textbackslash ").replace(/[&%$#_{}]/g, "\\$&").replaceAll("×", "$\\times$").replaceAll("−", "$-$");
+  const rows = lines.map((line) => line.map(escape).join(" & ") + " \\\\");
+  const align = lines[0].map((_, i) => (lines.slice(1).every((line) => typeof line[i] === "number" || line[i] == null) ? "r" : "l")).join("");
+  return ["\\begin{tabular}{" + align + "}", "\\toprule", rows[0], "\\midrule", ...rows.slice(1), "\\bottomrule", "\\end{tabular}"].join("\n") + "\n";
+}
+async function copy(text, what) {
+  try {
+    await navigator.clipboard.writeText(text);
+  } catch {
+    const area = el("textarea", {}, text);
+    document.body.append(area);
+    area.select();
+    document.execCommand("copy");
+    area.remove();
+  }
+  at("said").textContent = `${what} copied`;
+  clearTimeout(copy.timer);
+  copy.timer = setTimeout(() => { at("said").textContent = ""; }, 2000);
+}
+for (const place of document.querySelectorAll(".copy")) {
+  for (const [name, write] of [["CSV", csv], ["LaTeX", latex]]) {
+    place.append(el("button", { type: "button", onclick: () => copy(write(at(place.dataset.table).copied()), name) }, `Copy ${name}`));
+  }
+}
+
+/* ---- what is shown of a board ---- */
+const boards = () => data.boards.filter((board) => board.track === state.track);
+const current = () => boards()[state.board];
+const norms = { relative: (b) => `each value off by ${+(100 * b).toFixed(4)} % of itself`, linf: (b) => `each value off by ${b} of half its range`, patch: (b) => `a patch ${+(100 * b).toFixed(4)} % as wide as the sign` };
+const threatText = (t) => `${t.norm} ${t.budget}: ${norms[t.norm]?.(t.budget) ?? ""}; access ${t.access}, ${t.queries} queries`;
+const threatShort = (t) => (t.budget ? `${t.norm} ${t.budget}, ${t.access}` : "none");
+const order = (values) => [...new Set(values)].sort((a, b) => (typeof a === "number" ? a - b : ["clear", "rain", "fog"].indexOf(a) - ["clear", "rain", "fog"].indexOf(b)));
+
+function options(select, values, chosen) {
+  select.replaceChildren(...values.map(([value, text]) => el("option", { value, selected: String(value) === String(chosen) }, text)));
+}
+function setTrack(track) {
+  state.track = track; state.board = 0; state.shown = null; state.sort = {};
+  for (const button of document.querySelectorAll("nav button")) button.setAttribute("aria-pressed", button.dataset.track === track);
+  at("thesis").hidden = track !== "thesis";
+  at("method").hidden = track !== "method";
+  at("board").hidden = !boards().length;
+  if (boards().length) setBoard(0);
+}
+function setBoard(place) {
+  state.board = place; state.shown = null;
+  const board = current();
+  options(at("threat"), boards().map((one, i) => [i, `${one.world.name}: ${threatText(one.threat)}`]), place);
+  const cells = board.rows.flatMap((row) => row.cells);
+  for (const axis of AXES) {
+    const values = order(cells.map((cell) => cell[axis]));
+    state[axis] = new Set(values);
+    const field = at(axis);
+    field.replaceChildren(field.firstElementChild, ...values.map((value) => el("label", {}, el("input", {
+      type: "checkbox", checked: true, name: axis, value, onchange: (event) => {
+        if (event.target.checked) state[axis].add(value); else state[axis].delete(value);
+        render();
+      } }), String(value))));
+  }
+  for (const kind of ["defense", "victim"]) {
+    state[kind] = "";
+    options(at(kind), [["", "all"], ...[...new Set(board.rows.map((row) => row[kind].name))].sort().map((name) => [name, name])], "");
+  }
+  state.attack = "";
+  options(at("attack"), [["", "all"], ...[...new Set(within(board).map((pair) => pair.attack.name))].sort().map((name) => [name, name])], "");
+  render();
+}
+function within(board) {
+  const keys = new Set(board.rows.flatMap((row) => row.pairs));
+  const same = (a, b) => ["defense", "victim"].every((kind) => a[kind].label === b[kind].label && JSON.stringify(a[kind].params) === JSON.stringify(b[kind].params));
+  return data.pairs.filter((pair) => keys.has(pair.key) || (pair.attack.name === "none" && pair.track === board.track && board.rows.some((row) => same(row, pair))));
+}
+function chosen(one) {
+  return ["defense", "victim"].every((kind) => !state[kind] || one[kind].name === state[kind]);
+}
+
+function render() {
+  const board = current();
+  if (!board) return;
+  const rows = ranked(board.rows.filter(chosen).map((row) => ({ row, score: over(row.cells, row.score, row.scenarios) })).filter((one) => one.score));
+  const references = board.references.map((reference) => ({ reference, score: over(reference.cells, reference.score, 100) })).filter((one) => one.score);
+  const blind = references[0]?.score.estimate;
+  const metric = board.track === "driving" ? "safe progress" : "confidence";
+  const total = order(board.rows.flatMap((row) => row.cells.map((cell) => AXES.map((axis) => cell[axis]).join()))).length;
+  const left = new Set(board.rows.flatMap((row) => kept(row.cells).map((cell) => AXES.map((axis) => cell[axis]).join()))).size;
+  at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, interquartile mean with its 95 % interval.` +
+    (rows.length ? "" : " Nothing was driven in the cells that are left.");
+
+  const whole = left === total;
+  const columns = [
+    { name: "Rank", show: (one) => (one.row ? String(one.group) : ""), value: (one) => one.group ?? null },
+    { name: "Defence", show: (one) => (one.row ? el("a", { href: "#grid", onclick: () => { state.shown = `r${board.rows.indexOf(one.row)}`; render(); } }, one.row.defense.label) : one.reference.name), value: (one) => one.row?.defense.label ?? one.reference.name },
+    { name: "Victim", show: (one) => one.row?.victim.label ?? "", value: (one) => one.row?.victim.label ?? "" },
+    { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, number: true },
+    { name: "0 – 1", show: (one) => strip(one.score, blind) },
+    { name: "Clean", show: (one) => (whole ? fixed(one.row?.clean?.estimate) : fixed(cleanOf(one)?.estimate)), value: (one) => (whole ? one.row?.clean?.estimate : cleanOf(one)?.estimate) ?? null, number: true },
+    ...(board.references.length ? [{ name: "Against blind", show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, number: true }] : []),
+    { name: "Strongest attack", show: (one) => (one.row ? cardLink(pairs.get(one.row.strongest), pairs.get(one.row.strongest).attack.label) : ""), value: (one) => (one.row ? pairs.get(one.row.strongest).attack.label : "") },
+    { name: "Flags", class: "doubts", show: (one) => (one.row ? doubts(one.row) : ""), value: (one) => (one.row ? one.row.flags.filter((flag) => flag.fired).map((flag) => flag.name).join(" ") : "") },
+  ];
+  draw("ranks", columns, [...rows, ...references], (one, before, unsorted) =>
+    [one.reference ? "reference" : "", one.row?.flagged ? "flagged" : "", unsorted && before && one.group !== before.group ? "group" : ""].filter(Boolean).join(" "));
+
+  drawPairs(board, metric);
+  drawMatrix(board);
+  drawCurves(board);
+  drawHeat(board);
+}
+function cleanOf(one) {
+  if (!one.row) return null;
+  const strongest = pairs.get(one.row.strongest);
+  const control = data.pairs.find((pair) => pair.attack.name === "none" && pair.track === strongest.track &&
+    ["defense", "victim"].every((kind) => JSON.stringify([pair[kind].name, pair[kind].params]) === JSON.stringify([strongest[kind].name, strongest[kind].params])));
+  return control ? over(control.cells, control.score, 100) : null;
+}
+function leadOf(one, whole) {
+  if (!one.row) return null;
+  if (whole) return one.row.lead;
+  const cells = kept(one.row.cells).filter((cell) => cell.blind != null).map((cell) => ({ ...cell, runs: cell.runs.map((run) => run - cell.blind) }));
+  return cells.length ? interval(cells, one.row.scenarios) : null;
+}
+function lead(one, whole) {
+  const found = leadOf(one, whole);
+  return found ? [el("b", {}, signed(found)), " ", el("small", {}, found.low == null ? "" : `${fixed(found.low)} … ${fixed(found.high)}`)] : "—";
+}
+function doubts(row) {
+  const fired = row.flags.filter((flag) => flag.fired);
+  const unmeasured = row.flags.filter((flag) => flag.fired === null).length;
+  const summary = fired.length ? `⚑ ${fired.map((flag) => flag.title).join("; ")}` : `none of ${row.flags.length - unmeasured}`;
+  return el("details", {}, el("summary", { class: fired.length ? null : "quiet" }, summary), el("ul", {}, ...row.flags.map((flag) =>
+    el("li", {}, el("b", {}, `${flag.fired ? "⚑ " : ""}${flag.name.replaceAll("_", " ")}: `), flag.reason))));
+}
+function drawPairs(board, metric) {
+  const rows = within(board).filter(chosen).filter((pair) => !state.attack || pair.attack.name === state.attack)
+    .map((pair) => ({ pair, score: over(pair.cells, pair.score, 100) })).filter((one) => one.score);
+  const other = board.track === "driving" ? ["crashed", "Crashed"] : ["ran", "Runs the sign"];
+  draw("pairs", [
+    { name: "Attack", show: ({ pair }) => cardLink(pair, pair.attack.label), value: ({ pair }) => pair.attack.label },
+    { name: "Defence", show: ({ pair }) => pair.defense.label, value: ({ pair }) => pair.defense.label },
+    { name: "Victim", show: ({ pair }) => pair.victim.label, value: ({ pair }) => pair.victim.label },
+    { name: "Threat model", show: ({ pair }) => threatShort(pair.threat), value: ({ pair }) => threatShort(pair.threat) },
+    { name: metric[0].toUpperCase() + metric.slice(1), show: (one) => estimate(one.score), value: (one) => one.score.estimate, number: true },
+    { name: "0 – 1", show: (one) => strip(one.score) },
+    { name: other[1], show: ({ pair }) => percent(pair.measures[other[0]]), value: ({ pair }) => pair.measures[other[0]]?.estimate ?? null, number: true },
+    { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
+    { name: "Queries", show: ({ pair }) => fixed(pair.queries, 0), value: ({ pair }) => pair.queries, number: true },
+    { name: "Recording", show: ({ pair }) => (pair.card.recording ? el("a", { href: data.recordings + pair.card.recording }, "rrd") : "") },
+  ], rows);
+}
+
+/* ---- colour: cividis, safe for colour-blind eyes ---- */
+const STOPS = [[0, 34, 78], [66, 78, 108], [125, 124, 120], [188, 175, 111], [254, 232, 56]];
+function tint(value) {
+  const place = Math.max(0, Math.min(1, value)) * (STOPS.length - 1);
+  const low = Math.min(Math.floor(place), STOPS.length - 2);
+  const rgb = STOPS[low].map((from, i) => Math.round(from + (STOPS[low + 1][i] - from) * (place - low)));
+  const light = (0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]) / 255;
+  return `background: rgb(${rgb.join(", ")}); color: ${light > 0.45 ? "#111" : "#fff"}`;
+}
+function drawHeat(board) {
+  const choices = board.rows.map((row, i) => [`r${i}`, `${row.defense.label} · ${row.victim.label}: worst attack of each cell`])
+    .concat(within(board).map((pair) => [`p${pair.key}`, `${pair.defense.label} · ${pair.victim.label}: ${pair.attack.name === "none" ? "no attack" : `${pair.attack.label}, ${threatShort(pair.threat)}`}`]));
+  const known = choices.some(([value]) => value === state.shown) ? state.shown : choices[0][0];
+  options(at("shown"), choices, known);
+  const shown = known[0] === "r" ? board.rows[+known.slice(1)] : pairs.get(+known.slice(1));
+  const cells = kept(shown.cells), weathers = order(cells.map((cell) => cell.weather));
+  const roads = [...new Map(cells.map((cell) => [`${cell.lanes} × ${cell.density}`, cell])).entries()].sort(([, a], [, b]) => a.lanes - b.lanes || a.density - b.density);
+  const head = el("tr", {}, el("th", { scope: "col" }, "Lanes × density"), ...weathers.map((weather) => el("th", { scope: "col" }, weather)));
+  at("heat").className = "heat";
+  at("heat").replaceChildren(el("thead", {}, head), el("tbody", {}, ...roads.map(([name, road]) => el("tr", {}, el("th", { scope: "row" }, name),
+    ...weathers.map((weather) => {
+      const cell = cells.find((one) => one.weather === weather && one.lanes === road.lanes && one.density === road.density);
+      if (!cell) return el("td", {}, "—");
+      const by = cell.pair == null ? "" : pairs.get(cell.pair).attack.name;
+      return el("td", { style: tint(cell.estimate), title: `${name}, ${weather}: ${fixed(cell.estimate)} ${bounds(cell)} ${by}` },
+        fixed(cell.estimate), el("small", {}, [bounds(cell), by].filter(Boolean).join(" ")));
+    })))));
+}
+function drawMatrix(board) {
+  const rows = board.rows.filter(chosen);
+  const all = within(board).filter(chosen);
+  const controls = all.filter((pair) => pair.attack.name === "none");
+  const label = (pair) => (pair.attack.name === "none" ? "no attack" : pair.attack.label + (pair.threat.budget === board.threat.budget && pair.threat.access === board.threat.access && pair.threat.queries === board.threat.queries ? "" : ` (${threatShort(pair.threat)}, ${pair.threat.queries})`));
+  const attacks = [...new Set([...controls, ...all.filter((pair) => pair.attack.name !== "none")].map(label))];
+  const find = (row, attack) => all.find((pair) => label(pair) === attack && ["defense", "victim"].every((kind) => JSON.stringify([pair[kind].name, pair[kind].params]) === JSON.stringify([row[kind].name, row[kind].params])));
+  const scored = rows.map((row) => attacks.map((attack) => { const pair = find(row, attack); return pair && { pair, score: over(pair.cells, pair.score, 100) }; }));
+  at("matrix").replaceChildren(
+    el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Defence · victim"), ...attacks.map((attack) => el("th", { scope: "col" }, attack)))),
+    el("tbody", {}, ...rows.map((row, i) => el("tr", {}, el("th", { scope: "row" }, `${row.defense.label} · ${row.victim.label}`),
+      ...scored[i].map((one) => (one?.score ? el("td", { class: "value", style: tint(one.score.estimate) }, cardLink(one.pair, fixed(one.score.estimate)), el("small", {}, bounds(one.score))) : el("td", { class: "value" }, "")))))));
+  at("matrix").copied = () => [["defence", "victim", ...attacks], ...rows.map((row, i) => [row.defense.label, row.victim.label, ...scored[i].map((one) => one?.score?.estimate ?? null)])];
+}
+function drawCurves(board) {
+  const shown = data.curves.map((curve) => ({ ...curve, first: pairs.get(curve.points[0].pair) }))
+    .filter((curve) => curve.first.track === board.track && chosen(curve.first) && curve.first.threat.norm === board.threat.norm &&
+      board.rows.some((row) => row.defense.label === curve.first.defense.label && row.victim.label === curve.first.victim.label));
+  at("curves-section").hidden = !shown.length;
+  at("curves").replaceChildren(...shown.slice(0, 60).map((curve) => figure(curve, board)));
+}
+function figure(curve, board) {
+  const W = 340, H = 190, L = 34, B = 34, T = 8, R = 12, ns = "http://www.w3.org/2000/svg";
+  const points = curve.kind === "budget" && curve.first.clean ? [{ x: 0, ...curve.first.clean }, ...curve.points] : curve.points;
+  const log = curve.kind === "queries" && points[0].x > 0;
+  const scale = (x) => (log ? Math.log10(x) : x);
+  const low = scale(points[0].x), high = scale(points[points.length - 1].x) || 1;
+  const X = (x) => L + ((scale(x) - low) / (high - low || 1)) * (W - L - R), Y = (y) => H - B - Math.max(0, Math.min(1, y)) * (H - B - T);
+  const make = (tag, attributes, text) => { const made = document.createElementNS(ns, tag); for (const [k, v] of Object.entries(attributes)) made.setAttribute(k, v); if (text != null) made.textContent = text; return made; };
+  const svg = make("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": points.map((p) => `${p.x}: ${fixed(p.estimate)}`).join("; ") });
+  for (const y of [0, 0.5, 1]) svg.append(make("path", { class: "axis", d: `M${L} ${Y(y)}H${W - R}` }), make("text", { x: L - 6, y: Y(y) + 4, "text-anchor": "end" }, String(y)));
+  svg.append(make("path", { class: "band", d: "M" + points.map((p) => `${X(p.x)} ${Y(p.high ?? p.estimate)}`).join("L") + "L" + [...points].reverse().map((p) => `${X(p.x)} ${Y(p.low ?? p.estimate)}`).join("L") + "Z" }));
+  svg.append(make("path", { class: "line", d: "M" + points.map((p) => `${X(p.x)} ${Y(p.estimate)}`).join("L") }));
+  for (const p of points) svg.append(make("circle", { cx: X(p.x), cy: Y(p.estimate), r: 3 }), make("text", { x: X(p.x), y: H - B + 15, "text-anchor": "middle" }, p.x >= 100 ? Math.round(p.x) : +p.x.toFixed(3)));
+  const unit = curve.kind === "budget" ? `budget (${board.threat.norm})` : board.track === "driving" ? "queries a step" : "pictures asked about";
+  svg.append(make("text", { x: (L + W - R) / 2, y: H - 4, "text-anchor": "middle" }, unit + (log ? ", log scale" : "")));
+  return el("figure", {}, svg, el("figcaption", {}, `${curve.first.attack.name} on ${curve.first.defense.label} · ${curve.first.victim.label}`));
+}
+
+/* ---- the card of a pair: #pair-12 ---- */
+function showCard() {
+  const key = /^#pair-(\d+)$/.exec(location.hash)?.[1];
+  const pair = key && pairs.get(+key), dialog = at("card");
+  if (!pair) { if (dialog.open) dialog.close(); return; }
+  const card = pair.card, words = (values) => values.join(", ") || "none";
+  const params = (component) => [component.name, ...Object.entries(component.params).map(([k, v]) => `${k}=${JSON.stringify(v)}`)].join(" ");
+  const fact = (name, ...value) => [el("dt", {}, name), el("dd", {}, ...value)];
+  const command = (text) => [el("code", {}, text), el("button", { type: "button", onclick: () => copy(text, "Command") }, "Copy")];
+  dialog.replaceChildren(
+    el("div", { class: "bar" }, el("h2", { id: "card-title" }, card.pair), el("button", { type: "button", onclick: () => dialog.close() }, "Close")),
+    el("dl", {},
+      ...fact("score", ...estimate(pair.score)),
+      ...["attack", "defense", "victim", "world"].flatMap((kind) => fact(kind, params(card.components[kind]), el("br"), el("small", { class: "quiet" }, words(card.shipped_by[kind])))),
+      ...fact("threat model", pair.threat.budget ? threatText(pair.threat) : "nothing is attacked"),
+      ...fact("training seeds", words(card.training_seeds)),
+      ...fact("scenario seeds", `${card.scenario_seeds[0]} to ${card.scenario_seeds[1]} (${words(card.grid)}), ${pair.cells.length} cells, ${card.episodes} episodes` + (card.left_out ? `; ${card.left_out} left out` : "")),
+      ...fact("weights", words(card.weights_sha256)),
+      ...(card.patch_sha256.length ? fact("patch", words(card.patch_sha256)) : []),
+      ...fact("code", words(card.code_digest)),
+      ...fact("libraries", ...card.libraries.map((one) => el("div", {}, Object.entries(one).map(([k, v]) => `${k} ${v}`).join(", ")))),
+      ...fact("machine", words(card.machine)),
+      ...fact("finished", `${card.finished}, ${card.wall_s} s of work`),
+      ...fact("run it again", ...command(card.run)),
+      ...fact("replay an episode", ...command(card.replay)),
+      ...fact("recording", card.recording ? el("a", { href: data.recordings + card.recording }, card.recording) : "none here; the command above makes one"),
+    ));
+  if (!dialog.open) dialog.showModal();
+}
+at("card").addEventListener("close", () => { if (location.hash.startsWith("#pair-")) history.replaceState(null, "", location.pathname + location.search); });
+at("card").addEventListener("click", (event) => { if (event.target === at("card")) at("card").close(); });
+addEventListener("hashchange", showCard);
+
+for (const button of document.querySelectorAll("nav button")) button.addEventListener("click", () => setTrack(button.dataset.track));
+at("threat").addEventListener("change", (event) => setBoard(+event.target.value));
+for (const kind of ["defense", "victim", "attack"]) at(kind).addEventListener("change", (event) => { state[kind] = event.target.value; render(); });
+at("shown").addEventListener("change", (event) => { state.shown = event.target.value; render(); });
+at("filters").addEventListener("reset", (event) => { event.preventDefault(); setBoard(state.board); });
+at("filters").addEventListener("submit", (event) => event.preventDefault());
+setTrack(document.querySelector("nav button").dataset.track);
+showCard();

@@ -1,0 +1,47 @@
+"""From bad defences to their flags, through real runs: what is no defence is found out and ranks last."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bench import registry, results
+from leaderboard.entries import MEASUREMENTS
+from leaderboard.ranking import Row, read_boards
+from tests.framework.conftest import Said
+from tests.framework.distributions import install
+
+BAD = ("deaf", "stepped", "detached", "dicing")
+WORDS = ("victim=toy", "world=toy", "lanes=3,4", "density=1", "weather=clear", "episodes=20", "seeds=0,1,2", "workers=1",
+         "reference=false")  # fmt: skip
+
+
+@pytest.fixture
+def rows(plugins: Path, bench: Callable[..., Said], tmp_path: Path) -> dict[str, Row]:
+    """The leaderboard of the bad defences and of none, by defence."""
+    code = Path(__file__).with_name("bad_defenses.py").read_text()
+    points = {"cavbench.defenses": {name: f"bad_defenses_plugin:{name.capitalize()}" for name in BAD}}
+    install(plugins, "cavbench-bad", points, {"bad_defenses_plugin": code})
+    registry.entries.cache_clear()
+    out = tmp_path / "results"
+    said = bench("run", "attack=pgd,zo,noise", f"defense=none,{','.join(BAD)}", *WORDS, f"out={out}")
+    assert said.code == 0, said.err
+    measurements = {name for names in MEASUREMENTS.values() for name in names}
+    (board,) = read_boards(results.read_compact(out, measurements))[0]
+    return {str(row.identity["defense"]): row for row in board.rows}
+
+
+def fired(row: Row) -> set[str]:
+    return {flag.name for flag in row.flags if flag.fired}
+
+
+def test_bad_defences_are_found_out_and_a_sound_victim_is_not(rows: dict[str, Row]) -> None:
+    found_out = {"ignores_input", "zero_gradients", "one_draw"}
+    assert not fired(rows["none"]) & (found_out | {"unattacked"})
+    assert fired(rows["deaf"]) & found_out >= {"ignores_input"}
+    assert fired(rows["stepped"]) & found_out == {"zero_gradients"}
+    assert fired(rows["detached"]) & found_out == {"zero_gradients"}
+    assert fired(rows["dicing"]) & found_out == {"one_draw"}
+    assert all(rows[name].flagged for name in BAD)

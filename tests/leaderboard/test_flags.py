@@ -1,0 +1,169 @@
+"""Each flag fires on the records it is made for, does not on the others, and says so where nothing was measured."""
+
+from __future__ import annotations
+
+import pyarrow as pa
+import pytest
+from full_house import PGD, SEEN
+from synthetic import CLEAR, approach, drive, probed, reference_drivers
+
+from bench.scenario import GRIDS
+from leaderboard.entries import read_entries
+from leaderboard.flags import FLAGS, Flag
+from leaderboard.ranking import Board, boards
+
+HALF = CLEAR[:3]
+
+
+def board(*tables: pa.Table, track: str = "driving") -> Board:
+    return boards(read_entries({track: pa.concat_tables(tables)}))[0]  # type: ignore[dict-item]
+
+
+def flag(name: str, *tables: pa.Table, track: str = "driving") -> Flag:
+    """The flag of the only row."""
+    (row,) = board(*tables, track=track).rows
+    return next(each for each in row.flags if each.name == name)
+
+
+def zo(skill: float = 0.3, **changes: object) -> pa.Table:
+    given = {"attack": "zo", "queries": 44.0, "weights": "ab", **changes}
+    return probed(drive(skill=skill, **given), gradient_queries=0.0, **SEEN)  # type: ignore[arg-type]
+
+
+def pgd(skill: float = 0.3, **probes: float) -> pa.Table:
+    return probed(drive(attack="pgd", skill=skill, queries=45.0, weights="ab"), **(PGD | SEEN | probes))
+
+
+def clean(**probes: float) -> pa.Table:
+    return probed(drive(skill=0.8, weights="ab"), **(SEEN | probes))
+
+
+def noise(skill: float = 0.7) -> pa.Table:
+    return probed(drive(attack="noise", skill=skill, weights="ab"), gradient_queries=0.0, **SEEN)
+
+
+BLIND = reference_drivers()
+FIRES: dict[str, tuple[pa.Table, ...]] = {
+    "unattacked": (clean(), noise()),
+    "blind": (clean(), zo(0.1), BLIND),
+    "ignores_input": (clean(same_answer=1.0), probed(zo(), same_answer=1.0)),
+    "masked_gradients": (clean(), zo(0.2), pgd(0.5)),
+    "zero_gradients": (clean(), pgd(0.5, zero_gradients=0.9)),
+    "noise": (clean(), zo(0.7), noise(0.5)),
+    "one_draw": (clean(redrawn=1.0), probed(zo(), redrawn=1.0, draws=1.0)),
+    "no_fall": (clean(), zo(0.4, threat=("relative", 0.2)), zo(0.3, threat=("relative", 0.1))),
+    "not_flattened": (
+        clean(),
+        zo(0.2, attack_params={"steps": 40}, queries=400.0),
+        zo(0.5, attack_params={"steps": 4}, queries=40.0),
+    ),
+    "too_little": (probed(drive(skill=0.8, cells=HALF), **SEEN), zo(cells=HALF)),
+}
+FIRES_NOT: dict[str, tuple[pa.Table, ...]] = {
+    "unattacked": (clean(), zo(), noise()),
+    "blind": (clean(), zo(0.6), BLIND),
+    "ignores_input": (clean(), zo()),
+    "masked_gradients": (clean(), zo(0.5), pgd(0.2)),
+    "zero_gradients": (clean(), pgd(0.5)),
+    "noise": (clean(), zo(0.3), noise(0.7)),
+    "one_draw": (clean(redrawn=1.0), probed(zo(), redrawn=1.0, draws=8.0)),
+    "no_fall": (clean(), zo(0.2, threat=("relative", 0.2)), zo(0.5, threat=("relative", 0.1))),
+    "not_flattened": (
+        clean(),
+        zo(0.3, attack_params={"steps": 40}, queries=400.0),
+        zo(0.3, attack_params={"steps": 4}, queries=40.0),
+    ),
+    "too_little": (clean(), zo()),
+}
+NOT_MEASURED: dict[str, tuple[pa.Table, ...]] = {
+    "blind": (clean(), zo()),
+    "ignores_input": (drive(), drive(attack="zo", queries=44.0)),
+    "masked_gradients": (drive(), drive(attack="zo", queries=44.0), drive(attack="pgd", queries=45.0)),
+    "zero_gradients": (clean(), zo()),
+    "noise": (clean(), zo()),
+    "one_draw": (drive(), drive(attack="zo", queries=44.0)),
+    "no_fall": (clean(), zo()),
+    "not_flattened": (clean(), zo()),
+}
+
+
+def test_every_flag_is_tested_both_ways() -> None:
+    assert set(FIRES) == set(FIRES_NOT) == set(FLAGS)
+
+
+@pytest.mark.parametrize("name", FLAGS)
+def test_a_flag_fires_where_it_should_and_only_there(name: str) -> None:
+    assert flag(name, *FIRES[name]).fired is True
+    assert flag(name, *FIRES_NOT[name]).fired is False
+    if name in NOT_MEASURED:
+        unmeasured = flag(name, *NOT_MEASURED[name])
+        assert unmeasured.fired is None
+        assert unmeasured.reason.startswith("Not measured: ")
+
+
+@pytest.mark.parametrize("name", FLAGS)
+def test_a_reason_is_one_sentence(name: str) -> None:
+    for records in (FIRES, FIRES_NOT):
+        reason = flag(name, *records[name]).reason
+        assert reason.endswith(".")
+        assert ". " not in reason
+
+
+def test_a_detector_that_sees_signs_in_grey_pictures_is_flagged() -> None:
+    def seen(share: float) -> Flag:
+        tables = [approach(0.9), approach(0.8, attack="eot")]
+        return flag("ignores_input", *(probed(one, same_answer=share) for one in tables), track="detection")
+
+    assert seen(1.0).fired is True
+    assert seen(0.0).fired is False
+
+
+def test_a_patch_that_takes_no_more_than_noise_is_flagged() -> None:
+    def beside(left: float) -> Flag:
+        tables = approach(0.9), approach(left, attack="eot"), approach(0.6, attack="noise_patch")
+        return flag("noise", *tables, track="detection")
+
+    assert beside(0.65).fired is True
+    assert beside(0.2).fired is False
+
+
+def test_a_flagged_row_ranks_below_those_without_whatever_its_score() -> None:
+    cheat = {"defense": "cheat"}
+    good = [clean(), zo(0.4), noise(0.6)]
+    bad = [probed(drive(skill=0.8, weights="ab", **cheat), **(SEEN | {"same_answer": 1.0})),
+           probed(zo(0.7, **cheat), same_answer=1.0)]  # fmt: skip
+    found = board(*good, *bad)
+    assert [(row.identity["defense"], row.flagged, row.group) for row in found.rows] == [
+        ("none", False, 1),
+        ("cheat", True, 2),
+    ]
+    assert found.rows[1].worst.score.estimate > found.rows[0].worst.score.estimate
+
+
+def test_the_worst_attack_of_each_cell_counts() -> None:
+    dense = [cell for cell in GRIDS["standard-v1"].cells() if cell.density == 2]
+    (row,) = board(clean(), zo(0.4), probed(drive(attack="pgd", skill=0.1, cells=dense, queries=9.0), **PGD)).rows
+    attacks = {cell: entry.identity["attack"] for cell, entry in zip(row.worst.cells, row.worst.attacks, strict=True)}
+    assert {cell.density for cell, attack in attacks.items() if attack == "pgd"} == {2.0}
+    assert {cell.density for cell, attack in attacks.items() if attack == "zo"} == {1.0}
+    assert row.worst.score.estimate < min(
+        entry.score.estimate for entry in row.entries if entry.identity["attack"] == "zo"
+    )
+
+
+def test_an_attack_with_less_counts_in_a_larger_threat_model_but_not_the_other_way_round() -> None:
+    small = zo(0.2, threat=("relative", 0.05))
+    large = zo(0.5, threat=("relative", 0.1))
+    found = boards(read_entries({"driving": pa.concat_tables([clean(), small, large])}))
+    budgets = {one.threat[1]: [entry.identity["threat_budget"] for entry in one.rows[0].entries] for one in found}
+    assert budgets == {0.1: [0.05, 0.1], 0.05: [0.05]}
+
+
+def test_rows_whose_intervals_overlap_that_of_the_first_share_its_group() -> None:
+    skills = {"a": 0.7, "b": 0.69, "c": 0.3}
+    tables = []
+    for name, skill in skills.items():
+        tables += [drive(skill=0.9, defense=name, weights="ab"), zo(skill, defense=name)]
+    groups = {row.identity["defense"]: row.group for row in board(*tables).rows}
+    assert groups["a"] == groups["b"] == 1
+    assert groups["c"] == 2

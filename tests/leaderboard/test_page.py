@@ -1,0 +1,217 @@
+"""The page in a real browser: what a reader sees, clicks, types and copies."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+Open = Callable[..., Any]
+
+
+@pytest.fixture
+def opened(browser: Any, site: Path) -> Iterator[Open]:
+    """The page, opened from disk without a network: opened(width=360, ...) -> Playwright's page. Errors on its console fail."""
+    contexts, errors = [], []
+
+    def call(at: str = "", **options: Any) -> Any:
+        options.setdefault("viewport", {"width": 1280, "height": 900})
+        context = browser.new_context(offline=True, **options)
+        context.grant_permissions(["clipboard-read", "clipboard-write"])
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(5000)
+        page.on(
+            "console", lambda message: errors.append(message.text) if message.type in ("error", "warning") else None
+        )
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on(
+            "request",
+            lambda request: None if request.url.startswith(("file:", "data:")) else errors.append(request.url),
+        )
+        page.goto(f"{(site / 'leaderboard.html').as_uri()}{at}")
+        return page
+
+    yield call
+    for context in contexts:
+        context.close()
+    assert errors == []
+
+
+def texts(page: Any, selector: str) -> list[str]:
+    return [text.strip() for text in page.locator(selector).all_inner_texts()]
+
+
+def column(page: Any, table: str, number: int) -> list[str]:
+    return texts(page, f"#{table} tbody tr td:nth-child({number})")
+
+
+def test_the_page_is_one_file_of_at_most_three_megabytes(site: Path) -> None:
+    text = (site / "leaderboard.html").read_text()
+    assert len(text.encode()) < 3e6
+    assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")
+    assert "src=" not in text
+
+
+def test_rows_are_in_rank_groups_with_their_flags_and_the_references_below(opened: Open) -> None:
+    page = opened()
+    assert column(page, "ranks", 2)[-3:] == ["best blind policy", "random", "IDM and MOBIL"]
+    ranks = [int(text) for text in column(page, "ranks", 1) if text]
+    assert ranks == sorted(ranks)
+    row = page.locator("#ranks tr:has(a:text-is('masked'))")
+    row.locator("summary").click()
+    assert "a black-box attack beats the white-box one" in row.inner_text()
+    assert "(white box)" in row.locator("li", has_text="masked gradients").inner_text()
+
+
+def test_a_heading_sorts_up_and_down_by_mouse_and_by_keyboard(opened: Open) -> None:
+    page = opened()
+    heading = page.locator("#pairs th", has_text="Safe progress")
+    assert heading.get_attribute("aria-sort") == "none"
+    heading.locator("button").click()
+    assert heading.get_attribute("aria-sort") == "descending"
+    falling = [float(text.split()[0]) for text in column(page, "pairs", 5)]
+    assert falling == sorted(falling, reverse=True)
+    page.keyboard.press("Enter")
+    assert heading.get_attribute("aria-sort") == "ascending"
+    assert column(page, "pairs", 5)[0].startswith(f"{min(falling):.2f}")
+
+
+def test_filters_choose_rows_and_compute_scores_again_from_the_cells_that_are_left(opened: Open, site: Path) -> None:
+    page = opened()
+    made = json.loads((site / "leaderboard.json").read_text())
+    row = next(row for row in made["boards"][0]["rows"] if row["defense"]["name"] == "advtrain")
+    runs = [run for cell in row["cells"] if cell["weather"] == "clear" and cell["density"] == 1 for run in cell["runs"]]
+    middle = sorted(runs)[len(runs) // 4 : len(runs) - len(runs) // 4]
+    for name, value in (("weather", "rain"), ("weather", "fog"), ("density", "2")):
+        page.locator(f"input[name={name}][value='{value}']").uncheck()
+    assert "3 of 18 cells" in page.locator("#scope").inner_text()
+    shown = page.locator("#ranks tr", has_text="advtrain").locator("td").nth(3).inner_text()
+    assert float(shown.split()[0]) == pytest.approx(sum(middle) / len(middle), abs=0.006)
+    assert texts(page, "#heat thead th") == ["Lanes × density", "clear"]
+    page.locator("#defense").select_option("advtrain")
+    assert set(column(page, "pairs", 2)) == {"advtrain"}
+    page.locator("#attack").select_option("pgd")
+    assert len(column(page, "pairs", 1)) == 1
+    page.get_by_role("button", name="Reset").click()
+    assert "18 of 18 cells" in page.locator("#scope").inner_text()
+
+
+def test_no_cell_left_is_said_and_breaks_nothing(opened: Open) -> None:
+    page = opened()
+    for value in ("clear", "rain", "fog"):
+        page.locator(f"input[name=weather][value={value}]").uncheck()
+    assert "Nothing was driven" in page.locator("#scope").inner_text()
+
+
+def test_the_heat_map_shows_the_pair_that_was_chosen(opened: Open) -> None:
+    page = opened()
+    assert page.locator("#heat tbody tr").count() == 6
+    before = texts(page, "#heat td")
+    choice = page.locator("#shown option", has_text="none · dqn: no attack").first.get_attribute("value")
+    page.locator("#shown").select_option(choice)
+    after = texts(page, "#heat td")
+    assert len(after) == 18
+    assert after != before
+    colours = page.locator("#heat td").evaluate_all(
+        "cells => cells.map(cell => getComputedStyle(cell).backgroundColor)"
+    )
+    assert len(set(colours)) > 5
+
+
+def test_a_row_opens_its_card_and_its_recording_is_there(opened: Open, site: Path) -> None:
+    page = opened()
+    page.locator("#pairs tr:has(a[href$='.rrd']) a", has_text="zo steps=4").first.click()
+    card = page.locator("#card")
+    card.wait_for()
+    for words in (
+        "zo-none-dqn",
+        "ab" * 32,
+        "bench run attack=zo attack.steps=4",
+        "bench view zo-none-dqn",
+        "training seeds",
+    ):
+        assert words in card.inner_text()
+    link = card.locator("a[href$='.rrd']").get_attribute("href")
+    assert (site / link).is_file()
+    page.keyboard.press("Escape")
+    assert not card.is_visible()
+    assert page.evaluate("location.hash") == ""
+    assert opened(at="#pair-0").locator("#card").is_visible()
+
+
+def test_numbers_are_copied_as_csv_and_as_latex(opened: Open) -> None:
+    page = opened()
+    page.locator("[data-table=ranks] button", has_text="CSV").click()
+    lines = list(csv.DictReader(io.StringIO(page.evaluate("navigator.clipboard.readText()"))))
+    assert [line["Defence"] for line in lines] == column(page, "ranks", 2)
+    assert f"{float(lines[0]['Worst case']):.2f}" == column(page, "ranks", 4)[0].split()[0]
+    assert page.locator("#said").inner_text() == "CSV copied"
+    page.locator("[data-table=matrix] button", has_text="LaTeX").click()
+    latex = page.evaluate("navigator.clipboard.readText()")
+    assert latex.startswith("\\begin{tabular}{ll")
+    assert latex.count("\\\\") == 1 + page.locator("#matrix tbody tr").count()
+
+
+def test_both_tracks_the_thesis_and_the_threat_models_can_be_chosen(opened: Open) -> None:
+    page = opened()
+    page.locator("#threat").select_option("1")
+    assert "relative 0.05" in page.locator("#scope").inner_text()
+    page.get_by_role("button", name="Detection").click()
+    assert column(page, "ranks", 3)[:2] == ["yolov3_tiny", "yolov3_tiny"]
+    page.get_by_role("button", name="Thesis").click()
+    assert not page.locator("#board").is_visible()
+    assert any("Table 4.1" in title for title in texts(page, "#thesis h3"))
+    page.get_by_role("button", name="How to read this").click()
+    assert "black-box" in page.locator("#method").inner_text()
+
+
+def test_budget_curves_are_drawn(opened: Open) -> None:
+    page = opened()
+    assert page.locator("#curves figure").count() >= 8
+    assert page.locator("#curves svg circle").count() >= 16
+
+
+@pytest.mark.parametrize("track", ["Driving", "Detection", "Thesis", "How to read this"])
+def test_nothing_is_wider_than_a_phone(opened: Open, track: str) -> None:
+    page = opened(viewport={"width": 360, "height": 740})
+    page.get_by_role("button", name=track).click()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    if track == "Driving":
+        page.locator("#pairs a").first.click()
+        box = page.locator("#card").bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 360
+
+
+def test_the_keyboard_reaches_everything_and_shows_where_it_is(opened: Open) -> None:
+    page = opened()
+    seen = set()
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        seen.add(
+            page.evaluate(
+                "document.activeElement.id || document.activeElement.name || document.activeElement.innerText"
+            )
+        )
+        assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") != "none"
+    assert {"Detection", "threat", "weather", "Copy CSV", "Worst case"} <= seen
+
+
+def test_text_is_legible_in_light_and_in_dark(opened: Open) -> None:
+    contrast = """() => {
+      const linear = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+      const level = (colour) => colour.match(/\\d+/g).slice(0, 3).map((c) => linear(c / 255))
+        .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
+      const paper = level(getComputedStyle(document.body).backgroundColor);
+      return [...document.querySelectorAll("p, td, th, a, small, button")]
+        .filter((e) => !e.closest("#heat, #matrix, .skip, #said, dialog")).map((e) => level(getComputedStyle(e).color))
+        .map((ink) => (Math.max(ink, paper) + 0.05) / (Math.min(ink, paper) + 0.05)).reduce((a, b) => Math.min(a, b));
+    }"""
+    for scheme in ("light", "dark"):
+        assert opened(color_scheme=scheme).evaluate(contrast) >= 4.5
