@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
@@ -11,6 +13,9 @@ from rich.text import Text
 from bench import registry
 from bench.errors import UserError
 from bench.registry import KINDS
+
+if TYPE_CHECKING:
+    from bench.conformance.check import Outcome
 
 MARKS = {"pass": ("✓", "green"), "fail": ("✗ fix", "bold red"), "skip": ("– skipped", "dim")}
 
@@ -30,33 +35,35 @@ def print_checks(name: str, words: Sequence[str], console: Console) -> int:
     if not kinds:
         every = sorted({known for kind in KINDS for known in registry.names(kind)})
         raise UserError(registry.unknown(f"component {name!r}", name, every))
-    failed = 0
+    if strange := [key for key in given if key != "victim" and key.partition(".")[0] not in kinds]:
+        known = [*(f"{kind}.…" for kind in kinds), "victim"]
+        raise UserError(registry.unknown(f"key {strange[0]!r}", strange[0], known))
+    failed = False
     for kind in kinds:
-        own = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{kind}.")}
-        strange = [key for key in given if key != "victim" and key.partition(".")[0] not in kinds]
-        if strange:
-            raise UserError(
-                registry.unknown(f"key {strange[0]!r}", strange[0], [*(f"{kind}.…" for kind in kinds), "victim"])
-            )
         entry = registry.find(registry.GROUPS[kind], name, kind)
-        console.print(
-            Text.assemble((f"{kind} ", "dim"), (name, "bold"), (f"   {entry.target}, {entry.shipped_by}", "dim"))
-        )
-        table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
-        table.add_column(no_wrap=True)
-        table.add_column(no_wrap=True)
-        table.add_column(ratio=1)
-        counts = dict.fromkeys(MARKS, 0)
-        for outcome in examine(kind, name, own, given.get("victim", "")):
-            mark, style = MARKS[outcome.status]
-            counts[outcome.status] += 1
-            text = Text(outcome.text, style="" if outcome.status == "fail" else "dim")
-            table.add_row(outcome.check, Text(mark, style=style), text)
-        console.print(table)
-        told = f"{counts['pass']} passed, {counts['fail']} to fix, {counts['skip']} skipped"
-        console.print(Text(told + "\n", style="bold red" if counts["fail"] else "green"))
-        failed += counts["fail"]
-    return int(failed > 0)
+        shipped = f"   {entry.target}, {entry.shipped_by}"
+        console.print(Text.assemble((f"{kind} ", "dim"), (name, "bold"), (shipped, "dim")))
+        own = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{kind}.")}
+        with console.status("checking"):
+            outcomes = list(examine(kind, name, own, given.get("victim", "")))
+        console.print(_table(outcomes))
+        counts = Counter(outcome.status for outcome in outcomes)
+        told = f"{counts['pass']} passed, {counts['fail']} to fix, {counts['skip']} skipped\n"
+        console.print(Text(told, style="bold red" if counts["fail"] else "green"))
+        failed = failed or counts["fail"] > 0
+    return int(failed)
+
+
+def _table(outcomes: Sequence[Outcome]) -> Table:
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(ratio=1)
+    for outcome in outcomes:
+        mark, style = MARKS[outcome.status]
+        text = Text(outcome.text, style="" if outcome.status == "fail" else "dim")
+        table.add_row(outcome.check, Text(mark, style=style), text)
+    return table
 
 
 def _read(word: str) -> tuple[str, str]:

@@ -75,8 +75,10 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
 
 
 def _fits(kind: Kind, component: type[Any]) -> str:
-    """What decides where it fits: its track and, of an attack, what it needs."""
+    """What decides where it fits: its track and, of an attack, what it needs, of a black box what it answers."""
     track = f"Track: {' and '.join(component.tracks())}."
+    if kind == "victim" and component.answers != "gradients":
+        return f"{track} Answers {component.answers} at most: attacks that need gradients are refused."
     if kind != "attack":
         return track
     actions = f" and {' or '.join(component.action_types)} actions" if "driving" in component.tracks() else ""

@@ -66,7 +66,7 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
     try:
         return Chosen(kind=kind, name=name, component=component(**params))
     except (ValueError, TypeError) as error:
-        raise UserError(f"{kind} {name!r}: {str(error).splitlines()[0]}") from error
+        raise UserError(f"{kind} {name!r}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
     # A plug-in's own checks may fail in any other way.
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]

@@ -14,6 +14,7 @@ from bench.errors import UserError
 
 NewKind = Literal["attack", "defense", "victim"]
 TRACKS = ("driving", "detection")
+"""As in `bench.contracts`, which imports torch."""
 NOUNS = {"attack": "an attack", "defense": "a defence", "victim": "a victim"}
 LINES = {
     ("attack", "driving"): (
