@@ -28,7 +28,7 @@ from bench.results import FOLDER, SCHEMA
 from bench.scenario import GRIDS
 
 SEEDS, EPISODES, ATTACKS = 3, 100, 8
-POLICY = dict.fromkeys(("batch", "checkpoints", "copies", "crash_penalty", "decisions", "fine", "gamma", "hidden", "learning_rate", "memory", "n_step", "repeat", "tau", "updates", "warm_up"), 0.125)  # fmt: skip
+POLICY = {f"parameter_{number}": 0.125 for number in range(15)}
 MEASURE = """
 import resource, subprocess, sys, time
 start = time.perf_counter()
