@@ -91,7 +91,7 @@ def write(out: Path, episodes: int, units: int) -> int:
     folder.mkdir(parents=True)
     rng = np.random.default_rng(0)
     attacks = ["none", *(f"attack_{number}" for number in range(ATTACKS))]
-    every = itertools.product(itertools.count(), attacks, range(SEEDS), GRIDS["standard-v1"].cells())
+    every = itertools.product(range(episodes // EPISODES), attacks, range(SEEDS), GRIDS["standard-v1"].cells())
     waiting, files = [], 0
     for number, (place, attack, seed, cell) in enumerate(itertools.islice(every, episodes // EPISODES)):
         waiting.append(unit(number, f"defense_{place}", attack, seed, cell, rng))
