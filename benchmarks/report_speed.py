@@ -28,7 +28,7 @@ from bench.results import FOLDER, SCHEMA
 from bench.scenario import GRIDS
 
 SEEDS, EPISODES, ATTACKS = 3, 100, 8
-POLICY = dict.fromkeys(("batch", "checkpoints", "copies", "crash_penalty", "decisions", "fine", "gamma", "hidden", "learning_rate", "memory", "n_step", "repeat", "tau", "updates", "warm_up"), 0.125)  # fmt: skip
+POLICY = {f"parameter_{number}": 0.125 for number in range(15)}
 MEASURE = """
 import resource, subprocess, sys, time
 start = time.perf_counter()
@@ -91,7 +91,7 @@ def write(out: Path, episodes: int, units: int) -> int:
     folder.mkdir(parents=True)
     rng = np.random.default_rng(0)
     attacks = ["none", *(f"attack_{number}" for number in range(ATTACKS))]
-    every = itertools.product(itertools.count(), attacks, range(SEEDS), GRIDS["standard-v1"].cells())
+    every = itertools.product(range(episodes // EPISODES), attacks, range(SEEDS), GRIDS["standard-v1"].cells())
     waiting, files = [], 0
     for number, (place, attack, seed, cell) in enumerate(itertools.islice(every, episodes // EPISODES)):
         waiting.append(unit(number, f"defense_{place}", attack, seed, cell, rng))

@@ -367,7 +367,7 @@ function showCard() {
     el("div", { class: "bar" }, el("h2", { id: "card-title" }, card.pair), el("button", { type: "button", onclick: () => dialog.close() }, "Close")),
     el("dl", {},
       ...fact("score", ...estimate(pair.score)),
-      ...["attack", "defense", "victim", "world"].flatMap((kind) => fact(kind, params(card.components[kind]), el("br"), el("small", { class: "quiet" }, words(card.shipped_by[kind])))),
+      ...["attack", "defense", "victim", "world"].flatMap((kind) => fact(kind === "defense" ? "defence" : kind, params(card.components[kind]), el("br"), el("small", { class: "quiet" }, words(card.shipped_by[kind])))),
       ...fact("threat model", pair.threat.budget ? threatText(pair.threat) : "nothing is attacked"),
       ...fact("training seeds", words(card.training_seeds)),
       ...fact("scenario seeds", `${card.scenario_seeds[0]} to ${card.scenario_seeds[1]} (${words(card.grid)}), ${pair.cells.length} cells, ${card.episodes} episodes` + (card.left_out ? `; ${card.left_out} left out` : "")),
