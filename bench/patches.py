@@ -60,7 +60,7 @@ def read(out: Path, fingerprint: str) -> Patch:
                 texels=tensors.get("patch"),
                 queries=int(said["queries"]),
                 gradients=int(said["gradients"]),
-                zero_gradients=int(said["zero_gradients"]),
+                zero_gradients=int(said.get("zero_gradients", 0)),
                 seconds=float(said["seconds"]),
                 excess=float(said["excess"]),
                 evolution=_evolution(tensors),
