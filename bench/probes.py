@@ -40,9 +40,12 @@ class Probe:
         rows = running.nonzero().squeeze(-1)
         if len(rows) < 2:
             return False
-        own = observation[rows]
+        # All episodes are asked, so that a policy may keep something for each.
+        others = observation.clone()
+        others[rows] = observation[rows].roll(len(rows) // 2, 0)
         with torch.random.fork_rng(devices=[]):
-            first, again, other = (self.policy.scores(asked) for asked in (own, own, own.roll(len(rows) // 2, 0)))
+            asked = (observation, observation, others)
+            first, again, other = (self.policy.scores(each)[rows] for each in asked)
         redrawn = (first != again).flatten(1).any(1)
         same = ((first - other).abs() <= SAME).flatten(1).all(1)
         places = rows.numpy()

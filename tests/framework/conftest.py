@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -68,8 +69,13 @@ def bench(toy_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 def started(folder: Path, *words: str) -> subprocess.Popen[str]:
     """The command line as a process of its own, with the plug-ins of `folder`."""
     environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1", "COLUMNS": "160"}
+
+    def hear() -> None:
+        """A shell's background job, which these tests may be, is deaf to Ctrl-C and so are its children."""
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
     return subprocess.Popen(
-        [*BENCH, *words], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [*BENCH, *words], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=hear
     )
 
 
