@@ -18,11 +18,7 @@ from rich.text import Text
 from bench.errors import UserError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     import pyarrow as pa
-
-    from bench.contracts import Track
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -225,16 +221,11 @@ def fetch(
     cli_fetch.print_fetched(names, Console()) if names else cli_fetch.print_downloads(Console())
 
 
-def _report(name: str) -> Callable[[Mapping[Track, pa.Table], Console], None]:
-    from bench import registry
-
-    return registry.resolve(registry.REPORTS, name, "report")
-
-
 def _print_report(name: str, records: pa.Table) -> None:
-    from bench import results
+    from bench import registry, results
 
-    _report(name)({results.track_of(records.column_names): records}, Console())
+    report = registry.resolve(registry.REPORTS, name, "report")
+    report({results.track_of(records.column_names): records}, Console())
 
 
 def main() -> None:

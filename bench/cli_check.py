@@ -11,8 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from bench import registry
+from bench.cli_list import heading
 from bench.errors import UserError
-from bench.registry import KINDS
 
 if TYPE_CHECKING:
     from bench.conformance.check import Outcome
@@ -31,18 +31,13 @@ def print_checks(name: str, words: Sequence[str], console: Console) -> int:
 
     settle()
     given = dict(_read(word) for word in words)
-    kinds = [kind for kind in KINDS if name in registry.names(kind)]
-    if not kinds:
-        every = sorted({known for kind in KINDS for known in registry.names(kind)})
-        raise UserError(registry.unknown(f"component {name!r}", name, every))
+    kinds = registry.kinds_of(name)
     if strange := [key for key in given if key != "victim" and key.partition(".")[0] not in kinds]:
         known = [*(f"{kind}.…" for kind in kinds), "victim"]
         raise UserError(registry.unknown(f"key {strange[0]!r}", strange[0], known))
     failed = False
     for kind in kinds:
-        entry = registry.find(registry.GROUPS[kind], name, kind)
-        shipped = f"   {entry.target}, {entry.shipped_by}"
-        console.print(Text.assemble((f"{kind} ", "dim"), (name, "bold"), (shipped, "dim")))
+        console.print(heading(kind, name))
         own = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{kind}.")}
         with console.status("checking"):
             outcomes = list(examine(kind, name, own, given.get("victim", "")))

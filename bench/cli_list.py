@@ -10,7 +10,6 @@ from rich.table import Table
 from rich.text import Text
 
 from bench import registry
-from bench.errors import UserError
 from bench.registry import GROUPS, KINDS, Kind
 from bench.tracks import tracks_of
 
@@ -36,22 +35,23 @@ def print_component(name: str, console: Console) -> None:
     Raises:
         UserError: if no component has the name, or if its plug-in is broken.
     """
-    kinds = [kind for kind in KINDS if name in registry.names(kind)]
-    if not kinds:
-        every = sorted({known for kind in KINDS for known in registry.names(kind)})
-        raise UserError(registry.unknown(f"component {name!r}", name, every))
-    for number, kind in enumerate(kinds):
+    for number, kind in enumerate(registry.kinds_of(name)):
         if number:
             console.rule(style="dim")
         _print_page(kind, name, console)
+
+
+def heading(kind: Kind, name: str) -> Text:
+    """A component, where it is and what ships it, in a line."""
+    entry = registry.find(GROUPS[kind], name, kind)
+    return Text.assemble((f"{kind} ", "dim"), (name, "bold"), (f"   {entry.target}, {entry.shipped_by}", "dim"))
 
 
 def _print_page(kind: Kind, name: str, console: Console) -> None:
     from bench.parameters import description, parameters
 
     component = registry.load(kind, name)
-    entry = registry.find(GROUPS[kind], name, kind)
-    console.print(Text.assemble((f"{kind} ", "dim"), (name, "bold"), (f"   {entry.target}, {entry.shipped_by}", "dim")))
+    console.print(heading(kind, name))
     console.print()
     for paragraph in _paragraphs(description(component)):
         console.print(_with_code(paragraph), highlight=False)

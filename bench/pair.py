@@ -10,7 +10,7 @@ from torch import nn
 from bench import registry, tracks
 from bench.contracts import Attack, Defense, ThreatModel, Track, Victim, World, permits
 from bench.driving import DrivingAttack, DrivingVictim, Policy
-from bench.errors import UserError
+from bench.errors import UserError, reason
 from bench.fingerprint import canonical, digest, state_digest
 from bench.parameters import parameters
 from bench.patch import PatchThreat
@@ -69,8 +69,7 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
         raise UserError(f"{kind} {name!r}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
     # A plug-in's own checks may fail in any other way.
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise UserError(f"{kind} {name!r} cannot be made: {reason} (--debug shows where)") from error
+        raise UserError(f"{kind} {name!r} cannot be made: {reason(error)} (--debug shows where)") from error
 
 
 def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:
@@ -181,9 +180,8 @@ class Pair:
             raise
         # Third-party code may fail in any way; the person at the terminal is told which component did.
         except Exception as error:
-            reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise UserError(
-                f"{self.defense} + {self.victim} cannot be loaded: {reason} (--debug shows where)"
+                f"{self.defense} + {self.victim} cannot be loaded: {reason(error)} (--debug shows where)"
             ) from error
         if not isinstance(network, NETWORKS[self.track]):
             wanted = NETWORKS[self.track].__name__

@@ -13,7 +13,7 @@ from functools import cache
 from importlib import metadata
 from typing import Any, Literal, get_args
 
-from bench.errors import UserError
+from bench.errors import UserError, reason
 
 Kind = Literal["attack", "defense", "victim", "world"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -64,6 +64,20 @@ def names(kind: Kind) -> list[str]:
     return list(entries(GROUPS[kind]))
 
 
+def kinds_of(name: str) -> list[Kind]:
+    """The kinds of component that have this name.
+
+    Raises:
+        UserError: if none has.
+    """
+    kinds = [kind for kind in KINDS if name in names(kind)]
+    if not kinds:
+        raise UserError(
+            unknown(f"component {name!r}", name, sorted({known for kind in KINDS for known in names(kind)}))
+        )
+    return kinds
+
+
 def on_track(kind: Kind, name: str, track: str) -> str:
     """What a name means on a track: NAME_TRACK where there is such a component, or else the name itself."""
     own = f"{name}_{track}"
@@ -108,9 +122,8 @@ def resolve(group: str, name: str, noun: str) -> Any:
         return point.load()
     # A plug-in may fail in any way while it is imported, end the program too, and must not take the others with it.
     except (Exception, SystemExit) as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
         where = f"{noun} {name!r} ({entry.target} of {entry.shipped_by})"
-        raise UserError(f"{where} cannot be imported: {reason}") from error
+        raise UserError(f"{where} cannot be imported: {reason(error)}") from error
 
 
 def load(kind: Kind, name: str) -> type[Any]:

@@ -26,7 +26,7 @@ from bench import approach, patches, results, rollout
 from bench.config import RunConfig
 from bench.crafting import craft
 from bench.drive import drive
-from bench.errors import UserError
+from bench.errors import UserError, reason
 from bench.patch import Patch
 from bench.plan import plan
 from bench.process import settle
@@ -268,8 +268,7 @@ def _perform(task: Task, tell: Callable[[str, float, str], None] = _tell) -> Out
         raise UserError(f"{task.work}: {error}") from error
     # Third-party code may fail in any way; the person at the terminal is told which component did.
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise UserError(f"{task.work} failed: {reason} (--debug shows where)") from error
+        raise UserError(f"{task.work} failed: {reason(error)} (--debug shows where)") from error
     wall_s = time.perf_counter() - start
     return Outcome(columns=columns, wall_s=wall_s, warning=_record(task, trace) if trace else "")
 
@@ -281,5 +280,5 @@ def _record(task: Task, trace: Trace) -> str:
         save_recordings(task.out, task.work, trace)
     # The records are the result; a recording is a view of them, and its failure must not lose them.
     except Exception as error:
-        return f"{task.work} was not recorded: {type(error).__name__}: {error}".splitlines()[0]
+        return f"{task.work} was not recorded: {reason(error)}"
     return ""

@@ -10,11 +10,10 @@ from string import Template
 from typing import Literal, get_args
 
 from bench import registry
+from bench.contracts import TRACKS
 from bench.errors import UserError
 
 NewKind = Literal["attack", "defense", "victim"]
-TRACKS = ("driving", "detection")
-"""As in `bench.contracts`, which imports torch."""
 NOUNS = {"attack": "an attack", "defense": "a defence", "victim": "a victim"}
 LINES = {
     ("attack", "driving"): (

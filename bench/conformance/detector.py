@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from bench.conformance.check import Check, NotApplicableError, Suite, require
+from bench.conformance.check import Check, Suite, require
+from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.conformance.street import Street
-from bench.fingerprint import state_digest
 from bench.vision import STOP_SIGN, Detector, DetectorVictim
 
 PICTURES = 3
@@ -47,11 +48,7 @@ class DetectorSuite(Suite):
         require(
             isinstance(detector, Detector), f"load returned a {type(detector).__name__}, not a bench.vision.Detector"
         )
-        require(not detector.training, "it is in training mode: load must return detector.eval()")
-        require(
-            not any(weight.requires_grad for weight in detector.parameters()),
-            "its weights take gradients: load must return detector.requires_grad_(False)",
-        )
+        check_frozen(detector, "detector")
         require(STOP_SIGN in detector.names, f"none of its classes is {STOP_SIGN!r}, which is what attacks hide")
         require(isinstance(detector.stride, int) and detector.stride > 0, "stride must be a whole number of pixels")
 
@@ -99,26 +96,20 @@ class DetectorSuite(Suite):
 
     def differentiable(self) -> None:
         """White-box attacks find a way back to the pixels."""
-        if self.victim.answers != "gradients":
-            raise NotApplicableError(f"it answers {self.victim.answers} at most: gradient attacks are refused")
+        check_white_box(self.victim)
         leaf, detector = self._pictures().requires_grad_(True), self.load()
         scores = detector(leaf).scores_of(detector.index(STOP_SIGN))
         require(scores.requires_grad, "its scores have no graph: no torch.no_grad in predict, no .detach, no NumPy")
         (gradient,) = torch.autograd.grad(scores.sum(), leaf)
-        require(bool(gradient.isfinite().all()), "its gradient is NaN or infinite somewhere")
-        require(
-            bool(gradient.any()),
-            "its gradient is 0 everywhere, a wall that proves nothing: let it pass straight through (Athalye et al. 2018)",
-        )
+        check_gradient(gradient)
 
     def keeps_weights(self) -> None:
         """Loading and asking change nothing."""
         detector, pictures = self.load(), self._pictures()
-        before, shown = (state_digest(detector), state_digest(self.victim.load(0))), pictures.clone()
-        detector(pictures)
-        self.load()
-        require(state_digest(detector) == before[0], "its weights changed while it was asked")
-        require(state_digest(self.victim.load(0)) == before[1], "loading it changed the victim's own weights")
+        shown = pictures.clone()
+        with unchanged(detector, partial(self.victim.load, 0)):
+            detector(pictures)
+            self.load()
         require(torch.equal(pictures, shown), "the pictures were changed in place")
 
     def _pictures(self) -> Tensor:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from bench.conformance.check import Check, NotApplicableError, Suite, require
+from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.conformance.traffic import observations
 from bench.driving import DrivingVictim, DrivingWorld, Policy
-from bench.fingerprint import state_digest
 from bench.scenario import Cell
 
 EPISODES = 6
@@ -53,11 +54,7 @@ class PolicySuite(Suite):
         """Eval mode, no gradients on weights, of the action type it says."""
         policy = self.load()
         require(isinstance(policy, Policy), f"load returned a {type(policy).__name__}, not a bench.driving.Policy")
-        require(not policy.training, "it is in training mode: load must return policy.eval()")
-        require(
-            not any(weight.requires_grad for weight in policy.parameters()),
-            "its weights take gradients: load must return policy.requires_grad_(False)",
-        )
+        check_frozen(policy, "policy")
         require(
             policy.action_type == self.victim.action_type,
             f"the policy's action_type is {policy.action_type!r}, the victim's {self.victim.action_type!r}",
@@ -134,28 +131,21 @@ class PolicySuite(Suite):
         """White-box attacks find a way back to the observation."""
         if not self.victim.sees:
             raise NotApplicableError("it ignores what it is shown")
-        if self.victim.answers != "gradients":
-            raise NotApplicableError(f"it answers {self.victim.answers} at most: gradient attacks are refused")
+        check_white_box(self.victim)
         leaf = self._observations().requires_grad_(True)
         scores = self._ready().scores(leaf)
         require(scores.requires_grad, "its scores have no graph: no torch.no_grad in scores, no .detach, no NumPy")
         # Not their sum, which may be constant.
         weighted = scores @ torch.linspace(1, 2, scores.shape[-1])
         (gradient,) = torch.autograd.grad(weighted.sum(), leaf)
-        require(bool(gradient.isfinite().all()), "its gradient is NaN or infinite somewhere")
-        require(
-            bool(gradient.any()),
-            "its gradient is 0 everywhere, a wall that proves nothing: let it pass straight through (Athalye et al. 2018)",
-        )
+        check_gradient(gradient)
 
     def keeps_weights(self) -> None:
         """Loading and asking change nothing."""
         policy = self._ready()
-        before = state_digest(policy), state_digest(self.victim.load(0))
-        policy.decide(self._observations())
-        self.load()
-        require(state_digest(policy) == before[0], "its weights changed while it was asked")
-        require(state_digest(self.victim.load(0)) == before[1], "loading it changed the victim's own weights")
+        with unchanged(policy, partial(self.victim.load, 0)):
+            policy.decide(self._observations())
+            self.load()
 
     def _ready(self) -> Policy:
         policy = self.load()

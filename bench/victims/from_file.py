@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from bench.driving import ActionType, DrivingVictim, Policy
-from bench.errors import UserError
+from bench.errors import UserError, reason
 
 WIDTH: dict[ActionType, int] = {"discrete": 5, "continuous": 2}
 """What a policy gives for an observation: Q-values or logits of highway-env's five decisions, or acceleration and steering."""
@@ -105,8 +105,7 @@ class FileDriver(DrivingVictim):
             raise
         # A file that is cut short or of another kind can fail anywhere in the library that reads it.
         except Exception as error:
-            reason = f"{type(error).__name__}: {error}".splitlines()[0]
-            raise UserError(f"{self.path} cannot be read: {reason}") from error
+            raise UserError(f"{self.path} cannot be read: {reason(error)}") from error
         self._try(policy)
         return policy
 
@@ -133,9 +132,8 @@ class FileDriver(DrivingVictim):
                 with torch.no_grad():
                     answer = policy.scores(torch.zeros(batch, self.rows, self.features))
             except Exception as error:
-                reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise UserError(
-                    f"{self.path} takes no batch of {batch}: export it with a batch of any size ({reason})"
+                    f"{self.path} takes no batch of {batch}: export it with a batch of any size ({reason(error)})"
                 ) from error
             wanted = [batch, WIDTH[self.action_type]]
             if list(answer.shape) != wanted:
