@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from bench import files
+from bench import files, validity
 from bench.contracts import TRACKS, Track
 from bench.errors import UserError
 from bench.scenario import WEATHERS
@@ -237,7 +237,7 @@ def read(out: Path, units: Collection[str] | None = None, *, track: Track = "dri
             and training seed only what the newest code and weights made, and of a scenario driven twice the last one.
 
     Raises:
-        UserError: if there are no records, or if a file is truncated or foreign.
+        UserError: if there are no records, or if a file is truncated or foreign, or has values that cannot be.
     """
     if units is None:
         paths = sorted((out / FOLDER).glob("[!.]*.parquet"))
@@ -248,7 +248,18 @@ def read(out: Path, units: Collection[str] | None = None, *, track: Track = "dri
         raise UserError(_NOTHING.format(out=out))
     query = "from records" + (_NEWEST if units is None else "") + _ORDER
     with _records(out, paths, track) as connection:
-        return connection.sql(query).to_arrow_table().cast(SCHEMAS[track])
+        records = connection.sql(query).to_arrow_table().cast(SCHEMAS[track])
+    return _valid(records, out, track)
+
+
+def _valid(records: pa.Table, out: Path, track: Track) -> pa.Table:
+    """Records as they are; refused, and their file named, if a value cannot be."""
+    if found := validity.complaint(records, SCHEMAS[track]):
+        row, why = found
+        path = path_of(out, records["unit"][row].as_py())
+        named = f"the record {path}" if path.exists() else f"a record in {out} (unit {path.stem})"
+        raise UserError(f"{named} cannot be right: {why}; delete it and run again to make it anew")
+    return records
 
 
 def read_compact(out: Path, measurements: Collection[str]) -> dict[Track, pa.Table]:
@@ -293,7 +304,7 @@ def _read_compact(out: Path, paths: list[Path], track: Track, measurements: Coll
         for name in SCHEMAS[track].names
         if name in shared or name in measured.column_names
     }
-    return pa.table(columns)
+    return _valid(pa.table(columns), out, track)
 
 
 def _taken(column: pa.ChunkedArray, rows: pa.Array) -> pa.Array:

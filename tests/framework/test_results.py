@@ -101,6 +101,33 @@ def test_a_foreign_table_is_named(written: Path) -> None:
         results.read(written)
 
 
+CANNOT_BE = {
+    "safe_progress": (5.0, "safe_progress must be between 0 and 1, got 5"),
+    "changed": (float("nan"), "changed must be between 0 and 1, got nan"),
+    "weather": ("hail", "lanes/density/weather 3/1.0/hail: unknown weather 'hail'; known: clear"),
+    "lanes": (-1, "lanes must be between 2 and 8, got -1"),
+    "density": (float("nan"), "density must be in (0, 4], got nan"),
+    "attack_params": ("{scale: 1}", "attack_params {scale: 1}: Expecting property name"),
+    "world_params": ("[1]", "world_params [1]: not a JSON object"),
+    "threat_access": ("all", "threat_access all: known: oblivious, decisions, scores, gradients"),
+}
+
+
+@pytest.mark.parametrize("name", CANNOT_BE)
+def test_a_value_that_cannot_be_is_named_with_its_record(written: Path, units: list[Unit], name: str) -> None:
+    value, why = CANNOT_BE[name]
+    path = results.path_of(written, units[0].fingerprint)
+    records = pq.read_table(path)
+    place = records.schema.get_field_index(name)
+    wrong = pa.array([value] * records.num_rows, records.schema.field(name).type)
+    pq.write_table(records.set_column(place, records.schema.field(name), wrong), path)
+    for read in (results.read, lambda out: results.read_compact(out, {"safe_progress", "changed"})):
+        with pytest.raises(UserError) as raised:
+            read(written)
+        assert str(raised.value).startswith(f"the record {path} cannot be right: ")
+        assert why in str(raised.value)
+
+
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"the results folder .*file/results cannot be written: Not a directory"):

@@ -119,6 +119,7 @@ def _units(*identity: object, run: np.ndarray, place: np.ndarray) -> list[str]:
 
 def _table(schema: pa.Schema, columns: Mapping[str, object], count: int) -> pa.Table:
     arrays = []
+    columns = {"libraries": "{}", **columns}
     for field in schema:
         value = columns.get(field.name, None if field.nullable else "")
         arrays.append(pa.array(value if isinstance(value, list | np.ndarray) else [value] * count, field.type))
