@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -23,12 +24,9 @@ if TYPE_CHECKING:
 
 ATTACKS: dict[str, Access] = {
     "BoundaryAttack": "decisions",
-    "GeoDA": "decisions",
     "HopSkipJump": "decisions",
     "SignOPTAttack": "decisions",
-    "SimBA": "scores",
     "SquareAttack": "scores",
-    "ZooAttack": "scores",
     "AutoConjugateGradient": "gradients",
     "AutoProjectedGradientDescent": "gradients",
     "BasicIterativeMethod": "gradients",
@@ -44,14 +42,10 @@ ATTACKS: dict[str, Access] = {
 """The attacks of ART that fit, and what each asks the victim for."""
 BATCHED = ("BasicIterativeMethod", "MomentumIterativeMethod", "ProjectedGradientDescent", "SquareAttack")
 """Those that treat the episodes of a batch each by itself. With the others every episode is a call of its own."""
-FIXED: dict[str, Any] = {"norm": np.inf, "eps": 1.0, "batch_size": 1_000_000, "verbose": False}
+FIXED: dict[str, Any] = {"norm": np.inf, "eps": 1.0, "verbose": False}
 """Arguments that the threat model decides, or the benchmark."""
-LEFT_OUT = (*FIXED, "targeted", "summary_writer", "loss_type", "random_eps", "nb_restarts")
-DEFAULTS: dict[str, dict[str, object]] = {
-    "SimBA": {"attack": "px"},
-    "SquareAttack": {"p_init": 0.3},
-    "ZooAttack": {"use_resize": False, "use_importance": False},
-}
+LEFT_OUT = (*FIXED, "batch_size", "targeted", "summary_writer", "loss_type", "random_eps", "nb_restarts")
+DEFAULTS: dict[str, dict[str, object]] = {"SquareAttack": {"p_init": 0.3}}
 """Where ART's own default needs a larger image than an observation is."""
 PLAIN: dict[str, type] = {"bool": bool, "float": float, "int": int, "str": str}
 """Types of arguments that can be written on a command line."""
@@ -62,8 +56,8 @@ class ART(DrivingAttack):
     """An attack of the Adversarial Robustness Toolbox (Nicolae et al. 2018, "Adversarial Robustness Toolbox v1.0.0").
 
     ART's own code, on a victim that it asks through the oracle. It works on the box [-1, 1]^n that the perturbation set is in
-    shares of its radius, for any other action than the clean one or, where it has a `target`, for that. An episode asks no more in a step once that
-    is reached or its queries are spent, and is shown the best point asked. For discrete actions.
+    shares of its radius, for any other action than the clean one or, where it has a `target`, for that. An episode asks no
+    more in a step once that is reached or its queries are spent, and is shown the best point asked. For discrete actions.
 
     Needs the toolbox: pip install 'cavbench[art]'.
     """
@@ -109,8 +103,9 @@ class ART(DrivingAttack):
             classifier = Classifier(origin.shape[1:], search.classes)
             attack = self._on(classifier)
             classifier.search = search
+            labels = np.eye(search.classes, dtype=np.float32)[search.labels.numpy()]
             with seeded(seed), suppress(OverError):
-                attack.generate(x=origin, y=np.eye(search.classes, dtype=np.float32)[search.labels.numpy()])
+                search.scores(attack.generate(x=origin, y=labels))
             best[rows] = search.best
         return best
 
@@ -122,6 +117,8 @@ class ART(DrivingAttack):
         """ART's attack on a victim."""
         original = _original(self.choice)
         arguments = FIXED | {"targeted": self._target is not None} | asdict(self)
+        if self.choice in BATCHED:
+            arguments["batch_size"] = sys.maxsize
         return original(classifier, **{name: arguments[name] for name in _signature(original) if name in arguments})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import random
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +22,9 @@ from attacks.objectives import margin
 if TYPE_CHECKING:
     from bench.threat import Oracle
 
+logging.getLogger("art").setLevel(logging.ERROR)
+"""ART warns of every attack that comes to nothing, which here is every step and every episode."""
+
 Array = NDArray[np.float32]
 Value = Callable[[Tensor, Tensor], Tensor]
 """Of scores [N, C] and a class each [N]: a number each [N], differentiable in the scores."""
@@ -31,7 +35,7 @@ class OverError(Exception):
 
 
 class Search:
-    """What the victim was asked about some of the episodes in a step, and the best point of each.
+    """What the victim was asked about some of the episodes in this step, and the best point of each.
 
     A point z of the box [-1, 1]^n is the observation truth + radius * z. What was asked once is not asked again. An episode
     whose goal is met, or that cannot pay for what is asked next, is over: it asks nothing more.
@@ -48,7 +52,8 @@ class Search:
         self._truth, self._radius = oracle.observation[rows], oracle.radius[rows]
         decision = clean if clean.ndim == 1 else clean.argmax(-1)
         wanted = decision if target is None else torch.full_like(decision, target)
-        # Of decisions all that counts is whether they are this one: class 1, or not: class 0.
+        # Of decisions all that counts is whether they are this one: class 1, or not: class 0. Nothing is class 2; some of
+        # ART's attacks refuse less than three.
         self._action = wanted if clean.ndim == 1 else None
         self.labels = wanted if self._action is None else torch.ones_like(wanted)
         scores = clean if self._action is None else _classified(clean == wanted)
@@ -72,7 +77,7 @@ class Search:
         return np.zeros((count, 1, rows + 1, features), np.float32)
 
     def scores(self, points: Array) -> Array:
-        """The victim's scores [N, C] of points [N, 1, V + 1, F]; of an episode that is over, such as are no longer in its way."""
+        """The victim's scores [N, C] of points [N, 1, V + 1, F]; an episode that is over counts as won, and ART lets it be."""
         places = self._places(len(points))
 
         def ask(fresh: list[int]) -> Tensor:
@@ -214,7 +219,7 @@ def _labels(y: Array) -> Tensor:
 
 
 def _classified(same: Tensor) -> Tensor:
-    return functional.one_hot(same.long(), 2).float()
+    return functional.one_hot(same.long(), 3).float()
 
 
 def _loss(scores: Tensor, labels: Tensor) -> Tensor:

@@ -87,7 +87,9 @@ def _print_choices(name: str, choices: Mapping[str, str], console: Console) -> N
         table.add_row(Text(f"{name}:{choice}", style="bold"), word)
     console.print(table)
     example = f"{name}:{next(iter(choices))}"
-    console.print(f"\n`bench list {example}` says what one does and what its parameters are.", style="dim", highlight=False)
+    console.print(
+        f"\n`bench list {example}` says what one does and what its parameters are.", style="dim", highlight=False
+    )
 
 
 def _fits(kind: Kind, component: type[Any]) -> str:
