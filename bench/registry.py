@@ -174,10 +174,10 @@ def load(kind: Kind, name: str) -> type[Any]:
 def _chosen(kind: Kind, name: str) -> type[Any]:
     """The component itself, or the one that an adapter has for the choice."""
     component = declared(kind, name)
-    own, _, choice = name.partition(":")
+    own, colon, choice = name.partition(":")
     choices = component.choices()
-    if choice and not choices:
-        raise UserError(f"{kind} {own!r} leaves no choice; say {own}, without :{choice}")
+    if colon and not choices:
+        raise UserError(f"{kind} {own!r} leaves no choice; say {own}")
     if not choices:
         return component
     if choice not in choices:

