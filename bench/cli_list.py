@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
@@ -50,12 +51,17 @@ def heading(kind: Kind, name: str) -> Text:
 def _print_page(kind: Kind, name: str, console: Console) -> None:
     from bench.parameters import description, parameters
 
-    component = registry.load(kind, name)
+    component = registry.declared(kind, name)
+    choices = {} if ":" in name else component.choices()
+    component = component if choices else registry.load(kind, name)
     console.print(heading(kind, name))
     console.print()
     for paragraph in _paragraphs(description(component)):
         console.print(_with_code(paragraph), highlight=False)
         console.print()
+    if choices:
+        _print_choices(name, choices, console)
+        return
     console.print(_fits(kind, component), highlight=False)
     console.print()
     known = parameters(component)
@@ -72,6 +78,18 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
         default = "required" if parameter.required else _shown(parameter.default)
         table.add_row(Text(f"{kind}.{parameter.name}", style="bold"), parameter.type_name, default, meaning)
     console.print(table)
+
+
+def _print_choices(name: str, choices: Mapping[str, str], console: Console) -> None:
+    """What an adapter offers."""
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    for choice, word in choices.items():
+        table.add_row(Text(f"{name}:{choice}", style="bold"), word)
+    console.print(table)
+    example = f"{name}:{next(iter(choices))}"
+    console.print(
+        f"\n`bench list {example}` says what one does and what its parameters are.", style="dim", highlight=False
+    )
 
 
 def _fits(kind: Kind, component: type[Any]) -> str:

@@ -36,6 +36,22 @@ class Component(ABC):
 
     track: ClassVar[Track]
     """Set by the base classes of a track, and by them only."""
+    libraries: ClassVar[tuple[str, ...]] = ()
+    """Distributions that compute for it: records name their versions, beside those of torch and the rest."""
+
+    @classmethod
+    def choices(cls) -> Mapping[str, str]:
+        """Of an adapter to a library: what can be said after its name, `NAME:CHOICE`, and a word on each; else empty."""
+        return {}
+
+    @classmethod
+    def chosen(cls, choice: str) -> type[Component]:
+        """The component that `NAME:CHOICE` is, for every one of the `choices`.
+
+        Raises:
+            UserError: if the library is not installed, saying which command installs it.
+        """
+        raise NotImplementedError(f"{cls.__name__} leaves no choice")
 
     @classmethod
     def tracks(cls) -> tuple[Track, ...]:

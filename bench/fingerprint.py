@@ -121,9 +121,9 @@ def state_digest(network: Any) -> str:
 
 
 @cache
-def libraries() -> dict[str, str]:
-    """Versions of Python and of the libraries that compute results."""
-    return {"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}}
+def libraries(more: tuple[str, ...] = ()) -> dict[str, str]:
+    """Versions of Python and of the libraries that compute results, and of `more` distributions."""
+    return {"python": platform.python_version(), **{name: metadata.version(name) for name in (*LIBRARIES, *more)}}
 
 
 @cache

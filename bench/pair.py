@@ -162,7 +162,8 @@ class Pair:
     @property
     def id(self) -> str:
         """A short name for files and tables: the names and eight digits of the hash of the identity."""
-        return f"{self.attack.name}-{self.defense.name}-{self.victim.name}-{digest(self.identity)[:8]}"
+        names = f"{self.attack.name}-{self.defense.name}-{self.victim.name}".replace(":", "-")
+        return f"{names}-{digest(self.identity)[:8]}"
 
     def clean(self) -> Pair:
         """The same victim and defence without the attack: the control of every attacked pair."""

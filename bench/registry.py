@@ -70,7 +70,7 @@ def kinds_of(name: str) -> list[Kind]:
     Raises:
         UserError: if none has.
     """
-    kinds = [kind for kind in KINDS if name in names(kind)]
+    kinds = [kind for kind in KINDS if _plain(name) in names(kind)]
     if not kinds:
         raise UserError(
             unknown(f"component {name!r}", name, sorted({known for kind in KINDS for known in names(kind)}))
@@ -92,7 +92,7 @@ def problem(claims: tuple[Entry, ...]) -> str:
 
 
 def find(group: str, name: str, noun: str) -> Entry:
-    """The entry of a name.
+    """The entry of a name, or of the NAME of NAME:CHOICE.
 
     Args:
         group: entry-point group.
@@ -103,11 +103,12 @@ def find(group: str, name: str, noun: str) -> Entry:
         UserError: if there is none, or more than one.
     """
     known = entries(group)
-    if name not in known:
-        raise UserError(unknown(f"{noun} {name!r}", name, known))
-    if complaint := problem(known[name]):
-        raise UserError(f"{noun} {name!r} is {complaint}")
-    return known[name][0]
+    own = _plain(name)
+    if own not in known:
+        raise UserError(unknown(f"{noun} {own!r}", own, known))
+    if complaint := problem(known[own]):
+        raise UserError(f"{noun} {own!r} is {complaint}")
+    return known[own][0]
 
 
 def resolve(group: str, name: str, noun: str) -> Any:
@@ -126,24 +127,37 @@ def resolve(group: str, name: str, noun: str) -> Any:
         raise UserError(f"{where} cannot be imported: {reason(error)}") from error
 
 
-def load(kind: Kind, name: str) -> type[Any]:
-    """The class of a component.
+def declared(kind: Kind, name: str) -> type[Any]:
+    """The class that a name, or the NAME of NAME:CHOICE, stands for: a component, or an adapter with `choices`.
 
     Raises:
         UserError: if the name is unknown or taken twice, or if the plug-in is broken: it cannot be imported, or is
-            not a frozen dataclass derived from a base class of its kind and of a track.
+            not derived from a base class of its kind and of a track.
     """
     from bench import contracts
 
     component: Any = resolve(GROUPS[kind], name, kind)
-    entry = find(GROUPS[kind], name, kind)
     base = getattr(contracts, kind.capitalize())
-    where = f"{kind} {name!r} ({entry.target} of {entry.shipped_by})"
     if not (inspect.isclass(component) and issubclass(component, base)):
-        raise UserError(f"{where} is not a subclass of bench.contracts.{base.__name__}")
+        raise UserError(f"{_where(kind, name)} is not a subclass of bench.contracts.{base.__name__}")
     known: type[Any] = component
     if not known.tracks():
+        where = _where(kind, name)
         raise UserError(f"{where} is of no track: derive it from a base class of bench.driving or bench.vision")
+    return known
+
+
+def load(kind: Kind, name: str) -> type[Any]:
+    """The class of a component; of an adapter's, NAME:CHOICE.
+
+    Raises:
+        UserError: if the name or the choice is unknown, or if the plug-in is broken: see `declared`, or it is not a frozen
+            dataclass.
+    """
+    from bench import contracts
+
+    component = _chosen(kind, name)
+    where = _where(kind, name)
     if missing := sorted(getattr(component, "__abstractmethods__", ())):
         raise UserError(f"{where} does not implement {', '.join(missing)}")
     if not (is_dataclass(component) and component.__dataclass_params__.frozen):  # type: ignore[attr-defined]
@@ -155,6 +169,32 @@ def load(kind: Kind, name: str) -> type[Any]:
         levels = ", ".join(get_args(contracts.Access))
         raise UserError(f"{where} must say what it needs: access: ClassVar[Access] = one of {levels}")
     return component
+
+
+def _chosen(kind: Kind, name: str) -> type[Any]:
+    """The component itself, or the one that an adapter has for the choice."""
+    component = declared(kind, name)
+    own, colon, choice = name.partition(":")
+    choices = component.choices()
+    if colon and not choices:
+        raise UserError(f"{kind} {own!r} leaves no choice; say {own}")
+    if not choices:
+        return component
+    if choice not in choices:
+        if not choice:
+            raise UserError(f"{kind} {own!r} stands for many; say {own}:NAME, with one of {', '.join(choices)}")
+        raise UserError(unknown(f"{kind} {name!r}", choice, choices))
+    return component.chosen(choice)
+
+
+def _plain(name: str) -> str:
+    """NAME of NAME:CHOICE."""
+    return name.partition(":")[0]
+
+
+def _where(kind: Kind, name: str) -> str:
+    entry = find(GROUPS[kind], name, kind)
+    return f"{kind} {name!r} ({entry.target} of {entry.shipped_by})"
 
 
 def unknown(what: str, word: str, known: Iterable[str]) -> str:

@@ -117,7 +117,11 @@ PROVENANCE: tuple[pa.Field, ...] = (
     _field("world_shipped_by", _text, "distribution and version"),
     _field("weights_sha256", _text, "of the policy's weights; empty where it has none"),
     _field("code_digest", _text, "sha256 of the source of the packages that computed it"),
-    _field("libraries", _text, "JSON: versions of python, torch, torchrl, tensordict, highway-env, numba, numpy"),
+    _field(
+        "libraries",
+        _text,
+        "JSON: versions of python, torch and others that compute, and of a component's own libraries",
+    ),
     _field("machine", _text, "system, processor and number of cores"),
     _field("created_at", pa.timestamp("us", tz="UTC"), "when the unit was finished"),
     _field("wall_s", _float, "wall time of the unit, all its episodes", "s"),

@@ -54,6 +54,11 @@ class _Work:
         return self.pair.attack, self.pair.defense, self.pair.victim, self.pair.world
 
     @property
+    def libraries(self) -> dict[str, str]:
+        """Versions of what computes it beside that source."""
+        return libraries(tuple(sorted({name for part in self.parts for name in part.component.libraries})))
+
+    @property
     def origin(self) -> dict[str, object]:
         """What decides the result."""
         return {
@@ -62,7 +67,7 @@ class _Work:
             "weights": self.weights_sha256,
             "code": self.code_digest,
             "shipped_by": [_entry(part).shipped_by for part in self.parts],
-            "libraries": libraries(),
+            "libraries": self.libraries,
         }
 
 
@@ -151,7 +156,7 @@ class Unit(_Work):
             **{f"{part.kind}_shipped_by": _entry(part).shipped_by for part in self.parts},
             "weights_sha256": self.weights_sha256,
             "code_digest": self.code_digest,
-            "libraries": canonical(libraries()),
+            "libraries": canonical(self.libraries),
             "machine": machine(),
             "created_at": datetime.now(UTC),
             "wall_s": wall_s,

@@ -101,6 +101,8 @@ class Words:
     def chosen(self, kind: Kind) -> list[Chosen[Any]]:
         """Every component of a kind that is asked for, with every combination of its parameters' values."""
         names = self.values.get(kind) or (WORLDS[self.track] if kind == "world" else DEFAULTS[kind],)
+        # Hydra's grammar escapes the colon of NAME:CHOICE.
+        names = tuple(name.replace("\\:", ":") for name in names)
         if kind != "victim":
             names = tuple(registry.on_track(kind, name, self.track) for name in names)
         known = {name: parameters(registry.load(kind, name)) for name in names}

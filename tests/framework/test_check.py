@@ -18,12 +18,14 @@ from tests.framework.test_cli import assert_one_line
 Bench = Callable[..., Said]
 FROM_FILES = {"sb3", "torch", "onnx"}
 """Victims that are nothing without a file of the user's: checked with one in `tests/victims/test_from_file.py`."""
+ADAPTERS = {"art"}
+"""Nothing without a choice: checked with some in `tests/attacks/test_art.py`."""
 QUICK = {"noise", "noise_patch", "grey_patch", "blind", "random", "idm"}
 BUILT_IN: list[tuple[Kind, str]] = [
     (kind, name)
     for kind in KINDS
     for name, claims in registry.entries(GROUPS[kind]).items()
-    if claims[0].distribution == "cavbench" and name not in FROM_FILES
+    if claims[0].distribution == "cavbench" and name not in FROM_FILES | ADAPTERS
 ]
 
 
