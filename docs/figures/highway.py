@@ -24,9 +24,9 @@ def world() -> Figure:
     engine = env.engine
     engine.reset(np.arange(len(cells)), np.full(len(cells), SEED))
     count = len(GRID.cells())
-    made = style.figure(6.4, f"highway: {count} cells, {len(cells)} roads in {len(GRID.weather)} weathers")
+    made = style.figure(6.8, f"highway: {count} cells, {len(cells)} roads in {len(GRID.weather)} weathers")
     heights = [cell.lanes + 0.8 for cell in cells]
-    *roads, sensor = made.subplots(len(cells) + 1, 1, height_ratios=[*heights, 4])
+    *roads, sensor = made.subplots(len(cells) + 1, 1, height_ratios=[*heights, 7])
     for number, (axes, cell) in enumerate(zip(roads, cells, strict=True)):
         ego, *others = engine.vehicles[number]
         places = [(float(car["x"] - ego["x"]), float(car["y"])) for car in others]
@@ -37,7 +37,7 @@ def world() -> Figure:
         axes.set_xticks([])
     for number, name in enumerate(GRID.weather):
         weather = WEATHERS[name]
-        sensor.barh(number, sensor_range_m(weather), color=style.SKY, height=0.7)
+        sensor.barh(number, sensor_range_m(weather), color=style.SKY, height=0.85)
         said = f"{name}: {sensor_range_m(weather):.0f} m, noise {noise_sigma(weather):.2g} m and m/s"
         sensor.annotate(said, (2, number), va="center", fontsize=10, annotation_clip=False)
     sensor.set(xlim=REACH, yticks=[], xlabel="m ahead")

@@ -24,7 +24,7 @@ def patch_of(attack: str, defense: str = "none") -> Patch:
         defense=choose("defense", defense),
         victim=choose("victim", "yolov3_tiny"),
         world=choose("world", "camera"),
-        threat=PatchThreat(access="gradients"),
+        threat=PatchThreat(),
     )
     crafting = Crafting(pair=pair, training_seed=0, weights_sha256=pair.weights_sha256(0))
     try:

@@ -31,6 +31,7 @@ class _Values(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.policy = policy()
+        self.eval()
 
     def forward(self, observation: Tensor) -> Tensor:
         return self.policy.scores(observation)
@@ -103,6 +104,7 @@ def _figure(
         axes.plot(seconds, original[:, number], color=style.ACTIONS[name], lw=1.2)
         axes.plot(seconds[::EVERY], values[::EVERY, number], "o", ms=4, color=style.ACTIONS[name], label=name)
     axes.set(xlabel="time in an episode (s)", ylabel="Q-value", xlim=(0, seconds[-1]))
-    axes.set_title(f"lines: before; dots: from {file}, at most {most:.0e} apart;\n{access}", fontsize=10)
+    apart = f"at most {most:.0e} apart" if most else "the same to the last bit"
+    axes.set_title(f"lines: before; dots: from {file}, {apart};\n{access}", fontsize=10)
     made.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9.5, handletextpad=0.1)
     return made
