@@ -51,7 +51,9 @@ def make(file: str, folder: Path) -> Path:
 def main() -> None:
     """Make what the command line names."""
     names = {Path(file).stem: file for file in FIGURES}
-    parser = argparse.ArgumentParser(prog="python -m docs.figures", description="Make the figures of the documentation.")
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.figures", description="Make the figures of the documentation."
+    )
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}; none makes all")
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder to write to")
     words = parser.parse_args()

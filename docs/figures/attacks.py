@@ -88,8 +88,6 @@ def _figure(moment: Moment, points: Tensor, title: str, counted: str) -> Figure:
     """The road, the perturbation against its budget, and the values of every one of `points` [N, V, F]."""
     made = style.figure(5.4, title)
     above, below = made.subfigures(2, 1, height_ratios=(1, 1.8))
-    for part in (above, below):
-        part.set_facecolor(style.GROUND)
     _bird(above.subplots(), moment)
     used, values = below.subplots(1, 2, width_ratios=(1, 2.1))
     _budget(used, moment)
@@ -103,7 +101,8 @@ def _bird(axes: Axes, moment: Moment) -> None:
     true, shown = (physical(each)[present] for each in (moment.true, moment.shown[0]))
     ego = float(true[0, 1])
     there, seen = (
-        [(0.0, float(each[0, 1])), *((float(car[0]), ego + float(car[1])) for car in each[1:])] for each in (true, shown)
+        [(0.0, float(each[0, 1])), *((float(car[0]), ego + float(car[1])) for car in each[1:])]
+        for each in (true, shown)
     )
     road.lanes(axes, LANES, (-14, 106))
     road.cars(axes, there[1:], style.TRUE)

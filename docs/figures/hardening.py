@@ -1,77 +1,80 @@
-"""Adversarial training: what is left of a victim under attack, hardened or not."""
+"""What an attack leaves of a victim, undefended and hardened by adversarial training."""
 
 from __future__ import annotations
 
-
+import json
+from importlib.resources import files
 
 import numpy as np
-
-import pyarrow.compute as pc
-
+import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from tensordict import TensorDict
 
-from bench.config import run_config
-from bench.drive import drive
-from bench.plan import plan
-
+from bench.pair import choose
+from bench.pipeline import AttackModule
+from bench.threat import ObservationThreat
 from docs.figures import style
+from docs.figures.driving import FEATURES, episode, policy
 from docs.figures.sightings import curve, frame_axes, patched
-from leaderboard.published import published
 
-BUDGETS = (0.0, 0.025, 0.05, 0.1, 0.15, 0.2)
+BUDGETS = (0.01, 0.025, 0.05, 0.1, 0.15, 0.2)
 TRAINED_AT = 0.1
-EPISODES = 20
-ROAD = "lanes=5 density=1 weather=clear seeds=0 reference=false"
-
-
-def advtrain() -> Figure:
-    """Safe progress under both attacks as the budget grows, undefended and hardened."""
-    made = style.figure(4.2, "advtrain: the hardened policy gives way later")
-    axes = made.subplots(1, 2, sharey=True)
-    for panel, attack in zip(axes, ("zo", "pgd"), strict=True):
-        for defense, colour, marker, name in (
-            ("none", style.UNDEFENDED, "o", "undefended"),
-            ("advtrain", style.HARDENED, "s", "hardened"),
-        ):
-            kept = [100 * _safe_progress(attack, defense, budget) for budget in BUDGETS]
-            panel.plot([100 * budget for budget in BUDGETS], kept, marker=marker, color=colour, lw=2.2, label=name)
-        panel.axvline(100 * TRAINED_AT, color=style.GREY, lw=1, ls=":")
-        panel.set(xlabel="budget (% of each value)", ylim=(-3, 103))
-        panel.set_title(f"under {attack}", fontsize=11)
-    axes[0].set_ylabel("safe progress, %")
-    axes[1].legend(loc="upper right")
-    axes[0].annotate("trained\nat", (100 * TRAINED_AT, 2), (3, 0), textcoords="offset points", fontsize=9.5)
-    return made
-
-
-def _safe_progress(attack: str, defense: str, budget: float) -> float:
-    words = [*ROAD.split(), "victim=dqn", f"defense={defense}", f"episodes={EPISODES}"]
-    words += [f"attack={attack}", f"threat.budget={budget}"] if budget else ["attack=none"]
-    unit = next(unit for unit in plan(run_config(words)) if unit.pair.is_clean == (not budget))
-    return float(drive(unit)["safe_progress"].mean())
+EVERY = 5
+"""Every how many steps of the episode a moment is attacked."""
+SKIPS = ("0", "0.3", "0.5", "1")
+SEEDS = (0, 1, 2)
 
 
 def none() -> Figure:
-    """What undefended victims keep, from the published records."""
-    made = style.figure(3.6, "none: undefended, little is left under attack")
-    driving, detection = made.subplots(1, 2, width_ratios=(1.35, 1))
-    bars = {victim: {attack: _published(victim, attack) for attack in ("none", "noise", "zo")} for victim in ("dqn", "ddpg")}
-    colours = {"none": style.BLUE, "noise": style.GREY, "zo": style.RED}
-    for number, attack in enumerate(colours):
-        heights = [100 * bars[victim][attack] for victim in bars]
-        drawn = driving.bar(np.arange(2) + (number - 1) * 0.27, heights, 0.25, color=colours[attack], label=attack)
-        driving.bar_label(drawn, fmt="%.0f", fontsize=9.5)
-    driving.set(xticks=(0, 1), xticklabels=list(bars), ylabel="safe progress, %", ylim=(0, 108))
-    driving.set_title("driving, linf 0.2", fontsize=10.5)
-    driving.legend(loc="upper right", fontsize=9.5, handlelength=1)
+    """How many decisions of the undefended DQN attacks change, and the confidence of YOLOv3-tiny under patches."""
+    made = style.figure(3.7, "none: small changes turn the undefended")
+    driving, detection = made.subplots(1, 2, width_ratios=(1.25, 1))
+    for attack, colour, dashes in (("pgd", style.RED, "-"), ("zo", style.ORANGE, "--"), ("noise", style.GREY, "-.")):
+        changed = [_changed(attack, "none", budget) for budget in BUDGETS]
+        driving.plot(
+            _percent(BUDGETS), _percent(changed), color=colour, ls=dashes, marker="o", ms=4, lw=2.2, label=attack
+        )
+    _changes(driving, "dqn")
+    driving.legend(loc="upper left", bbox_to_anchor=(0.35, 0.93), fontsize=10)
     pair = patched("eot")
-    confidence = {"none": pair.control["none"], "grey": pair.control["grey_patch"], "noise": pair.control["noise_patch"]}
-    confidence["eot"] = pair.measured
-    estimates = [100 * measured.confidence.estimate for measured in confidence.values()]
-    drawn = detection.bar(range(4), estimates, color=(style.BLUE, style.GREY, style.GREY, style.RED))
-    detection.bar_label(drawn, fmt="%.0f", fontsize=9.5)
-    detection.set(xticks=range(4), xticklabels=confidence, ylabel="confidence, %", ylim=(0, 108))
-    detection.set_title("yolov3_tiny, patches", fontsize=10.5)
+    measured = {
+        "none": pair.control["none"],
+        "grey": pair.control["grey_patch"],
+        "noise": pair.control["noise_patch"],
+        "eot": pair.measured,
+    }
+    confidence = [each.confidence.estimate for each in measured.values()]
+    colours = (style.BLUE, style.GREY, style.GREY, style.RED)
+    detection.bar_label(detection.bar(list(measured), confidence, color=colours), fmt="%.2f", fontsize=10)
+    detection.set(ylabel="confidence", xlabel="patch", ylim=(0, 1))
+    detection.set_title("yolov3_tiny", fontsize=10.5)
+    return made
+
+
+def advtrain() -> Figure:
+    """How many decisions PGD changes, undefended and hardened, and what the skip probability trades."""
+    made = style.figure(3.9, "advtrain: the hardened policy is harder to turn")
+    turned, traded = made.subplots(1, 2)
+    for defense, colour, dashes in (("none", style.UNDEFENDED, "-"), ("advtrain", style.HARDENED, "--")):
+        changed = [_changed("pgd", defense, budget) for budget in BUDGETS]
+        turned.plot(_percent(BUDGETS), _percent(changed), color=colour, ls=dashes, marker="o", ms=4, lw=2.2)
+    _changes(turned, "dqn under pgd")
+    turned.axvline(100 * TRAINED_AT, color=style.GREY, lw=1, ls=":")
+    turned.annotate("undefended", (7, 91), color=style.UNDEFENDED)
+    turned.annotate("hardened", (11.5, 45), color=style.HARDENED)
+    turned.annotate("budget of\nthe training", (10.3, 3), color=style.GREY, fontsize=9.5)
+    for score, colour in (("clean", style.BLUE), ("attacked", style.RED)):
+        means = {skip: [_card(skip, seed)[score] for seed in SEEDS] for skip in SKIPS}
+        known = [skip for skip in SKIPS if None not in means[skip]]
+        traded.plot(
+            known, [100 * np.mean(means[skip]) for skip in known], color=colour, marker="o", lw=2.2, label=score
+        )
+        for skip in known:
+            traded.plot([skip] * len(SEEDS), _percent(means[skip]), "_", color=colour, ms=9)
+    traded.set(xlabel="skip probability", ylabel="safe progress, %", ylim=(0, 103))
+    traded.set_title("hardened dqn, three seeds", fontsize=10.5)
+    traded.legend(loc="lower right", fontsize=10)
     return made
 
 
@@ -91,10 +94,29 @@ def advtrain_detection() -> Figure:
     return made
 
 
-def _published(victim: str, attack: str) -> float:
-    """Mean safe progress of an undefended victim on one road, of the published records."""
-    records = published("driving")
-    wanted = {"attack": attack, "defense": "none", "victim": victim, "lanes": 3, "density": 1.0, "weather": "clear"}
-    for name, value in wanted.items():
-        records = records.filter(pc.equal(records[name], value))
-    return float(pc.mean(records["safe_progress"]).as_py())
+def _changed(attack: str, defense: str, budget: float) -> float:
+    """Share of the moments of a real episode at which an attack changes the decision of the (defended) DQN."""
+    moments = torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"][::EVERY])
+    driver = policy("dqn", defense)
+    module = AttackModule(
+        choose("attack", attack).component, driver, ObservationThreat(budget=budget), FEATURES, seed=0
+    )
+    shown = module(TensorDict({"observation": moments}, batch_size=[len(moments)]))["perturbed"]
+    with torch.no_grad():
+        return float((driver.decide(shown) != driver.decide(moments)).float().mean())
+
+
+def _card(skip: str, seed: int) -> dict[str, float | None]:
+    """Safe progress on the seeds that chose the checkpoint of a hardened DQN, by `clean` and `attacked`."""
+    card = files("bench") / "victims" / "policies" / f"dqn-advtrain-pgd-skip{skip}" / f"seed{seed}.json"
+    scores = json.loads(card.read_text())["selection"]["safe_progress"]
+    return {name: scores[name]["mean"] if name in scores else None for name in ("clean", "attacked")}
+
+
+def _changes(axes: Axes, title: str) -> None:
+    axes.set(xlabel="budget, % of each value", ylabel="decisions changed, %", ylim=(0, 103))
+    axes.set_title(title, fontsize=10.5)
+
+
+def _percent(shares: object) -> np.ndarray:
+    return 100 * np.asarray(shares, dtype=np.float64)

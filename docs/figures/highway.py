@@ -26,7 +26,7 @@ def world() -> Figure:
     count = len(GRID.cells())
     made = style.figure(6.8, f"highway: {count} cells, {len(cells)} roads in {len(GRID.weather)} weathers")
     heights = [cell.lanes + 0.8 for cell in cells]
-    *roads, sensor = made.subplots(len(cells) + 1, 1, height_ratios=[*heights, 7])
+    *roads, sensor = made.subplots(len(cells) + 1, 1, height_ratios=[*heights, 8])
     for number, (axes, cell) in enumerate(zip(roads, cells, strict=True)):
         ego, *others = engine.vehicles[number]
         places = [(float(car["x"] - ego["x"]), float(car["y"])) for car in others]
@@ -38,10 +38,10 @@ def world() -> Figure:
     for number, name in enumerate(GRID.weather):
         weather = WEATHERS[name]
         sensor.barh(number, sensor_range_m(weather), color=style.SKY, height=0.85)
-        said = f"{name}: {sensor_range_m(weather):.0f} m, noise {noise_sigma(weather):.2g} m and m/s"
-        sensor.annotate(said, (2, number), va="center", fontsize=10, annotation_clip=False)
+        said = f"{name}: {sensor_range_m(weather):.0f} m, noise {noise_sigma(weather):.2g} m"
+        sensor.annotate(said, (2, number), va="center", fontsize=9.5)
     sensor.set(xlim=REACH, yticks=[], xlabel="m ahead")
     sensor.invert_yaxis()
     sensor.spines["left"].set_visible(False)
-    sensor.set_title("how far the ego sees, and its sensor's noise", fontsize=10)
+    sensor.set_title("how far the ego sees, and how noisily", fontsize=10)
     return made

@@ -1,4 +1,4 @@
-"""Patches for the figures: crafted once with the default settings, then kept in the user's cache."""
+"""Patches for the figures: crafted once, then kept in the user's cache."""
 
 from __future__ import annotations
 
@@ -17,10 +17,15 @@ SHARE = PatchThreat().budget
 """Side of a patch in shares of the sign's."""
 
 
-def patch_of(attack: str, defense: str = "none") -> Patch:
-    """The patch of patch seed 0 against the (defended) YOLOv3-tiny; crafting one with `eot` takes some minutes."""
+def patch_of(attack: str, defense: str = "none", **params: object) -> Patch:
+    """The patch of patch seed 0 against the (defended) YOLOv3-tiny; crafting one with `eot` takes some minutes.
+
+    Args:
+        attack, defense: names.
+        params: of the attack; the defaults of the others.
+    """
     pair = Pair(
-        attack=choose("attack", attack),
+        attack=choose("attack", attack, **params),
         defense=choose("defense", defense),
         victim=choose("victim", "yolov3_tiny"),
         world=choose("world", "camera"),
@@ -34,8 +39,8 @@ def patch_of(attack: str, defense: str = "none") -> Patch:
         return patches.read(KEPT, crafting.fingerprint)
 
 
-def texels_of(attack: str, defense: str = "none") -> Tensor:
+def texels_of(attack: str, defense: str = "none", **params: object) -> Tensor:
     """The texels [3, P, P] of `patch_of`."""
-    texels = patch_of(attack, defense).texels
+    texels = patch_of(attack, defense, **params).texels
     assert texels is not None
     return texels

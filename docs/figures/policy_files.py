@@ -41,7 +41,9 @@ def torch_file() -> Figure:
     """The zoo's DQN through `torch.export`."""
 
     def write(path: Path) -> Callable[[Tensor], Tensor]:
-        torch.export.save(torch.export.export(_Values(), (torch.rand(3, ROWS, FEATURES),), dynamic_shapes=_any_batch()), path)
+        torch.export.save(
+            torch.export.export(_Values(), (torch.rand(3, ROWS, FEATURES),), dynamic_shapes=_any_batch()), path
+        )
         return policy().scores
 
     return _figure("torch", "policy.pt2", write, "attacks may ask for scores and gradients")

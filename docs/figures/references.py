@@ -7,11 +7,14 @@ import json
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import torch
 from matplotlib.figure import Figure
 
 from bench.metrics import MAX_RETURN
+from bench.pair import choose
 from docs.figures import style
-from docs.figures.driving import episode
+from docs.figures.driving import episode, physical
+from envs.highway.dynamics import LANE_WIDTH
 from leaderboard.published import published
 
 STEPS_PER_SECOND, SECONDS = 15, 30
@@ -42,26 +45,22 @@ def blind() -> Figure:
 def random() -> Figure:
     """How long random drivers last."""
     records = _records("random")
-    made = style.figure(3.4, "")
-    axes = made.subplots()
-    lasted = {}
-    for actions, colour, style_ in (("discrete", style.ORANGE, "-"), ("continuous", style.BLUE, "--")):
-        chosen = records.filter(pc.equal(records["victim_params"], json.dumps({"actions": actions}, separators=(",", ":"))))
-        seconds = np.sort(chosen["steps"].to_numpy()) / STEPS_PER_SECOND
-        left = 100 * (1 - np.arange(len(seconds) + 1) / len(seconds))
-        over = seconds < SECONDS
-        times = np.concatenate(([0.0], seconds[over], [SECONDS]))
-        axes.step(times, np.append(left[: over.sum() + 1], left[over.sum()]), where="post", color=colour, ls=style_, lw=2.4)
-        lasted[actions] = float(np.median(seconds)), left[over.sum()]
-    axes.annotate("random lane changes and speeds", (12, 62), color=style.ORANGE, fontsize=11)
-    axes.annotate("random steering", (4.5, 4), color=style.BLUE, fontsize=11)
-    made.suptitle(
-        f"random: half are off after {lasted['discrete'][0]:.0f} s, or {lasted['continuous'][0]:.0f} s steering",
-        x=0.01,
-        ha="left",
-        fontsize=12.5,
-        fontweight="bold",
+    params = {actions: choose("victim", "random", actions=actions).params for actions in ("discrete", "continuous")}
+    lasted = {
+        name: records.filter(pc.equal(records["victim_params"], each))["steps"].to_numpy()
+        for name, each in params.items()
+    }
+    half = {actions: np.median(steps) / STEPS_PER_SECOND for actions, steps in lasted.items()}
+    made = style.figure(
+        3.4, f"random: half are off after {half['discrete']:.0f} s, or {half['continuous']:.0f} s steering"
     )
+    axes = made.subplots()
+    steps = np.arange(SECONDS * STEPS_PER_SECOND)
+    for actions, colour, dashes in (("discrete", style.ORANGE, "-"), ("continuous", style.BLUE, "--")):
+        left = (lasted[actions][:, None] > steps).mean(0)
+        axes.plot(steps / STEPS_PER_SECOND, 100 * left, color=colour, ls=dashes, lw=2.4)
+    axes.annotate("random lane changes and speeds", (12, 62), color=style.ORANGE)
+    axes.annotate("random steering", (4.5, 4), color=style.BLUE)
     axes.set(xlabel="time (s)", ylabel="still driving, %", xlim=(0, SECONDS), ylim=(-2, 103))
     axes.set_title(ROAD, fontsize=10)
     return made
@@ -77,11 +76,11 @@ def idm() -> Figure:
         seconds = np.arange(len(steps["speed"])) / STEPS_PER_SECOND
         label = f"{victim}: {columns['distance_m'][0]:.0f} m, safe progress {columns['safe_progress'][0]:.0%}"
         speed.plot(seconds, steps["speed"], color=colour, ls=dashes, lw=2.2, label=label)
-        # The ego's own row is absolute: y is in units of 20 m, and a lane is 4 m wide.
-        lane.plot(seconds, steps["observation"][:, 0, 2] * 20 / 4 + 1, color=colour, ls=dashes, lw=2.2)
+        across = physical(torch.tensor(steps["observation"]))[:, 0, 1]
+        lane.plot(seconds, across / LANE_WIDTH, color=colour, ls=dashes, lw=2.2)
     speed.set(ylabel="speed (m/s)", xlim=(0, SECONDS))
     speed.legend(loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=10.5)
-    lane.set(xlabel="time (s)", ylabel="lane", yticks=(1, 2, 3), ylim=(3.3, 0.7))
+    lane.set(xlabel="time (s)", ylabel="lane", yticks=(0, 1, 2), ylim=(2.3, -0.3))
     lane.set_yticklabels(("left", "middle", "right"))
     return made
 

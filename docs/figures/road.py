@@ -18,7 +18,9 @@ def lanes(axes: Axes, count: int, reach: tuple[float, float]) -> None:
     """The lines of a road, and an axis along it."""
     for line in range(count + 1):
         edge = line in (0, count)
-        axes.axhline((line - 0.5) * LANE_WIDTH, color=style.GREY, lw=1.2 if edge else 0.8, ls="-" if edge else (0, (6, 6)))
+        axes.axhline(
+            (line - 0.5) * LANE_WIDTH, color=style.GREY, lw=1.2 if edge else 0.8, ls="-" if edge else (0, (6, 6))
+        )
     axes.set(xlim=reach, ylim=((count - 0.5) * LANE_WIDTH + 0.6, -0.5 * LANE_WIDTH - 0.6), yticks=[])
     axes.spines[["left", "bottom"]].set_visible(False)
 

@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.approach import Sight, found_of, look
+from bench.approach import Sight, look
 from bench.pair import choose
 from bench.scenario import GRIDS, Cell
 from bench.stopping import THRESHOLD
@@ -76,12 +76,13 @@ def said(of: Detector, shown: Tensor, approach: Approach, frame: int) -> float:
     return float(confidence(predictions, of.index(STOP_SIGN), approach.scenes.boxes[frame : frame + 1]))
 
 
-def box(axes: Axes, corners: Tensor, text: str, colour: str) -> None:
-    """A box with a word above it."""
+def box(axes: Axes, corners: Tensor, text: str, colour: str, *, below: bool = False) -> None:
+    """A box with a word above or below it."""
     left, top, right, bottom = corners.tolist()
     axes.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, lw=1.8))
-    ground = {"facecolor": style.GROUND, "edgecolor": "none", "alpha": 0.85, "pad": 1}
-    axes.annotate(text, (left, top), (0, 2), textcoords="offset points", fontsize=9.5, color=style.INK, bbox=ground)
+    ground = {"facecolor": style.GROUND, "edgecolor": "none", "alpha": 0.7, "pad": 1}
+    place, away = ((left, bottom), (0, -10)) if below else ((left, top), (0, 2))
+    axes.annotate(text, place, away, textcoords="offset points", fontsize=9.5, bbox=ground)
 
 
 @cache
@@ -108,7 +109,9 @@ def frame_axes(axes: Axes) -> None:
     axes.axhline(THRESHOLD, color=style.GREY, lw=1, ls=":")
     axes.set(xlabel="m before the sign", ylabel="confidence", ylim=(-0.03, 1.03))
     axes.invert_xaxis()
-    axes.annotate("detected above", (0.995, THRESHOLD), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=9)
+    axes.annotate(
+        "detected above", (0.995, THRESHOLD), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=9
+    )
 
 
 def _frames(records: pa.Table, name: str) -> NDArray[np.float64]:

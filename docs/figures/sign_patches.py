@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 from docs.figures import style
 from docs.figures.patches import patch_of, texels_of
@@ -16,10 +16,13 @@ MOMENTS = 5
 
 def eot() -> Figure:
     """How the patch came about, the sign with it, and the confidence."""
-    made, (crafted, below) = _begun("eot", 6.2, (1, 3.6))
+    made, (crafted, below) = _begun("eot", 6.4, (1.15, 3.6))
     evolution = patch_of("eot").evolution
     assert evolution is not None
     chosen = torch.linspace(0, len(evolution.steps) - 1, MOMENTS).round().long()
+    crafted.suptitle(
+        "as it comes about: step of the crafting, and score of a stop sign", x=0.01, ha="left", fontsize=10
+    )
     for axes, place in zip(crafted.subplots(1, MOMENTS), chosen, strict=True):
         show(axes, evolution.texels[place] / 255)
         axes.set_title(f"step {int(evolution.steps[place])}: {float(evolution.losses['found'][place]):.2f}", fontsize=9)
@@ -41,21 +44,17 @@ def grey_patch() -> Figure:
     return made
 
 
-def _begun(attack: str, height: float, ratios: tuple[float, ...]):  # type: ignore[no-untyped-def]
+def _begun(attack: str, height: float, ratios: tuple[float, ...]) -> tuple[Figure, list[SubFigure]]:
     """A figure whose title says what the patch does, and its parts."""
     pair = patched(attack)
     before, after = pair.control["none"].confidence.estimate, pair.measured.confidence.estimate
     made = style.figure(height, f"{attack}: confidence {before:.2f} without, {after:.2f} with it")
-    parts = made.subfigures(len(ratios), 1, height_ratios=ratios, squeeze=False)[:, 0]
-    for part in parts:
-        part.set_facecolor(style.GROUND)
-    return made, parts
+    return made, list(made.subfigures(len(ratios), 1, height_ratios=ratios, squeeze=False)[:, 0])
 
 
-def _seen(part, attack: str) -> None:  # type: ignore[no-untyped-def]
+def _seen(part: SubFigure, attack: str) -> None:
+    """The patch, the sign without and with it, and the confidence."""
     pictures, curves = part.subfigures(2, 1, height_ratios=(1, 1.25))
-    for one in (pictures, curves):
-        one.set_facecolor(style.GROUND)
     approach, texels = approaches()[0], texels_of(attack)
     patch, *signs = pictures.subplots(1, 3)
     patch.imshow(texels.permute(1, 2, 0).numpy(), interpolation="nearest")

@@ -30,7 +30,7 @@ ACTIONS = {"LANE_LEFT": PURPLE, "IDLE": GREY, "LANE_RIGHT": ORANGE, "FASTER": RE
 
 WIDTH = 6.0
 """Of a figure in inches."""
-PNG_DPI, PNG_COLOURS = 130, 256
+PNG_DPI, PNG_COLOURS = 110, 128
 
 STYLE = {
     "svg.hashsalt": "cavbench",
