@@ -20,7 +20,8 @@ lint: install
 
 # The site, in docs/_build/html. A broken link, a page in no table of contents or an unknown component is an error.
 docs: install
-	$(BIN)/python -m sphinx -W --keep-going -q -E -d docs/_build/doctrees docs docs/_build/html
+	rm -rf docs/_build
+	$(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
 
 bench: install
 	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done

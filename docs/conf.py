@@ -11,7 +11,7 @@ author = "the authors of cavbench"
 version = release = metadata.version("cavbench")
 language = "en-GB"
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "cavbench_site"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "cavbench_site"]
 exclude_patterns = ["_build", "_ext"]
 
 myst_enable_extensions = ["dollarmath"]

@@ -1,4 +1,4 @@
-"""What the site adds to Sphinx: parameters read from the code, formulas as MathML, and the leaderboard's page."""
+"""What the site adds to Sphinx: parameters read from the code, formulas as MathML, docstrings, and the leaderboard's page."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx import addnodes
 from sphinx.application import Sphinx
+from sphinx.ext.napoleon import GoogleDocstring
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
@@ -80,10 +81,10 @@ def _formula(translator: Any, node: nodes.math | nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
-def _plain_attribute(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
-    """Keep napoleon from taking what stands before a colon in an attribute's first line for its type."""
-    if what in ("attribute", "data"):
-        lines.insert(0, "")
+def _google_style(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Read `Args:` and the like; of attributes napoleon would take all before a colon for a type, so they stay as they are."""
+    if what not in ("attribute", "data", "property"):
+        lines[:] = GoogleDocstring(lines, what=what, name=name, obj=obj, options=options).lines()
 
 
 def _link_leaderboard(app: Sphinx, doctree: nodes.document) -> None:
@@ -108,7 +109,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Called by Sphinx."""
     app.add_directive("component", ComponentDirective)
     app.add_html_math_renderer("mathml", inline_renderers=(_formula, None), block_renderers=(_formula, None))
-    app.connect("autodoc-process-docstring", _plain_attribute, priority=400)
+    app.connect("autodoc-process-docstring", _google_style)
     # Before Sphinx notes what is to be offered for download.
     app.connect("doctree-read", _link_leaderboard, priority=400)
     app.connect("build-finished", _copy_leaderboard)
