@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from bench.rollout import Columns, Trace
 from bench.threat import ObservationThreat
 from envs.highway.config import STANDARD_FEATURES as FEATURES
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 ROAD = "lanes=3 density=1 weather=clear seeds=0 reference=false"
 """The cell of the episodes that are shown."""

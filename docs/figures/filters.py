@@ -34,9 +34,11 @@ def _figure(defense: str, aware: Tensor) -> Figure:
         "patch crafted without the defence": sight(guarded, approach, unaware).confidence,
         "patch crafted against it": sight(guarded, approach, aware).confidence,
     }
-    _, found, again = (int((each > THRESHOLD).sum()) for each in seen.values())
-    frames = len(approach.scenes)
-    title = f"{defense}: with a patch the sign is found in {found} of {frames} frames,\nin {again} once the patch knows of it"
+    clean, found, again = (int((each > THRESHOLD).sum()) for each in seen.values())
+    title = (
+        f"{defense}: sign found in {clean} of {len(approach.scenes)} frames, with a patch in {found},\n"
+        f"with one that knows of the defence in {again}"
+    )
     made = style.figure(5.6, title)
     pictures, curves = made.subfigures(2, 1, height_ratios=(1, 1.35))
     for axes, (name, texels, filtered) in zip(

@@ -64,14 +64,13 @@ def advtrain() -> Figure:
     turned.annotate("undefended", (7, 91), color=style.UNDEFENDED)
     turned.annotate("hardened", (11.5, 45), color=style.HARDENED)
     turned.annotate("budget of\nthe training", (10.3, 3), color=style.GREY, fontsize=9.5)
+    cards = {skip: [_card(skip, seed) for seed in SEEDS] for skip in SKIPS}
     for score, colour in (("clean", style.BLUE), ("attacked", style.RED)):
-        means = {skip: [_card(skip, seed)[score] for seed in SEEDS] for skip in SKIPS}
-        known = [skip for skip in SKIPS if None not in means[skip]]
-        traded.plot(
-            known, [100 * np.mean(means[skip]) for skip in known], color=colour, marker="o", lw=2.2, label=score
-        )
-        for skip in known:
-            traded.plot([skip] * len(SEEDS), _percent(means[skip]), "_", color=colour, ms=9)
+        known = {skip: _percent([card[score] for card in cards[skip]]) for skip in SKIPS if score in cards[skip][0]}
+        means = [each.mean() for each in known.values()]
+        traded.plot(list(known), means, color=colour, marker="o", lw=2.2, label=score)
+        for skip, each in known.items():
+            traded.plot([skip] * len(each), each, "_", color=colour, ms=9)
     traded.set(xlabel="skip probability", ylabel="safe progress, %", ylim=(0, 103))
     traded.set_title("hardened dqn, three seeds", fontsize=10.5)
     traded.legend(loc="lower right", fontsize=10)
@@ -106,11 +105,11 @@ def _changed(attack: str, defense: str, budget: float) -> float:
         return float((driver.decide(shown) != driver.decide(moments)).float().mean())
 
 
-def _card(skip: str, seed: int) -> dict[str, float | None]:
+def _card(skip: str, seed: int) -> dict[str, float]:
     """Safe progress on the seeds that chose the checkpoint of a hardened DQN, by `clean` and `attacked`."""
     card = files("bench") / "victims" / "policies" / f"dqn-advtrain-pgd-skip{skip}" / f"seed{seed}.json"
     scores = json.loads(card.read_text())["selection"]["safe_progress"]
-    return {name: scores[name]["mean"] if name in scores else None for name in ("clean", "attacked")}
+    return {name: float(score["mean"]) for name, score in scores.items()}
 
 
 def _changes(axes: Axes, title: str) -> None:

@@ -23,7 +23,7 @@ from docs.figures.patches import SHARE
 from leaderboard.approaches import Patched, read_patched
 from leaderboard.published import published
 
-ROAD = {"lanes": 3, "density": 1.0}
+LANES, DENSITY = 3, 1.0
 FRAME = 6
 """Of an approach, from its beginning: some 15 m before the sign."""
 MARGIN = 1.1
@@ -33,7 +33,9 @@ MARGIN = 1.1
 @cache
 def approaches(weather: str = "clear") -> list[Approach]:
     """One approach a place."""
-    return choose("world", "camera").component.approaches(Cell(**ROAD, weather=weather), GRIDS["approach-v1"].seeds())
+    return choose("world", "camera").component.approaches(
+        Cell(lanes=LANES, density=DENSITY, weather=weather), GRIDS["approach-v1"].seeds()
+    )
 
 
 @cache
@@ -89,11 +91,14 @@ def box(axes: Axes, corners: Tensor, text: str, colour: str, *, below: bool = Fa
 def patched(attack: str, defense: str = "none") -> Patched:
     """The published approaches of the default attack in clear weather, with their controls."""
     records = published("detection").filter(pc.field("weather") == "clear")
-    names = {"attack": attack, "defense": defense}
-    default = {"attack_params": choose("attack", attack).params, "threat_budget": SHARE}
-    found = [pair for pair in read_patched(records) if (names | default).items() <= pair.identity.items()]
-    (pair,) = found
-    return pair
+    wanted: dict[str, object] = {
+        "attack": attack,
+        "attack_params": choose("attack", attack).params,
+        "defense": defense,
+        "threat_budget": SHARE,
+    }
+    (found,) = (pair for pair in read_patched(records) if wanted.items() <= pair.identity.items())
+    return found
 
 
 def curve(axes: Axes, records: pa.Table, colour: str, label: str, dashes: str = "-") -> None:
