@@ -1,11 +1,11 @@
-# make run: from nothing to the first score. make test, make lint: what CI runs. make bench: the speed figures.
+# make run: from nothing to the first score. make test, make lint, make docs: what CI runs. make bench: the speed figures.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 BROWSERS := chromium chromium-browser google-chrome
 STAMP := $(VENV)/installed
 
-.PHONY: run test lint bench install browser clean
+.PHONY: run test lint docs bench install browser clean
 
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
@@ -18,6 +18,11 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The site, in docs/_build/html. A broken link, a page in no table of contents or an unknown component is an error.
+docs: install
+	rm -rf docs/_build
+	$(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
+
 bench: install
 	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 
@@ -27,7 +32,7 @@ install: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,render]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,docs,render]'
 	touch $@
 
 # The browser that the tests of the leaderboard's page drive: one on the PATH, else Debian's (as root), else Playwright's own.
@@ -40,4 +45,4 @@ browser: install
 	$(BIN)/python -m playwright install chromium || echo "no browser: the tests of the page will be skipped"
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist docs/_build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

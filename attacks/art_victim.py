@@ -164,7 +164,7 @@ class Search:
                 self._running[place] = lead >= 0
 
 
-class Classifier(ClassGradientsMixin, ClassifierMixin, LossGradientsMixin, NeuralNetworkMixin, BaseEstimator):  # type: ignore[misc]
+class Classifier(ClassGradientsMixin, ClassifierMixin, LossGradientsMixin, NeuralNetworkMixin, BaseEstimator):
     """An estimator of ART's that answers what a search finds out.
 
     Its loss is the lead of the best other action over that of the label: Q-values are no logits, and a cross-entropy would

@@ -51,18 +51,17 @@ def heading(kind: Kind, name: str) -> Text:
 def _print_page(kind: Kind, name: str, console: Console) -> None:
     from bench.parameters import description, parameters
 
-    component = registry.declared(kind, name)
-    choices = {} if ":" in name else component.choices()
-    component = component if choices else registry.load(kind, name)
+    offered = registry.offers(kind, name)
+    component = registry.declared(kind, name) if offered else registry.load(kind, name)
     console.print(heading(kind, name))
     console.print()
     for paragraph in _paragraphs(description(component)):
         console.print(_with_code(paragraph), highlight=False)
         console.print()
-    if choices:
-        _print_choices(name, choices, console)
+    if offered:
+        _print_choices(name, offered, console)
         return
-    console.print(_fits(kind, component), highlight=False)
+    console.print(fits(kind, component), highlight=False)
     console.print()
     known = parameters(component)
     if not known:
@@ -73,10 +72,9 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
         table.add_column(column, no_wrap=True)
     table.add_column("meaning", ratio=1)
     for parameter in known.values():
-        choices = f"one of {', '.join(map(str, parameter.choices))}" if parameter.choices else ""
-        meaning = Text("\n").join(filter(None, [_with_code(parameter.meaning), Text(choices, style="dim")]))
-        default = "required" if parameter.required else _shown(parameter.default)
-        table.add_row(Text(f"{kind}.{parameter.name}", style="bold"), parameter.type_name, default, meaning)
+        meaning = Text("\n").join(filter(None, [_with_code(parameter.meaning), Text(parameter.allowed, style="dim")]))
+        written = Text(f"{kind}.{parameter.name}", style="bold")
+        table.add_row(written, parameter.type_name, parameter.default_text, meaning)
     console.print(table)
 
 
@@ -92,7 +90,7 @@ def _print_choices(name: str, choices: Mapping[str, str], console: Console) -> N
     )
 
 
-def _fits(kind: Kind, component: type[Any]) -> str:
+def fits(kind: Kind, component: type[Any]) -> str:
     """What decides where it fits: its track and, of an attack, what it needs, of a black box what it answers."""
     track = f"Track: {' and '.join(component.tracks())}."
     if kind == "victim" and component.answers != "gradients":
@@ -101,12 +99,6 @@ def _fits(kind: Kind, component: type[Any]) -> str:
         return track
     actions = f" and {' or '.join(component.action_types)} actions" if "driving" in component.tracks() else ""
     return f"{track} Needs access {component.access}{actions}."
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return str(value)
 
 
 def _paragraphs(text: str) -> list[str]:

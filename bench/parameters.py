@@ -37,6 +37,18 @@ class Parameter:
         return tuple(choice for hint in hints if get_origin(hint) is Literal for choice in get_args(hint))
 
     @property
+    def allowed(self) -> str:
+        """The choices in words; empty where there are none."""
+        return f"one of {', '.join(map(str, self.choices))}" if self.choices else ""
+
+    @property
+    def default_text(self) -> str:
+        """The default as it is shown, or that there is none."""
+        if self.required:
+            return "required"
+        return str(self.default).lower() if isinstance(self.default, bool) else str(self.default)
+
+    @property
     def type_name(self) -> str:
         """The type as an author writes it."""
         if self.choices:

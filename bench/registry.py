@@ -147,6 +147,11 @@ def declared(kind: Kind, name: str) -> type[Any]:
     return known
 
 
+def offers(kind: Kind, name: str) -> dict[str, str]:
+    """What can be said after the name of an adapter, and a word on each; empty for what is a component itself."""
+    return {} if ":" in name else dict(declared(kind, name).choices())
+
+
 def load(kind: Kind, name: str) -> type[Any]:
     """The class of a component; of an adapter's, NAME:CHOICE.
 

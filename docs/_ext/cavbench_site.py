@@ -1,0 +1,121 @@
+"""What the site adds to Sphinx: parameters read from the code, formulas as MathML, docstrings, and the leaderboard's page."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any, get_args
+
+from docutils import nodes
+from docutils.utils.math import MathError
+from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.ext.napoleon import GoogleDocstring
+from sphinx.util import logging
+from sphinx.util.docutils import SphinxDirective
+
+from bench import registry
+from bench.cli_list import fits
+from bench.errors import UserError
+from bench.parameters import parameters
+from bench.registry import GROUPS, Kind
+
+LEADERBOARD = ("leaderboard/index.html", "leaderboard/index.json", "leaderboard/index.csv")
+"""Files of the repository that the site holds at the same place."""
+
+logger = logging.getLogger(__name__)
+
+
+class ComponentDirective(SphinxDirective):
+    """What `bench list NAME` says of a component: where it is, what ships it, what it fits, its parameters.
+
+    Its argument is the kind of component, its content the command line. So it tells a reader of the plain Markdown what to type.
+    """
+
+    required_arguments = 1
+    has_content = True
+
+    def run(self) -> list[nodes.Node]:
+        (kind,), name = self.arguments, " ".join(self.content).removeprefix("bench list ")
+        if kind not in get_args(Kind):
+            raise self.error(f"unknown kind of component {kind!r}; known: {', '.join(get_args(Kind))}")
+        try:
+            text = described(kind, name)
+        except UserError as error:
+            raise self.error(str(error)) from error
+        found = self.parse_text_to_nodes(text)
+        for table in (node for node in found if isinstance(node, nodes.table)):
+            table["classes"].append("parameters")
+        return found
+
+
+def described(kind: Kind, name: str) -> str:
+    """A component in Markdown: a paragraph and a table of its parameters, or of what an adapter offers.
+
+    Raises:
+        UserError: if there is no such component, or if its plug-in is broken.
+    """
+    entry = registry.find(GROUPS[kind], name, kind)
+    shipped = f"`{entry.target}`, {entry.shipped_by}."
+    if offered := registry.offers(kind, name):
+        rows = [f"| `{name}:{choice}` | {word} |" for choice, word in offered.items()]
+        return "\n".join((shipped, "", "| name | |", "|---|---|", *rows))
+    component = registry.load(kind, name)
+    known = parameters(component).values()
+    lines = [f"{shipped} {fits(kind, component)}"]
+    if not known:
+        return f"{lines[0]} It has no parameters."
+    lines += ["", "| parameter | type | default | meaning |", "|---|---|---|---|"]
+    for parameter in known:
+        meaning = "; ".join(filter(None, (parameter.meaning.rstrip("."), parameter.allowed)))
+        cells = (f"`{kind}.{parameter.name}`", parameter.type_name, parameter.default_text, meaning)
+        lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
+    return "\n".join(lines)
+
+
+def _formula(translator: Any, node: nodes.math | nodes.math_block) -> None:
+    """Write a formula as MathML, which browsers draw by themselves; one that cannot be read is a warning."""
+    block = isinstance(node, nodes.math_block)
+    try:
+        mathml = tex2mathml(node.astext(), as_block=block)
+    except MathError as error:
+        logger.warning("the formula %r cannot be read: %s", node.astext(), error, location=node)
+        raise nodes.SkipNode from error
+    translator.body.append(f'<div class="math">{mathml}</div>\n' if block else mathml)
+    raise nodes.SkipNode
+
+
+def _google_style(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Read `Args:` and the like; of attributes napoleon would take all before a colon for a type, so they stay as they are."""
+    if what not in ("attribute", "data", "property"):
+        lines[:] = GoogleDocstring(lines, what=what, name=name, obj=obj, options=options).lines()
+
+
+def _link_leaderboard(app: Sphinx, doctree: nodes.document) -> None:
+    """A link to a file of the leaderboard opens the site's own copy; it would be offered for download otherwise."""
+    up = "../" * app.env.docname.count("/")
+    for link in list(doctree.findall(addnodes.download_reference)):
+        target = link["reftarget"].lstrip("./")
+        if target in LEADERBOARD:
+            link.replace_self(nodes.reference("", "", *link.children, refuri=up + target, internal=True))
+
+
+def _copy_leaderboard(app: Sphinx, failure: Exception | None) -> None:
+    for name in LEADERBOARD if failure is None else ():
+        source, target = app.srcdir.parent / name, Path(app.outdir) / name
+        # Where it is missing, the pages that link it say so.
+        if source.exists():
+            target.parent.mkdir(exist_ok=True)
+            shutil.copyfile(source, target)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Called by Sphinx."""
+    app.add_directive("component", ComponentDirective)
+    app.add_html_math_renderer("mathml", inline_renderers=(_formula, None), block_renderers=(_formula, None))
+    app.connect("autodoc-process-docstring", _google_style)
+    # Before Sphinx notes what is to be offered for download.
+    app.connect("doctree-read", _link_leaderboard, priority=400)
+    app.connect("build-finished", _copy_leaderboard)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,34 @@
+"""How the site of the documentation is built: `make docs`."""
+
+import sys
+from importlib import metadata
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+
+project = "cavbench"
+author = "the authors of cavbench"
+version = release = metadata.version("cavbench")
+language = "en-GB"
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "cavbench_site"]
+exclude_patterns = ["_build", "_ext"]
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+
+autodoc_member_order = "bysource"
+autodoc_inherit_docstrings = False
+# Docstrings set names apart by `single backticks`.
+default_role = "code"
+
+html_theme = "furo"
+html_title = "cavbench"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sourcelink = False
+html_copy_source = False
+html_show_sphinx = False
+html_show_copyright = False
+html_math_renderer = "mathml"
+highlight_language = "none"

@@ -1,0 +1,70 @@
+"""`python -m docs.figures [NAME...] [--out FOLDER]`: make figures, all of them without a name."""
+
+from __future__ import annotations
+
+import argparse
+from importlib import import_module
+from pathlib import Path
+
+from bench.process import settle
+
+FIGURES = {
+    "attack_none.svg": "attacks:none",
+    "attack_noise.svg": "attacks:noise",
+    "attack_zo.svg": "attacks:zo",
+    "attack_pgd.svg": "attacks:pgd",
+    "attack_art.svg": "attacks:art",
+    "attack_eot.png": "sign_patches:eot",
+    "attack_noise_patch.png": "sign_patches:noise_patch",
+    "attack_grey_patch.png": "sign_patches:grey_patch",
+    "defense_none.svg": "hardening:none",
+    "defense_advtrain.svg": "hardening:advtrain",
+    "defense_advtrain_detection.svg": "hardening:advtrain_detection",
+    "defense_median.png": "filters:median",
+    "defense_jpeg.png": "filters:jpeg",
+    "victim_dqn.svg": "decisions:dqn",
+    "victim_ddpg.svg": "decisions:ddpg",
+    "victim_blind.svg": "references:blind",
+    "victim_random.svg": "references:random",
+    "victim_idm.svg": "references:idm",
+    "victim_sb3.svg": "policy_files:sb3_file",
+    "victim_torch.svg": "policy_files:torch_file",
+    "victim_onnx.svg": "policy_files:onnx_file",
+    "victim_yolov3_tiny.png": "detectors:yolov3_tiny",
+    "victim_yolov5.png": "detectors:yolov5",
+    "world_highway.svg": "highway:world",
+    "world_camera.png": "camera:world",
+}
+"""The module and the function that makes each file."""
+FOLDER = Path(__file__).parents[1] / "images"
+
+
+def make(file: str, folder: Path) -> Path:
+    """Make one figure and return its file."""
+    from docs.figures.style import save
+
+    module, function = FIGURES[file].split(":")
+    path = folder / file
+    save(getattr(import_module(f"docs.figures.{module}"), function)(), path)
+    return path
+
+
+def main() -> None:
+    """Make what the command line names."""
+    names = {Path(file).stem: file for file in FIGURES}
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.figures", description="Make the figures of the documentation."
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}; none makes all")
+    parser.add_argument("--out", type=Path, default=FOLDER, help="folder to write to")
+    words = parser.parse_args()
+    if unknown := set(words.names) - set(names):
+        parser.error(f"no figure {', '.join(sorted(unknown))}")
+    settle()
+    words.out.mkdir(parents=True, exist_ok=True)
+    for name in words.names or names:
+        print(make(names[name], words.out))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""Input transformations before the detector: what they leave of a patch, and what it still does."""
+
+from __future__ import annotations
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from bench.stopping import THRESHOLD
+from defenses.smoothing import Guarded
+from docs.figures import style
+from docs.figures.patches import texels_of
+from docs.figures.sightings import FRAME, approaches, crop, detector, frame_axes, picture, show, sight
+
+
+def median() -> Figure:
+    """The median of each neighbourhood."""
+    return _figure("median", texels_of("eot", "median"))
+
+
+def jpeg() -> Figure:
+    """JPEG's compression; 40 steps of the crafting instead of 150 are enough against it."""
+    return _figure("jpeg", texels_of("eot", "jpeg", steps=40))
+
+
+def _figure(defense: str, aware: Tensor) -> Figure:
+    """The sign and the confidence with a patch that was crafted without the defence, and with `aware`, crafted against it."""
+    guarded = detector(defense=defense)
+    assert isinstance(guarded, Guarded)
+    unaware = texels_of("eot")
+    approach = approaches()[0]
+    seen = {
+        "no patch": sight(guarded, approach).confidence,
+        "patch crafted without the defence": sight(guarded, approach, unaware).confidence,
+        "patch crafted against it": sight(guarded, approach, aware).confidence,
+    }
+    clean, found, again = (int((each > THRESHOLD).sum()) for each in seen.values())
+    title = (
+        f"{defense}: sign found in {clean} of {len(approach.scenes)} frames, with a patch in {found},\n"
+        f"with one that knows of the defence in {again}"
+    )
+    made = style.figure(5.6, title)
+    pictures, curves = made.subfigures(2, 1, height_ratios=(1, 1.35))
+    for axes, (name, texels, filtered) in zip(
+        pictures.subplots(1, 3),
+        (("before", unaware, False), (f"after {defense}", unaware, True), ("a patch that knows of it", aware, True)),
+        strict=True,
+    ):
+        shown = picture(approach, FRAME, texels)
+        with torch.no_grad():
+            shown = guarded.transform(shown[None])[0] if filtered else shown
+        show(axes, crop(shown, approach, FRAME))
+        axes.set_title(name, fontsize=10)
+    axes = curves.subplots()
+    distance = approach.scenes.distance.numpy()
+    looks = ((style.BLUE, "-"), (style.GREEN, "-."), (style.RED, "--"))
+    for (name, each), (colour, dashes) in zip(seen.items(), looks, strict=True):
+        axes.plot(distance, each, color=colour, ls=dashes, lw=2.2, marker="o", ms=4, label=name)
+    frame_axes(axes)
+    axes.set_title("yolov3_tiny on one approach in clear weather", fontsize=10)
+    curves.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9.5)
+    return made

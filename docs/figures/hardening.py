@@ -1,0 +1,121 @@
+"""What an attack leaves of a victim, undefended and hardened by adversarial training."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from tensordict import TensorDict
+
+from bench.pair import choose
+from bench.pipeline import AttackModule
+from bench.threat import ObservationThreat
+from docs.figures import style
+from docs.figures.driving import FEATURES, episode, policy
+from docs.figures.sightings import curve, frame_axes, patched
+
+BUDGETS = (0.01, 0.025, 0.05, 0.1, 0.15, 0.2)
+TRAINED_AT = 0.1
+EVERY = 5
+"""Every how many steps of the episode a moment is attacked."""
+SKIPS = ("0", "0.3", "0.5", "1")
+SEEDS = (0, 1, 2)
+
+
+def none() -> Figure:
+    """How many decisions of the undefended DQN attacks change, and the confidence of YOLOv3-tiny under patches."""
+    made = style.figure(3.7, "none: small changes turn the undefended")
+    driving, detection = made.subplots(1, 2, width_ratios=(1.25, 1))
+    for attack, colour, dashes in (("pgd", style.RED, "-"), ("zo", style.ORANGE, "--"), ("noise", style.GREY, "-.")):
+        changed = [_changed(attack, "none", budget) for budget in BUDGETS]
+        driving.plot(
+            _percent(BUDGETS), _percent(changed), color=colour, ls=dashes, marker="o", ms=4, lw=2.2, label=attack
+        )
+    _changes(driving, "dqn")
+    driving.legend(loc="upper left", bbox_to_anchor=(0.35, 0.93), fontsize=10)
+    pair = patched("eot")
+    measured = {
+        "none": pair.control["none"],
+        "grey": pair.control["grey_patch"],
+        "noise": pair.control["noise_patch"],
+        "eot": pair.measured,
+    }
+    confidence = [each.confidence.estimate for each in measured.values()]
+    colours = (style.BLUE, style.GREY, style.GREY, style.RED)
+    detection.bar_label(detection.bar(list(measured), confidence, color=colours), fmt="%.2f", fontsize=10)
+    detection.set(ylabel="confidence", xlabel="patch", ylim=(0, 1))
+    detection.set_title("yolov3_tiny", fontsize=10.5)
+    return made
+
+
+def advtrain() -> Figure:
+    """How many decisions PGD changes, undefended and hardened, and what the skip probability trades."""
+    made = style.figure(3.9, "advtrain: the hardened policy is harder to turn")
+    turned, traded = made.subplots(1, 2)
+    for defense, colour, dashes in (("none", style.UNDEFENDED, "-"), ("advtrain", style.HARDENED, "--")):
+        changed = [_changed("pgd", defense, budget) for budget in BUDGETS]
+        turned.plot(_percent(BUDGETS), _percent(changed), color=colour, ls=dashes, marker="o", ms=4, lw=2.2)
+    _changes(turned, "dqn under pgd")
+    turned.axvline(100 * TRAINED_AT, color=style.GREY, lw=1, ls=":")
+    turned.annotate("undefended", (7, 91), color=style.UNDEFENDED)
+    turned.annotate("hardened", (11.5, 45), color=style.HARDENED)
+    turned.annotate("budget of\nthe training", (10.3, 3), color=style.GREY, fontsize=9.5)
+    cards = {skip: [_card(skip, seed) for seed in SEEDS] for skip in SKIPS}
+    for score, colour in (("clean", style.BLUE), ("attacked", style.RED)):
+        known = {skip: _percent([card[score] for card in cards[skip]]) for skip in SKIPS if score in cards[skip][0]}
+        means = [each.mean() for each in known.values()]
+        traded.plot(list(known), means, color=colour, marker="o", lw=2.2, label=score)
+        for skip, each in known.items():
+            traded.plot([skip] * len(each), each, "_", color=colour, ms=9)
+    traded.set(xlabel="skip probability", ylabel="safe progress, %", ylim=(0, 103))
+    traded.set_title("hardened dqn, three seeds", fontsize=10.5)
+    traded.legend(loc="lower right", fontsize=10)
+    return made
+
+
+def advtrain_detection() -> Figure:
+    """Confidence on the way to the sign, undefended and hardened, from the published records."""
+    pairs = {"undefended": patched("eot"), "hardened": patched("eot", "advtrain_detection")}
+    left = {name: pair.measured.confidence.estimate for name, pair in pairs.items()}
+    title = f"advtrain: confidence under eot {left['undefended']:.2f} undefended,\n{left['hardened']:.2f} hardened"
+    made = style.figure(4.0, title)
+    for axes, (name, pair) in zip(made.subplots(1, 2, sharey=True), pairs.items(), strict=True):
+        curve(axes, pair.controls["none"].table, style.BLUE, "no patch")
+        curve(axes, pair.own.table, style.RED, "eot", "--")
+        frame_axes(axes)
+        axes.set_title(f"yolov3_tiny, {name}", fontsize=10.5)
+    made.axes[1].set_ylabel("")
+    made.legend(*made.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return made
+
+
+def _changed(attack: str, defense: str, budget: float) -> float:
+    """Share of the moments of a real episode at which an attack changes the decision of the (defended) DQN."""
+    moments = torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"][::EVERY])
+    driver = policy("dqn", defense)
+    module = AttackModule(
+        choose("attack", attack).component, driver, ObservationThreat(budget=budget), FEATURES, seed=0
+    )
+    shown = module(TensorDict({"observation": moments}, batch_size=[len(moments)]))["perturbed"]
+    with torch.no_grad():
+        return float((driver.decide(shown) != driver.decide(moments)).float().mean())
+
+
+def _card(skip: str, seed: int) -> dict[str, float]:
+    """Safe progress on the seeds that chose the checkpoint of a hardened DQN, by `clean` and `attacked`."""
+    card = files("bench") / "victims" / "policies" / f"dqn-advtrain-pgd-skip{skip}" / f"seed{seed}.json"
+    scores = json.loads(card.read_text())["selection"]["safe_progress"]
+    return {name: float(score["mean"]) for name, score in scores.items()}
+
+
+def _changes(axes: Axes, title: str) -> None:
+    axes.set(xlabel="budget, % of each value", ylabel="decisions changed, %", ylim=(0, 103))
+    axes.set_title(title, fontsize=10.5)
+
+
+def _percent(shares: object) -> np.ndarray:
+    return 100 * np.asarray(shares, dtype=np.float64)

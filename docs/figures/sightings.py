@@ -1,0 +1,124 @@
+"""What detectors see on real approaches: frames, crops of the sign, and confidence on the way to it."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import torch
+from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bench.approach import Sight, look
+from bench.pair import choose
+from bench.scenario import GRIDS, Cell
+from bench.stopping import THRESHOLD
+from bench.vision import STOP_SIGN, Approach, Detector, confidence
+from docs.figures import style
+from docs.figures.patches import SHARE
+from leaderboard.approaches import Patched, read_patched
+from leaderboard.published import published
+
+LANES, DENSITY = 3, 1.0
+FRAME = 6
+"""Of an approach, from its beginning: some 15 m before the sign."""
+MARGIN = 1.1
+"""Around the sign in a crop, in shares of its width."""
+
+
+@cache
+def approaches(weather: str = "clear") -> list[Approach]:
+    """One approach a place."""
+    return choose("world", "camera").component.approaches(
+        Cell(lanes=LANES, density=DENSITY, weather=weather), GRIDS["approach-v1"].seeds()
+    )
+
+
+@cache
+def detector(victim: str = "yolov3_tiny", defense: str = "none") -> Detector:
+    """The (defended) detector."""
+    return choose("defense", defense).component.load(choose("victim", victim).component, 0)
+
+
+def sight(of: Detector, approach: Approach, texels: Tensor | None = None) -> Sight:
+    """What a detector says of an approach, with a patch on the sign or without."""
+    with torch.no_grad():
+        return look(of, approach.scenes, texels, SHARE)
+
+
+def picture(approach: Approach, frame: int, texels: Tensor | None = None) -> Tensor:
+    """[3, H, W] one frame, with a patch on the sign or without."""
+    patches = None if texels is None else texels[None]
+    with torch.no_grad():
+        return approach.scenes.render(torch.tensor([frame]), patches, SHARE)[0]
+
+
+def show(axes: Axes, shown: Tensor) -> None:
+    """A picture [3, H, W], without an axis."""
+    axes.imshow(shown.clamp(0, 1).permute(1, 2, 0).numpy(), interpolation="lanczos")
+    style.bare(axes)
+
+
+def crop(shown: Tensor, approach: Approach, frame: int) -> Tensor:
+    """The part of a picture around the sign."""
+    left, top, right, bottom = approach.scenes.boxes[frame].tolist()
+    around = MARGIN * (right - left) / 2
+    x, y = (round(max(0, low - around)) for low in (left, top))
+    return shown[:, y : round(bottom + around), x : round(right + around)]
+
+
+def said(of: Detector, shown: Tensor, approach: Approach, frame: int) -> float:
+    """Confidence in the sign of one picture."""
+    with torch.no_grad():
+        predictions = of(shown[None])
+    return float(confidence(predictions, of.index(STOP_SIGN), approach.scenes.boxes[frame : frame + 1]))
+
+
+def box(axes: Axes, corners: Tensor, text: str, colour: str, *, below: bool = False) -> None:
+    """A box with a word above or below it."""
+    left, top, right, bottom = corners.tolist()
+    axes.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, lw=1.8))
+    ground = {"facecolor": style.GROUND, "edgecolor": "none", "alpha": 0.7, "pad": 1}
+    place, away = ((left, bottom), (0, -10)) if below else ((left, top), (0, 2))
+    axes.annotate(text, place, away, textcoords="offset points", fontsize=9.5, bbox=ground)
+
+
+@cache
+def patched(attack: str, defense: str = "none") -> Patched:
+    """The published approaches of the default attack in clear weather, with their controls."""
+    records = published("detection").filter(pc.field("weather") == "clear")
+    wanted: dict[str, object] = {
+        "attack": attack,
+        "attack_params": choose("attack", attack).params,
+        "defense": defense,
+        "threat_budget": SHARE,
+    }
+    (found,) = (pair for pair in read_patched(records) if wanted.items() <= pair.identity.items())
+    return found
+
+
+def curve(axes: Axes, records: pa.Table, colour: str, label: str, dashes: str = "-") -> None:
+    """The median confidence of approaches on the way to the sign, and where eight of ten lie."""
+    distance, seen = (_frames(records, name) for name in ("frame_distance_m", "frame_confidence"))
+    low, middle, high = np.quantile(seen, (0.1, 0.5, 0.9), axis=0)
+    axes.fill_between(distance[0], low, high, color=colour, alpha=0.18, lw=0)
+    axes.plot(distance[0], middle, color=colour, ls=dashes, lw=2.2, marker="o", ms=4, label=label)
+
+
+def frame_axes(axes: Axes) -> None:
+    """Confidence over the way to the sign."""
+    axes.axhline(THRESHOLD, color=style.GREY, lw=1, ls=":")
+    axes.set(xlabel="m before the sign", ylabel="confidence", ylim=(-0.03, 1.03))
+    axes.invert_xaxis()
+    axes.annotate(
+        "detected above", (0.995, THRESHOLD), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=9
+    )
+
+
+def _frames(records: pa.Table, name: str) -> NDArray[np.float64]:
+    """[approaches, frames] of a column of lists."""
+    return np.array(records[name].to_pylist(), dtype=np.float64)

@@ -1,0 +1,85 @@
+"""How all figures look: light ground, colours that the colour-blind tell apart, letters that are legible at 360 pixels."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image
+
+# Okabe and Ito's colours.
+BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW = (
+    "#0072b2",
+    "#e69f00",
+    "#009e73",
+    "#d55e00",
+    "#cc79a7",
+    "#56b4e9",
+    "#f0e442",
+)
+INK, GREY, FAINT, GROUND = "#222222", "#767676", "#d9d9d4", "#fcfcfa"
+
+TRUE, SHOWN = BLUE, RED
+"""Of what was measured, and of what an attack makes of it."""
+UNDEFENDED, HARDENED = RED, GREEN
+ACTIONS = {"LANE_LEFT": PURPLE, "IDLE": GREY, "LANE_RIGHT": ORANGE, "FASTER": RED, "SLOWER": BLUE}
+"""By the name in `envs.highway.config.ACTIONS`, in its order."""
+
+WIDTH = 6.0
+"""Of a figure in inches."""
+PNG_DPI, PNG_COLOURS = 110, 128
+
+STYLE = {
+    "svg.hashsalt": "cavbench",
+    "svg.fonttype": "path",
+    "font.family": "DejaVu Sans",
+    "font.size": 11,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 11,
+    "xtick.labelsize": 10,
+    "ytick.labelsize": 10,
+    "legend.fontsize": 10,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GREY,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "figure.facecolor": GROUND,
+    "axes.facecolor": GROUND,
+    "savefig.facecolor": GROUND,
+}
+
+
+def figure(height: float, title: str) -> Figure:
+    """An empty figure, `height` inches high, whose title says what it shows."""
+    made = Figure(figsize=(WIDTH, height), layout="constrained")
+    made.suptitle(title, x=0.01, ha="left", fontsize=12.5, fontweight="bold")
+    return made
+
+
+def bare(axes: Axes) -> None:
+    """Take ticks and frame away."""
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+
+
+def save(made: Figure, path: Path) -> None:
+    """Write a figure as SVG or PNG, the same bytes every time."""
+    if path.suffix == ".svg":
+        made.savefig(path, metadata={"Date": None, "Creator": None})
+        return
+    drawn = io.BytesIO()
+    made.savefig(drawn, format="png", dpi=PNG_DPI)
+    Image.open(drawn).convert("RGB").quantize(PNG_COLOURS).save(path, optimize=True)
+
+
+mpl.rcParams.update(STYLE)

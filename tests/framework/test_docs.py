@@ -1,0 +1,73 @@
+"""Every built-in component has a page with a formula, a figure and its parameters; the site says what the code says."""
+
+from __future__ import annotations
+
+import re
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from bench.registry import GROUPS, KINDS, Kind, entries
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+FOLDERS: dict[Kind, str] = {"attack": "attacks", "defense": "defenses", "victim": "victims", "world": "worlds"}
+BUILT_IN = [
+    (kind, name)
+    for kind in KINDS
+    for name, claims in entries(GROUPS[kind]).items()
+    if claims[0].distribution == "cavbench"
+]
+
+
+@pytest.mark.parametrize(("kind", "name"), BUILT_IN)
+def test_a_component_has_a_page_of_its_own(kind: Kind, name: str) -> None:
+    page = f"{FOLDERS[kind]}/{name}"
+    text = (DOCS / f"{page}.md").read_text()
+    assert text.startswith(f"# `{name}`")
+    assert re.search(r"^\$\$ .+ \$\$$", text, re.MULTILINE), "no formula"
+    assert f"```{{component}} {kind}\nbench list {name}\n```" in text
+    figure = re.search(rf"!\[.+\]\(\.\./images/({kind}_{name}\.(?:svg|png))\)", text)
+    assert figure, "no figure"
+    assert (DOCS / "images" / figure[1]).is_file()
+    assert re.search(rf"^{name} <{page}>$", (DOCS / "index.md").read_text(), re.MULTILINE), (
+        "not in the table of contents"
+    )
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
+def test_what_is_outside_of_the_site_links_what_is_there(name: str) -> None:
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / name).read_text())
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+@pytest.mark.slow
+def test_the_site_reads_the_code_and_refuses_what_it_does_not_know(tmp_path: Path) -> None:
+    from sphinx.application import Sphinx
+
+    source, built = tmp_path / "docs", tmp_path / "built"
+    source.mkdir()
+    (source / "index.md").write_text(
+        "# Page\n\n$$ \\frac{a}{b} $$\n\n$\\nosuchcommand$\n\n[ranking](../leaderboard/index.html)\n\n"
+        "```{component} attack\nbench list noise\n```\n\n```{component} attack\nbench list nois\n```\n"
+    )
+    (tmp_path / "leaderboard").mkdir()
+    (tmp_path / "leaderboard" / "index.html").write_text("<p>ranks</p>")
+    (warned := tmp_path / "warned").touch()
+    with warned.open("w") as warning:
+        app = Sphinx(source, DOCS, built, tmp_path / "doctrees", "html", status=None, warning=warning)
+        app.build()
+    page = (built / "index.html").read_text()
+    assert re.search(r"<mfrac>\s*<mi>a</mi>\s*<mi>b</mi>", page)
+    assert f"cavbench {metadata.version('cavbench')}" in page
+    row = re.search(r"attack\.distribution.*?</tr>", page, re.DOTALL)
+    assert row
+    assert "<p>uniform</p>" in row[0]
+    assert "one of uniform, gaussian" in row[0]
+    assert 'href="leaderboard/index.html"' in page
+    assert (built / "leaderboard" / "index.html").read_text() == "<p>ranks</p>"
+    complaints = warned.read_text()
+    assert "unknown attack 'nois'; did you mean 'noise'?" in complaints
+    assert r'Unknown LaTeX command "\nosuchcommand"' in complaints

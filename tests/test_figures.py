@@ -1,0 +1,32 @@
+"""The figures of the documentation: a command makes them, and makes the same ones again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("matplotlib")
+
+from docs.figures.__main__ import FIGURES, FOLDER, make
+
+LARGEST, ALL = 150_000, 2_000_000
+"""Bytes of one figure, and of all."""
+
+
+@pytest.mark.parametrize("file", ["victim_blind.svg", "victim_dqn.svg"])
+def test_a_figure_is_made_the_same_again(file: str, tmp_path: Path) -> None:
+    first = make(file, tmp_path).read_bytes()
+    assert make(file, tmp_path).read_bytes() == first
+
+
+def test_a_figure_of_published_records_is_the_one_that_ships(tmp_path: Path) -> None:
+    """Nothing in it is computed by a network, so it does not depend on the machine."""
+    assert make("victim_blind.svg", tmp_path).read_bytes() == (FOLDER / "victim_blind.svg").read_bytes()
+
+
+def test_every_figure_is_there_and_small() -> None:
+    sizes = [(FOLDER / file).stat().st_size for file in FIGURES]
+    assert min(sizes) > 0
+    assert max(sizes) < LARGEST
+    assert sum(sizes) < ALL
