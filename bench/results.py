@@ -282,6 +282,7 @@ def _read_compact(out: Path, paths: list[Path], track: Track, measurements: Coll
         connection.sql("set preserve_insertion_order = false")
         units = connection.sql(f"select unit, {once}, {lists} from records group by unit").to_arrow_table()
         alone = units.select(["unit", *shared]).append_column("row", pa.array(range(units.num_rows)))
+        connection.register("alone", alone)
         newest = connection.sql(f"select row from alone {_NEWEST_UNITS} {_UNIT_ORDER}").to_arrow_table()
     units = units.take(newest["row"]).combine_chunks()
     rows = np.repeat(np.arange(units.num_rows), pc.list_value_length(units["seed"]).to_numpy())
