@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress, product
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -50,8 +52,8 @@ class Episodes:
         """
         if not records.num_rows:
             raise ValueError("no records to measure")
-        runs, run = np.unique(_numbers(records["training_seed"]), return_inverse=True)
-        seeds, seed = np.unique(_numbers(records["seed"]), return_inverse=True)
+        runs, run = _distinct(records["training_seed"])
+        seeds, seed = _distinct(records["seed"])
         cells, cell = _cells(records)
         place = np.full((len(runs), len(cells), len(seeds)), -1)
         place[run, cell, seed] = np.arange(records.num_rows)
@@ -68,9 +70,9 @@ class Episodes:
         whole = len(rows) == records.num_rows and bool((rows[1:] > rows[:-1]).all())
         return Episodes(
             table=records if whole else records.take(pa.array(rows)),
-            runs=tuple(runs.tolist()),
+            runs=tuple(runs),
             cells=tuple(one for one, kept in zip(cells, every_run, strict=True) if kept),
-            seeds=tuple(seeds[every_cell].tolist()),
+            seeds=tuple(seed for seed, kept in zip(seeds, every_cell, strict=True) if kept),
             left_out=records.num_rows - len(rows),
         )
 
@@ -99,6 +101,8 @@ class Episodes:
         axes = (_places(self.runs, runs), _places(self.cells, cells), _places(self.seeds, seeds))
         if not all(axes):
             raise ValueError("no episode is left")
+        if tuple(map(len, axes)) == self.shape:
+            return self
         rows = np.arange(self.table.num_rows).reshape(self.shape)[np.ix_(*axes)].ravel()
         return Episodes(
             table=self.table.take(pa.array(rows)),
@@ -141,23 +145,28 @@ def _places(own: Sequence[object], wanted: Collection[object] | None) -> list[in
     return [place for place, value in enumerate(own) if kept is None or value in kept]
 
 
-def _numbers(column: pa.ChunkedArray) -> NDArray[np.generic]:
-    return np.asarray(column.to_numpy(zero_copy_only=False))
+def _distinct(column: pa.ChunkedArray, order: Sequence[Any] = ()) -> tuple[list[Any], NDArray[np.int64]]:
+    """The values of a column, rising or in this order, and the place of each record's among them."""
+    encoded = column.combine_chunks()
+    encoded = encoded if pa.types.is_dictionary(encoded.type) else encoded.dictionary_encode()
+    values, codes = encoded.dictionary.to_pylist(), encoded.indices.to_numpy()
+    there = np.flatnonzero(np.bincount(codes, minlength=len(values))).tolist()
+    rising = sorted(there, key=lambda code: order.index(values[code]) if order else values[code])
+    place = np.zeros(len(values), np.int64)
+    place[rising] = np.arange(len(rising))
+    return [values[code] for code in rising], place[codes]
 
 
 def _cells(records: pa.Table) -> tuple[list[Cell], NDArray[np.int64]]:
     """The cells of some records, by weather, lanes, density, and the place of each record's."""
-    weather = pa.chunked_array(records["weather"].chunks).combine_chunks()
-    weather = weather if pa.types.is_dictionary(weather.type) else weather.dictionary_encode()
-    names = weather.dictionary.to_pylist()
-    order = list(WEATHERS)
-    rank = np.array([order.index(name) for name in names])[weather.indices.to_numpy()]
-    keys = np.stack((rank, _numbers(records["lanes"]), _numbers(records["density"])), 1)
-    distinct, place = np.unique(keys, axis=0, return_inverse=True)
-    cells = [
-        Cell(weather=order[int(kind)], lanes=int(lanes), density=density) for kind, lanes, density in distinct.tolist()
-    ]
-    return cells, place.reshape(-1)
+    weathers, weather = _distinct(records["weather"], tuple(WEATHERS))
+    lanes, lane = _distinct(records["lanes"])
+    densities, density = _distinct(records["density"])
+    codes = (weather * len(lanes) + lane) * len(densities) + density
+    every = list(product(weathers, lanes, densities))
+    driven = np.bincount(codes, minlength=len(every)) > 0
+    cells = [Cell(weather=name, lanes=lane, density=factor) for name, lane, factor in compress(every, driven)]
+    return cells, (np.cumsum(driven) - 1)[codes]
 
 
 def shared(first: Episodes, second: Episodes) -> tuple[Episodes, Episodes]:

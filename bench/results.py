@@ -14,6 +14,7 @@ from pathlib import Path
 import duckdb
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -287,36 +288,31 @@ def read_compact(out: Path, measurements: Collection[str]) -> dict[Track, pa.Tab
 
 
 def _read_compact(out: Path, paths: list[Path], track: Track, measurements: Collection[str]) -> pa.Table:
-    """Units and episodes apart, as what a unit's episodes share is most of a record; then put together again."""
-    wanted = [field.name for field in MEASUREMENTS[track] if field.name in measurements]
-    apart = [*wanted, *(field.name for field in PROBES)]
-    shared = [field.name for field in (*IDENTITY, *PROVENANCE) if field.name != "seed"]
+    """A row a unit, as what its episodes share is most of a record, with its episodes as lists; these are laid out then."""
+    shared = [field.name for field in (*IDENTITY, *PROVENANCE) if field.name not in ("unit", "seed")]
+    wanted = [field.name for field in (*MEASUREMENTS[track], *PROBES) if field in PROBES or field.name in measurements]
+    once = ", ".join(f'any_value("{name}") as "{name}"' for name in shared)
+    lists = ", ".join(f'list("{name}") as "{name}"' for name in ("seed", *wanted))
     with _records(out, paths, track) as connection:
         connection.sql("set preserve_insertion_order = false")
-        measured = connection.sql(f"select hash(unit) as code, seed, {_quoted(apart)} from records").to_arrow_table()
-        each = ", ".join(f'any_value("{name}") as "{name}"' for name in shared)
-        units = connection.sql(f"select hash(unit) as code, {each} from records group by all").to_arrow_table()
-        units = connection.sql(f"from units {_NEWEST_UNITS} {_UNIT_ORDER}").to_arrow_table()
-    codes, own = units["code"].to_numpy(), measured["code"].to_numpy()
-    by_code = np.argsort(codes)
-    place = by_code[np.minimum(np.searchsorted(codes, own, sorter=by_code), len(codes) - 1)]
-    place[codes[place] != own] = len(codes)
-    order = np.lexsort((measured["seed"].to_numpy(), place))[: int((place < len(codes)).sum())]
-    rows, taken = pa.array(place[order]), pa.array(order)
-    columns = {
-        name: _taken(units[name], rows) if name in shared else measured[name].combine_chunks().take(taken)
-        for name in SCHEMAS[track].names
-        if name in shared or name in measured.column_names
-    }
-    return _valid(pa.table(columns), out, track)
+        units = connection.sql(f"select unit, {once}, {lists} from records group by unit").to_arrow_table()
+        alone = units.select(["unit", *shared]).append_column("row", pa.array(range(units.num_rows)))
+        connection.register("alone", alone)
+        newest = connection.sql(f"select row from alone {_NEWEST_UNITS} {_UNIT_ORDER}").to_arrow_table()
+    units = units.take(newest["row"]).combine_chunks()
+    rows = np.repeat(np.arange(units.num_rows), pc.list_value_length(units["seed"]).to_numpy())
+    names = [name for name in SCHEMAS[track].names if name in units.column_names]
+    return _valid(pa.table({name: _laid_out(units[name].chunk(0), rows) for name in names}), out, track)
 
 
-def _taken(column: pa.ChunkedArray, rows: pa.Array) -> pa.Array:
-    """A unit's value for each of its episodes; text stays a dictionary."""
-    if not pa.types.is_string(column.type):
-        return column.combine_chunks().take(rows)
-    encoded = column.combine_chunks().dictionary_encode()
-    return pa.DictionaryArray.from_arrays(encoded.indices.take(rows), encoded.dictionary)
+def _laid_out(column: pa.Array, rows: NDArray[np.int64]) -> pa.Array:
+    """A column of units as one of their episodes: lists are unpacked, text becomes a dictionary."""
+    if pa.types.is_list(column.type):
+        return column.flatten()
+    if pa.types.is_string(column.type):
+        encoded = column.dictionary_encode()
+        return pa.DictionaryArray.from_arrays(encoded.indices.to_numpy()[rows], encoded.dictionary)
+    return column.take(pa.array(rows))
 
 
 @contextmanager

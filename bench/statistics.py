@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 Array = NDArray[np.float64]
 
@@ -41,9 +41,11 @@ def iqm(scores: Array, axis: int | None = None) -> Array:
 
     The definition of `rliable.metrics.aggregate_iqm`; with fewer than four values it is the mean.
     """
+    count = scores.size if axis is None else scores.shape[axis]
+    if count < 4:
+        return np.asarray(scores.mean(axis))
     ordered = np.sort(scores, axis=axis)
     last = 0 if axis is None else axis
-    count = ordered.shape[last]
     return np.asarray(np.take(ordered, range(count // 4, count - count // 4), axis=last).mean(last))
 
 
@@ -132,7 +134,7 @@ def wilson(successes: float, trials: int) -> Interval:
         raise ValueError(f"successes must be between 0 and the {trials} trials, got {successes}")
     if trials == 0:
         return Interval(np.nan, 0.0, 1.0)
-    z2 = float(ndtri((1 + CONFIDENCE) / 2)) ** 2
+    z2 = NormalDist().inv_cdf((1 + CONFIDENCE) / 2) ** 2
     rate = successes / trials
     centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
     half = math.sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (1 + z2 / trials)

@@ -57,7 +57,9 @@ def _refused(records: pa.Table, names: Sequence[str], check: Callable[..., objec
         if not pa.types.is_dictionary(encoded.type):
             encoded = encoded.dictionary_encode(null_encoding="encode")
         codes = codes * (len(encoded.dictionary) + 1) + encoded.indices.to_numpy(zero_copy_only=False)
-    for row in np.unique(codes, return_index=True)[1].tolist():
+    first = np.full(codes.max(initial=0) + 1, -1)
+    first[codes[::-1]] = np.arange(len(codes))[::-1]
+    for row in first[first >= 0].tolist():
         values = [records[name][row].as_py() for name in names]
         try:
             check(*values)

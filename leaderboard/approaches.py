@@ -21,38 +21,48 @@ NO_PATCH = "none"
 
 @dataclass(frozen=True)
 class Measured:
-    """What a set of approaches says. A patch seed is a run, a cell a task, an approach an episode.
+    """What a set of approaches says, a whole grid or a part of it; each number is computed when it is asked for.
 
     Args:
-        confidence: interquartile mean of the approaches' mean confidence, in [0, 1].
-        detected: the same of the share of frames that detect the sign, in [0, 1].
-        first_seen_m: the same of the distance at which it is first detected; 0 where it never is.
-        ran: share of approaches that run the sign, all pooled.
-        overrun_m: mean of how far beyond the line the car stops.
-        visible: mean visible share of the sign, in [0, 1].
-        false_alarms: stop signs seen where there is none, mean over the frames.
+        approaches: a patch seed is a run, a cell a task, an approach an episode.
     """
 
-    confidence: Interval
-    detected: Interval
-    first_seen_m: Interval
-    ran: Interval
-    overrun_m: float
-    visible: float
-    false_alarms: float
+    approaches: Episodes
 
+    @cached_property
+    def confidence(self) -> Interval:
+        """Interquartile mean of the approaches' mean confidence, in [0, 1]."""
+        return unit_interval(self.approaches.column("confidence_mean"))
 
-def measure(approaches: Episodes) -> Measured:
-    """Measure a set of approaches: a whole grid, or a part of it."""
-    return Measured(
-        confidence=unit_interval(approaches.column("confidence_mean")),
-        detected=unit_interval(approaches.column("detection_rate")),
-        first_seen_m=interval(approaches.column("first_seen_m")),
-        ran=rate(approaches, "ran"),
-        overrun_m=float(approaches.column("overrun_m").mean()),
-        visible=float(approaches.column("visible_share").mean()),
-        false_alarms=float(approaches.column("false_alarms").mean()),
-    )
+    @cached_property
+    def detected(self) -> Interval:
+        """The same of the share of frames that detect the sign, in [0, 1]."""
+        return unit_interval(self.approaches.column("detection_rate"))
+
+    @cached_property
+    def first_seen_m(self) -> Interval:
+        """The same of the distance at which it is first detected; 0 where it never is."""
+        return interval(self.approaches.column("first_seen_m"))
+
+    @cached_property
+    def ran(self) -> Interval:
+        """Share of approaches that run the sign, all pooled."""
+        return rate(self.approaches, "ran")
+
+    @property
+    def overrun_m(self) -> float:
+        """Mean of how far beyond the line the car stops."""
+        return float(self.approaches.column("overrun_m").mean())
+
+    @property
+    def visible(self) -> float:
+        """Mean visible share of the sign, in [0, 1]."""
+        return float(self.approaches.column("visible_share").mean())
+
+    @property
+    def false_alarms(self) -> float:
+        """Stop signs seen where there is none, mean over the frames."""
+        return float(self.approaches.column("false_alarms").mean())
 
 
 @dataclass(frozen=True)
@@ -83,7 +93,7 @@ class Patched:
 
     @cached_property
     def measured(self) -> Measured:
-        return measure(self.own)
+        return Measured(self.own)
 
     @cached_property
     def control(self) -> dict[str, Measured]:
@@ -91,7 +101,7 @@ class Patched:
         once = {
             name: one.only(runs=one.runs[:1]) if name in self.stand_ins else one for name, one in self.controls.items()
         }
-        return {name: measure(approaches) for name, approaches in once.items()}
+        return {name: Measured(approaches) for name, approaches in once.items()}
 
     @property
     def lost(self) -> float:

@@ -7,11 +7,12 @@ import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from leaderboard.entries import Entry
-from leaderboard.pairs import parameters
+from leaderboard.pairs import codes_of, parameters
 
 KINDS = ("attack", "defense", "victim", "world")
 
@@ -25,7 +26,7 @@ def card(entry: Entry, folder: Path | None) -> dict[str, object]:
     """
     records, identity = entry.own.table, entry.identity
     seeds = entry.own.seeds
-    units = records.group_by("unit").aggregate([("wall_s", "max")])
+    _, units = np.unique(codes_of(records, ["unit"]), return_index=True)
     pair = str(records["pair"][0].as_py())
     return {
         "pair": pair,
@@ -46,7 +47,7 @@ def card(entry: Entry, folder: Path | None) -> dict[str, object]:
         "libraries": [json.loads(text) for text in _values(records, "libraries") if text],
         "machine": _values(records, "machine"),
         "finished": pc.max(records["created_at"]).as_py().isoformat(timespec="seconds"),
-        "wall_s": round(pc.sum(units["wall_s_max"]).as_py(), 1),
+        "wall_s": round(pc.sum(records["wall_s"].take(pa.array(units))).as_py(), 1),
         "run": run_command(entry),
         "replay": replay_command(entry, pair, folder),
         "recording": _recording(pair, folder),

@@ -65,8 +65,7 @@ def _controls(entries: Sequence[Entry]) -> list[Entry]:
     found: dict[tuple[object, ...], Entry] = {}
     for entry in entries:
         if entry.attacked and entry.clean:
-            first = entry.clean.table.slice(0, 1).to_pylist()[0]
-            identity = {name: first[name] for name in entry.identity}
+            (identity,) = entry.clean.table.select(list(entry.identity)).slice(0, 1).to_pylist()
             runs = entry.clean.runs if entry.track == "driving" else entry.clean.runs[:1]
             control = Entry(entry.track, identity, entry.clean.only(runs=runs), entry.clean, entry.references)
             known = found.get(entry.defended)
@@ -156,6 +155,10 @@ def _named(entry: Entry, kinds: Sequence[str], shown: Shown) -> dict[str, Any]:
 
 def _pair(entry: Entry, key: int, shown: Shown, folder: Path | None) -> dict[str, Any]:
     own, identity = entry.own, entry.identity
+    cells = _cells(own.cells, entry.scores)
+    for name in ("crashed" if entry.track == "driving" else "ran", "queries"):
+        for cell, value in zip(cells, own.column(name).mean((0, 2)).tolist(), strict=True):
+            cell[name] = _number(value)
     return {
         "key": key,
         "track": entry.track,
@@ -167,7 +170,7 @@ def _pair(entry: Entry, key: int, shown: Shown, folder: Path | None) -> dict[str
         "clean": _interval(entry.clean_score),
         "queries": _number(entry.queries),
         "measures": _measures(entry.track, own),
-        "cells": _cells(own.cells, entry.scores),
+        "cells": cells,
         "card": card(entry, folder),
     }
 

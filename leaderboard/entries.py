@@ -16,7 +16,7 @@ from bench.metrics import Episodes, unit_interval
 from bench.scenario import Cell
 from bench.statistics import Array, Interval, interval
 from leaderboard.approaches import NO_PATCH, read_patched
-from leaderboard.pairs import ATTACKER, BEST_BLIND, DEFENDED, read_pairs
+from leaderboard.pairs import ATTACKER, BEST_BLIND, DEFENDED, parameters, read_pairs
 
 METRICS: dict[Track, str] = {"driving": "safe_progress", "detection": "confidence_mean"}
 """What each track is ranked by; both in [0, 1], and more is better for the victim."""
@@ -58,6 +58,13 @@ class Entry:
     def defended(self) -> tuple[object, ...]:
         """What is attacked: the values of `DEFENDED`."""
         return tuple(self.identity[name] for name in DEFENDED)
+
+    @cached_property
+    def settings(self) -> dict[str, object]:
+        """All it was run with, name by name: `identity`, and each of the attack's parameters as `attack.NAME`."""
+        params = parameters(self.identity["attack_params"])
+        identity = {name: value for name, value in self.identity.items() if name != "attack_params"}
+        return identity | {f"attack.{name}": value for name, value in params.items()}
 
     @property
     def metric(self) -> str:

@@ -5,7 +5,6 @@ A flag fires, does not fire, or says that it was not measured; it never guesses.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -160,7 +159,7 @@ def one_draw(of: Subject) -> Finding:
 def no_fall(of: Subject) -> Finding:
     """Fires where the largest perturbation budget takes no more than the smallest, by the same attack."""
     found = []
-    for family in _families(of.others, vary=("threat_budget",)):
+    for family in _families(of.others, "threat_budget"):
         small, large = family[0], family[-1]
         change = gap(small, large)
         if change:
@@ -229,44 +228,38 @@ def efforts(entries: Sequence[Entry]) -> list[list[Entry]]:
     found = []
     names = sorted({name for entry in entries for name in _numbers(entry)})
     for name in names:
-        for family in _families(entries, vary=(name,)):
+        for family in _families(entries, name):
             ordered = sorted(family, key=lambda entry: entry.queries)
             if ordered[0].queries < ordered[-1].queries:
                 found.append(ordered)
-    return [*found, *_families(entries, vary=("threat_queries",))]
+    return [*found, *_families(entries, "threat_queries")]
 
 
 def budgets(entries: Sequence[Entry]) -> list[list[Entry]]:
     """Attacks that differ in the budget of their perturbation alone, the smallest first."""
-    return _families(entries, vary=("threat_budget",))
+    return _families(entries, "threat_budget")
 
 
-def _families(entries: Sequence[Entry], vary: tuple[str, ...]) -> list[list[Entry]]:
-    """Those that share everything but these, of two or more, in their order."""
-    found: dict[str, list[Entry]] = {}
+def _families(entries: Sequence[Entry], vary: str) -> list[list[Entry]]:
+    """Those that share every setting but this one, of two or more, in its order."""
+    found: dict[frozenset[tuple[str, str]], list[Entry]] = {}
     for entry in entries:
-        flat = {
-            **entry.identity,
-            **{f"attack.{name}": value for name, value in _params(entry).items()},
-            "attack_params": "",
-        }
-        key = json.dumps({name: value for name, value in flat.items() if name not in vary}, sort_keys=True, default=str)
-        found.setdefault(key, []).append(entry)
+        others = frozenset((name, repr(value)) for name, value in entry.settings.items() if name != vary)
+        found.setdefault(others, []).append(entry)
 
     def value(entry: Entry) -> float:
-        name = vary[0]
-        return float(str(_numbers(entry)[name] if name.startswith("attack.") else entry.identity[name]))
+        return float(str(entry.settings[vary]))
 
     return [sorted(family, key=value) for family in found.values() if len(family) > 1]
 
 
-def _params(entry: Entry) -> dict[str, object]:
-    return dict(json.loads(str(entry.identity["attack_params"]) or "{}"))
-
-
-def _numbers(entry: Entry) -> dict[str, float]:
-    params = _params(entry)
-    return {f"attack.{k}": v for k, v in params.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+def _numbers(entry: Entry) -> list[str]:
+    """The attack's own parameters that are numbers."""
+    return [
+        name
+        for name, value in entry.settings.items()
+        if name.startswith("attack.") and isinstance(value, int | float) and not isinstance(value, bool)
+    ]
 
 
 def _grid(of: Subject) -> Grid:

@@ -24,7 +24,6 @@ from bench.contracts import TRACKS, Track
 from bench.errors import UserError
 from bench.files import whole
 from bench.metrics import unit_interval
-from bench.process import settle
 from leaderboard import thesis_page
 from leaderboard.document import document, table
 from leaderboard.entries import MEASUREMENTS, METRICS
@@ -60,8 +59,8 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         UserError: if there are no records, or nothing can be written.
     """
     page = page / NAME if page.is_dir() else page
-    # The thesis' tables need torch, which takes seconds to import: a process of their own does that meanwhile.
-    with ProcessPoolExecutor(1, get_context("spawn"), initializer=settle) as beside:
+    # The thesis' tables are made of other records, and so in a process of their own meanwhile.
+    with ProcessPoolExecutor(1, get_context("spawn")) as beside:
         beside.submit(thesis_page.prepare)
         records = {track: published(track) for track in TRACKS} if out is None else _read(out)
         thesis = beside.submit(thesis_page.chapters, {track: _for_thesis(records, track) for track in TRACKS})

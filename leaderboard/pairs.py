@@ -123,7 +123,7 @@ def read_pairs(records: pa.Table) -> list[Pair]:
 
 def newest(records: pa.Table, identity: tuple[str, ...] = (*DEFENDED, *ATTACKER, "grid")) -> pa.Table:
     """The last record of each scenario, in the order given."""
-    codes = _codes(records, (*identity, *SCENARIO))
+    codes = codes_of(records, (*identity, *SCENARIO))
     rising = np.sort(codes)
     if (rising[1:] > rising[:-1]).all():
         return records
@@ -140,7 +140,7 @@ def groups(
     kept = records if keep is None else records.filter(keep)
     if not kept.num_rows:
         return
-    codes = _codes(kept, columns)
+    codes = codes_of(kept, columns)
     starts = np.flatnonzero(np.append(True, codes[1:] != codes[:-1]))
     together: dict[int, list[NDArray[np.int64]]] = {}
     for start, end in zip(starts, [*starts[1:], len(codes)], strict=True):
@@ -152,7 +152,7 @@ def groups(
         yield part.select(columns).slice(0, 1).to_pylist()[0], part
 
 
-def _codes(records: pa.Table, columns: Sequence[str]) -> NDArray[np.int64]:
+def codes_of(records: pa.Table, columns: Sequence[str]) -> NDArray[np.int64]:
     """A number for each record, the same for those that share the values of `columns`."""
     codes = np.zeros(records.num_rows, np.int64)
     kinds = 1
@@ -172,8 +172,9 @@ def _drives(identity: Mapping[str, object]) -> tuple[object, ...]:
 
 
 def _first(drive: Episodes) -> dict[str, object]:
-    """One record, for the columns that all records of a pair share."""
-    return dict(drive.table.slice(0, 1).to_pylist()[0])
+    """Of the columns that all records of a pair share."""
+    shared = (*DEFENDED, *ATTACKER, "grid", "action_type", "sees")
+    return dict(drive.table.select(shared).slice(0, 1).to_pylist()[0])
 
 
 def _pair(

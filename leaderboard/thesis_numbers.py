@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
-from omegaconf import OmegaConf
 from rich.table import Table
 from rich.text import Text
 
@@ -38,6 +37,9 @@ class Beside:
 
 def printed() -> dict[str, Any]:
     """The thesis' numbers, as printed (`data/thesis.yaml`)."""
+    # Imported here: a page is put together without it, and it takes a tenth of a second.
+    from omegaconf import OmegaConf
+
     text = (files("leaderboard") / "data" / "thesis.yaml").read_text(encoding="utf-8")
     found = OmegaConf.to_container(OmegaConf.create(text))
     assert isinstance(found, dict)

@@ -19,6 +19,8 @@ Chapter = dict[str, Any]
 
 def prepare() -> None:
     """Import what the tables need."""
+    from scipy import stats  # noqa: F401
+
     from leaderboard import thesis_driving, thesis_patches  # noqa: F401
 
 

@@ -14,11 +14,11 @@ import pyarrow.compute as pc
 
 from bench.contracts import REFERENCE_PATCHES
 from bench.fingerprint import canonical
-from bench.pair import choose
-from bench.patch import PatchThreat
+from bench.registry import Kind
 from bench.statistics import Interval
 from leaderboard.approaches import NO_PATCH, Patched, read_patched
-from leaderboard.pairs import groups, parameters
+from leaderboard.entries import MEASUREMENTS
+from leaderboard.pairs import ATTACKER, DEFENDED, SCENARIO, groups, parameters
 from leaderboard.published import published
 
 ATTACK, WORLD, DETECTOR = "eot", "camera", "yolov3_tiny"
@@ -27,10 +27,19 @@ WEATHERS = {"sun": "clear", "rain": "rain"}
 """The thesis' and ours."""
 LOCATIONS = {1: "sun-behind-ego", 2: "sun-beside", 3: "sun-behind-sign"}
 """The thesis' locations by where the sun is, and ours."""
+SIDE = 0.5
+"""Of the patch, in shares of the sign's, where a table says nothing else: the default of a threat model."""
+VARIED = {
+    "texels": 100, "tv": 0.1, "brightness": 0.2, "contrast": 0.2, "saturation": 0.2, "hue": 0.05, "noise": 0.02,
+    "perspective": 0.15, "rotation": 8.0, "scale": 0.3, "translation": 0.15,
+}  # fmt: skip
+"""The attack's parameters that the thesis varies, and their defaults; stated here, as importing the attack imports torch."""
 SWITCHED_OFF = (
     "brightness", "contrast", "saturation", "hue", "noise", "perspective", "rotation", "scale", "translation",
 )  # fmt: skip
 """The transformations in the order in which the thesis leaves them out; the first four are its colour jitter."""
+COLUMNS = (*DEFENDED, *ATTACKER, *SCENARIO, "created_at", *MEASUREMENTS["detection"])
+"""Of a record that are read here."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +59,7 @@ class Configuration:
     @property
     def budget(self) -> float:
         """Side of the patch in shares of the sign's."""
-        return PatchThreat().budget * self.size
+        return SIDE * self.size
 
 
 def _without(label: str, last: str) -> Configuration:
@@ -79,7 +88,6 @@ CONFIGURATIONS: dict[str, Configuration] = {
 }
 """The rows of tables 3.1 and 3.2. A smaller patch of the thesis covers less of the sign; the last two are as coarse, but not
 smaller."""
-VARIED = {name for configuration in CONFIGURATIONS.values() for name in configuration.changes}
 
 
 @dataclass(frozen=True)
@@ -128,7 +136,7 @@ class Source:
     def __init__(self, records: pa.Table, shipped: pa.Table | None = None) -> None:
         ours = (pc.field("world") == WORLD) & (pc.field("defense") == "none")
         tables = (records, published("detection") if shipped is None else shipped)
-        self.tables = [table.filter(ours) for table in tables]
+        self.tables = [table.select(COLUMNS).filter(ours) for table in tables]
         self.detectors = _detectors(self.tables)
         self.missing: dict[Detector, set[str]] = {}
         self._pairs = cache(self._read)
@@ -207,9 +215,7 @@ def is_of(row: str, identity: Mapping[str, object]) -> bool:
         return identity["attack"] == row
     crafted = parameters(identity["attack_params"])
     return identity["attack"] == ATTACK and all(
-        crafted.get(name) == configuration.changes.get(name, value)
-        for name, value in _defaults().items()
-        if name in VARIED
+        crafted.get(name) == configuration.changes.get(name, value) for name, value in VARIED.items()
     )
 
 
@@ -224,15 +230,18 @@ def _detectors(tables: Iterable[pa.Table]) -> list[Detector]:
             rows[Detector(victim, victim_params, world_params, _crafting(attack))] += some.num_rows
         for detector, _ in rows.most_common():
             found.setdefault(detector.victim, detector)
-    standard = choose("victim", DETECTOR), choose("world", WORLD), choose("attack", ATTACK)
-    victim, world, attack = (component.params for component in standard)
-    return [found[name] for name in sorted(found)] or [Detector(DETECTOR, victim, world, _crafting(attack))]
+    if not found:
+        victim, world, attack = _standard("victim", DETECTOR), _standard("world", WORLD), _standard("attack", ATTACK)
+        return [Detector(DETECTOR, victim, world, _crafting(attack))]
+    return [found[name] for name in sorted(found)]
 
 
-@cache
-def _defaults() -> dict[str, object]:
-    """Of the attack's parameters."""
-    return parameters(choose("attack", ATTACK).params)
+def _standard(kind: Kind, name: str) -> str:
+    """The default parameters of a component."""
+    # Imported here: torch takes seconds, and whoever has all the records needs no component.
+    from bench.pair import choose
+
+    return choose(kind, name).params
 
 
 def _crafting(attack_params: str) -> str:
@@ -243,8 +252,8 @@ def _command(detector: Detector, configurations: list[Configuration]) -> str:
     words = [f"attack={ATTACK}", f"victim={detector.victim}", f"weather={','.join(WEATHERS.values())}", "seeds=0,1,2"]
     for kind, text in (("victim", detector.victim_params), ("world", detector.world_params)):
         words += [f"{kind}.{name}={value}" for name, value in parameters(text).items() if value not in ("", None)]
-    crafting = parameters(detector.crafting)
-    words += [f"attack.{name}={value}" for name, value in crafting.items() if value != _defaults().get(name)]
+    crafting, defaults = parameters(detector.crafting), parameters(_standard("attack", ATTACK))
+    words += [f"attack.{name}={value}" for name, value in crafting.items() if value != defaults.get(name)]
     first = configurations[0]
     for name in first.changes:
         words.append(f"attack.{name}={','.join(f'{one.changes[name]:g}' for one in configurations)}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Literal
 
 import numpy as np
@@ -14,7 +14,8 @@ import pyarrow.compute as pc
 from bench.metrics import Episodes, unit_interval
 from bench.scenario import Cell
 from bench.statistics import Interval, interval
-from leaderboard.pairs import ATTACKER, BEST_BLIND, DEFENDED, groups, newest, parameters, references
+from leaderboard.entries import MEASUREMENTS
+from leaderboard.pairs import ATTACKER, BEST_BLIND, DEFENDED, SCENARIO, groups, newest, parameters, references
 from leaderboard.published import published
 
 Victim = Literal["dqn", "ddpg"]
@@ -29,6 +30,8 @@ TARGETS: dict[str, dict[str, float]] = {
     "ddpg": {"target_acceleration": 1.0, "target_steering": 0.5},
 }
 """What the thesis' attack drives a victim to (4.4.3): FASTER; full throttle and a turn to the right."""
+COLUMNS = (*DEFENDED, *ATTACKER, *SCENARIO, "action_type", "sees", "grid", "created_at", *MEASUREMENTS["driving"])
+"""Of a record that are read here."""
 
 
 @dataclass(frozen=True)
@@ -94,20 +97,23 @@ class Source:
 
     def __init__(self, records: pa.Table, shipped: pa.Table | None = None) -> None:
         tables = (records, published("driving") if shipped is None else shipped)
-        self.tables = [table.filter(pc.equal(table["weather"], "clear")) for table in tables]
+        self.tables = [table.select(COLUMNS).filter(pc.equal(table["weather"], "clear")) for table in tables]
         self.missing: list[tuple[Wanted, tuple[Cell, ...]]] = []
+        self._driven = cache(self._groups)
 
     def find(self, wanted: Wanted, cells: Sequence[Cell] = (TRAINED_ON,)) -> Found | None:
         """The episodes in these cells; None, and noted as missing, where there are none."""
-        for table, shipped in zip(self.tables, (False, True), strict=True):
-            candidates = [
-                rows for identity, rows in groups(_in(table, cells), (*DEFENDED, *ATTACKER)) if wanted.matches(identity)
-            ]
+        for shipped in (False, True):
+            candidates = [rows for identity, rows in self._driven(shipped, tuple(cells)) if wanted.matches(identity)]
             if candidates:
                 most = max(candidates, key=lambda rows: rows.num_rows)
                 return Found(Episodes.arrange(newest(most, (*DEFENDED, *ATTACKER))), shipped)
         self.missing.append((wanted, tuple(cells)))
         return None
+
+    def _groups(self, shipped: bool, cells: tuple[Cell, ...]) -> list[tuple[dict[str, object], pa.Table]]:
+        """What was driven in these cells, by attack and defended victim."""
+        return list(groups(_in(self.tables[shipped], cells), (*DEFENDED, *ATTACKER)))
 
     def reference(self, found: Found | None, name: str = BEST_BLIND) -> Interval | None:
         """The return of a reference driver on the scenarios of `found`."""

@@ -19,7 +19,7 @@ const fixed = (value, digits = 2) => (value == null ? "—" : value.toFixed(digi
 const short = (value) => fixed(value).replace(/^(−?)0\./, "$1.");
 const bounds = (found) => (found && found.low != null ? `${short(found.low)}–${short(found.high)}` : "");
 const signed = (found) => (found == null ? "—" : (found.estimate > 0 ? "+" : "") + fixed(found.estimate));
-const percent = (found) => (found == null ? "—" : `${Math.round(100 * found.estimate)} %`);
+const percent = (share) => (share == null ? "—" : `${Math.round(100 * share)} %`);
 function estimate(found) {
   return found == null ? ["—"] : [el("b", {}, fixed(found.estimate)), " ", el("small", {}, bounds(found))];
 }
@@ -67,6 +67,10 @@ function over(cells, whole, scenarios) {
   const left = kept(cells);
   if (!left.length) return null;
   return left.length === cells.length ? whole : interval(left, scenarios);
+}
+function mean(pair, name, whole) {
+  const left = kept(pair.cells);
+  return left.length === pair.cells.length ? whole : left.reduce((sum, cell) => sum + cell[name], 0) / left.length;
 }
 function ranked(rows) {
   const ordered = [...rows].sort((a, b) => a.row.flagged - b.row.flagged || b.score.estimate - a.score.estimate);
@@ -272,7 +276,9 @@ function doubts(row) {
 function drawPairs(board, metric) {
   const rows = within(board).filter(chosen).filter((pair) => !state.attack || pair.attack.name === state.attack)
     .map((pair) => ({ pair, score: over(pair.cells, pair.score, 100) })).filter((one) => one.score);
-  const other = board.track === "driving" ? ["crashed", "Crashed"] : ["ran", "Runs the sign"];
+  const [other, title] = board.track === "driving" ? ["crashed", "Crashed"] : ["ran", "Runs the sign"];
+  const share = ({ pair }) => mean(pair, other, pair.measures[other]?.estimate ?? null);
+  const queries = ({ pair }) => mean(pair, "queries", pair.queries);
   draw("pairs", [
     { name: "Attack", show: ({ pair }) => cardLink(pair, pair.attack.label), value: ({ pair }) => pair.attack.label },
     { name: "Defence", show: ({ pair }) => pair.defense.label, value: ({ pair }) => pair.defense.label },
@@ -280,9 +286,9 @@ function drawPairs(board, metric) {
     { name: "Threat model", show: ({ pair }) => threatShort(pair.threat), value: ({ pair }) => threatShort(pair.threat) },
     { name: metric[0].toUpperCase() + metric.slice(1), show: (one) => estimate(one.score), value: (one) => one.score.estimate, number: true },
     { name: "0 – 1", show: (one) => strip(one.score) },
-    { name: other[1], show: ({ pair }) => percent(pair.measures[other[0]]), value: ({ pair }) => pair.measures[other[0]]?.estimate ?? null, number: true },
+    { name: title, show: (one) => percent(share(one)), value: share, number: true },
     { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
-    { name: "Queries", show: ({ pair }) => fixed(pair.queries, 0), value: ({ pair }) => pair.queries, number: true },
+    { name: "Queries", show: (one) => fixed(queries(one), 0), value: queries, number: true },
     { name: "Recording", show: ({ pair }) => (pair.card.recording ? el("a", { href: data.recordings + pair.card.recording }, "rrd") : "") },
   ], rows);
 }

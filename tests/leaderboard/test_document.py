@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import jsonschema
+import numpy as np
 import pytest
 from full_house import driving
 
@@ -30,6 +31,15 @@ def test_the_document_keeps_to_its_schema(site: Path) -> None:
     del made["boards"][0]["rows"][0]["score"]
     with pytest.raises(jsonschema.ValidationError, match="'score' is a required property"):
         validator.validate(made)
+
+
+def test_what_a_pair_did_is_the_mean_of_what_it_did_in_its_cells(site: Path) -> None:
+    made = json.loads((site / "leaderboard.json").read_text())
+    for pair in made["pairs"]:
+        rate = "crashed" if pair["track"] == "driving" else "ran"
+        whole = {rate: pair["measures"][rate]["estimate"], "queries": pair["queries"]}
+        for name, value in whole.items():
+            assert value == pytest.approx(np.mean([cell[name] for cell in pair["cells"]]), abs=1e-4)
 
 
 def test_the_schema_knows_every_flag() -> None:

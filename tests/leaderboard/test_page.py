@@ -102,6 +102,26 @@ def test_filters_choose_rows_and_compute_scores_again_from_the_cells_that_are_le
     assert "18 of 18 cells" in page.locator("#scope").inner_text()
 
 
+def test_crashes_and_queries_are_those_of_the_cells_that_are_left(opened: Open, site: Path) -> None:
+    page = opened()
+    made = json.loads((site / "leaderboard.json").read_text())
+    (pair,) = (
+        pair for pair in made["pairs"] if (pair["attack"]["name"], pair["defense"]["name"]) == ("pgd", "advtrain")
+    )
+    page.locator("#defense").select_option("advtrain")
+    page.locator("#attack").select_option("pgd")
+    shown = []
+    for weathers in (("clear", "rain", "fog"), ("clear", "rain"), ("clear",)):
+        if len(weathers) < 3:
+            page.locator(f"input[name=weather][value={('fog', 'rain')[2 - len(weathers)]}]").uncheck()
+        cells = [cell for cell in pair["cells"] if cell["weather"] in weathers]
+        crashed, queries = (sum(cell[name] for cell in cells) / len(cells) for name in ("crashed", "queries"))
+        shown += column(page, "pairs", 7)
+        assert shown[-1] == f"{100 * crashed:.0f} %"
+        assert column(page, "pairs", 9) == [f"{queries:.0f}"]
+    assert len(set(shown)) > 1
+
+
 def test_no_cell_left_is_said_and_breaks_nothing(opened: Open) -> None:
     page = opened()
     for value in ("clear", "rain", "fog"):

@@ -12,6 +12,8 @@ from rich.console import Console
 from synthetic import approach
 
 from bench.config import run_config
+from bench.pair import choose
+from bench.patch import PatchThreat
 from bench.results import SCHEMAS
 from leaderboard import thesis_patch_records, thesis_records
 from leaderboard.approaches import NO_PATCH
@@ -19,7 +21,16 @@ from leaderboard.pairs import parameters
 from leaderboard.thesis import thesis_report
 from leaderboard.thesis_claims import configuration_claims, location_claims
 from leaderboard.thesis_numbers import printed
-from leaderboard.thesis_patch_records import ABLATION, CONFIGURATIONS, CONTROLS, LOCATIONS, STANDARD, WEATHERS, Source
+from leaderboard.thesis_patch_records import (
+    ABLATION,
+    CONFIGURATIONS,
+    CONTROLS,
+    LOCATIONS,
+    STANDARD,
+    VARIED,
+    WEATHERS,
+    Source,
+)
 
 Left = float | Callable[[str, str], float]
 NONE = SCHEMAS["detection"].empty_table()
@@ -38,6 +49,13 @@ def patch(row: str = STANDARD, left: Left = 0.1, victim: str = "yolov3_tiny", **
     configuration = CONFIGURATIONS[row]
     settings = {"changes": dict(configuration.changes), "budget": configuration.budget, **more}
     return approach(left, victim, attack="eot", **settings)  # type: ignore[arg-type]
+
+
+def test_the_first_row_is_the_attack_and_the_threat_model_with_their_defaults() -> None:
+    defaults = parameters(choose("attack", "eot").params)
+    assert {name: defaults[name] for name in VARIED} == VARIED
+    assert CONFIGURATIONS[STANDARD].budget == PatchThreat().budget
+    assert {name for configuration in CONFIGURATIONS.values() for name in configuration.changes} == set(VARIED)
 
 
 def controls(victim: str = "yolov3_tiny", left: Left = 0.9, noise: Left = 0.6, **more: object) -> pa.Table:
