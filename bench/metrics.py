@@ -63,7 +63,7 @@ class Episodes:
         every_run: NDArray[np.bool_] = np.asarray(driven.any(2).all(0))
         if not every_run.any():
             raise ValueError("the training seeds have no cell in common")
-        every_cell = driven[:, every_run].all((0, 1))
+        every_cell: NDArray[np.bool_] = np.asarray(driven[:, every_run].all((0, 1)))
         if not every_cell.any():
             raise ValueError("the cells have no scenario seed in common")
         rows = place[:, every_run][..., every_cell].ravel()

@@ -21,7 +21,6 @@ from bench.statistics import Array, Interval, interval, task_intervals
 from leaderboard.cards import card
 from leaderboard.entries import METRICS, Entry
 from leaderboard.flags import FLAGS, budgets, efforts
-from leaderboard.overview import NAMES
 from leaderboard.pairs import parameters
 from leaderboard.ranking import Board, Row
 from leaderboard.text import component, varying
@@ -105,7 +104,7 @@ def _board(board: Board, keys: Mapping[int, int], shown: Shown) -> dict[str, Any
         "rows": [_row(row, keys, shown) for row in board.rows],
         "references": [
             {
-                "name": NAMES.get(name, name),
+                "name": name,
                 "score": _interval(unit_interval(drive.column(METRICS[board.track]))),
                 "cells": _cells(drive.cells, drive.column(METRICS[board.track])),
             }

@@ -29,7 +29,6 @@ from leaderboard.document import document, table
 from leaderboard.entries import MEASUREMENTS, METRICS
 from leaderboard.flags import FLAGS
 from leaderboard.layout import STRIP, Column, Section, axis, fitted
-from leaderboard.overview import NAMES
 from leaderboard.published import published
 from leaderboard.ranking import Board, Row, read_boards
 from leaderboard.text import ATTACKED, BLIND, CLEAN, component, estimate, strip, varying, verdict
@@ -154,7 +153,7 @@ def print_boards(boards: Sequence[Board], console: Console) -> None:
         console.print(Padding(fitted(_columns(board), [Section(board.rows)], console), (0, 1)))
         for name, drive in board.references.items():
             score = estimate(unit_interval(drive.column(METRICS[board.track])), style=BLIND)
-            console.print(Padding(Text.assemble(f"{NAMES.get(name, name)}: ", score), (0, 3)))
+            console.print(Padding(Text.assemble(f"{name}: ", score), (0, 3)))
         for row in board.rows:
             if row.flagged:
                 titles = "; ".join(FLAGS[flag.name][0] for flag in row.flags if flag.fired)

@@ -16,6 +16,7 @@ from bench.scenario import WEATHERS, Cell
 from bench.statistics import Array, Interval, interval
 from leaderboard.entries import Entry, read_entries
 from leaderboard.flags import Flag, Subject, flags
+from leaderboard.overview import NAMES
 
 THREAT = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
 
@@ -88,7 +89,7 @@ class Board:
         world: name and parameters.
         threat: the values of `THREAT`.
         rows: best first; flagged ones last.
-        references: drivers that learn nothing, by name.
+        references: drivers that learn nothing, by what they are called.
     """
 
     track: Track
@@ -209,12 +210,19 @@ def ranked(rows: Iterable[Row]) -> Iterator[Row]:
 
 
 def _references(entries: Sequence[Entry]) -> dict[str, Episodes]:
-    """Those of the entry that was driven most; they have no training seeds, so one run says it all."""
-    with_them = [entry for entry in entries if entry.references]
-    if not with_them:
-        return {}
-    found = max(with_them, key=lambda entry: entry.own.table.num_rows).references
-    return {name: drive.only(runs=drive.runs[:1]) for name, drive in found.items()}
+    """Drivers that do not see, by what they are called: of each type of action where they differ, on the scenarios of who was
+    driven most. They have no training seeds, so one run says it all.
+    """
+    found: dict[str, dict[str, Episodes]] = {}
+    for entry in sorted(entries, key=lambda entry: -entry.own.table.num_rows):
+        actions = entry.own.table["action_type"][0].as_py()
+        for name, drive in entry.references.items():
+            found.setdefault(NAMES.get(name, name), {}).setdefault(actions, drive.only(runs=drive.runs[:1]))
+    return {
+        f"{name}, {actions}" if len({drive.table["unit"][0] for drive in drives.values()}) > 1 else name: drive
+        for name, drives in found.items()
+        for actions, drive in sorted(drives.items(), reverse=True)
+    }
 
 
 def read_boards(records: Mapping[Track, pa.Table]) -> tuple[list[Board], list[Entry]]:

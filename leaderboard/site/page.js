@@ -222,7 +222,6 @@ function render() {
   if (!board) return;
   const rows = ranked(board.rows.filter(chosen).map((row) => ({ row, score: over(row.cells, row.score, row.scenarios) })).filter((one) => one.score));
   const references = board.references.map((reference) => ({ reference, score: over(reference.cells, reference.score, 100) })).filter((one) => one.score);
-  const blind = references[0]?.score.estimate;
   const metric = board.track === "driving" ? "safe progress" : "confidence";
   const total = order(board.rows.flatMap((row) => row.cells.map((cell) => AXES.map((axis) => cell[axis]).join()))).length;
   const left = new Set(board.rows.flatMap((row) => kept(row.cells).map((cell) => AXES.map((axis) => cell[axis]).join()))).size;
@@ -235,7 +234,7 @@ function render() {
     { name: "Defence", show: (one) => (one.row ? el("a", { href: "#grid", onclick: () => { state.shown = `r${board.rows.indexOf(one.row)}`; render(); } }, one.row.defense.label) : one.reference.name), value: (one) => one.row?.defense.label ?? one.reference.name },
     { name: "Victim", show: (one) => one.row?.victim.label ?? "", value: (one) => one.row?.victim.label ?? "" },
     { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, number: true },
-    { name: "0 – 1", show: (one) => strip(one.score, blind) },
+    { name: "0 – 1", show: (one) => strip(one.score, blindOf(one)) },
     { name: "Clean", show: (one) => (whole ? fixed(one.row?.clean?.estimate) : fixed(cleanOf(one)?.estimate)), value: (one) => (whole ? one.row?.clean?.estimate : cleanOf(one)?.estimate) ?? null, number: true },
     ...(board.references.length ? [{ name: "Against blind", show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, number: true }] : []),
     { name: "Strongest attack", show: (one) => (one.row ? cardLink(pairs.get(one.row.strongest), pairs.get(one.row.strongest).attack.label) : ""), value: (one) => (one.row ? pairs.get(one.row.strongest).attack.label : "") },
@@ -256,10 +255,17 @@ function cleanOf(one) {
     ["defense", "victim"].every((kind) => JSON.stringify([pair[kind].name, pair[kind].params]) === JSON.stringify([strongest[kind].name, strongest[kind].params])));
   return control ? over(control.cells, control.score, 100) : null;
 }
+function besideBlind(row) {
+  return kept(row.cells).filter((cell) => cell.blind != null);
+}
+function blindOf(one) {
+  const cells = one.row ? besideBlind(one.row) : [];
+  return cells.length ? iqm(cells.map((cell) => cell.blind)) : null;
+}
 function leadOf(one, whole) {
   if (!one.row) return null;
   if (whole) return one.row.lead;
-  const cells = kept(one.row.cells).filter((cell) => cell.blind != null).map((cell) => ({ ...cell, runs: cell.runs.map((run) => run - cell.blind) }));
+  const cells = besideBlind(one.row).map((cell) => ({ ...cell, runs: cell.runs.map((run) => run - cell.blind) }));
   return cells.length ? interval(cells, one.row.scenarios) : null;
 }
 function lead(one, whole) {

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import jsonschema
 import numpy as np
+import pyarrow as pa
 import pytest
 from full_house import driving
+from synthetic import drive
 
 from bench import results
 from bench.errors import UserError
@@ -19,6 +21,7 @@ from leaderboard.entries import MEASUREMENTS, read_entries
 from leaderboard.flags import FLAGS
 from leaderboard.page import NAME, write
 from leaderboard.published import published
+from leaderboard.ranking import read_boards
 
 
 def test_the_document_keeps_to_its_schema(site: Path) -> None:
@@ -100,3 +103,21 @@ def test_a_folder_without_records_is_refused_and_so_is_a_place_that_cannot_be_wr
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match="cannot be written"):
         write(site / "results", tmp_path / "file" / NAME, Console())
+
+
+def test_reference_drivers_of_both_types_of_action_stand_apart() -> None:
+    own = {"discrete": ("dqn", 0.4), "continuous": ("ddpg", 0.1)}
+    records = [
+        table
+        for kind, (victim, blind) in own.items()
+        for table in (
+            drive(victim, action_type=kind, episodes=3),
+            drive(victim, action_type=kind, episodes=3, attack="noise"),
+            drive("blind", action_type=kind, episodes=3, sees=False, skill=blind, victim_params={"policy": kind}),
+        )
+    ]
+    (board,), _ = read_boards({"driving": pa.concat_tables(records)})
+    names = ["best blind policy, discrete", "best blind policy, continuous"]
+    assert list(board.references) == names
+    better, worse = (board.references[name].column("safe_progress").mean() for name in names)
+    assert better > worse
