@@ -123,8 +123,7 @@ def resolve(group: str, name: str, noun: str) -> Any:
         return point.load()
     # A plug-in may fail in any way while it is imported, end the program too, and must not take the others with it.
     except (Exception, SystemExit) as error:
-        where = f"{noun} {name!r} ({entry.target} of {entry.shipped_by})"
-        raise UserError(f"{where} cannot be imported: {reason(error)}") from error
+        raise UserError(f"{_where(group, name, noun)} cannot be imported: {reason(error)}") from error
 
 
 def declared(kind: Kind, name: str) -> type[Any]:
@@ -137,12 +136,12 @@ def declared(kind: Kind, name: str) -> type[Any]:
     from bench import contracts
 
     component: Any = resolve(GROUPS[kind], name, kind)
+    where = _where(GROUPS[kind], name, kind)
     base = getattr(contracts, kind.capitalize())
     if not (inspect.isclass(component) and issubclass(component, base)):
-        raise UserError(f"{_where(kind, name)} is not a subclass of bench.contracts.{base.__name__}")
+        raise UserError(f"{where} is not a subclass of bench.contracts.{base.__name__}")
     known: type[Any] = component
     if not known.tracks():
-        where = _where(kind, name)
         raise UserError(f"{where} is of no track: derive it from a base class of bench.driving or bench.vision")
     return known
 
@@ -162,7 +161,7 @@ def load(kind: Kind, name: str) -> type[Any]:
     from bench import contracts
 
     component = _chosen(kind, name)
-    where = _where(kind, name)
+    where = _where(GROUPS[kind], name, kind)
     if missing := sorted(getattr(component, "__abstractmethods__", ())):
         raise UserError(f"{where} does not implement {', '.join(missing)}")
     if not (is_dataclass(component) and component.__dataclass_params__.frozen):  # type: ignore[attr-defined]
@@ -197,9 +196,10 @@ def _plain(name: str) -> str:
     return name.partition(":")[0]
 
 
-def _where(kind: Kind, name: str) -> str:
-    entry = find(GROUPS[kind], name, kind)
-    return f"{kind} {name!r} ({entry.target} of {entry.shipped_by})"
+def _where(group: str, name: str, noun: str) -> str:
+    """What a message calls the entry of a name."""
+    entry = find(group, name, noun)
+    return f"{noun} {name!r} ({entry.target} of {entry.shipped_by})"
 
 
 def unknown(what: str, word: str, known: Iterable[str]) -> str:

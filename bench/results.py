@@ -277,7 +277,7 @@ def read_compact(out: Path, measurements: Collection[str]) -> dict[Track, pa.Tab
         measurements: names of columns in `MEASUREMENTS` that hold no lists.
 
     Raises:
-        UserError: if there are no records, or if a file is truncated or foreign.
+        UserError: if there are no records, or if a file is truncated or foreign, or has values that cannot be.
     """
     paths: dict[Track, list[Path]] = {}
     for path in sorted((out / FOLDER).glob("[!.]*.parquet")):

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from bench.pair import choose
 from docs.figures import road, style
-from docs.figures.driving import FEATURES, Moment, attacked, episode, physical, policy
+from docs.figures.driving import FEATURES, STEPS_PER_SECOND, Moment, attacked, episode, physical, policy
 from envs.highway.config import ACTIONS
 
-STEP, STEPS_PER_SECOND = 200, 15
+STEP = 200
 """The moment: 13.3 s into the episode, close behind a slower car."""
 LANES = 3
 FAR = 2.5

@@ -21,9 +21,11 @@ from bench.plan import plan
 from bench.rollout import Columns, Trace
 from bench.threat import ObservationThreat
 from envs.highway.config import STANDARD_FEATURES as FEATURES
+from envs.highway.config import HighwayConfig
 
 Array = NDArray[Any]
 
+STEPS_PER_SECOND = HighwayConfig.policy_frequency
 ROAD = "lanes=3 density=1 weather=clear seeds=0 reference=false"
 """The cell of the episodes that are shown."""
 

@@ -16,10 +16,9 @@ from torch import Tensor, nn
 from bench.driving import Policy
 from bench.pair import choose
 from docs.figures import style
-from docs.figures.driving import episode, policy
+from docs.figures.driving import STEPS_PER_SECOND, episode, policy
 from envs.highway.config import ACTIONS
 
-STEPS_PER_SECOND = 15
 EVERY = 10
 """Every how many steps a value of the file is drawn."""
 ROWS, FEATURES = 10, 5

@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from bench.metrics import MAX_RETURN
 from bench.pair import choose
 from docs.figures import style
-from docs.figures.driving import episode, physical
+from docs.figures.driving import STEPS_PER_SECOND, episode, physical
 from envs.highway.dynamics import LANE_WIDTH
 from leaderboard.published import published
 
-STEPS_PER_SECOND, SECONDS = 15, 30
+SECONDS = 30
 ROAD = "3 lanes, density 1, clear, 100 scenarios"
 
 
