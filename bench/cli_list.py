@@ -68,8 +68,9 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
         console.print("It has no parameters.")
         return
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
-    for column in ("parameter", "type", "default"):
-        table.add_column(column, no_wrap=True)
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("type", no_wrap=True)
+    table.add_column("default", max_width=18)
     table.add_column("meaning", ratio=1)
     for parameter in known.values():
         meaning = Text("\n").join(filter(None, [_with_code(parameter.meaning), Text(parameter.allowed, style="dim")]))

@@ -12,7 +12,8 @@ import psutil
 import pyarrow as pa
 import pytest
 
-from bench import results
+from bench import registry, results
+from bench.registry import GROUPS, KINDS
 from tests.framework.conftest import Said, ran, started
 from tests.framework.test_runner import comparable
 
@@ -48,6 +49,15 @@ def test_a_name_of_two_kinds_has_two_pages(bench: Bench) -> None:
     said = bench("list", "none")
     assert "attack none" in said.out
     assert "defense none" in said.out
+
+
+@pytest.mark.parametrize("name", sorted({name for kind in KINDS for name in registry.entries(GROUPS[kind])}))
+def test_a_components_page_fits_a_terminal_of_80_columns(name: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    said = bench("list", name)
+    assert said.code == 0
+    assert max(map(len, said.out.splitlines())) <= 80
+    assert "…" not in said.out  # a column too narrow for its words
 
 
 def test_an_unknown_component_has_no_page(bench: Bench) -> None:
