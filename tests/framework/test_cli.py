@@ -52,7 +52,9 @@ def test_a_name_of_two_kinds_has_two_pages(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("name", sorted({name for kind in KINDS for name in registry.entries(GROUPS[kind])}))
-def test_a_components_page_fits_a_terminal_of_80_columns(name: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_components_page_fits_a_terminal_of_80_columns(
+    name: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     said = bench("list", name)
     assert said.code == 0
