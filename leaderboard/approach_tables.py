@@ -42,7 +42,7 @@ def approach_report(records: pa.Table, console: Console) -> None:
 
     Args:
         records: of approaches (`bench.results.SCHEMAS`), their controls among them.
-        console: where to print; readable from 100 columns on; wider ones add columns.
+        console: where to print; readable from 80 columns on; wider ones add columns.
     """
     pairs = read_patched(records)
     console.print(Padding(Text(_size(pairs), style="bold"), (1, 1)))
@@ -67,7 +67,7 @@ class Line:
 
 def _columns() -> list[Column[Line]]:
     return [
-        Column("", lambda line: f"  {line.name}", "left"),
+        Column("", lambda line: f"  {line.name}", "left", folds=True),
         Column("confidence\n[95 %]", lambda line: estimate(line.measured.confidence, style=line.colour), "left"),
         Column("lost", lambda line: share(line.pair.lost) if line.pair else ""),
         Column("beyond best\ncontrol", lambda line: _beyond(line, interval=False), spare=2),
@@ -214,12 +214,12 @@ def _cell_columns(pair: Patched) -> list[Column[Part]]:
         ]
     for name in pair.controls:
         if name != NO_PATCH:
-            columns.append(Column(f"\n{SHORT.get(name, name)}", _control(name)))
+            columns.append(Column(f"\n{SHORT.get(name, name)}", _control(name), spare=1))
     columns += [
         Column("frames\nseen %", _both(lambda one: number(100 * one.detected.estimate))),
-        Column("first\nseen m", _both(lambda one: number(one.first_seen_m.estimate))),
+        Column("first\nseen m", _both(lambda one: number(one.first_seen_m.estimate)), spare=2),
         Column("ran\n%", _both(lambda one: number(100 * one.ran.estimate))),
-        Column("overrun\nm", _both(lambda one: number(one.overrun_m, 1)), spare=2),
+        Column("overrun\nm", _both(lambda one: number(one.overrun_m, 1)), spare=3),
         Column("visible\n%", lambda part: number(100 * part.pair.measured.visible), spare=5),
         Column("false alarms\na frame", _both(lambda one: number(one.false_alarms, 2)), spare=7),
         Column(axis("confidence"), _strip, "left", spare=9),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, product
 from typing import Generic, Literal, TypeVar
 
 from rich import box
@@ -29,12 +29,14 @@ class Column(Generic[Subject]):
         value: what it shows of a row's subject.
         justify: numbers to the right, text to the left.
         spare: columns are left out of a narrow terminal from the highest number down; 0 stays.
+        folds: names that may be long; they go on in the next line where there is no room otherwise.
     """
 
     heading: str
     value: Callable[[Subject], Text | str]
     justify: Literal["left", "right"] = "right"
     spare: int = 0
+    folds: bool = False
 
 
 @dataclass(frozen=True)
@@ -48,20 +50,28 @@ class Section(Generic[Subject]):
 def fitted(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], console: Console) -> Table:
     """The table with as many of the columns as the console has room for, and air between them where there is room."""
     room = console.width - 2
-    spare = max(column.spare for column in columns)
-    for limit in range(spare, -1, -1):
-        kept = [column for column in columns if column.spare <= limit]
-        for gap in (1, 0):
-            made = _table(kept, sections, gap)
-            if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= room:
-                return made
+    limits = range(max(column.spare for column in columns), -1, -1)
+    for names, limit, gap in product((None, console.width // 3), limits, (1, 0)):
+        made = _table([column for column in columns if column.spare <= limit], sections, gap, names)
+        if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= room:
+            break
     return made
 
 
-def _table(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], gap: int) -> Table:
+def _table(
+    columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], gap: int, names: int | None
+) -> Table:
+    """With `gap` characters between the columns; names that fold are at most `names` wide."""
     made = Table(box=box.SIMPLE_HEAD, header_style="dim", padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
     for column in columns:
-        made.add_column(column.heading, justify=column.justify, no_wrap=True, vertical="bottom")
+        whole = not column.folds or names is None
+        made.add_column(
+            column.heading,
+            justify=column.justify,
+            no_wrap=whole,
+            max_width=None if whole else names,
+            vertical="bottom",
+        )
     for section in sections:
         if section.title is not None:
             made.add_row(section.title)

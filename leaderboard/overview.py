@@ -48,7 +48,7 @@ def overview(pairs: Sequence[Pair], console: Console) -> Table:
 
 def _columns(*, attacked: bool) -> list[Column[Line]]:
     columns: list[Column[Line]] = [
-        Column("", lambda line: f"  {line.name}", "left"),
+        Column("", lambda line: f"  {line.name}", "left", folds=True),
         Column("safe progress\n[95 %]", lambda line: estimate(line.summary.safe_progress, style=line.colour), "left"),
     ]
     if attacked:

@@ -174,8 +174,8 @@ def _columns(board: Board) -> list[Column[Row]]:
     measure = "safe progress" if board.track == "driving" else "confidence"
     columns: list[Column[Row]] = [
         Column("rank", lambda row: str(row.group)),
-        Column("defence", lambda row: component(row.entries[0], "defense", shown["defense"]), "left"),
-        Column("victim", lambda row: component(row.entries[0], "victim", shown["victim"]), "left"),
+        Column("defence", lambda row: component(row.entries[0], "defense", shown["defense"]), "left", folds=True),
+        Column("victim", lambda row: component(row.entries[0], "victim", shown["victim"]), "left", folds=True),
         Column(f"{measure}\nworst [95 %]", lambda row: estimate(row.worst.score, style=ATTACKED), "left"),
         Column("\nclean", lambda row: estimate(row.clean, style=CLEAN), "left", spare=3),
     ]

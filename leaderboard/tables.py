@@ -24,7 +24,7 @@ def run_report(records: Mapping[Track, pa.Table], console: Console) -> None:
 
     Args:
         records: by track (`bench.results.SCHEMAS`), clean controls and references among them.
-        console: where to print; readable from 100 columns on; wider ones add columns.
+        console: where to print; readable from 80 columns on; wider ones add columns.
     """
     if "driving" in records:
         driving_report(records["driving"], console)

@@ -1,0 +1,23 @@
+"""The tables of the detection track, of the published records."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import pyarrow.compute as pc
+import pytest
+from rich.console import Console
+
+from leaderboard.published import published
+from leaderboard.tables import run_report
+
+
+@pytest.mark.parametrize("width", [80, 100, 120, 160])
+def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut_off(width: int) -> None:
+    out = io.StringIO()
+    records = published("detection").filter(pc.field("defense") == "none")
+    run_report({"detection": records}, Console(file=out, width=width))
+    text = out.getvalue()
+    assert max(map(len, text.splitlines())) <= width
+    assert "…" not in re.sub(r"[−+]\S*…[−+]\S*", "", text)  # an interval of numbers below 0 is written −.54…−.53
