@@ -19,7 +19,7 @@ from bench.metrics import Episodes, rate, unit_interval
 from bench.scenario import Cell
 from bench.statistics import Array, Interval, interval, task_intervals
 from leaderboard.cards import card
-from leaderboard.entries import METRICS, Entry
+from leaderboard.entries import METRICS, Aligned, Entry, align
 from leaderboard.flags import FLAGS, budgets, efforts
 from leaderboard.pairs import parameters
 from leaderboard.ranking import Board, Row
@@ -55,7 +55,9 @@ def document(boards: Sequence[Board], entries: Sequence[Entry], folder: Path | N
         "metrics": dict(METRICS),
         "boards": [_board(board, keys, shown) for board in boards],
         "pairs": [_pair(entry, keys[id(entry)], shown, folder) for entry in everything],
-        "curves": [_curve(family, kind, keys) for kind, family in _families(entries)],
+        "curves": [
+            _curve(family, kind, aligned, keys) for kind, family in _families(entries) if (aligned := align(family))
+        ],
     }
 
 
@@ -63,10 +65,9 @@ def _controls(entries: Sequence[Entry]) -> list[Entry]:
     """Of every defended victim that was attacked, the same without an attack: the one that was driven most."""
     found: dict[tuple[object, ...], Entry] = {}
     for entry in entries:
-        if entry.attacked and entry.clean:
-            (identity,) = entry.clean.table.select(list(entry.identity)).slice(0, 1).to_pylist()
-            runs = entry.clean.runs if entry.track == "driving" else entry.clean.runs[:1]
-            control = Entry(entry.track, identity, entry.clean.only(runs=runs), entry.clean, entry.references)
+        if entry.attacked and entry.control:
+            (identity,) = entry.control.table.select(list(entry.identity)).slice(0, 1).to_pylist()
+            control = Entry(entry.track, identity, entry.control, entry.clean, entry.references)
             known = found.get(entry.defended)
             if known is None or known.own.table.num_rows < control.own.table.num_rows:
                 found[entry.defended] = control
@@ -82,16 +83,23 @@ def _families(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
     ]
 
 
-def _curve(family: Sequence[Entry], kind: str, keys: Mapping[int, int]) -> dict[str, Any]:
+def _curve(family: Sequence[Entry], kind: str, aligned: Aligned, keys: Mapping[int, int]) -> dict[str, Any]:
+    """On the scenarios that all points have."""
+    known = (entry.control for entry in family if entry.control)
+    control = next((one for one in known if set(aligned.cells) <= set(one.cells)), None)
     return {
         "kind": kind,
+        "cells": len(aligned.cells),
+        "clean": _interval(unit_interval(control.only(cells=aligned.cells).column(family[0].metric)))
+        if control
+        else None,
         "points": [
             {
                 "x": entry.queries if kind == "queries" else entry.identity["threat_budget"],
-                **(_interval(entry.score) or {}),
+                **(_interval(unit_interval(scores)) or {}),
                 "pair": keys[id(entry)],
             }
-            for entry in family
+            for entry, scores in zip(family, aligned.scores, strict=True)
         ],
     }
 

@@ -82,12 +82,16 @@ class Entry:
         return unit_interval(self.scores)
 
     @cached_property
+    def control(self) -> Episodes | None:
+        """The same without an attack; one that stands for several patch seeds is there once."""
+        if self.clean is None or self.track == "driving":
+            return self.clean
+        return self.clean.only(runs=self.clean.runs[:1])
+
+    @cached_property
     def clean_score(self) -> Interval | None:
-        """The same without an attack; a control that stands for several patch seeds counts once."""
-        if self.clean is None:
-            return None
-        runs = self.clean.runs if self.track == "driving" else self.clean.runs[:1]
-        return unit_interval(self.clean.only(runs=runs).column(self.metric))
+        """Of the ranking metric without an attack."""
+        return unit_interval(self.control.column(self.metric)) if self.control else None
 
     @property
     def blind(self) -> Episodes | None:

@@ -13,10 +13,11 @@ import numpy as np
 import pyarrow.compute as pc
 
 from bench.contracts import Track
-from bench.scenario import GRIDS, Cell, Grid
-from bench.statistics import Array, Interval
+from bench.scenario import GRIDS, Grid
+from bench.statistics import Interval
 from leaderboard.entries import Entry, gap, mean
 from leaderboard.trend import ENOUGH_SEEDS
+from leaderboard.worst import Worst, margin, worst
 
 ENOUGH_EPISODES: dict[Track, int] = {"driving": 20, "detection": 3}
 """Scenarios a cell below which a score is flagged."""
@@ -52,24 +53,18 @@ class Subject:
         track: its.
         entries: the attacks that count.
         others: all attacks under the same norm, of larger budgets too.
-        scores: [R, C, E] what the worst of them leave.
-        runs: seeds.
-        cells: driven.
-        lead: over the best blind policy, paired; None where that was not driven.
+        worst: what the strongest of them leaves in each cell.
     """
 
     track: Track
     entries: Sequence[Entry]
     others: Sequence[Entry]
-    scores: Array
-    runs: tuple[int, ...]
-    cells: tuple[Cell, ...]
-    lead: Interval | None
+    worst: Worst
 
-    def strongest(self, *knowledge: str) -> Entry | None:
-        """The attack that leaves least, of those that asked so much."""
+    def strongest(self, *knowledge: str) -> Worst | None:
+        """What the attacks that asked so much leave, the strongest in each cell."""
         some = [entry for entry in self.entries if entry.knowledge in knowledge]
-        return min(some, key=lambda entry: entry.score.estimate, default=None)
+        return worst(some) if some else None
 
     def shares(self, name: str) -> float:
         """Mean of a probe over all its episodes, under attack and without; NaN where none was measured."""
@@ -96,7 +91,7 @@ def masked_gradients(of: Subject) -> Finding:
         return None, "Not measured: these records are older than the count of gradients."
     if white is None or black is None:
         return None, f"Not measured: no {'white' if white is None else 'black'}-box attack was run."
-    found = gap(white, black)
+    found = margin(white, black)
     if found is None:
         return None, "Not measured: the black-box and the white-box attack share no scenario."
     names = f"{_leaves(black)} (black box), {_leaves(white)} (white box)"
@@ -108,7 +103,7 @@ def noise(of: Subject) -> Finding:
     quiet, asking = of.strongest("nothing"), of.strongest("answers", "gradients", "unknown")
     if quiet is None or asking is None:
         return None, f"Not measured: no {'noise' if quiet is None else 'attack beside noise'} was run."
-    found = gap(quiet, asking)
+    found = margin(quiet, asking)
     if found is None:
         return None, "Not measured: noise and attack share no scenario."
     names = f"{_leaves(quiet)}, {_leaves(asking)}"
@@ -119,10 +114,13 @@ def noise(of: Subject) -> Finding:
 
 def blind(of: Subject) -> Finding:
     """Fires where the score under attack is not significantly above that of the best policy that ignores its input."""
-    if of.lead is None:
+    if of.worst.lead is None:
         none = "a detector has no blind policy" if of.track == "detection" else "the blind policies were not driven"
         return None, f"Not measured: {none}."
-    return of.lead.low <= 0, f"Under attack it scores {_signed(of.lead)} against the best policy that does not look."
+    return (
+        of.worst.lead.low <= 0,
+        f"Under attack it scores {_signed(of.worst.lead)} against the best policy that does not look.",
+    )
 
 
 def ignores_input(of: Subject) -> Finding:
@@ -192,11 +190,11 @@ def not_flattened(of: Subject) -> Finding:
 
 def too_little(of: Subject) -> Finding:
     """Fires below 3 seeds, 20 scenarios a cell (3 approaches), or where cells of the standard grid are missing."""
-    runs, _, episodes = of.scores.shape
+    runs, _, episodes = of.worst.scores.shape
     weights = {value for entry in of.entries for value in pc.unique(entry.own.table["weights_sha256"]).to_pylist()}
     seeded = of.track == "detection" or bool(weights - {""})
     grid = _grid(of)
-    cells = len(set(grid.cells()) & set(of.cells))
+    cells = len(set(grid.cells()) & set(of.worst.cells))
     what = f"{runs} seed{'s' * (runs != 1)}, {cells} of {len(grid.cells())} cells of {grid.name}, {episodes} scenarios each"
     few = (seeded and runs < ENOUGH_SEEDS) or episodes < ENOUGH_EPISODES[of.track] or cells < len(grid.cells())
     return few, f"It was driven with {what}."
@@ -243,7 +241,7 @@ def budgets(entries: Sequence[Entry]) -> list[list[Entry]]:
 def _families(entries: Sequence[Entry], vary: str) -> list[list[Entry]]:
     """Those that share every setting but this one, of two or more, in its order."""
     found: dict[frozenset[tuple[str, str]], list[Entry]] = {}
-    for entry in entries:
+    for entry in (entry for entry in entries if vary in entry.settings):
         others = frozenset((name, repr(value)) for name, value in entry.settings.items() if name != vary)
         found.setdefault(others, []).append(entry)
 
@@ -268,8 +266,8 @@ def _grid(of: Subject) -> Grid:
     return next((grid for grid in own if grid.name in named), own[0])
 
 
-def _leaves(entry: Entry) -> str:
-    return f"{entry.identity['attack']} leaves {entry.score.estimate:.2f}"
+def _leaves(found: Worst) -> str:
+    return f"{found.name} leaves {found.score.estimate:.2f}"
 
 
 def _signed(found: Interval) -> str:

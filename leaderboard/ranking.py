@@ -4,51 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import get_args
 
-import numpy as np
 import pyarrow as pa
 
 from bench.contracts import TRACKS, Access, Track
-from bench.metrics import Episodes, unit_interval
-from bench.scenario import WEATHERS, Cell
-from bench.statistics import Array, Interval, interval
+from bench.metrics import Episodes
+from bench.statistics import Interval
 from leaderboard.entries import Entry, read_entries
 from leaderboard.flags import Flag, Subject, flags
 from leaderboard.overview import NAMES
+from leaderboard.worst import Worst, worst
 
 THREAT = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
-
-
-@dataclass(frozen=True, eq=False)
-class Worst:
-    """What is left of a defended victim where in every cell the strongest attack counts.
-
-    Args:
-        scores: [R, C, E] of the ranking metric.
-        runs: training or patch seeds.
-        cells: [C].
-        attacks: the strongest attack of each cell.
-        blind: [C, E] of the best blind policy on the same scenarios; NaN where it was not driven.
-    """
-
-    scores: Array
-    runs: tuple[int, ...]
-    cells: tuple[Cell, ...]
-    attacks: tuple[Entry, ...]
-    blind: Array
-
-    @cached_property
-    def score(self) -> Interval:
-        """Over all runs and cells."""
-        return unit_interval(self.scores)
-
-    @cached_property
-    def lead(self) -> Interval | None:
-        """Minus the best blind policy of the cell, paired scenario by scenario, in the cells where that was driven."""
-        known = np.isfinite(self.blind).all(1)
-        return interval((self.scores - self.blind)[:, known]) if known.any() else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +24,9 @@ class Row:
     """A defended victim on a leaderboard.
 
     Args:
-        entries: the attacks that count, the strongest first.
+        entries: the attacks that count: first the one that is the strongest in most cells.
         worst: what they leave.
-        clean: without an attack; None where that was not driven.
+        clean: without an attack in the same cells; None where that was not driven.
         flags: each with its measurement, fired or not.
         group: rank group, from 1; rows of a group cannot be told from its first. Flagged rows follow the others.
     """
@@ -132,13 +100,11 @@ def _board(key: Key, attacked: Sequence[Entry]) -> Board:
     for defended in dict.fromkeys(entry.defended for entry in attacked if _key(entry) == key):
         own = [entry for entry in allowed if entry.defended == defended]
         found = worst(own)
-        own.sort(key=lambda entry: entry.score.estimate)
+        own.sort(key=lambda entry: (-found.attacks.count(entry), entry.score.estimate))
         others = [
             entry for entry in attacked if entry.defended == defended and entry.identity["threat_norm"] == threat[0]
         ]
-        clean = next((entry.clean_score for entry in own if entry.clean_score), None)
-        subject = Subject(track, own, others, found.scores, found.runs, found.cells, found.lead)
-        rows.append(Row(tuple(own), found, clean, tuple(flags(subject))))
+        rows.append(Row(tuple(own), found, found.clean, tuple(flags(Subject(track, own, others, found)))))
     return Board(track, (world, world_params), tuple(threat), tuple(ranked(rows)), _references(allowed))  # type: ignore[arg-type]
 
 
@@ -153,50 +119,6 @@ def _within(entry: Entry, key: Key) -> bool:
         and _access(str(identity["threat_access"])) <= _access(access)
         and int(str(identity["threat_queries"])) <= queries
     )
-
-
-def worst(entries: Sequence[Entry]) -> Worst:
-    """Of each cell the attack that leaves least, on the runs that all attacks share.
-
-    An attack that shares no run with those that were driven more is left out.
-    """
-    kept: list[Entry] = []
-    shared: set[int] = set()
-    for entry in sorted(entries, key=lambda entry: (entry.stands_for_all, -entry.own.table.num_rows)):
-        own = shared if kept and entry.stands_for_all else set(entry.own.runs)
-        if not kept or shared & own:
-            shared = shared & own if kept else own
-            kept.append(entry)
-    runs = tuple(sorted(shared))
-    order = list(WEATHERS)
-    cells = sorted(
-        {cell for entry in kept for cell in entry.own.cells},
-        key=lambda cell: (order.index(cell.weather), cell.lanes, cell.density),
-    )
-    chosen = [_strongest(kept, cell, runs) for cell in cells]
-    fewest = min(scores.shape[1] for _, scores, _ in chosen)
-    return Worst(
-        scores=np.stack([scores[:, :fewest] for _, scores, _ in chosen], 1),
-        runs=runs,
-        cells=tuple(cells),
-        attacks=tuple(entry for entry, _, _ in chosen),
-        blind=np.stack([blind[:fewest] for _, _, blind in chosen]),
-    )
-
-
-def _strongest(entries: Iterable[Entry], cell: Cell, runs: Sequence[int]) -> tuple[Entry, Array, Array]:
-    """The attack that leaves least in a cell, what it leaves [R, E], and what the best blind policy gets there [E]."""
-    found = []
-    for entry in entries:
-        if cell in entry.own.cells:
-            place = entry.own.cells.index(cell)
-            rows = [0] * len(runs) if entry.stands_for_all else [entry.own.runs.index(run) for run in runs]
-            found.append((entry, entry.scores[rows, place]))
-    entry, scores = min(found, key=lambda pair: float(pair[1].mean()))
-    blind = entry.blind
-    if blind is None or cell not in blind.cells or blind.seeds != entry.own.seeds:
-        return entry, scores, np.full(scores.shape[1], np.nan)
-    return entry, scores, blind.column(entry.metric)[0, blind.cells.index(cell)]
 
 
 def ranked(rows: Iterable[Row]) -> Iterator[Row]:

@@ -34,6 +34,7 @@ FIGURES = {
     "victim_yolov5.png": "detectors:yolov5",
     "world_highway.svg": "highway:world",
     "world_camera.png": "camera:world",
+    "leaderboard.svg": "leaderboard:standard",
 }
 """The module and the function that makes each file."""
 FOLDER = Path(__file__).parents[1] / "images"

@@ -89,12 +89,13 @@ def box(axes: Axes, corners: Tensor, text: str, colour: str, *, below: bool = Fa
 
 @cache
 def patched(attack: str, defense: str = "none") -> Patched:
-    """The published approaches of the default attack in clear weather, with their controls."""
+    """The published approaches of `yolov3_tiny` under the default attack in clear weather, with their controls."""
     records = published("detection").filter(pc.field("weather") == "clear")
     wanted: dict[str, object] = {
         "attack": attack,
         "attack_params": choose("attack", attack).params,
         "defense": defense,
+        "victim": "yolov3_tiny",
         "threat_budget": SHARE,
     }
     (found,) = (pair for pair in read_patched(records) if wanted.items() <= pair.identity.items())

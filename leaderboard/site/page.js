@@ -350,7 +350,7 @@ function drawCurves(board) {
 }
 function figure(curve, board) {
   const W = 340, H = 190, L = 34, B = 34, T = 8, R = 12, ns = "http://www.w3.org/2000/svg";
-  const points = curve.kind === "budget" && curve.first.clean ? [{ x: 0, ...curve.first.clean }, ...curve.points] : curve.points;
+  const points = curve.kind === "budget" && curve.clean ? [{ x: 0, ...curve.clean }, ...curve.points] : curve.points;
   const log = curve.kind === "queries" && points[0].x > 0;
   const scale = (x) => (log ? Math.log10(x) : x);
   const low = scale(points[0].x), high = scale(points[points.length - 1].x) || 1;
@@ -363,7 +363,7 @@ function figure(curve, board) {
   for (const p of points) svg.append(make("circle", { cx: X(p.x), cy: Y(p.estimate), r: 3 }), make("text", { x: X(p.x), y: H - B + 15, "text-anchor": "middle" }, p.x >= 100 ? Math.round(p.x) : +p.x.toFixed(3)));
   const unit = curve.kind === "budget" ? `budget (${board.threat.norm})` : board.track === "driving" ? "queries a step" : "pictures asked about";
   svg.append(make("text", { x: (L + W - R) / 2, y: H - 4, "text-anchor": "middle" }, unit + (log ? ", log scale" : "")));
-  return el("figure", {}, svg, el("figcaption", {}, `${curve.first.attack.name} on ${curve.first.defense.label} · ${curve.first.victim.label}`));
+  return el("figure", {}, svg, el("figcaption", {}, `${curve.first.attack.name} on ${curve.first.defense.label} · ${curve.first.victim.label}, ${curve.cells} cell${curve.cells > 1 ? "s" : ""}`));
 }
 
 /* ---- the card of a pair: #pair-12 ---- */

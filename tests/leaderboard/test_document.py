@@ -9,6 +9,7 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 from full_house import driving
 from synthetic import drive
@@ -16,7 +17,7 @@ from synthetic import drive
 from bench import results
 from bench.errors import UserError
 from leaderboard.cards import run_command
-from leaderboard.document import CSV, schema
+from leaderboard.document import CSV, document, schema
 from leaderboard.entries import MEASUREMENTS, read_entries
 from leaderboard.flags import FLAGS
 from leaderboard.page import NAME, write
@@ -121,3 +122,18 @@ def test_reference_drivers_of_both_types_of_action_stand_apart() -> None:
     assert list(board.references) == names
     better, worse = (board.references[name].column("safe_progress").mean() for name in names)
     assert better > worse
+
+
+def test_a_curve_is_about_the_cells_that_all_its_points_have() -> None:
+    clean, few, many = (
+        drive(attack=attack, skill=skill, threat=("relative", budget), queries=44.0)
+        for attack, skill, budget in (("none", 0.8, 0.1), ("zo", 0.5, 0.05), ("zo", 0.3, 0.1))
+    )
+    part = (pc.field("lanes") == 3) & (pc.field("weather") == "clear")
+    boards, entries = read_boards({"driving": pa.concat_tables([clean, few.filter(part), many])})
+    (curve,) = document(boards, entries, None)["curves"]
+    only = read_entries({"driving": pa.concat_tables([clean, few, many]).filter(part)})
+    wanted = {entry.identity["threat_budget"]: entry.score.estimate for entry in only if entry.attacked}
+    assert curve["cells"] == 2
+    assert {point["x"]: point["estimate"] for point in curve["points"]} == pytest.approx(wanted, abs=1e-4)
+    assert curve["clean"]["estimate"] == pytest.approx(only[0].clean_score.estimate, abs=1e-4)

@@ -167,3 +167,29 @@ def test_rows_whose_intervals_overlap_that_of_the_first_share_its_group() -> Non
     groups = {row.identity["defense"]: row.group for row in board(*tables).rows}
     assert groups["a"] == groups["b"] == 1
     assert groups["c"] == 2
+
+
+def test_an_attack_on_a_few_cells_changes_nothing_but_their_score() -> None:
+    (row,) = board(clean(), BLIND, pgd(0.3), zo(0.5)).rows
+    longer = probed(
+        drive(attack="pgd", attack_params={"steps": 30}, skill=0.1, queries=99.0, weights="ab", cells=HALF[:1]),
+        **(PGD | SEEN),
+    )
+    (also,) = board(clean(), BLIND, pgd(0.3), zo(0.5), longer).rows
+    assert also.worst.score.estimate < row.worst.score.estimate
+    assert also.clean == row.clean
+    assert also.entries[0].identity["attack_params"] == row.entries[0].identity["attack_params"]
+    fired = [[flag.name for flag in each.flags if flag.fired] for each in (row, also)]
+    assert fired[1] == fired[0]
+
+
+def test_masked_gradients_are_judged_cell_by_cell() -> None:
+    """The best white-box attack of each cell is held against the black box, not the one whose own cells are hardest."""
+    strong = probed(
+        drive(attack="pgd", attack_params={"objective": "target"}, skill=0.05, queries=45.0, weights="ab"),
+        **(PGD | SEEN),
+    )
+    assert flag("masked_gradients", clean(), zo(0.3), pgd(0.5)).fired
+    assert not flag("masked_gradients", clean(), zo(0.3), pgd(0.5), strong).fired
+    easy = drive(attack="pgd", attack_params={"steps": 30}, skill=0.5, queries=99.0, weights="ab", cells=HALF[:1])
+    assert flag("masked_gradients", clean(), zo(0.3), pgd(0.5), probed(easy, **(PGD | SEEN))).fired

@@ -1,0 +1,68 @@
+"""What stands on the leaderboard: the published records in the standard threat model of each track."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.transforms import blended_transform_factory
+
+from bench.contracts import TRACKS, Track
+from bench.metrics import unit_interval
+from bench.statistics import Interval
+from docs.figures import style
+from leaderboard.published import published
+from leaderboard.ranking import Board, Row, read_boards
+
+MEASURES: dict[Track, str] = {"driving": "safe progress", "detection": "confidence in the stop sign"}
+MARKS = {
+    "no attack": ("o", 7, style.TRUE),
+    "strongest": ("o", 7, style.SHOWN),
+    "best blind policy": ("|", 13, style.INK),
+}
+FLAGGED = 0.4
+"""Opacity of a flagged row."""
+
+
+def standard() -> Figure:
+    """A row a defended victim: without an attack, and where in every cell the strongest attack counts."""
+    boards, _ = read_boards({track: published(track) for track in TRACKS})
+    first = {board.track: board for board in reversed(boards)}
+    rows = [len(first[track].rows) for track in TRACKS]
+    made = style.figure(1.9 + 0.34 * sum(rows), "What the strongest attack leaves")
+    for axes, track in zip(made.subplots(2, 1, height_ratios=rows), TRACKS, strict=True):
+        _draw(axes, first[track])
+    handles = [Line2D([], [], marker=mark, ls="", ms=size, color=colour) for mark, size, colour in MARKS.values()]
+    made.legend(handles, MARKS, loc="outside lower center", ncols=3, handletextpad=0.1)
+    return made
+
+
+def _draw(axes: Axes, board: Board) -> None:
+    names = blended_transform_factory(axes.transAxes, axes.transData)
+    for place, row in enumerate(board.rows):
+        opacity = FLAGGED if row.flagged else 1
+        worst = row.worst.score
+        if row.clean:
+            axes.plot([worst.estimate, row.clean.estimate], [place, place], color=style.FAINT, lw=5, zorder=1)
+            _point(axes, row.clean, place, style.TRUE, opacity)
+        _point(axes, worst, place, style.SHOWN, opacity)
+        if np.isfinite(row.worst.blind).all():
+            blind = unit_interval(row.worst.blind[None]).estimate
+            axes.plot(blind, place, "|", color=style.INK, ms=13, mew=1.8)
+        axes.text(-0.02, place, _name(row), transform=names, ha="right", va="center", alpha=max(opacity, 0.65))
+    axes.set(xlim=(0, 1), ylim=(len(board.rows) - 0.5, -0.5), yticks=[], xlabel=MEASURES[board.track])
+    axes.spines["left"].set_visible(False)
+    norm, budget, *_ = board.threat
+    axes.set_title(f"{board.track}, {norm} {budget:g}", fontsize=10.5)
+
+
+def _point(axes: Axes, found: Interval, place: int, colour: str, opacity: float) -> None:
+    axes.plot([found.low, found.high], [place, place], color=colour, lw=2.2, alpha=opacity, clip_on=False)
+    axes.plot(found.estimate, place, "o", color=colour, ms=7, alpha=opacity, mec="none", clip_on=False)
+
+
+def _name(row: Row) -> str:
+    victim, defense = (str(row.identity[name]) for name in ("victim", "defense"))
+    plain = victim if defense == "none" else f"{victim} + {defense.removesuffix('_detection')}"
+    return f"{plain} (flagged)" if row.flagged else plain
