@@ -23,12 +23,12 @@ from leaderboard.entries import METRICS, Aligned, Entry, align
 from leaderboard.flags import FLAGS, budgets, efforts
 from leaderboard.pairs import parameters
 from leaderboard.ranking import Board, Row
-from leaderboard.text import component, varying
+from leaderboard.text import labels
 
 VERSION = 1
 """Of the schema; a reader that knows it can read every later document of the same version."""
-Shown = Mapping[str, set[str]]
-"""The parameters that tell the components of a kind apart."""
+Labels = Mapping[str, Mapping[tuple[object, object], str]]
+"""What a component is called: by its kind, then by its name and parameters."""
 
 
 def schema() -> dict[str, Any]:
@@ -45,16 +45,17 @@ def document(boards: Sequence[Board], entries: Sequence[Entry], folder: Path | N
         entries: all that was driven.
         folder: the results folder; None where records are published.
     """
-    shown = {kind: varying(entries, kind) for kind in ("attack", "defense", "victim")}
     everything = [*entries, *_controls(entries)]
+    driven = [(entry, entry.own.table.num_rows) for entry in everything]
+    called = {kind: labels(driven, kind) for kind in ("attack", "defense", "victim")}
     keys = {id(entry): key for key, entry in enumerate(everything)}
     return {
         "schema": VERSION,
         "cavbench": metadata.version("cavbench"),
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "metrics": dict(METRICS),
-        "boards": [_board(board, keys, shown) for board in boards],
-        "pairs": [_pair(entry, keys[id(entry)], shown, folder) for entry in everything],
+        "boards": [_board(board, keys, called) for board in boards],
+        "pairs": [_pair(entry, keys[id(entry)], called, folder) for entry in everything],
         "curves": [
             _curve(family, kind, aligned, keys) for kind, family in _families(entries) if (aligned := align(family))
         ],
@@ -104,12 +105,12 @@ def _curve(family: Sequence[Entry], kind: str, aligned: Aligned, keys: Mapping[i
     }
 
 
-def _board(board: Board, keys: Mapping[int, int], shown: Shown) -> dict[str, Any]:
+def _board(board: Board, keys: Mapping[int, int], called: Labels) -> dict[str, Any]:
     return {
         "track": board.track,
         "world": {"name": board.world[0], "params": parameters(board.world[1])},
         "threat": _threat(board.threat),
-        "rows": [_row(row, keys, shown) for row in board.rows],
+        "rows": [_row(row, keys, called) for row in board.rows],
         "references": [
             {
                 "name": name,
@@ -125,7 +126,7 @@ def _threat(values: Sequence[object]) -> dict[str, object]:
     return dict(zip(("norm", "budget", "access", "queries"), values, strict=True))
 
 
-def _row(row: Row, keys: Mapping[int, int], shown: Shown) -> dict[str, Any]:
+def _row(row: Row, keys: Mapping[int, int], called: Labels) -> dict[str, Any]:
     worst = row.worst
     cells = _cells(worst.cells, worst.scores)
     for cell, entry, blind in zip(cells, worst.attacks, worst.blind, strict=True):
@@ -133,7 +134,7 @@ def _row(row: Row, keys: Mapping[int, int], shown: Shown) -> dict[str, Any]:
     return {
         "group": row.group,
         "flagged": row.flagged,
-        **_named(row.entries[0], ("defense", "victim"), shown),
+        **_named(row.entries[0], ("defense", "victim"), called),
         "score": _interval(worst.score),
         "clean": _interval(row.clean),
         "lead": _interval(worst.lead),
@@ -149,18 +150,18 @@ def _row(row: Row, keys: Mapping[int, int], shown: Shown) -> dict[str, Any]:
     }
 
 
-def _named(entry: Entry, kinds: Sequence[str], shown: Shown) -> dict[str, Any]:
+def _named(entry: Entry, kinds: Sequence[str], called: Labels) -> dict[str, Any]:
     return {
         kind: {
             "name": entry.identity[kind],
-            "label": component(entry, kind, shown[kind]),
+            "label": called[kind][entry.identity[kind], entry.identity[f"{kind}_params"]],
             "params": parameters(entry.identity[f"{kind}_params"]),
         }
         for kind in kinds
     }
 
 
-def _pair(entry: Entry, key: int, shown: Shown, folder: Path | None) -> dict[str, Any]:
+def _pair(entry: Entry, key: int, called: Labels, folder: Path | None) -> dict[str, Any]:
     own, identity = entry.own, entry.identity
     cells = _cells(own.cells, entry.scores)
     for name in ("crashed" if entry.track == "driving" else "ran", "queries"):
@@ -169,7 +170,7 @@ def _pair(entry: Entry, key: int, shown: Shown, folder: Path | None) -> dict[str
     return {
         "key": key,
         "track": entry.track,
-        **_named(entry, ("attack", "defense", "victim"), shown),
+        **_named(entry, ("attack", "defense", "victim"), called),
         "world": {"name": identity["world"], "params": parameters(identity["world_params"])},
         "threat": _threat([identity[f"threat_{name}"] for name in ("norm", "budget", "access", "queries")]),
         "asks": entry.knowledge if entry.attacked else "nothing",

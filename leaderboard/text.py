@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
@@ -115,6 +116,33 @@ def varying(pairs: Sequence[Identified], column: str) -> set[str]:
         for name in set().union(*sets)
         if len({repr(each.get(name)) for each in sets}) > 1
     }
+
+
+def labels(driven: Sequence[tuple[Identified, int]], column: str) -> dict[tuple[object, object], str]:
+    """A label for each component of a kind, by name and parameters as in the records.
+
+    It is the name with the parameters in which components of this name differ, but for those in which it is as most of them.
+
+    Args:
+        driven: pairs, each with how many episodes it is of.
+        column: `attack`, `defense` or `victim`.
+    """
+    names = varying([pair for pair, _ in driven], column)
+    episodes: dict[tuple[object, str], Counter[str]] = {}
+    for pair, count in driven:
+        for name, value in parameters(pair.identity[f"{column}_params"]).items():
+            episodes.setdefault((pair.identity[column], name), Counter())[repr(value)] += count
+    usual = {key: value for key, counts in episodes.items() for value, n in counts.items() if 2 * n > counts.total()}
+    found = {}
+    for pair, _ in driven:
+        component, params = pair.identity[column], pair.identity[f"{column}_params"]
+        words = [
+            f"{name}={value}"
+            for name, value in parameters(params).items()
+            if name in names and usual.get((component, name)) != repr(value)
+        ]
+        found[component, params] = " ".join([str(component), *words])
+    return found
 
 
 def component(pair: Identified, column: str, shown: set[str] | None = None) -> str:

@@ -210,8 +210,7 @@ function setBoard(place) {
 }
 function within(board) {
   const keys = new Set(board.rows.flatMap((row) => row.pairs));
-  const same = (a, b) => ["defense", "victim"].every((kind) => a[kind].label === b[kind].label && JSON.stringify(a[kind].params) === JSON.stringify(b[kind].params));
-  return data.pairs.filter((pair) => keys.has(pair.key) || (pair.attack.name === "none" && pair.track === board.track && board.rows.some((row) => same(row, pair))));
+  return data.pairs.filter((pair) => keys.has(pair.key) || (pair.attack.name === "none" && pair.track === board.track && board.rows.some((row) => sameDefended(row, pair))));
 }
 function chosen(one) {
   return ["defense", "victim"].every((kind) => !state[kind] || one[kind].name === state[kind]);
@@ -231,13 +230,13 @@ function render() {
   const whole = left === total;
   const columns = [
     { name: "Rank", show: (one) => (one.row ? String(one.group) : ""), value: (one) => one.group ?? null },
-    { name: "Defence", show: (one) => (one.row ? el("a", { href: "#grid", onclick: () => { state.shown = `r${board.rows.indexOf(one.row)}`; render(); } }, one.row.defense.label) : one.reference.name), value: (one) => one.row?.defense.label ?? one.reference.name },
+    { name: "Defence", class: "name", show: (one) => (one.row ? el("a", { href: "#grid", onclick: () => { state.shown = `r${board.rows.indexOf(one.row)}`; render(); } }, one.row.defense.label) : one.reference.name), value: (one) => one.row?.defense.label ?? one.reference.name },
     { name: "Victim", show: (one) => one.row?.victim.label ?? "", value: (one) => one.row?.victim.label ?? "" },
     { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, number: true },
     { name: "0 – 1", show: (one) => strip(one.score, blindOf(one)) },
     { name: "Clean", show: (one) => (whole ? fixed(one.row?.clean?.estimate) : fixed(cleanOf(one)?.estimate)), value: (one) => (whole ? one.row?.clean?.estimate : cleanOf(one)?.estimate) ?? null, number: true },
     ...(board.references.length ? [{ name: "Against blind", show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, number: true }] : []),
-    { name: "Strongest attack", show: (one) => (one.row ? cardLink(pairs.get(one.row.strongest), pairs.get(one.row.strongest).attack.label) : ""), value: (one) => (one.row ? pairs.get(one.row.strongest).attack.label : "") },
+    { name: "Strongest attack", class: "name", show: (one) => (one.row ? cardLink(pairs.get(one.row.strongest), pairs.get(one.row.strongest).attack.label) : ""), value: (one) => (one.row ? pairs.get(one.row.strongest).attack.label : "") },
     { name: "Flags", class: "doubts", show: (one) => (one.row ? doubts(one.row) : ""), value: (one) => (one.row ? one.row.flags.filter((flag) => flag.fired).map((flag) => flag.name).join(" ") : "") },
   ];
   draw("ranks", columns, [...rows, ...references], (one, before, unsorted) =>
@@ -248,11 +247,14 @@ function render() {
   drawCurves(board);
   drawHeat(board);
 }
+function sameDefended(a, b) {
+  return ["defense", "victim"].every((kind) => JSON.stringify([a[kind].name, a[kind].params]) === JSON.stringify([b[kind].name, b[kind].params]));
+}
 function cleanOf(one) {
   if (!one.row) return null;
   const strongest = pairs.get(one.row.strongest);
   const control = data.pairs.find((pair) => pair.attack.name === "none" && pair.track === strongest.track &&
-    ["defense", "victim"].every((kind) => JSON.stringify([pair[kind].name, pair[kind].params]) === JSON.stringify([strongest[kind].name, strongest[kind].params])));
+    sameDefended(pair, strongest));
   return control ? over(control.cells, control.score, 100) : null;
 }
 function besideBlind(row) {
@@ -282,15 +284,16 @@ function doubts(row) {
 function drawPairs(board, metric) {
   const rows = within(board).filter(chosen).filter((pair) => !state.attack || pair.attack.name === state.attack)
     .map((pair) => ({ pair, score: over(pair.cells, pair.score, 100) })).filter((one) => one.score);
+  const rowOf = (pair) => board.rows.find((row) => sameDefended(row, pair));
   const [other, title] = board.track === "driving" ? ["crashed", "Crashed"] : ["ran", "Runs the sign"];
   const share = ({ pair }) => mean(pair, other, pair.measures[other]?.estimate ?? null);
   const queries = ({ pair }) => mean(pair, "queries", pair.queries);
   draw("pairs", [
-    { name: "Attack", show: ({ pair }) => cardLink(pair, pair.attack.label), value: ({ pair }) => pair.attack.label },
-    { name: "Defence", show: ({ pair }) => pair.defense.label, value: ({ pair }) => pair.defense.label },
+    { name: "Attack", class: "name", show: ({ pair }) => cardLink(pair, pair.attack.label), value: ({ pair }) => pair.attack.label },
+    { name: "Defence", class: "name", show: ({ pair }) => pair.defense.label, value: ({ pair }) => pair.defense.label },
     { name: "Victim", show: ({ pair }) => pair.victim.label, value: ({ pair }) => pair.victim.label },
     { name: "Threat model", show: ({ pair }) => threatShort(pair.threat), value: ({ pair }) => threatShort(pair.threat) },
-    { name: metric[0].toUpperCase() + metric.slice(1), show: (one) => estimate(one.score), value: (one) => one.score.estimate, number: true },
+    { name: metric[0].toUpperCase() + metric.slice(1), show: (one) => [estimate(one.score), el("small", {}, " ", part(one.pair, rowOf(one.pair)))].flat(), value: (one) => one.score.estimate, number: true },
     { name: "0 – 1", show: (one) => strip(one.score) },
     { name: title, show: (one) => percent(share(one)), value: share, number: true },
     { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
@@ -327,18 +330,25 @@ function drawHeat(board) {
         fixed(cell.estimate), el("small", {}, [bounds(cell), by].filter(Boolean).join(" ")));
     })))));
 }
+/* Of a pair that was driven in fewer cells than its row. */
+function part(pair, row) {
+  const own = kept(pair.cells).length, all = row ? kept(row.cells).length : own;
+  return own < all ? `${own} of ${all} cells` : "";
+}
 function drawMatrix(board) {
   const rows = board.rows.filter(chosen);
   const all = within(board).filter(chosen);
   const controls = all.filter((pair) => pair.attack.name === "none");
   const label = (pair) => (pair.attack.name === "none" ? "no attack" : pair.attack.label + (pair.threat.budget === board.threat.budget && pair.threat.access === board.threat.access && pair.threat.queries === board.threat.queries ? "" : ` (${threatShort(pair.threat)}, ${pair.threat.queries})`));
-  const attacks = [...new Set([...controls, ...all.filter((pair) => pair.attack.name !== "none")].map(label))];
-  const find = (row, attack) => all.find((pair) => label(pair) === attack && ["defense", "victim"].every((kind) => JSON.stringify([pair[kind].name, pair[kind].params]) === JSON.stringify([row[kind].name, row[kind].params])));
+  const named = [...controls, ...all.filter((pair) => pair.attack.name !== "none")].map(label);
+  const times = (attack) => named.filter((other) => other === attack).length;
+  const attacks = [...new Set(named)].sort((a, b) => (b === "no attack") - (a === "no attack") || times(b) - times(a));
+  const find = (row, attack) => all.find((pair) => label(pair) === attack && sameDefended(pair, row));
   const scored = rows.map((row) => attacks.map((attack) => { const pair = find(row, attack); return pair && { pair, score: over(pair.cells, pair.score, 100) }; }));
   at("matrix").replaceChildren(
     el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Defence · victim"), ...attacks.map((attack) => el("th", { scope: "col" }, attack)))),
     el("tbody", {}, ...rows.map((row, i) => el("tr", {}, el("th", { scope: "row" }, `${row.defense.label} · ${row.victim.label}`),
-      ...scored[i].map((one) => (one?.score ? el("td", { class: "value", style: tint(one.score.estimate) }, cardLink(one.pair, fixed(one.score.estimate)), el("small", {}, bounds(one.score))) : el("td", { class: "value" }, "")))))));
+      ...scored[i].map((one) => (one?.score ? el("td", { class: "value", style: tint(one.score.estimate) }, cardLink(one.pair, fixed(one.score.estimate)), el("small", {}, bounds(one.score)), el("small", {}, part(one.pair, rows[i]))) : el("td", { class: "value" }, "")))))));
   at("matrix").copied = () => [["defence", "victim", ...attacks], ...rows.map((row, i) => [row.defense.label, row.victim.label, ...scored[i].map((one) => one?.score?.estimate ?? null)])];
 }
 function drawCurves(board) {
@@ -363,7 +373,7 @@ function figure(curve, board) {
   for (const p of points) svg.append(make("circle", { cx: X(p.x), cy: Y(p.estimate), r: 3 }), make("text", { x: X(p.x), y: H - B + 15, "text-anchor": "middle" }, p.x >= 100 ? Math.round(p.x) : +p.x.toFixed(3)));
   const unit = curve.kind === "budget" ? `budget (${board.threat.norm})` : board.track === "driving" ? "queries a step" : "pictures asked about";
   svg.append(make("text", { x: (L + W - R) / 2, y: H - 4, "text-anchor": "middle" }, unit + (log ? ", log scale" : "")));
-  return el("figure", {}, svg, el("figcaption", {}, `${curve.first.attack.name} on ${curve.first.defense.label} · ${curve.first.victim.label}, ${curve.cells} cell${curve.cells > 1 ? "s" : ""}`));
+  return el("figure", {}, svg, el("figcaption", {}, `${curve.first.attack.label} on ${curve.first.defense.label} · ${curve.first.victim.label}, ${curve.cells} cell${curve.cells > 1 ? "s" : ""}`));
 }
 
 /* ---- the card of a pair: #pair-12 ---- */

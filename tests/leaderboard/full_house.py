@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from synthetic import approach, drive, probed, reference_drivers
+from synthetic import CLEAR, approach, drive, probed, reference_drivers
 
 from bench.results import FOLDER
 
@@ -15,7 +15,7 @@ PGD = {"queries": 45.0, "gradient_queries": 44.0, "zero_gradients": 0.0}
 
 
 def driving() -> pa.Table:
-    """Two victims, three defences, three attacks, two budgets, two efforts."""
+    """Two victims, three defences, three attacks, two budgets, two efforts, one more effort on two cells only."""
     skills = {
         ("dqn", "none"): (0.75, 0.25),
         ("dqn", "advtrain"): (0.7, 0.5),
@@ -40,7 +40,10 @@ def driving() -> pa.Table:
                        queries=11.0 * steps, **own)  # fmt: skip
             name = f"zo-{defense}-{victim}" + ("" if (steps, budget) == (4, 0.1) else f"-{steps}-{budget}")
             tables.append(probed(zo, pair=name, gradient_queries=0.0, **SEEN))
-    return pa.concat_tables(tables)
+    longer = drive(
+        attack="pgd", attack_params={"steps": 30}, skill=0.15, queries=125.0, weights="ab" * 32, cells=CLEAR[:2]
+    )
+    return pa.concat_tables([*tables, probed(longer, pair="pgd-none-dqn-30", **PGD, **SEEN)])
 
 
 def detection() -> pa.Table:
