@@ -340,9 +340,9 @@ function drawMatrix(board) {
   const all = within(board).filter(chosen);
   const controls = all.filter((pair) => pair.attack.name === "none");
   const label = (pair) => (pair.attack.name === "none" ? "no attack" : pair.attack.label + (pair.threat.budget === board.threat.budget && pair.threat.access === board.threat.access && pair.threat.queries === board.threat.queries ? "" : ` (${threatShort(pair.threat)}, ${pair.threat.queries})`));
-  const named = [...controls, ...all.filter((pair) => pair.attack.name !== "none")].map(label);
-  const times = (attack) => named.filter((other) => other === attack).length;
-  const attacks = [...new Set(named)].sort((a, b) => (b === "no attack") - (a === "no attack") || times(b) - times(a));
+  const driven = (attack) => all.reduce((sum, pair) => sum + (label(pair) === attack ? pair.cells.length : 0), 0);
+  const attacks = [...new Set([...controls, ...all.filter((pair) => pair.attack.name !== "none")].map(label))]
+    .sort((a, b) => (b === "no attack") - (a === "no attack") || driven(b) - driven(a));
   const find = (row, attack) => all.find((pair) => label(pair) === attack && sameDefended(pair, row));
   const scored = rows.map((row) => attacks.map((attack) => { const pair = find(row, attack); return pair && { pair, score: over(pair.cells, pair.score, 100) }; }));
   at("matrix").replaceChildren(
