@@ -195,12 +195,13 @@ class Source:
     def commands(self) -> list[str]:
         """What to type for everything that was asked for and not found."""
         lines = []
+        usual = usual_crafting() if self.missing else None
         for detector, wanted in self.missing.items():
             together: dict[tuple[object, ...], list[Configuration]] = {}
             for row, one in CONFIGURATIONS.items():
                 if row in wanted:
                     together.setdefault((*one.changes, one.size), []).append(one)
-            lines += [_command(detector, some) for some in together.values()]
+            lines += [_command(detector, some, usual) for some in together.values()]
         return lines
 
 
@@ -248,12 +249,21 @@ def _crafting(attack_params: str) -> str:
     return canonical({name: value for name, value in parameters(attack_params).items() if name not in VARIED})
 
 
-def _command(detector: Detector, configurations: list[Configuration]) -> str:
+def usual_crafting() -> str | None:
+    """The attack's default parameters as in the published records, most of which were run with them; None without any."""
+    records = published("detection")
+    counts = records.filter(pc.field("attack") == ATTACK)["attack_params"].value_counts()
+    most = max(counts.to_pylist(), key=lambda one: one["counts"], default=None)
+    return _crafting(most["values"]) if most else None
+
+
+def _command(detector: Detector, configurations: list[Configuration], usual: str | None) -> str:
     words = [f"attack={ATTACK}", f"victim={detector.victim}", f"weather={','.join(WEATHERS.values())}", "seeds=0,1,2"]
     for kind, text in (("victim", detector.victim_params), ("world", detector.world_params)):
         words += [f"{kind}.{name}={value}" for name, value in parameters(text).items() if value not in ("", None)]
-    crafting, defaults = parameters(detector.crafting), parameters(_standard("attack", ATTACK))
-    words += [f"attack.{name}={value}" for name, value in crafting.items() if value != defaults.get(name)]
+    if detector.crafting != usual:
+        defaults = parameters(_standard("attack", ATTACK))
+        words += [f"attack.{name}={v}" for name, v in parameters(detector.crafting).items() if v != defaults.get(name)]
     first = configurations[0]
     for name in first.changes:
         words.append(f"attack.{name}={','.join(f'{one.changes[name]:g}' for one in configurations)}")

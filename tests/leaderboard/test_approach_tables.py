@@ -9,8 +9,11 @@ import pyarrow.compute as pc
 import pytest
 from rich.console import Console
 
+from bench.pair import choose
+from leaderboard.pairs import parameters
 from leaderboard.published import published
 from leaderboard.tables import run_report
+from leaderboard.thesis_patch_records import usual_crafting
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 160])
@@ -21,3 +24,10 @@ def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut_off(width: int)
     text = out.getvalue()
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in re.sub(r"[−+]\S*…[−+]\S*", "", text)  # an interval of numbers below 0 is written −.54…−.53
+
+
+def test_most_published_patches_were_crafted_with_the_default_parameters() -> None:
+    """The commands of `bench report thesis` leave these out without importing the attack, which takes seconds."""
+    usual = parameters(usual_crafting())
+    assert usual
+    assert usual.items() <= parameters(choose("attack", "eot").params).items()
