@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.contracts import Access
-from bench.driving import ActionType, DrivingAttack
+from bench.driving.contracts import ActionType, DrivingAttack
 from bench.errors import UserError
+from bench.plugins.contracts import Access
 
 if TYPE_CHECKING:
-    from bench.threat import Oracle
+    from bench.driving.threat import Oracle
 
 ATTACKS: dict[str, Access] = {
     "BoundaryAttack": "decisions",

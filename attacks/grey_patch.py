@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from bench.contracts import Access, Progress
-from bench.vision import PatchAttack, Scenes
+from bench.detection.contracts import PatchAttack, Scenes
+from bench.plugins.contracts import Access, Progress
 
 if TYPE_CHECKING:
-    from bench.patch import VisionOracle
+    from bench.detection.threat import VisionOracle
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,9 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from bench.contracts import Access, Progress
-from bench.patch import VisionOracle, check_texels
-from bench.vision import PatchAttack, Scenes
+from bench.detection.contracts import PatchAttack, Scenes
+from bench.detection.threat import VisionOracle, check_texels
+from bench.plugins.contracts import Access, Progress
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
-from bench.contracts import Access, Progress
-from bench.driving import DrivingAttack
-from bench.vision import PatchAttack, Scenes
+from bench.detection.contracts import PatchAttack, Scenes
+from bench.driving.contracts import DrivingAttack
+from bench.plugins.contracts import Access, Progress
 
 if TYPE_CHECKING:
-    from bench.patch import VisionOracle
-    from bench.threat import Oracle
+    from bench.detection.threat import VisionOracle
+    from bench.driving.threat import Oracle
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Objective
-from bench.contracts import Access
-from bench.driving import DrivingAttack
+from bench.driving.contracts import DrivingAttack
+from bench.plugins.contracts import Access
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bench.threat import Oracle
+    from bench.driving.threat import Oracle
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion
-from bench.contracts import Access
-from bench.driving import DrivingAttack
+from bench.driving.contracts import DrivingAttack
+from bench.plugins.contracts import Access
 
 if TYPE_CHECKING:
-    from bench.threat import Oracle
+    from bench.driving.threat import Oracle
 
 ZOObjective = Literal["collision", "expected", "margin", "target", "thesis"]
 

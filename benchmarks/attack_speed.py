@@ -19,12 +19,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from attacks.zo import ZOSignSGD
-from bench.driving import DrivingAttack, Policy
-from bench.pipeline import AttackModule
-from bench.process import settle
-from bench.scenario import Cell, SeedBlock
-from bench.threat import ObservationThreat
-from bench.victims.networks import QPolicy
+from bench.driving.contracts import DrivingAttack, Policy
+from bench.driving.pipeline import AttackModule
+from bench.driving.threat import ObservationThreat
+from bench.run.process import settle
+from bench.scenarios.grid import Cell, SeedBlock
+from bench.victims.drivers.networks import QPolicy
 from envs.highway.world import HighwayWorld
 
 SMOOTHING, STEP_SIZE, FASTER = 0.01, 0.01, 3

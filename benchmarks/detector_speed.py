@@ -13,11 +13,11 @@ from collections.abc import Callable
 
 import torch
 
-from bench.process import settle
-from bench.victims.yolo import frozen
-from bench.victims.yolov3_tiny import YOLOv3TinyNetwork
-from bench.victims.yolov5 import YOLOv5Network
-from bench.vision import Detector
+from bench.detection.contracts import Detector
+from bench.run.process import settle
+from bench.victims.detectors.yolo import frozen
+from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
+from bench.victims.detectors.yolov5 import YOLOv5Network
 
 STOP_SIGN = 11
 

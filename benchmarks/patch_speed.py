@@ -17,13 +17,13 @@ import numpy as np
 import torch
 
 from attacks.eot import EOT
-from bench.approach import look
+from bench.detection.approach import look
+from bench.detection.contracts import Detector, Scenes
+from bench.detection.threat import STOP_SIGN, PatchThreat, VisionOracle
 from bench.errors import UserError
-from bench.patch import STOP_SIGN, PatchThreat, VisionOracle
-from bench.process import settle
-from bench.scenario import GRIDS
-from bench.victims.yolov3_tiny import YOLOv3Tiny
-from bench.vision import Detector, Scenes
+from bench.run.process import settle
+from bench.scenarios.grid import GRIDS
+from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
 from envs.camera.world import StopSignApproach
 
 GRID, THREAT, WORKERS = GRIDS["approach-v1"], PatchThreat(), 2

@@ -24,15 +24,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bench.results import FOLDER, SCHEMA
-from bench.scenario import GRIDS
+from bench.records.store import FOLDER, SCHEMA
+from bench.scenarios.grid import GRIDS
 
 SEEDS, EPISODES, ATTACKS = 3, 100, 8
 POLICY = {f"parameter_{number}": 0.125 for number in range(15)}
 MEASURE = """
 import resource, subprocess, sys, time
 start = time.perf_counter()
-code = subprocess.run([sys.executable, "-m", "bench.cli", "report", *sys.argv[1:]], stdout=subprocess.DEVNULL).returncode
+code = subprocess.run([sys.executable, "-m", "bench", "report", *sys.argv[1:]], stdout=subprocess.DEVNULL).returncode
 used = resource.getrusage(resource.RUSAGE_CHILDREN)
 print(code, time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss / 1e6)
 """

@@ -8,12 +8,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bench.contracts import Progress, Trained
-from bench.driving import AttackInLoop, DrivingDefense, DrivingVictim, DrivingWorld, Policy
+from bench.driving.contracts import AttackInLoop, DrivingDefense, DrivingVictim, DrivingWorld, Policy
+from bench.driving.threat import Norm, ObservationThreat, Oracle
 from bench.errors import UserError
-from bench.threat import Norm, ObservationThreat, Oracle
+from bench.plugins.contracts import Progress, Trained
+from bench.plugins.options import configured, parameter_words
 from bench.victims import zoo
-from bench.words import configured, parameter_words
 
 
 @dataclass(frozen=True, kw_only=True)

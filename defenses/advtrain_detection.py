@@ -8,15 +8,23 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from bench.contracts import Progress, Trained
+from bench.detection.contracts import (
+    STOP_SIGN,
+    CameraWorld,
+    Detector,
+    DetectorDefense,
+    DetectorVictim,
+    PatchAttack,
+    Scenes,
+)
+from bench.detection.threat import PatchThreat, VisionOracle
 from bench.errors import UserError
-from bench.patch import PatchThreat, VisionOracle
+from bench.plugins.contracts import Progress, Trained
+from bench.plugins.options import configured, parameter_words
 from bench.victims import zoo
-from bench.victims.detection_loss import missed, unlike
-from bench.victims.detector_training import descend
-from bench.victims.windows import Views, Windows
-from bench.vision import STOP_SIGN, CameraWorld, Detector, DetectorDefense, DetectorVictim, PatchAttack, Scenes
-from bench.words import configured, parameter_words
+from bench.victims.detectors.loss import missed, unlike
+from bench.victims.detectors.training import descend
+from bench.victims.detectors.windows import Views, Windows
 
 AWAY = 0.2
 """Share of the windows that are anywhere in the picture, and not about the sign."""

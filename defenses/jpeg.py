@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.vision import Detector, DetectorDefense, DetectorVictim
+from bench.detection.contracts import Detector, DetectorDefense, DetectorVictim
 from defenses.smoothing import Guarded
 
 

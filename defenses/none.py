@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from bench.contracts import Victim
-from bench.driving import DrivingDefense
-from bench.vision import DetectorDefense
+from bench.detection.contracts import DetectorDefense
+from bench.driving.contracts import DrivingDefense
+from bench.plugins.contracts import Victim
 
 
 @dataclass(frozen=True, kw_only=True)

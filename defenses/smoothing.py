@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.vision import Detector, DetectorDefense, DetectorVictim, Predictions
+from bench.detection.contracts import Detector, DetectorDefense, DetectorVictim, Predictions
 
 
 class Guarded(Detector):

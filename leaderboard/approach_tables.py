@@ -12,8 +12,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from bench import stopping
-from bench.statistics import Interval
+from bench.detection import stopping
+from bench.statistics.estimates import Interval
 from leaderboard.approaches import NO_PATCH, Measured, Patched, read_patched
 from leaderboard.layout import STRIP, Column, Section, axis, fitted, rows_by_weather
 from leaderboard.pairs import DEFENDED
@@ -41,7 +41,7 @@ def approach_report(records: pa.Table, console: Console) -> None:
     """Print what the records of a run of the detection track say.
 
     Args:
-        records: of approaches (`bench.results.SCHEMAS`), their controls among them.
+        records: of approaches (`bench.records.store.SCHEMAS`), their controls among them.
         console: where to print; readable from 80 columns on; wider ones add columns.
     """
     pairs = read_patched(records)

@@ -10,10 +10,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.contracts import REFERENCE_PATCHES
-from bench.metrics import Episodes, difference, rate, unit_interval
-from bench.scenario import Cell
-from bench.statistics import Interval, interval
+from bench.plugins.contracts import REFERENCE_PATCHES
+from bench.scenarios.grid import Cell
+from bench.statistics.episodes import Episodes, difference, rate, unit_interval
+from bench.statistics.estimates import Interval, interval
 from leaderboard.pairs import ATTACKER, DEFENDED, groups, newest
 
 NO_PATCH = "none"

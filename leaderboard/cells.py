@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.metrics import MAX_RETURN, Summary
-from bench.statistics import Interval
+from bench.statistics.episodes import MAX_RETURN, Summary
+from bench.statistics.estimates import Interval
 from leaderboard.layout import STRIP, Column, Section, axis, fitted, rows_by_weather
 from leaderboard.pairs import BEST_BLIND, IDM, Pair
 from leaderboard.text import ATTACKED, BLIND, CLEAN, MISSING, arrow, estimate, number, share, strip, verdict

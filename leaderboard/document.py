@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from bench.contracts import Track
-from bench.metrics import Episodes, rate, unit_interval
-from bench.scenario import Cell
-from bench.statistics import Array, Interval, interval, task_intervals
+from bench.plugins.contracts import Track
+from bench.scenarios.grid import Cell
+from bench.statistics.episodes import Episodes, rate, unit_interval
+from bench.statistics.estimates import Array, Interval, interval, task_intervals
 from leaderboard.cards import card
 from leaderboard.entries import METRICS, Aligned, Entry, align
 from leaderboard.flags import FLAGS, budgets, efforts

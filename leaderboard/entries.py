@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.contracts import REFERENCE_PATCHES, Track
-from bench.metrics import Episodes, unit_interval
-from bench.scenario import Cell
-from bench.statistics import Array, Interval, interval
+from bench.plugins.contracts import REFERENCE_PATCHES, Track
+from bench.scenarios.grid import Cell
+from bench.statistics.episodes import Episodes, unit_interval
+from bench.statistics.estimates import Array, Interval, interval
 from leaderboard.approaches import NO_PATCH, read_patched
 from leaderboard.pairs import ATTACKER, BEST_BLIND, DEFENDED, parameters, read_pairs
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow.compute as pc
 
-from bench.contracts import Track
-from bench.scenario import GRIDS, Grid
-from bench.statistics import Interval
+from bench.plugins.contracts import Track
+from bench.scenarios.grid import GRIDS, Grid
+from bench.statistics.estimates import Interval
 from leaderboard.entries import Entry, gap, mean
 from leaderboard.trend import ENOUGH_SEEDS
 from leaderboard.worst import Worst, margin, worst

@@ -13,7 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from bench.scenario import Cell
+from bench.scenarios.grid import Cell
 
 Subject = TypeVar("Subject")
 STRIP = 25

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.metrics import MAX_RETURN, Summary, summarise
+from bench.statistics.episodes import MAX_RETURN, Summary, summarise
 from leaderboard.layout import STRIP, Column, Section, axis, fitted
 from leaderboard.pairs import BEST_BLIND, DEFENDED, Pair
 from leaderboard.text import (

@@ -19,11 +19,11 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from bench import results
-from bench.contracts import TRACKS, Track
 from bench.errors import UserError
 from bench.files import whole
-from bench.metrics import unit_interval
+from bench.plugins.contracts import TRACKS, Track
+from bench.records import store as results
+from bench.statistics.episodes import unit_interval
 from leaderboard import thesis_page
 from leaderboard.document import document, table
 from leaderboard.entries import MEASUREMENTS, METRICS
@@ -40,7 +40,7 @@ def leaderboard_report(records: Mapping[Track, pa.Table], console: Console) -> N
     """Print the ranking of every threat model, with the flags that have fired.
 
     Args:
-        records: by track (`bench.results.SCHEMAS`).
+        records: by track (`bench.records.store.SCHEMAS`).
         console: where to print.
     """
     print_boards(read_boards(records)[0], console)

@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from bench.metrics import Episodes, Summary, difference, shared, summarise, unit_interval
-from bench.scenario import Cell
-from bench.statistics import Interval, iqm
+from bench.scenarios.grid import Cell
+from bench.statistics.episodes import Episodes, Summary, difference, shared, summarise, unit_interval
+from bench.statistics.estimates import Interval, iqm
 
 DEFENDED = ("defense", "defense_params", "victim", "victim_params", "world", "world_params")
 """What drives: the columns that a clean control shares with the attacked episodes."""

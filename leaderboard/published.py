@@ -15,11 +15,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from bench import results
-from bench.contracts import Track
 from bench.errors import UserError
 from bench.files import whole
-from bench.results import SCHEMAS, track_of
+from bench.plugins.contracts import Track
+from bench.records import store as results
+from bench.records.store import SCHEMAS, track_of
 
 
 def published(track: Track) -> pa.Table:

@@ -8,9 +8,9 @@ from typing import get_args
 
 import pyarrow as pa
 
-from bench.contracts import TRACKS, Access, Track
-from bench.metrics import Episodes
-from bench.statistics import Interval
+from bench.plugins.contracts import TRACKS, Access, Track
+from bench.statistics.episodes import Episodes
+from bench.statistics.estimates import Interval
 from leaderboard.entries import Entry, read_entries
 from leaderboard.flags import Flag, Subject, flags
 from leaderboard.overview import NAMES

@@ -10,8 +10,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from bench.contracts import Track
-from bench.metrics import CONTROL_PERIOD_MS, step_mean
+from bench.plugins.contracts import Track
+from bench.statistics.episodes import CONTROL_PERIOD_MS, step_mean
 from leaderboard.approach_tables import approach_report
 from leaderboard.cells import cell_by_cell
 from leaderboard.overview import overview, size
@@ -23,7 +23,7 @@ def run_report(records: Mapping[Track, pa.Table], console: Console) -> None:
     """Print what the records of a run say.
 
     Args:
-        records: by track (`bench.results.SCHEMAS`), clean controls and references among them.
+        records: by track (`bench.records.store.SCHEMAS`), clean controls and references among them.
         console: where to print; readable from 80 columns on; wider ones add columns.
     """
     if "driving" in records:

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from rich.text import Text
 
-from bench.statistics import Interval
+from bench.statistics.estimates import Interval
 from leaderboard.pairs import Pair, parameters
 
 MISSING = "—"
@@ -160,7 +160,7 @@ def threat(pair: Pair) -> str:
     budget = float(str(identity["threat_budget"]))
     if identity["threat_norm"] == "relative":
         # Imported here: with torch, that takes seconds, and a leaderboard writes no such sentence.
-        from bench.threat import FLOORS
+        from bench.driving.threat import FLOORS
 
         floors = ", ".join(f"{name} {floor * budget / 0.1:g} {_unit(name)}" for name, floor in FLOORS.items())
         bounds = f"each measured value may be off by {100 * budget:g} % of itself, or by its floor ({floors})"

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from bench.contracts import TRACKS, Track
-from bench.results import SCHEMAS
+from bench.plugins.contracts import TRACKS, Track
+from bench.records.store import SCHEMAS
 from leaderboard import thesis_driving, thesis_patches
 from leaderboard.thesis_numbers import PUBLISHED, THESIS, Beside, printed
 

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from rich.text import Text
 
-from bench.contracts import REFERENCE_PATCHES
-from bench.metrics import shared
-from bench.statistics import Array, interval
+from bench.plugins.contracts import REFERENCE_PATCHES
+from bench.statistics.episodes import shared
+from bench.statistics.estimates import Array, interval
 from leaderboard.approaches import NO_PATCH
 from leaderboard.text import bounds, change
 from leaderboard.thesis_patch_records import ABLATION, LOCATIONS, STANDARD, WEATHERS, Detector, Source

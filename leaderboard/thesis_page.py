@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.contracts import Track
+from bench.plugins.contracts import Track
 from leaderboard.thesis_numbers import THESIS, printed
 
 Chapter = dict[str, Any]

@@ -12,10 +12,10 @@ from functools import cache
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.contracts import REFERENCE_PATCHES
-from bench.fingerprint import canonical
-from bench.registry import Kind
-from bench.statistics import Interval
+from bench.plugins.contracts import REFERENCE_PATCHES
+from bench.plugins.fingerprint import canonical
+from bench.plugins.registry import Kind
+from bench.statistics.estimates import Interval
 from leaderboard.approaches import NO_PATCH, Patched, read_patched
 from leaderboard.entries import MEASUREMENTS
 from leaderboard.pairs import ATTACKER, DEFENDED, SCENARIO, groups, parameters
@@ -240,7 +240,7 @@ def _detectors(tables: Iterable[pa.Table]) -> list[Detector]:
 def _standard(kind: Kind, name: str) -> str:
     """The default parameters of a component."""
     # Imported here: torch takes seconds, and whoever has all the records needs no component.
-    from bench.pair import choose
+    from bench.plugins.pair import choose
 
     return choose(kind, name).params
 

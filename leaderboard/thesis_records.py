@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.metrics import Episodes, unit_interval
-from bench.scenario import Cell
-from bench.statistics import Interval, interval
+from bench.scenarios.grid import Cell
+from bench.statistics.episodes import Episodes, unit_interval
+from bench.statistics.estimates import Interval, interval
 from leaderboard.entries import MEASUREMENTS
 from leaderboard.pairs import ATTACKER, BEST_BLIND, DEFENDED, SCENARIO, groups, newest, parameters, references
 from leaderboard.published import published

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from bench.statistics import Array
+from bench.statistics.estimates import Array
 
 ENOUGH_SEEDS = 3
 LEVEL = 0.05

@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.metrics import unit_interval
-from bench.scenario import WEATHERS, Cell
-from bench.statistics import Array, Interval, interval
+from bench.scenarios.grid import WEATHERS, Cell
+from bench.statistics.episodes import unit_interval
+from bench.statistics.estimates import Array, Interval, interval
 from leaderboard.entries import Aligned, Entry, align
 
 

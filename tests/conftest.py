@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from bench.errors import UserError
-from bench.process import settle
-from bench.victims.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
+from bench.run.process import settle
+from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
 
 # Tests run in as many processes as there are cores: threads that wait for each other would only be in the way.
 settle()

@@ -11,9 +11,9 @@ from hypothesis.extra.numpy import arrays
 from rliable import metrics as rliable_metrics
 from scipy.stats import binomtest
 
-from bench.metrics import Episodes, action_entropy, difference, shared, summarise, unit_interval
-from bench.scenario import Cell
-from bench.statistics import interval, iqm, wilson
+from bench.scenarios.grid import Cell
+from bench.statistics.episodes import Episodes, action_entropy, difference, shared, summarise, unit_interval
+from bench.statistics.estimates import interval, iqm, wilson
 
 quick = settings(max_examples=40, deadline=None)
 shapes = st.tuples(st.integers(1, 5), st.integers(1, 6), st.integers(1, 8))

@@ -9,11 +9,11 @@ import pytest
 import torch
 from rerun.chunk import Chunk, RrdReader
 
-from bench.driving import Features
+from bench.driving.contracts import Features
+from bench.driving.rollout import Trace
+from bench.driving.threat import ObservationThreat, project
 from bench.recording import RerunLogger, save
-from bench.recording.episode import ACTIONS, Episode
-from bench.rollout import Trace
-from bench.threat import ObservationThreat, project
+from bench.recording.driving.episode import ACTIONS, Episode
 
 FEATURES = Features(
     names=("x", "y", "vx", "vy"), low=(-100.0, -20.0, -40.0, -20.0), high=(100.0, 20.0, 40.0, 20.0),
@@ -166,7 +166,7 @@ def test_the_file_appears_whole_or_not_at_all(path: Path, monkeypatch: pytest.Mo
     def broken(*_: object) -> None:
         raise RuntimeError("the disk is full")
 
-    monkeypatch.setattr("bench.recording.curves.log", broken)
+    monkeypatch.setattr("bench.recording.driving.curves.log", broken)
     with pytest.raises(RuntimeError, match="disk"):
         save(made_up(), features=FEATURES, meta=META, path=path)
     assert list(path.parent.iterdir()) == []

@@ -12,11 +12,11 @@ import torch
 from rerun.chunk import Chunk, RrdReader
 from torch import Tensor
 
-from bench import stopping
-from bench.approach import Sighting, look
-from bench.patch import Evolution, Patch
+from bench.detection import stopping
+from bench.detection.approach import Sighting, look
+from bench.detection.contracts import Approach
+from bench.detection.threat import Evolution, Patch
 from bench.recording import save_approach
-from bench.vision import Approach
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.test_recording import META, read, values
 

@@ -12,11 +12,11 @@ from torch import Tensor
 from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
 from bench.conformance.randomness import stir_others
 from bench.conformance.traffic import observations, victim
-from bench.contracts import QueryBudgetError
-from bench.driving import ActionType, DrivingAttack, Features, Policy
+from bench.driving.contracts import ActionType, DrivingAttack, Features, Policy
+from bench.driving.threat import ObservationThreat, Oracle
 from bench.errors import UserError
-from bench.fingerprint import state_digest
-from bench.threat import ObservationThreat, Oracle
+from bench.plugins.contracts import QueryBudgetError
+from bench.plugins.fingerprint import state_digest
 
 EPISODES = 6
 BUDGETS = (0, 1, 2, 7, 50, 1000)

@@ -6,13 +6,13 @@ import pickle
 from collections.abc import Mapping
 from typing import Any
 
-from bench import registry
 from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
 from bench.errors import UserError
-from bench.fingerprint import canonical
-from bench.parameters import description, parameters
-from bench.registry import Kind
-from bench.words import configured
+from bench.plugins import registry
+from bench.plugins.fingerprint import canonical
+from bench.plugins.options import configured
+from bench.plugins.parameters import description, parameters
+from bench.plugins.registry import Kind
 
 
 class ComponentSuite(Suite):

@@ -12,7 +12,7 @@ from torch import Tensor
 from bench.conformance.check import Check, Suite, require
 from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.conformance.street import Street
-from bench.vision import STOP_SIGN, Detector, DetectorVictim
+from bench.detection.contracts import STOP_SIGN, Detector, DetectorVictim
 
 PICTURES = 3
 
@@ -46,7 +46,8 @@ class DetectorSuite(Suite):
         """Eval mode, no gradients on weights, and a stop sign among its classes."""
         detector = self.load()
         require(
-            isinstance(detector, Detector), f"load returned a {type(detector).__name__}, not a bench.vision.Detector"
+            isinstance(detector, Detector),
+            f"load returned a {type(detector).__name__}, not a bench.detection.contracts.Detector",
         )
         check_frozen(detector, "detector")
         require(STOP_SIGN in detector.names, f"none of its classes is {STOP_SIGN!r}, which is what attacks hide")

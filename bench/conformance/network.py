@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from torch import Tensor, nn
 
 from bench.conformance.check import NotApplicableError, require
-from bench.contracts import Victim
-from bench.fingerprint import state_digest
+from bench.plugins.contracts import Victim
+from bench.plugins.fingerprint import state_digest
 
 
 def check_frozen(network: nn.Module, noun: str) -> None:

@@ -10,11 +10,11 @@ from torch import Tensor
 from bench.conformance.check import BrokenRuleError, Check, NotApplicableError, Suite, one_line, require
 from bench.conformance.randomness import stir_others
 from bench.conformance.street import SignDetector, Street
-from bench.contracts import QueryBudgetError
+from bench.detection.contracts import PatchAttack
+from bench.detection.threat import PatchThreat, VisionOracle
 from bench.errors import UserError
-from bench.fingerprint import state_digest
-from bench.patch import PatchThreat, VisionOracle
-from bench.vision import PatchAttack
+from bench.plugins.contracts import QueryBudgetError
+from bench.plugins.fingerprint import state_digest
 
 QUERIES = 160
 """Most pictures that a check lets the detector be asked about."""

@@ -12,8 +12,8 @@ from torch import Tensor
 from bench.conformance.check import Check, NotApplicableError, Suite, require
 from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.conformance.traffic import observations
-from bench.driving import DrivingVictim, DrivingWorld, Policy
-from bench.scenario import Cell
+from bench.driving.contracts import DrivingVictim, DrivingWorld, Policy
+from bench.scenarios.grid import Cell
 
 EPISODES = 6
 
@@ -53,7 +53,9 @@ class PolicySuite(Suite):
     def frozen(self) -> None:
         """Eval mode, no gradients on weights, of the action type it says."""
         policy = self.load()
-        require(isinstance(policy, Policy), f"load returned a {type(policy).__name__}, not a bench.driving.Policy")
+        require(
+            isinstance(policy, Policy), f"load returned a {type(policy).__name__}, not a bench.driving.contracts.Policy"
+        )
         check_frozen(policy, "policy")
         require(
             policy.action_type == self.victim.action_type,

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-from bench import tracks
 from bench.conformance.check import NotApplicableError, Outcome, Suite, one_line
 from bench.conformance.component import ComponentSuite
-from bench.contracts import Track
 from bench.errors import UserError
-from bench.pair import choose
-from bench.registry import Kind
-from bench.words import WORLDS, configured
+from bench.plugins import sources as tracks
+from bench.plugins.contracts import Track
+from bench.plugins.options import WORLDS, configured
+from bench.plugins.pair import choose
+from bench.plugins.registry import Kind
 
 
 def examine(kind: Kind, name: str, values: Mapping[str, str] | None = None, victim: str = "") -> Iterator[Outcome]:

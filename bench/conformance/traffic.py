@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.driving import ActionType, Features, Policy
+from bench.driving.contracts import ActionType, Features, Policy
 
 ACTIONS, HIDDEN = 5, 16
 
@@ -21,7 +21,7 @@ def observations(count: int, *, features: Features, rows: int = 10, seed: int = 
 
 def victim(action_type: ActionType, features: Features) -> Policy:
     """A network of the zoo's kind with random weights, large enough that its decisions vary."""
-    from bench.victims.networks import ActorPolicy, QPolicy
+    from bench.victims.drivers.networks import ActorPolicy, QPolicy
 
     width = len(features.names) + 1
     with torch.random.fork_rng(devices=[]):

@@ -15,15 +15,18 @@ from typing import TYPE_CHECKING
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.recording import about, approach, approach_blueprint, blueprint, curves, scene
+from bench.recording import about
 from bench.recording.columns import Columns
-from bench.recording.episode import Episode
+from bench.recording.detection import approach
+from bench.recording.detection import blueprint as approach_blueprint
+from bench.recording.driving import blueprint, curves, scene
+from bench.recording.driving.episode import Episode
 from bench.recording.logger import RerunLogger
 
 if TYPE_CHECKING:
-    from bench.approach import Sighting
-    from bench.driving import Features
-    from bench.rollout import Trace
+    from bench.detection.approach import Sighting
+    from bench.driving.contracts import Features
+    from bench.driving.rollout import Trace
 
 __all__ = ["RerunLogger", "save", "save_approach"]
 
@@ -32,7 +35,7 @@ def save(trace: Trace, *, features: Features, meta: Mapping[str, object], path: 
     """Write the recording of one episode; the file appears whole or not at all.
 
     Args:
-        trace: one episode (`bench.rollout.Trace` with one entry in `episodes`).
+        trace: one episode (`bench.driving.rollout.Trace` with one entry in `episodes`).
         features: of its observations.
         meta: the record's identity columns: names, parameters, threat model, cell, scenario seed.
         path: of the `.rrd` file; its folder exists.

@@ -15,11 +15,11 @@ from sphinx.ext.napoleon import GoogleDocstring
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
-from bench import registry
-from bench.cli_list import fits
+from bench.cli.listing import fits
 from bench.errors import UserError
-from bench.parameters import parameters
-from bench.registry import GROUPS, Kind
+from bench.plugins import registry
+from bench.plugins.parameters import parameters
+from bench.plugins.registry import GROUPS, Kind
 
 LEADERBOARD = ("leaderboard/index.html", "leaderboard/index.json", "leaderboard/index.csv")
 """Files of the repository that the site holds at the same place."""

@@ -6,7 +6,7 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from bench.process import settle
+from bench.run.process import settle
 
 FIGURES = {
     "attack_none.svg": "attacks:none",

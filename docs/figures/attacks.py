@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from bench.pair import choose
+from bench.plugins.pair import choose
 from docs.figures import road, style
 from docs.figures.driving import FEATURES, STEPS_PER_SECOND, Moment, attacked, episode, physical, policy
 from envs.highway.config import ACTIONS

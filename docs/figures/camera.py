@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from bench.scenario import WEATHERS
+from bench.scenarios.grid import WEATHERS
 from docs.figures import style
 from docs.figures.sightings import FRAME, approaches, picture, show
 

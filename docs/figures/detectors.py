@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from matplotlib.figure import Figure
 
-from bench.approach import NMS_IOU
-from bench.scenario import WEATHERS
-from bench.stopping import THRESHOLD
-from bench.vision import detections
+from bench.detection.approach import NMS_IOU
+from bench.detection.contracts import detections
+from bench.detection.stopping import THRESHOLD
+from bench.scenarios.grid import WEATHERS
 from docs.figures import style
 from docs.figures.sightings import FRAME, approaches, box, detector, frame_axes, picture, show, sight
 

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from bench.config import run_config
-from bench.drive import drive
-from bench.driving import DrivingAttack, Policy
-from bench.pair import choose
-from bench.pipeline import AttackModule
-from bench.plan import plan
-from bench.rollout import Columns, Trace
-from bench.threat import ObservationThreat
+from bench.driving.contracts import DrivingAttack, Policy
+from bench.driving.drive import drive
+from bench.driving.pipeline import AttackModule
+from bench.driving.rollout import Columns, Trace
+from bench.driving.threat import ObservationThreat
+from bench.plugins.pair import choose
+from bench.run.config import run_config
+from bench.run.plan import plan
 from envs.highway.config import STANDARD_FEATURES as FEATURES
 from envs.highway.config import HighwayConfig
 

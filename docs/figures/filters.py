@@ -6,7 +6,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from bench.stopping import THRESHOLD
+from bench.detection.stopping import THRESHOLD
 from defenses.smoothing import Guarded
 from docs.figures import style
 from docs.figures.patches import texels_of

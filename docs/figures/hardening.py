@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tensordict import TensorDict
 
-from bench.pair import choose
-from bench.pipeline import AttackModule
-from bench.threat import ObservationThreat
+from bench.driving.pipeline import AttackModule
+from bench.driving.threat import ObservationThreat
+from bench.plugins.pair import choose
 from docs.figures import style
 from docs.figures.driving import FEATURES, episode, policy
 from docs.figures.sightings import curve, frame_axes, patched

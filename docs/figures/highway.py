@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from bench.scenario import GRIDS, WEATHERS
+from bench.scenarios.grid import GRIDS, WEATHERS
 from docs.figures import road, style
 from envs.highway.batched import BatchedHighway
 from envs.highway.sensor import noise_sigma, sensor_range_m

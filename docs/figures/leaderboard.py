@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import blended_transform_factory
 
-from bench.contracts import TRACKS, Track
-from bench.metrics import unit_interval
-from bench.statistics import Interval
+from bench.plugins.contracts import TRACKS, Track
+from bench.statistics.episodes import unit_interval
+from bench.statistics.estimates import Interval
 from docs.figures import style
 from leaderboard.published import published
 from leaderboard.ranking import Board, Row, read_boards

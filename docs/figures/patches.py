@@ -5,12 +5,12 @@ from __future__ import annotations
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from bench import patches
-from bench.crafting import craft
+from bench.detection import patches
+from bench.detection.crafting import craft
+from bench.detection.threat import Patch, PatchThreat
 from bench.errors import UserError
-from bench.pair import Pair, choose
-from bench.patch import Patch, PatchThreat
-from bench.unit import Crafting
+from bench.plugins.pair import Pair, choose
+from bench.run.unit import Crafting
 
 KEPT = user_cache_path("cavbench") / "figures"
 SHARE = PatchThreat().budget

@@ -13,8 +13,8 @@ from gymnasium.spaces import Box, Discrete
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from bench.driving import Policy
-from bench.pair import choose
+from bench.driving.contracts import Policy
+from bench.plugins.pair import choose
 from docs.figures import style
 from docs.figures.driving import STEPS_PER_SECOND, episode, policy
 from envs.highway.config import ACTIONS

@@ -10,8 +10,8 @@ import pyarrow.compute as pc
 import torch
 from matplotlib.figure import Figure
 
-from bench.metrics import MAX_RETURN
-from bench.pair import choose
+from bench.plugins.pair import choose
+from bench.statistics.episodes import MAX_RETURN
 from docs.figures import style
 from docs.figures.driving import STEPS_PER_SECOND, episode, physical
 from envs.highway.dynamics import LANE_WIDTH

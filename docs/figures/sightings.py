@@ -13,11 +13,11 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.approach import Sight, look
-from bench.pair import choose
-from bench.scenario import GRIDS, Cell
-from bench.stopping import THRESHOLD
-from bench.vision import STOP_SIGN, Approach, Detector, confidence
+from bench.detection.approach import Sight, look
+from bench.detection.contracts import STOP_SIGN, Approach, Detector, confidence
+from bench.detection.stopping import THRESHOLD
+from bench.plugins.pair import choose
+from bench.scenarios.grid import GRIDS, Cell
 from docs.figures import style
 from docs.figures.patches import SHARE
 from leaderboard.approaches import Patched, read_patched

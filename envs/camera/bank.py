@@ -16,10 +16,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
 
+from bench.detection.contracts import Objects, Scenes
 from bench.errors import UserError
 from bench.files import whole
-from bench.scenario import WEATHERS
-from bench.vision import Objects, Scenes
+from bench.scenarios.grid import WEATHERS
 from envs.camera import sign
 from envs.camera.frame import Frame, noise_level
 from envs.camera.objects import objects

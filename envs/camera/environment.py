@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.stopping import SPEED_MPS
-from bench.vision import Scenes
+from bench.detection.contracts import Scenes
+from bench.detection.stopping import SPEED_MPS
 
 HARDEST_MPS2 = 8.0
 """Full braking on a dry road."""
@@ -24,7 +24,7 @@ class ApproachEnv(EnvBase):
     to the next. `observation` is what the camera shows, [B, 3, H, W]: the frame whose distance is nearest (the last one
     stays in view after it). `info` has the `distance` to the sign in m, the `speed` in m/s, the sign's `box` in pixels [B, 4]
     and its `visible` share. An episode ends when the car stands or is past the sign, which the stop line is level with
-    (`bench.stopping`); the reward is 1 for standing before it, else 0.
+    (`bench.detection.stopping`); the reward is 1 for standing before it, else 0.
 
     Args:
         scenes: of each approach, farthest first, all of one size and at the same distances.

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bench.scenario import Weather
-from bench.stopping import SPEED_MPS
+from bench.detection.stopping import SPEED_MPS
+from bench.scenarios.grid import Weather
 from envs.camera import develop, sign
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x

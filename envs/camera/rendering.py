@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.errors import UserError
 from bench.files import whole
-from bench.scenario import WEATHERS
+from bench.scenarios.grid import WEATHERS
 from envs.camera import bank
 from envs.camera.frame import frame
 from envs.camera.poses import Pose

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.scenario import Weather
+from bench.scenarios.grid import Weather
 
 Image = NDArray[np.float32]
 

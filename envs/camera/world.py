@@ -9,10 +9,10 @@ from typing import ClassVar
 
 from platformdirs import user_cache_path
 
-from bench.contracts import Progress
+from bench.detection.contracts import Approach, CameraWorld
 from bench.errors import UserError
-from bench.scenario import Cell
-from bench.vision import Approach, CameraWorld
+from bench.plugins.contracts import Progress
+from bench.scenarios.grid import Cell
 from envs.camera import bank, poses
 from envs.camera.bank import BankScenes
 from envs.camera.objects import NAMES

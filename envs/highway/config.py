@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, get_args
 
-from bench.driving import ActionType, Driver, Features
-from bench.scenario import Cell
+from bench.driving.contracts import ActionType, Driver, Features
+from bench.scenarios.grid import Cell
 
 Preset = Literal["standard", "thesis"]
 

@@ -10,7 +10,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.scenario import WEATHERS
+from bench.scenarios.grid import WEATHERS
 from envs.highway.collision import find_collisions
 from envs.highway.compiled import entry_point, inner
 from envs.highway.config import ACTIONS, HighwayConfig

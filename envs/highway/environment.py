@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.scenario import SeedBlock
+from bench.scenarios.grid import SeedBlock
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.engine import Flag, Number
 
@@ -36,7 +36,7 @@ def drawn_seed(environment_seed: int, episode: int, reset: int) -> int:
 
 
 class HighwayEnv(EnvBase):
-    """B episodes of highway driving as a TorchRL environment (keys and shapes: `bench.driving.DrivingWorld`).
+    """B episodes of highway driving as a TorchRL environment (keys and shapes: `bench.driving.contracts.DrivingWorld`).
 
     Give `seed` (int64 [B]) in the tensordict of `reset` to choose the scenarios; otherwise they follow from `set_seed`.
     A finished episode stays where it is, with `done` set and reward 0, until it is reset.

@@ -14,7 +14,7 @@ from highway_env.envs.highway_env import HighwayEnv as FaramaHighwayEnv
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
-from bench.scenario import WEATHERS, Cell
+from bench.scenarios.grid import WEATHERS, Cell
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.dynamics import VEHICLE_LENGTH
 from envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED

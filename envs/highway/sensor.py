@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.scenario import Weather
+from bench.scenarios.grid import Weather
 from envs.highway.compiled import entry_point, inner
 
 CLEAR_RANGE_M = 200.0

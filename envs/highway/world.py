@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from bench.driving import ActionType, Driver, DrivingWorld, Features
-from bench.scenario import Cell
+from bench.driving.contracts import ActionType, Driver, DrivingWorld, Features
+from bench.scenarios.grid import Cell
 from envs.highway.config import (
     STANDARD_FEATURES,
     STANDARD_TARGET_SPEEDS,
@@ -102,7 +102,7 @@ class HighwayWorld(DrivingWorld):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        """See `bench.driving.DrivingWorld.make`."""
+        """See `bench.driving.contracts.DrivingWorld.make`."""
         config = self.config(cells, action_type=action_type, driver=driver, action_repeat=action_repeat)
         # Imported here: both load torchrl and numba or pygame, which listing components must not.
         if self.backend == "batched":

@@ -13,10 +13,10 @@ from attacks.art import ATTACKS, _component
 from attacks.noise import Noise
 from attacks.pgd import PGD
 from bench.conformance import complaints
-from bench.driving import DrivingAttack
+from bench.driving.contracts import DrivingAttack
+from bench.driving.threat import ObservationThreat
 from bench.errors import UserError
-from bench.pair import choose
-from bench.threat import ObservationThreat
+from bench.plugins.pair import choose
 from tests.attacks.victims import FEATURES, Linear, observations, perturb, victim
 
 THREAT = ObservationThreat(norm="linf", budget=0.4, queries=60)

@@ -13,9 +13,9 @@ from torch import Tensor
 from attacks.eot import EOT, total_variation
 from attacks.grey_patch import GreyPatch
 from attacks.noise_patch import NoisePatch
-from bench.patch import PatchThreat, VisionOracle
-from bench.victims.yolov3_tiny import YOLOv3TinyNetwork
-from bench.vision import Detector, Scenes, confidence
+from bench.detection.contracts import Detector, Scenes, confidence
+from bench.detection.threat import PatchThreat, VisionOracle
+from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.vision.drawn_street import DrawnStreet
 

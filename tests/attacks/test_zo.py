@@ -14,8 +14,8 @@ from attacks.noise import Noise
 from attacks.none import NoAttack
 from attacks.objectives import Objective, distortion
 from attacks.zo import ZOObjective, ZOSignSGD, _directions
-from bench.driving import ActionType, Policy
-from bench.threat import ObservationThreat
+from bench.driving.contracts import ActionType, Policy
+from bench.driving.threat import ObservationThreat
 from tests.attacks.victims import Linear, left, loss_of, observations, perturb, victim
 
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from attacks.objectives import DiscreteLoss, Objective
-from bench.driving import ActionType, DrivingAttack, Features, Policy
-from bench.threat import ObservationThreat, Oracle
-from bench.victims.networks import ActorPolicy, QPolicy
+from bench.driving.contracts import ActionType, DrivingAttack, Features, Policy
+from bench.driving.threat import ObservationThreat, Oracle
+from bench.victims.drivers.networks import ActorPolicy, QPolicy
 
 FEATURES = Features(
     names=("x", "y", "vx", "vy"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.scenario import WEATHERS
+from bench.scenarios.grid import WEATHERS
 from envs.camera import sign
 from envs.camera.bank import BankScenes
 from envs.camera.frame import Frame, frame

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.errors import UserError
-from bench.scenario import WEATHERS, Weather
+from bench.scenarios.grid import WEATHERS, Weather
 from envs.camera import bank, sign
 from envs.camera.frame import frame
 from envs.camera.plate import detail, filtered

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bench.errors import UserError
-from bench.scenario import WEATHERS, Cell
+from bench.scenarios.grid import WEATHERS, Cell
 from envs.camera import poses
 from envs.camera.bank import SHIPPED
 from envs.camera.street.layout import LOCATIONS

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import envs.camera.carla as backend
-from bench.scenario import WEATHERS
+from bench.scenarios.grid import WEATHERS
 from envs.camera.camera import Camera
 from envs.camera.carla.geometry import Place, stand
 from envs.camera.carla.weather import parameters

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.scenario import WEATHERS, Weather
+from bench.scenarios.grid import WEATHERS, Weather
 from envs.camera.carla.weather import parameters
 
 RAIN = st.floats(0, 300)

@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from bench.errors import UserError
-from bench.scenario import Cell
+from bench.scenarios.grid import Cell
 from envs.camera.carla.world import CarlaWorld
 
 CELL = Cell(lanes=3, density=1.0)

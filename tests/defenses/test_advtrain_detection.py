@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from attacks.eot import EOT
-from bench.config import component, run_config
+from bench.detection.contracts import STOP_SIGN, Detector, confidence
+from bench.detection.threat import PatchThreat, VisionOracle
 from bench.errors import UserError
-from bench.patch import PatchThreat, VisionOracle
-from bench.victims import yolov5_file, zoo
-from bench.victims.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
-from bench.victims.yolov5 import YOLOv5, YOLOv5Network
-from bench.vision import STOP_SIGN, Detector, confidence
+from bench.run.config import component, run_config
+from bench.victims import zoo
+from bench.victims.detectors import yolov5_file
+from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
+from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
 from defenses.advtrain_detection import DetectorAdversarialTraining
 from envs.camera.world import StopSignApproach
 from tests.vision.drawn_street import DrawnStreet

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from bench import cli, registry
+from bench.cli.main import main as cli
+from bench.plugins import registry
 from tests.framework.distributions import install_toy
 
-BENCH = (sys.executable, "-m", "bench.cli")
+BENCH = (sys.executable, "-m", "bench")
 
 
 @pytest.fixture(scope="session")
@@ -54,7 +55,7 @@ class Said:
 def bench(toy_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
     """The command line in this process: bench("run", "attack=nudge") -> Said."""
     monkeypatch.setenv("COLUMNS", "160")
-    monkeypatch.setattr("bench.cli_view._has_display", lambda: False)
+    monkeypatch.setattr("bench.cli.view._has_display", lambda: False)
 
     def call(*words: str) -> Said:
         monkeypatch.setattr(sys, "argv", ["bench", *words])

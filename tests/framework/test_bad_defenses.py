@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from bench import registry, results
+from bench.plugins import registry
+from bench.records import store as results
 from leaderboard.entries import MEASUREMENTS
 from leaderboard.ranking import Row, read_boards
 from tests.framework.conftest import Said

@@ -19,8 +19,8 @@ TOY = ("world=toy", *RUN)
 HEAD = """
 from dataclasses import dataclass
 from typing import ClassVar
-from bench.contracts import Access, Attack
-from bench.driving import DrivingAttack
+from bench.plugins.contracts import Access, Attack
+from bench.driving.contracts import DrivingAttack
 """
 GOOD = """
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +35,11 @@ CANNOT_BE_LOADED = {
     "a syntax error": ("def\n", "cannot be imported: SyntaxError"),
     "one that ends the program": ("import sys; sys.exit(3)\n", "cannot be imported: SystemExit: 3"),
     "no such class": ("class Other: ...\n", "cannot be imported: AttributeError"),
-    "another base class": ("class Plugin: ...\n", "is not a subclass of bench.contracts.Attack"),
-    "an instance": (f"{HEAD}{GOOD}Plugin = Plugin()\n", "is not a subclass of bench.contracts.Attack"),
+    "another base class": ("class Plugin: ...\n", "is not a subclass of bench.plugins.contracts.Attack"),
+    "an instance": (f"{HEAD}{GOOD}Plugin = Plugin()\n", "is not a subclass of bench.plugins.contracts.Attack"),
     "another kind": (
-        "from bench.driving import DrivingDefense\nclass Plugin(DrivingDefense): ...\n",
-        "is not a subclass of bench.contracts.Attack",
+        "from bench.driving.contracts import DrivingDefense\nclass Plugin(DrivingDefense): ...\n",
+        "is not a subclass of bench.plugins.contracts.Attack",
     ),
     "no track": (f"{HEAD}{GOOD}".replace("(DrivingAttack)", "(Attack)"), "is of no track"),
     "an abstract method": (f"{HEAD}{GOOD}".replace("def perturb", "def disturb"), "does not implement perturb"),

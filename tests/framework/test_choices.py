@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from bench import results
-from bench.config import run_config
 from bench.conformance import complaints
 from bench.errors import UserError
+from bench.records import store as results
+from bench.run.config import run_config
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 
@@ -19,8 +19,8 @@ ADAPTER = '''
 from dataclasses import dataclass, field, make_dataclass
 from typing import ClassVar
 
-from bench.contracts import Access
-from bench.driving import DrivingAttack
+from bench.plugins.contracts import Access
+from bench.driving.contracts import DrivingAttack
 
 
 @dataclass(frozen=True, kw_only=True)

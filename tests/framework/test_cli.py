@@ -12,8 +12,9 @@ import psutil
 import pyarrow as pa
 import pytest
 
-from bench import registry, results
-from bench.registry import GROUPS, KINDS
+from bench.plugins import registry
+from bench.plugins.registry import GROUPS, KINDS
+from bench.records import store as results
 from tests.framework.conftest import Said, ran, started
 from tests.framework.test_runner import comparable
 
@@ -151,7 +152,7 @@ def test_without_a_display_view_says_how_to_open_a_recording(
 
 
 def test_a_traceback_is_shown_to_who_asks_for_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    from bench import cli
+    from bench.cli.main import main as cli
     from bench.errors import UserError
 
     monkeypatch.setattr(sys, "argv", ["bench", "run", "attack=nugde", "--debug"])

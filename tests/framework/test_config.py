@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.config import RunConfig, component, run_config, train_config
 from bench.errors import UserError
-from bench.registry import load
-from bench.scenario import GRIDS
+from bench.plugins.registry import load
+from bench.run.config import RunConfig, component, run_config, train_config
+from bench.scenarios.grid import GRIDS
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 

@@ -10,14 +10,16 @@ import pyarrow.compute as pc
 import pytest
 from safetensors import safe_open
 
-from bench import patches, plan, results, runner
-from bench.cli_show import recordings
-from bench.config import RunConfig, run_config, train_config
+from bench.cli.show import recordings
+from bench.detection import patches
 from bench.errors import UserError
-from bench.replay import find, replay
-from bench.scenario import GRIDS
-from bench.tracks import names, tracks_of
-from bench.unit import Crafting
+from bench.plugins.sources import names, tracks_of
+from bench.records import store as results
+from bench.run import plan, runner
+from bench.run.config import RunConfig, run_config, train_config
+from bench.run.replay import find, replay
+from bench.run.unit import Crafting
+from bench.scenarios.grid import GRIDS
 from bench.victims import zoo
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
@@ -85,7 +87,7 @@ def test_what_does_not_fit_the_track_is_refused_in_one_line(line: str) -> None:
 
 def test_the_track_of_a_component_is_read_from_its_source() -> None:
     assert tracks_of("toy_camera_plugin:Paint") == ["detection"]
-    assert tracks_of("bench.victims.dqn:DQN") == ["driving"]
+    assert tracks_of("bench.victims.drivers.dqn:DQN") == ["driving"]
     assert tracks_of("attacks.none:NoAttack") == ["detection", "driving"]
     assert tracks_of("nowhere:Nothing") == []
     assert {"none", "paint", "blank"} <= set(names("attack", "detection"))
@@ -161,9 +163,9 @@ def test_results_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
 def test_scoring_code_and_crafting_code_are_told_apart() -> None:
     unit = next(unit for unit in plan.plan(read(SMALL)) if unit.crafting)
     assert unit.crafting is not None
-    assert "bench.approach" in unit.modules
-    assert "bench.crafting" in unit.crafting.modules
-    assert "bench.approach" not in unit.crafting.modules
+    assert "bench.detection.approach" in unit.modules
+    assert "bench.detection.crafting" in unit.crafting.modules
+    assert "bench.detection.approach" not in unit.crafting.modules
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.registry import GROUPS, KINDS, Kind, entries
+from bench.plugins.registry import GROUPS, KINDS, Kind, entries
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

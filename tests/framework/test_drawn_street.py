@@ -10,9 +10,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from bench import registry, results
-from bench.replay import find, replay
-from bench.victims.yolov3_tiny import YOLOv3TinyNetwork
+from bench.plugins import registry
+from bench.records import store as results
+from bench.run.replay import find, replay
+from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.test_recording import read

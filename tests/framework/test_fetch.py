@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from bench import fetch
 from bench.errors import UserError
+from bench.victims import fetch
 from tests.framework.conftest import Said
 
 CONTENT = b"weights" * 1000

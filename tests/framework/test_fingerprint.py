@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from bench import fingerprint
-from bench.config import run_config
-from bench.plan import plan
-from bench.unit import Unit
+from bench.plugins import fingerprint
+from bench.run.config import run_config
+from bench.run.plan import plan
+from bench.run.unit import Unit
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
@@ -60,7 +60,7 @@ def test_other_weights_or_another_training_seed_are_another_unit() -> None:
 def test_other_library_versions_are_another_unit(monkeypatch: pytest.MonkeyPatch) -> None:
     unit = first()
     before = unit.fingerprint
-    monkeypatch.setattr("bench.unit.libraries", lambda more: {"torch": "0.0"})
+    monkeypatch.setattr("bench.run.unit.libraries", lambda more: {"torch": "0.0"})
     assert unit.fingerprint != before
 
 
@@ -101,16 +101,16 @@ def test_the_code_of_a_unit_is_what_computes_it_and_nothing_else() -> None:
             f"bench.{name}"
             for name in ("contracts", "drive", "driving", "pipeline", "rollout", "scenario", "threat", "unit")
         ),
-        *("attacks.pgd", "attacks.objectives", "defenses.none", "bench.victims.ddpg"),
+        *("attacks.pgd", "attacks.objectives", "defenses.none", "bench.victims.drivers.ddpg"),
         *("envs.highway.world", "envs.highway.batched", "envs.highway.engine", "envs.highway.sensor"),
     }
     assert not counted & {
         "attacks.zo",
-        "bench.victims.dqn",
-        "bench.results",
-        "bench.cli",
-        "bench.approach",
-        "bench.crafting",
+        "bench.victims.drivers.dqn",
+        "bench.records.store",
+        "bench.cli.main",
+        "bench.detection.approach",
+        "bench.detection.crafting",
         "leaderboard",
     }
 

@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from bench import results
-from bench.replay import find, replay
+from bench.records import store as results
+from bench.run.replay import find, replay
 from bench.victims import zoo
 from tests.framework.conftest import Said
 

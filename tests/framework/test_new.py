@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from bench import results, scaffold
+from bench.conformance import scaffold
+from bench.records import store as results
 from tests.framework.conftest import Said, ran
 from tests.framework.distributions import pip_install
 from tests.framework.test_cli import assert_one_line

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from bench import registry
-from bench.contracts import Attack, Defense, Victim, World
 from bench.errors import UserError
-from bench.registry import GROUPS, KINDS
+from bench.plugins import registry
+from bench.plugins.contracts import Attack, Defense, Victim, World
+from bench.plugins.registry import GROUPS, KINDS
 from tests.framework.conftest import BENCH
 from tests.framework.distributions import TOY_POINTS, install, install_toy
 
@@ -43,21 +43,21 @@ def test_an_unknown_name_is_answered_with_the_nearest_and_all_others() -> None:
 
 BROKEN = {
     "cannot be imported: ZeroDivisionError": "1 / 0\n",
-    "is not a subclass of bench.contracts.Attack": "class Plugin: ...\n",
+    "is not a subclass of bench.plugins.contracts.Attack": "class Plugin: ...\n",
     "cannot be imported: AttributeError": "class Other: ...\n",
-    "is of no track: derive it from a base class of bench.driving or bench.vision": (
-        "from dataclasses import dataclass\nfrom bench.contracts import Attack\n"
+    "is of no track: derive it from a base class of bench.driving.contracts or bench.detection.contracts": (
+        "from dataclasses import dataclass\nfrom bench.plugins.contracts import Attack\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(Attack): ...\n"
     ),
     "does not implement perturb": (
-        "from dataclasses import dataclass\nfrom bench.driving import DrivingAttack\n"
+        "from dataclasses import dataclass\nfrom bench.driving.contracts import DrivingAttack\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(DrivingAttack): ...\n"
     ),
     "is not a frozen dataclass": (
-        "from bench.driving import DrivingAttack\nclass Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
+        "from bench.driving.contracts import DrivingAttack\nclass Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
     ),
     "takes steps by position": (
-        "from dataclasses import dataclass\nfrom bench.driving import DrivingAttack\n"
+        "from dataclasses import dataclass\nfrom bench.driving.contracts import DrivingAttack\n"
         "@dataclass(frozen=True)\nclass Plugin(DrivingAttack):\n    steps: int = 1\n    def perturb(self, o, oracle): ...\n"
     ),
 }

@@ -8,8 +8,8 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from bench import results
-from bench.replay import find, replay
+from bench.records import store as results
+from bench.run.replay import find, replay
 from tests.framework.conftest import Said
 from tests.framework.test_cli import TOY, assert_one_line
 

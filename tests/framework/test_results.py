@@ -11,13 +11,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bench import results
-from bench.config import run_config
-from bench.drive import drive
+from bench.driving.drive import drive
 from bench.errors import UserError
-from bench.plan import plan
-from bench.results import MEASUREMENTS, PROBES, SCHEMA
-from bench.unit import Unit
+from bench.records import store as results
+from bench.records.store import MEASUREMENTS, PROBES, SCHEMA
+from bench.run.config import run_config
+from bench.run.plan import plan
+from bench.run.unit import Unit
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 

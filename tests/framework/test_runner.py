@@ -8,11 +8,12 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from bench import results, runner
-from bench.config import run_config
 from bench.errors import UserError
-from bench.plan import plan
-from bench.runner import Work
+from bench.records import store as results
+from bench.run import runner
+from bench.run.config import run_config
+from bench.run.plan import plan
+from bench.run.runner import Work
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import results
+from bench.records import store as results
 from tests.framework.conftest import Said
 
 pytest.importorskip("art")

@@ -15,8 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.contracts import Access, Progress, Trained
-from bench.driving import (
+from bench.driving.contracts import (
     ActionType,
     Driver,
     DrivingAttack,
@@ -26,8 +25,9 @@ from bench.driving import (
     Features,
     Policy,
 )
-from bench.scenario import Cell
-from bench.threat import Oracle
+from bench.driving.threat import Oracle
+from bench.plugins.contracts import Access, Progress, Trained
+from bench.scenarios.grid import Cell
 
 FLAGS = ("crashed", "offroad")
 MEASURES = ("progress", "speed", "x", "ttc")

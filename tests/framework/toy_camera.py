@@ -11,11 +11,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from bench.contracts import Access, Progress, Trained
-from bench.patch import VisionOracle
-from bench.scenario import WEATHERS, Cell
-from bench.victims import zoo
-from bench.vision import (
+from bench.detection.contracts import (
     Approach,
     CameraWorld,
     Detector,
@@ -25,6 +21,10 @@ from bench.vision import (
     Predictions,
     Scenes,
 )
+from bench.detection.threat import VisionOracle
+from bench.plugins.contracts import Access, Progress, Trained
+from bench.scenarios.grid import WEATHERS, Cell
+from bench.victims import zoo
 
 SIDE, SIGN = 32, slice(8, 24)
 """Of the pictures, and where the sign is in them, in both directions."""

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from bench.scenario import WEATHERS, Cell, Weather
+from bench.scenarios.grid import WEATHERS, Cell, Weather
 from envs.highway.config import HighwayConfig
 from envs.highway.engine import HighwayEngine
 from envs.highway.sensor import add_noise, noise_sigma, sensor_range_m

@@ -10,9 +10,9 @@ from datetime import UTC, datetime
 import numpy as np
 import pyarrow as pa
 
-from bench.pair import choose
-from bench.results import SCHEMA, SCHEMAS
-from bench.scenario import GRIDS, Cell
+from bench.plugins.pair import choose
+from bench.records.store import SCHEMA, SCHEMAS
+from bench.scenarios.grid import GRIDS, Cell
 
 CLEAR = tuple(cell for cell in GRIDS["standard-v1"].cells() if cell.weather == "clear")
 

@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 import pytest
 from rich.console import Console
 
-from bench.pair import choose
+from bench.plugins.pair import choose
 from leaderboard.pairs import parameters
 from leaderboard.published import published
 from leaderboard.tables import run_report

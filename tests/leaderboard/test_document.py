@@ -14,8 +14,8 @@ import pytest
 from full_house import driving
 from synthetic import drive
 
-from bench import results
 from bench.errors import UserError
+from bench.records import store as results
 from leaderboard.cards import run_command
 from leaderboard.document import CSV, document, schema
 from leaderboard.entries import MEASUREMENTS, read_entries

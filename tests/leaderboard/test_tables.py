@@ -12,9 +12,9 @@ import pytest
 from rich.console import Console
 from synthetic import CLEAR, drive, reference_drivers
 
-from bench.results import SCHEMA
-from bench.scenario import GRIDS, Cell
-from bench.statistics import Interval
+from bench.records.store import SCHEMA
+from bench.scenarios.grid import GRIDS, Cell
+from bench.statistics.estimates import Interval
 from leaderboard.pairs import BEST_BLIND, read_pairs
 from leaderboard.tables import remarks, run_report
 from leaderboard.text import CLEAN, estimate, strip, threat

@@ -17,11 +17,11 @@ from hypothesis.extra.numpy import arrays
 from rich.console import Console
 from synthetic import CLEAR, approach, drive, reference_drivers
 
-from bench import results
-from bench.config import run_config
-from bench.contracts import TRACKS, Track
 from bench.errors import UserError
-from bench.results import SCHEMA, SCHEMAS
+from bench.plugins.contracts import TRACKS, Track
+from bench.records import store as results
+from bench.records.store import SCHEMA, SCHEMAS
+from bench.run.config import run_config
 from leaderboard import thesis_records
 from leaderboard.published import publish, published
 from leaderboard.thesis import thesis_report

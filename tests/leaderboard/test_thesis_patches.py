@@ -11,10 +11,10 @@ import pytest
 from rich.console import Console
 from synthetic import approach
 
-from bench.config import run_config
-from bench.pair import choose
-from bench.patch import PatchThreat
-from bench.results import SCHEMAS
+from bench.detection.threat import PatchThreat
+from bench.plugins.pair import choose
+from bench.records.store import SCHEMAS
+from bench.run.config import run_config
 from leaderboard import thesis_patch_records, thesis_records
 from leaderboard.approaches import NO_PATCH
 from leaderboard.pairs import parameters

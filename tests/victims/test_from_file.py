@@ -18,13 +18,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from bench.config import run_config
 from bench.conformance import complaints
-from bench.drive import drive
+from bench.driving.drive import drive
+from bench.driving.rollout import Columns
 from bench.errors import UserError
-from bench.pair import choose
-from bench.plan import plan
-from bench.rollout import Columns
+from bench.plugins.pair import choose
+from bench.run.config import run_config
+from bench.run.plan import plan
 
 ALGORITHMS = [
     ("dqn", False),
@@ -257,7 +257,7 @@ class Softer(nn.ReLU):
 
 @pytest.mark.parametrize("what", BAD)
 def test_a_file_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
-    from bench.config import component
+    from bench.run.config import component
 
     name, make, part = BAD[what]
     with pytest.raises(UserError) as raised:

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.driving import Policy
-from bench.victims.networks import ActorPolicy, QPolicy
+from bench.driving.contracts import Policy
+from bench.victims.drivers.networks import ActorPolicy, QPolicy
 
 
 def observation(batch: tuple[int, ...], seed: int = 0) -> Tensor:

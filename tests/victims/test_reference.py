@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from bench.victims.reference import FASTER, LANE_RIGHT, RIGHT_STEPS, SLOWER, Blind, IDMDriver, RandomDriver
+from bench.victims.drivers.reference import FASTER, LANE_RIGHT, RIGHT_STEPS, SLOWER, Blind, IDMDriver, RandomDriver
 
 
 def test_a_blind_driver_does_not_look() -> None:

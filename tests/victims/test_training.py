@@ -8,13 +8,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bench import registry
-from bench.driving import AttackInLoop, DrivingWorld
+from bench.driving.contracts import AttackInLoop, DrivingWorld
+from bench.plugins import registry
 from bench.victims import zoo
-from bench.victims.ddpg import DDPG
-from bench.victims.dqn import DQN
-from bench.victims.networks import ActorPolicy, QPolicy
-from bench.victims.training import LearningDriver, Practice, roads
+from bench.victims.drivers.ddpg import DDPG
+from bench.victims.drivers.dqn import DQN
+from bench.victims.drivers.networks import ActorPolicy, QPolicy
+from bench.victims.drivers.training import LearningDriver, Practice, roads
 from defenses.advtrain import AdversarialTraining
 
 SHORT = {"decisions": 160, "copies": 1, "hidden": 8, "batch": 16, "memory": 2000, "checkpoints": 1}

@@ -10,10 +10,10 @@ import torch
 
 from bench.errors import UserError
 from bench.victims import zoo
-from bench.victims.ddpg import DDPG
-from bench.victims.dqn import DQN
-from bench.victims.networks import QPolicy
-from bench.victims.yolov5 import YOLOv5Network
+from bench.victims.detectors.yolov5 import YOLOv5Network
+from bench.victims.drivers.ddpg import DDPG
+from bench.victims.drivers.dqn import DQN
+from bench.victims.drivers.networks import QPolicy
 from defenses.advtrain import AdversarialTraining
 
 MADE_BY = {"victim": {"gamma": 0.9}}

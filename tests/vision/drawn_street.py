@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from bench.scenario import WEATHERS, Cell
-from bench.vision import Approach, CameraWorld, Scenes
+from bench.detection.contracts import Approach, CameraWorld, Scenes
+from bench.scenarios.grid import WEATHERS, Cell
 from tests.vision.pictures import stop_sign
 
 SIDE = 416

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.victims.detection_loss import complete_overlap, missed, supervised, unlike
-from bench.vision import Predictions, detections
+from bench.detection.contracts import Predictions, detections
+from bench.victims.detectors.loss import complete_overlap, missed, supervised, unlike
 
 BOXES = torch.tensor([[10.0, 10.0, 40.0, 40.0], [50.0, 20.0, 70.0, 60.0]])
 LABELS = torch.tensor([1, 0])

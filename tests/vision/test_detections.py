@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from bench.detection.contracts import Detector, Predictions, confidence, detections, overlap
 from bench.errors import UserError
-from bench.vision import Detector, Predictions, confidence, detections, overlap
 
 relaxed = settings(deadline=None)
 LENGTH = st.integers(0, 12)

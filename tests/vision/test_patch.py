@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.contracts import Access, QueryBudgetError
+from bench.detection.threat import GREY, MOMENTS, PatchThreat, VisionOracle
 from bench.errors import UserError
-from bench.patch import GREY, MOMENTS, PatchThreat, VisionOracle
+from bench.plugins.contracts import Access, QueryBudgetError
 from tests.framework.toy_camera import RedDetector
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bench.victims.windows import Views, Windows
-from bench.vision import STOP_SIGN
+from bench.detection.contracts import STOP_SIGN
+from bench.victims.detectors.windows import Views, Windows
 from tests.vision.drawn_street import DrawnStreet
 
 SIDE = 128

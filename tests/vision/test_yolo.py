@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import nn
 
-from bench.victims import yolo
-from bench.victims.yolov3_tiny import YOLOv3TinyNetwork
-from bench.victims.yolov5 import YOLOv5Network
-from bench.vision import Detector
+from bench.detection.contracts import Detector
+from bench.victims.detectors import yolo
+from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
+from bench.victims.detectors.yolov5 import YOLOv5Network
 
 ANCHORS = {
     "yolov3_tiny": {32: ((81, 82), (135, 169), (344, 319)), 16: ((23, 27), (37, 58), (81, 82))},

@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from bench.detection.contracts import STOP_SIGN, confidence
 from bench.errors import UserError
-from bench.scenario import Cell
-from bench.victims import yolov5_file, zoo
-from bench.victims.yolov5 import MULTIPLES, Size, YOLOv5, YOLOv5Network
-from bench.vision import STOP_SIGN, confidence
+from bench.scenarios.grid import Cell
+from bench.victims import zoo
+from bench.victims.detectors import yolov5_file
+from bench.victims.detectors.yolov5 import MULTIPLES, Size, YOLOv5, YOLOv5Network
 from envs.camera.world import StopSignApproach
 from tests.vision.drawn_street import DrawnStreet
 

@@ -17,8 +17,8 @@ from safetensors.torch import save_file
 from torch import nn
 
 from bench.errors import UserError
-from bench.victims import yolov5_file
-from bench.victims.yolov5 import YOLOv5, YOLOv5Network
+from bench.victims.detectors import yolov5_file
+from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
 
 COMMON = ("Conv", "Bottleneck", "C3", "SPPF", "Concat")
 ORIGINAL = {"Convolution": "Conv", "Bottleneck": "Bottleneck", "C3": "C3", "SPPF": "SPPF", "Detect": "Detect"}

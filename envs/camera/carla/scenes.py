@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bench.detection.contracts import Scenes
 from bench.errors import UserError
-from bench.scenario import WEATHERS, Cell
-from bench.vision import Scenes
+from bench.scenarios.grid import WEATHERS, Cell
 from envs.camera.camera import Array, Camera
 from envs.camera.carla import capture
 from envs.camera.carla.geometry import stand

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.scenario import Weather
+from bench.scenarios.grid import Weather
 from envs.camera.street.light import lighting
 
 FULL_RAIN_MM_H = 50.0

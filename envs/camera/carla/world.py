@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.errors import UserError
-from bench.registry import unknown
-from bench.scenario import WEATHERS, Cell
+from bench.plugins.registry import unknown
+from bench.scenarios.grid import WEATHERS, Cell
 from envs.camera.carla.texture import WHOLE, Region
 from envs.camera.street.layout import LOCATIONS
 

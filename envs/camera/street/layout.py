@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from bench.stopping import SPEED_MPS
+from bench.detection.stopping import SPEED_MPS
 from envs.camera import sign
 from envs.camera.camera import Camera
 from envs.camera.street import material as m

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.scenario import Weather
+from bench.scenarios.grid import Weather
 from envs.camera.street.textures import noise
 
 HEADLIGHTS_X = (-0.62, 0.62)

@@ -1,0 +1,70 @@
+"""`bench check`: the rules of the benchmark, one line each, and what to fix."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bench.cli.listing import heading
+from bench.errors import UserError
+from bench.plugins import registry
+
+if TYPE_CHECKING:
+    from bench.conformance.check import Outcome
+
+MARKS = {"pass": ("✓", "green"), "fail": ("✗ fix", "bold red"), "skip": ("– skipped", "dim")}
+
+
+def print_checks(name: str, words: Sequence[str], console: Console) -> int:
+    """Carry out the checks of every component of this name, print them, and return 1 if any failed, else 0.
+
+    Raises:
+        UserError: if no component has the name, its plug-in is broken, or a word cannot be read.
+    """
+    from bench.conformance import examine
+    from bench.run.process import settle
+
+    settle()
+    given = dict(_read(word) for word in words)
+    kinds = registry.kinds_of(name)
+    if strange := [key for key in given if key != "victim" and key.partition(".")[0] not in kinds]:
+        known = [*(f"{kind}.…" for kind in kinds), "victim"]
+        raise UserError(registry.unknown(f"key {strange[0]!r}", strange[0], known))
+    failed = False
+    for kind in kinds:
+        console.print(heading(kind, name))
+        own = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{kind}.")}
+        with console.status("checking"):
+            outcomes = list(examine(kind, name, own, given.get("victim", "")))
+        console.print(_table(outcomes))
+        counts = Counter(outcome.status for outcome in outcomes)
+        told = f"{counts['pass']} passed, {counts['fail']} to fix, {counts['skip']} skipped\n"
+        console.print(Text(told, style="bold red" if counts["fail"] else "green"))
+        failed = failed or counts["fail"] > 0
+    return int(failed)
+
+
+def _table(outcomes: Sequence[Outcome]) -> Table:
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(ratio=1)
+    for outcome in outcomes:
+        mark, style = MARKS[outcome.status]
+        text = Text(outcome.text, style="" if outcome.status == "fail" else "dim")
+        table.add_row(outcome.check, Text(mark, style=style), text)
+    return table
+
+
+def _read(word: str) -> tuple[str, str]:
+    key, equals, value = word.partition("=")
+    if not (equals and value and (key == "victim" or "." in key)):
+        raise UserError(
+            f"cannot read {word!r}: write attack.steps=50 for a parameter, or victim=NAME to try a defence on"
+        )
+    return key, value

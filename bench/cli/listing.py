@@ -1,0 +1,119 @@
+"""`bench list`: the names of all components, and the page of one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bench.plugins import registry
+from bench.plugins.registry import GROUPS, KINDS, Kind
+from bench.plugins.sources import tracks_of
+
+
+def print_names(console: Console) -> None:
+    """Every component by kind, with its tracks and the package that ships it. Imports none of them."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for column in ("kind", "name", "track", "shipped by"):
+        table.add_column(column)
+    for kind in KINDS:
+        for number, (name, claims) in enumerate(registry.entries(GROUPS[kind]).items()):
+            complaint = registry.problem(claims)
+            shipped_by = Text(complaint, style="red") if complaint else Text(claims[0].shipped_by)
+            served = ", ".join(tracks_of(claims[0].target)) or "?"
+            table.add_row(kind if number == 0 else "", Text(name, style="bold"), served, shipped_by)
+    console.print(table)
+    console.print("\n`bench list NAME` says what one does and what its parameters are.", style="dim", highlight=False)
+
+
+def print_component(name: str, console: Console) -> None:
+    """What every component of this name does, what it needs, its parameters, and the package that ships it.
+
+    Raises:
+        UserError: if no component has the name, or if its plug-in is broken.
+    """
+    for number, kind in enumerate(registry.kinds_of(name)):
+        if number:
+            console.rule(style="dim")
+        _print_page(kind, name, console)
+
+
+def heading(kind: Kind, name: str) -> Text:
+    """A component, where it is and what ships it, in a line."""
+    entry = registry.find(GROUPS[kind], name, kind)
+    return Text.assemble((f"{kind} ", "dim"), (name, "bold"), (f"   {entry.target}, {entry.shipped_by}", "dim"))
+
+
+def _print_page(kind: Kind, name: str, console: Console) -> None:
+    from bench.plugins.parameters import description, parameters
+
+    offered = registry.offers(kind, name)
+    component = registry.declared(kind, name) if offered else registry.load(kind, name)
+    console.print(heading(kind, name))
+    console.print()
+    for paragraph in _paragraphs(description(component)):
+        console.print(_with_code(paragraph), highlight=False)
+        console.print()
+    if offered:
+        _print_choices(name, offered, console)
+        return
+    console.print(fits(kind, component), highlight=False)
+    console.print()
+    known = parameters(component)
+    if not known:
+        console.print("It has no parameters.")
+        return
+    table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("type", no_wrap=True)
+    table.add_column("default", max_width=18)
+    table.add_column("meaning", ratio=1)
+    for parameter in known.values():
+        meaning = Text("\n").join(filter(None, [_with_code(parameter.meaning), Text(parameter.allowed, style="dim")]))
+        written = Text(f"{kind}.{parameter.name}", style="bold")
+        table.add_row(written, parameter.type_name, parameter.default_text, meaning)
+    console.print(table)
+
+
+def _print_choices(name: str, choices: Mapping[str, str], console: Console) -> None:
+    """What an adapter offers."""
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    for choice, word in choices.items():
+        table.add_row(Text(f"{name}:{choice}", style="bold"), word)
+    console.print(table)
+    example = f"{name}:{next(iter(choices))}"
+    console.print(
+        f"\n`bench list {example}` says what one does and what its parameters are.", style="dim", highlight=False
+    )
+
+
+def fits(kind: Kind, component: type[Any]) -> str:
+    """What decides where it fits: its track and, of an attack, what it needs, of a black box what it answers."""
+    track = f"Track: {' and '.join(component.tracks())}."
+    if kind == "victim" and component.answers != "gradients":
+        return f"{track} Answers {component.answers} at most: attacks that need gradients are refused."
+    if kind != "attack":
+        return track
+    actions = f" and {' or '.join(component.action_types)} actions" if "driving" in component.tracks() else ""
+    return f"{track} Needs access {component.access}{actions}."
+
+
+def _paragraphs(text: str) -> list[str]:
+    """The paragraphs of a docstring, each on one line unless it is indented (an example)."""
+    found = []
+    for paragraph in text.split("\n\n"):
+        indented = any(line.startswith(" ") for line in paragraph.splitlines())
+        found.append(paragraph if indented else " ".join(paragraph.split()))
+    return [paragraph for paragraph in found if paragraph.strip()]
+
+
+def _with_code(text: str) -> Text:
+    """Text with what stands in `backticks` set apart."""
+    rendered = Text()
+    for number, piece in enumerate(re.split(r"`([^`]+)`", text)):
+        rendered.append(piece, style="cyan" if number % 2 else "")
+    return rendered

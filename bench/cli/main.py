@@ -1,0 +1,259 @@
+"""The command line: `bench run | train | list | new | check | show | view | report | fetch`.
+
+Commands import what they need when they are called, so that `bench list` and `--help` do not wait for torch.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from bench.errors import UserError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+
+Words = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="KEY=VALUE...",
+        help="Comma lists sweep: attack=zo,noise defense=advtrain victim=dqn attack.steps=50 threat.budget=0.1,0.2. "
+        "lanes, density, weather and seeds choose from the grid: lanes=3,4 density=1 weather=clear,rain episodes=20.",
+    ),
+]
+
+
+@app.callback()
+def bench() -> None:
+    """How much does this attack hurt this defence of an automated vehicle?
+
+    With --debug anywhere on the line, or BENCH_DEBUG=1, an error shows its traceback.
+    """
+
+
+@app.command("list")
+def list_components(
+    name: Annotated[str, typer.Argument(help="One component: what it does and its parameters.")] = "",
+) -> None:
+    """List the attacks, defences, victims and worlds that are installed."""
+    from bench.cli import listing as cli_list
+
+    cli_list.print_component(name, Console()) if name else cli_list.print_names(Console())
+
+
+@app.command()
+def new(
+    kind: Annotated[str, typer.Argument(help="attack, defense or victim.")],
+    name: Annotated[str, typer.Argument(help="What the command line shall call it, for instance my_attack.")],
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[track=…] [out=…]", help="track=detection; out=FOLDER for the package."),
+    ] = None,
+) -> None:
+    """Write a small plug-in package that installs, works and passes its test, to begin with.
+
+    For instance: bench new attack my_attack, or bench new defense my_defense track=detection
+    """
+    from bench.cli import new as cli_new
+
+    cli_new.print_new(kind, name, words or [], Console())
+
+
+@app.command()
+def check(
+    name: Annotated[str, typer.Argument(help="A component, built in or a plug-in's.")],
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[KEY=VALUE]...", help="Its parameters, and victim=NAME that a defence is tried on."),
+    ] = None,
+) -> None:
+    """Check that a component keeps the rules of the benchmark, and say what to fix.
+
+    For instance: bench check my_attack attack.strength=2
+    """
+    from bench.cli import check as cli_check
+
+    raise typer.Exit(cli_check.print_checks(name, words or [], Console()))
+
+
+@app.command()
+def run(words: Words = None) -> None:
+    """Score attacks on defended victims over the standard grid; goes on where a run was broken off.
+
+    For instance: bench run attack=zo defense=advtrain
+    """
+    from bench.cli.progress import RunProgress
+    from bench.records import store as results
+    from bench.run import runner
+    from bench.run.config import run_config
+
+    config = run_config(words or [])
+    with RunProgress(Console(stderr=True)) as progress:
+        try:
+            units = runner.run(config, progress)
+        except KeyboardInterrupt:
+            kept = f"{progress.done} of {progress.total} episodes are kept"
+            raise UserError(f"interrupted; {kept}, and the same command goes on from there") from None
+    _print_report("run", results.read(config.out, units, track=config.pairs[0].track))
+    Console().print(Text(f"Records in {config.out}: `bench show {config.out}` says what made them."), soft_wrap=True)
+
+
+@app.command()
+def train(words: Words = None) -> None:
+    """Train a victim, or harden it with a defence, and save it to the zoo.
+
+    For instance: bench train victim=dqn seeds=0,1,2, or bench train defense=advtrain defense.skip=0.3 victim=dqn
+    """
+    from bench.cli.progress import TrainingProgress
+    from bench.run.config import train_config
+    from bench.run.process import settle
+    from bench.victims import zoo
+
+    settle()
+    config = train_config(words or [])
+    victim, defense, world = (part.component for part in (config.victim, config.defense, config.world))
+    hardens = config.defense.name != "none"
+    if not hardens and not victim.learns:
+        raise UserError(f"there is nothing to train: {config.victim.name} does not learn")
+    try:
+        name = defense.zoo_name(victim) if hardens else victim.zoo_name()
+    except NotImplementedError as error:
+        raise UserError(f"there is nothing to train: {error}") from error
+    for seed in config.seeds:
+        start = time.perf_counter()
+        with TrainingProgress(Console(stderr=True), f"{name}, seed {seed}") as progress:
+            if hardens:
+                trained = defense.train(victim, world, seed=seed, progress=progress)
+            else:
+                trained = victim.train(world, seed=seed, progress=progress)
+        if trained is None:
+            raise UserError(f"there is nothing to train: defense {config.defense.name!r} works at run time only")
+        path = zoo.save(trained.network, trained.card, name=name, seed=seed, root=config.out)
+        seconds = time.perf_counter() - start
+        Console().print(Text(f"{name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"), soft_wrap=True)
+
+
+@app.command()
+def render(
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the frames; by default those that bench run uses.")
+    ] = None,
+    world: Annotated[str, typer.Option(help="The camera world.")] = "camera",
+) -> None:
+    """Render the frames of a camera world; hours of work, that goes on where it was broken off.
+
+    It needs the renderer: pip install 'cavbench[render]'. The frames of the standard grid ship with the project.
+    """
+    from bench.cli.progress import TrainingProgress
+    from bench.detection.contracts import CameraWorld
+    from bench.run.config import component
+
+    found = component("world", world, {})
+    if not isinstance(found, CameraWorld):
+        raise UserError(f"world {world!r} has no camera to render for")
+    with TrainingProgress(Console(stderr=True), f"render {world}") as progress:
+        try:
+            files = found.render(out, progress)
+        except NotImplementedError as error:
+            raise UserError(str(error)) from error
+    size = sum(file.stat().st_size for file in files) / 1e6
+    Console().print(Text(f"{len(files)} files, {size:.1f} MB, in {files[0].parent}"), soft_wrap=True)
+
+
+@app.command()
+def show(
+    run: Annotated[str, typer.Argument(help="A results folder, or the name of a pair in it.")] = "results",
+    out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
+) -> None:
+    """Show a run: its configuration, what produced it, its table and its recordings."""
+    from bench.cli import show as cli_show
+
+    cli_show.print_run(run, out, Console(), _print_report)
+
+
+@app.command()
+def view(
+    run: Annotated[str, typer.Argument(help="A recording (.rrd), a results folder, or the name of a pair in it.")],
+    where: Annotated[
+        list[str] | None, typer.Argument(metavar="COLUMN=VALUE...", help="Which record to replay.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
+) -> None:
+    """Open a recording in the rerun viewer; with COLUMN=VALUE, drive that episode again and record it first.
+
+    For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017
+    """
+    from bench.cli import view as cli_view
+
+    cli_view.open_recording(run, where or [], out, Console())
+
+
+@app.command()
+def report(words: Words = None) -> None:
+    """Print a report on all records of a results folder: bench report NAME out=FOLDER, for instance thesis.
+
+    With html=PAGE it writes the leaderboards as one HTML file that opens from disk, with JSON and CSV beside it. Without a folder
+    and without out=, a report sees no records; it may have published ones of its own.
+    """
+    from bench.cli import report as cli_report
+
+    cli_report.print_report(words or [], Console())
+
+
+@app.command()
+def fetch(
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="What to fetch.")] = None,
+) -> None:
+    """Fetch published weights into the cache, or list what there is.
+
+    What is needed is fetched when it is first needed; this is for a machine that will be without a network later.
+    """
+    from bench.cli import fetch as cli_fetch
+
+    cli_fetch.print_fetched(names, Console()) if names else cli_fetch.print_downloads(Console())
+
+
+def _print_report(name: str, records: pa.Table) -> None:
+    from bench.plugins import registry
+    from bench.records import store as results
+
+    report = registry.resolve(registry.REPORTS, name, "report")
+    report({results.track_of(records.column_names): records}, Console())
+
+
+def main() -> None:
+    """Run the command line. Bad input ends in one line on standard error and exit code 2."""
+    debug = "--debug" in sys.argv or bool(os.environ.get("BENCH_DEBUG"))
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    try:
+        status = app(arguments, standalone_mode=False)
+    except (UserError, typer.TyperException) as error:
+        if debug:
+            raise
+        reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
+        sys.exit(_complain(reason))
+    # What nobody foresaw is mostly in a plug-in; its author is told how to see where.
+    except Exception as error:
+        if debug:
+            raise
+        sys.exit(_complain(f"{type(error).__name__}: {error} (--debug shows where)"))
+    sys.exit(status or 0)
+
+
+def _complain(reason: str) -> int:
+    line = " ".join(reason.split())
+    Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
+    return 2
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,152 @@
+"""What the terminal shows while work goes on, and of a component: bars and tables on rich consoles."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from bench.run.runner import Work
+
+
+class RunProgress:
+    """The progress of a run (`bench.run.runner.Watcher`): a bar on a terminal, a line a finished unit elsewhere.
+
+    Args:
+        console: where it is drawn; standard error, so that tables can be piped.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.bar = _bar(console, MofNCompleteColumn(), TextColumn("episodes"))
+        self.task: TaskID | None = None
+        self.total = self.done = 0
+        self.working_on: dict[str, str] = {}
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self.bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.bar.stop()
+
+    def begin(self, *, episodes: int, finished: int) -> None:
+        self.total, self.done = episodes, finished
+        self.task = self.bar.add_task("", total=episodes, completed=finished)
+        if finished:
+            self.console.print(f"{finished} of {episodes} episodes were there already", style="dim", highlight=False)
+
+    def working(self, works: Sequence[Work]) -> None:
+        self.working_on = {str(work): self.working_on.get(str(work), "") for work in works}
+        self._describe()
+
+    def crafting(self, work: str, share: float, text: str) -> None:
+        self.working_on[work] = f" {share:.0%} {text}"
+        self._describe()
+
+    def finished(self, work: Work, wall_s: float) -> None:
+        # A patch is no episode: it is counted with those that show it.
+        self.done += len(getattr(work, "seeds", ()))
+        if self.task is not None:
+            self.bar.update(self.task, completed=self.done)
+        if not self.console.is_terminal:
+            line = f"{self.done}/{self.total} episodes | {work} | {wall_s:.1f} s"
+            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def _describe(self) -> None:
+        if self.task is not None and self.working_on:
+            first, *others = (f"{work}{news}" for work, news in self.working_on.items())
+            self.bar.update(self.task, description=f"{first} (+{len(others)})" if others else first)
+
+    def warn(self, line: str) -> None:
+        self.console.print(Text(f"warning: {line}", style="yellow"), soft_wrap=True)
+
+
+class TrainingProgress:
+    """The progress of one training (`bench.plugins.contracts.Progress`): a bar on a terminal, a line every tenth elsewhere."""
+
+    def __init__(self, console: Console, label: str) -> None:
+        self.console = console
+        self.label = label
+        self.started = time.perf_counter()
+        self.tenths = 0
+        self.bar = _bar(console, TextColumn("{task.percentage:>3.0f}%"))
+        self.task = self.bar.add_task(label, total=1.0)
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self.bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.bar.stop()
+
+    def __call__(self, share: float, text: str) -> None:
+        self.bar.update(self.task, completed=share, description=f"{self.label}  {text}")
+        if not self.console.is_terminal and int(share * 10) > self.tenths:
+            self.tenths = int(share * 10)
+            seconds = time.perf_counter() - self.started
+            line = f"{self.label} | {share:.0%} | {seconds:.0f} s | {text}"
+            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+class DownloadProgress:
+    """The progress of one download, called with the bytes that came and those there are: a bar on a terminal, else a line."""
+
+    def __init__(self, console: Console, label: str) -> None:
+        self.console = console
+        self.label = label
+        self.bar = _bar(console, DownloadColumn())
+        self.task = self.bar.add_task(label, total=None)
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self.bar.start()
+        else:
+            self.console.print(f"downloading {self.label}", highlight=False, markup=False)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.console.is_terminal:
+            self.bar.stop()
+
+    def __call__(self, done: int, total: int) -> None:
+        self.bar.update(self.task, completed=done, total=total)
+
+
+def _bar(console: Console, *counts: ProgressColumn) -> Progress:
+    return Progress(
+        SpinnerColumn(),
+        BarColumn(bar_width=24),
+        *counts,
+        TimeElapsedColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False),
+        console=console,
+        transient=True,
+    )

@@ -1,0 +1,54 @@
+"""`bench report`: prints a report on a results folder, or writes its leaderboards as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from bench.errors import UserError
+from bench.plugins import registry
+from bench.records import store as results
+
+PAGES = "cavbench.pages"
+KEYS = ("out", "html")
+
+
+def print_report(words: Sequence[str], console: Console) -> None:
+    """Print a report, or write a page.
+
+    Args:
+        words: the name of a report (default `run`), `out=FOLDER` and `html=PAGE`.
+        console: where to print.
+
+    Raises:
+        UserError: if the words are none of these, or there are no records.
+    """
+    values: dict[str, str] = {}
+    names = []
+    for word in words:
+        key, given, value = word.partition("=")
+        if not given:
+            names.append(word)
+        elif key not in KEYS or key in values or not value:
+            raise UserError(_TAKES)
+        else:
+            values[key] = value
+    if len(names) > 1:
+        raise UserError(_TAKES)
+    out = Path(values.get("out", "results")).expanduser()
+    unasked = "out" not in values and not out.exists()
+    if "html" in values:
+        page = registry.resolve(PAGES, names[0] if names else "leaderboard", "page")
+        page(None if unasked else out, Path(values["html"]).expanduser(), console)
+        return
+    name = names[0] if names else "run"
+    function = registry.resolve(registry.REPORTS, name, "report")
+    function({} if name != "run" and unasked else results.read_all(out), console)
+
+
+_TAKES = (
+    "bench report takes one report, one out=folder and one html=page, for instance: bench report thesis out=results, "
+    "or bench report out=results html=leaderboard.html"
+)

@@ -1,0 +1,142 @@
+"""`bench show`: what a results folder holds, what made it, and its recordings."""
+
+from __future__ import annotations
+
+import functools
+import json
+import operator
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bench.errors import UserError
+from bench.plugins import registry
+from bench.plugins.contracts import REFERENCE_PATCHES
+from bench.records import store as results
+
+Report = Callable[[str, pa.Table], None]
+
+
+def print_run(run: str, out: Path, console: Console, report: Report) -> None:
+    """Print the configuration and the provenance of every pair of a run, its table and its recordings.
+
+    Args:
+        run: a results folder, or the beginning of the name of a pair in `out`.
+        out: results folder.
+        console: where to print.
+        report: prints a table by its name, from records.
+
+    Raises:
+        UserError: if there is no such run.
+    """
+    folder, pair = located(run, out)
+    name = None
+    for records in records_of(folder, pair):
+        name = pair_named(pair, records) if pair else None
+        shown = records.filter(pc.field("pair") == name if name else pc.field("sees"))
+        _print_facts(shown if shown.num_rows else records, console)
+        report("run", _with_controls(shown, records) if name else records)
+    for path in recordings(folder, name):
+        console.print(Text(f"recording: bench view {path}"), soft_wrap=True)
+
+
+def located(run: str, out: Path) -> tuple[Path, str]:
+    """The results folder and the beginning of a pair's name; the name is empty if `run` is a folder.
+
+    Raises:
+        UserError: if `run` can only be a path, and nothing is there.
+    """
+    if Path(run).is_dir():
+        return Path(run), ""
+    if "/" in run:
+        raise UserError(f"there is nothing at {run}")
+    return out, run
+
+
+def records_of(folder: Path, pair: str = "") -> list[pa.Table]:
+    """The records of each track in a folder; where a pair's name begins with `pair`, those of its track alone."""
+    found = list(results.read_all(folder).values())
+    with_it = [records for records in found if pc.any(pc.starts_with(records["pair"], pair)).as_py()]
+    return with_it[:1] if pair and with_it else found
+
+
+def pair_named(beginning: str, records: pa.Table) -> str:
+    """The one pair whose name begins so."""
+    known = sorted(set(records["pair"].to_pylist()))
+    found = [name for name in known if name.startswith(beginning)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UserError(f"{beginning!r} is the beginning of {len(found)} pairs: {', '.join(found)}")
+    raise UserError(registry.unknown(f"pair {beginning!r}", beginning, known))
+
+
+def _with_controls(pairs: pa.Table, records: pa.Table) -> pa.Table:
+    """A pair's records with its clean control and what it is held against: reference drivers, or reference patches."""
+
+    def same(*names: str) -> pc.Expression:
+        return functools.reduce(operator.and_, [pc.field(name) == pairs[name][0].as_py() for name in names])
+
+    driver = same("victim", "victim_params", "defense", "defense_params")
+    patches = pc.field("attack").isin(REFERENCE_PATCHES) & same("threat_norm", "threat_budget")
+    control = (((pc.field("attack") == "none") | patches) & driver) | ~pc.field("sees")
+    return records.filter(same("pair") | (same("world", "world_params") & control))
+
+
+def _print_facts(records: pa.Table, console: Console) -> None:
+    """The pairs of some records, their configuration and their provenance; what differs between them has several lines."""
+    for name in pc.unique(records["pair"]).to_pylist():
+        console.print(Text(name, style="bold"))
+    facts = Table.grid(padding=(0, 2, 0, 0))
+    facts.add_column(style="dim", no_wrap=True)
+    facts.add_column()
+    for kind in registry.KINDS:
+        facts.add_row(kind, _each(records, (kind, f"{kind}_params", f"{kind}_shipped_by"), _component))
+    threat = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
+    facts.add_row("threat", _each(records, threat, "{} {:g}, access {}, {} queries".format))
+    facts.add_row("cells", "; ".join(f"{axis} {_listed(records[axis])}" for axis in ("lanes", "density", "weather")))
+    seeds = pc.min_max(records["seed"]).as_py()
+    facts.add_row("scenario seeds", f"{seeds['min']} to {seeds['max']} ({_listed(records['grid'])})")
+    facts.add_row("training seeds", _listed(records["training_seed"]))
+    facts.add_row("weights", _listed(records["weights_sha256"], 12) or "none")
+    facts.add_row("code", _listed(records["code_digest"], 12))
+    facts.add_row("libraries", _each(records, ("libraries",), _versions))
+    facts.add_row("machine", _each(records, ("machine",), str))
+    units = records.group_by("unit").aggregate([("wall_s", "max")])
+    facts.add_row(
+        "made",
+        f"by {pc.max(records['created_at']).as_py():%Y-%m-%d %H:%M} UTC: {records.num_rows} episodes, "
+        f"{units.num_rows} units of work, {pc.sum(units['wall_s_max']).as_py():.0f} s",
+    )
+    console.print(facts, highlight=False)
+    console.print()
+
+
+def _each(records: pa.Table, names: tuple[str, ...], describe: Callable[..., str]) -> Text:
+    """A line for every different combination of values in these columns."""
+    rows = records.select(names).group_by(list(names)).aggregate([]).to_pylist()
+    return Text("\n".join(sorted(describe(*(row[name] for name in names)) for row in rows)))
+
+
+def _component(name: str, params: str, shipped_by: str) -> str:
+    values = ", ".join(f"{key}={value}" for key, value in json.loads(params).items())
+    return f"{name}({values})  {shipped_by}" if values else f"{name}  {shipped_by}"
+
+
+def _versions(libraries: str) -> str:
+    return ", ".join(f"{name} {version}" for name, version in json.loads(libraries).items())
+
+
+def _listed(column: pa.ChunkedArray, digits: int | None = None) -> str:
+    values: Iterable[Any] = sorted(set(column.to_pylist()))
+    return ", ".join(f"{value:g}" if isinstance(value, float) else str(value)[:digits] for value in values)
+
+
+def recordings(folder: Path, pair: str | None) -> list[Path]:
+    return sorted((folder / "recordings").glob(f"{pair or '*'}/*.rrd"))

@@ -1,0 +1,91 @@
+"""What a victim's answers hang on, measured now and then while it drives: the flags of a leaderboard stand on it.
+
+A probe asks the victim the same thing twice and, of the same step, about another episode. It is no query of the attack's, and
+it leaves torch's global random generator as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bench.driving.contracts import Policy
+
+EVERY = 15
+"""Steps between two probes: a second of driving."""
+SAME = 1e-6
+"""Scores no farther apart than this are the same answer."""
+
+
+class Probe:
+    """Counts of a batch of B episodes."""
+
+    def __init__(self, batch: int, policy: Policy) -> None:
+        self.policy = policy
+        self.redrawn, self.same, self.probed = (np.zeros(batch) for _ in range(3))
+        self.draws, self.drawn = np.zeros(batch), np.zeros(batch)
+
+    @torch.no_grad()
+    def look(self, observation: Tensor, running: Tensor) -> bool:
+        """Probe the running episodes [B] of a step; whether any was answered otherwise when asked again.
+
+        Args:
+            observation: true, [B, V, F].
+            running: bool [B].
+        """
+        rows = running.nonzero().squeeze(-1)
+        if len(rows) < 2:
+            return False
+        # All episodes are asked, so that a policy may keep something for each.
+        others = observation.clone()
+        others[rows] = observation[rows].roll(len(rows) // 2, 0)
+        with torch.random.fork_rng(devices=[]):
+            asked = (observation, observation, others)
+            first, again, other = (self.policy.scores(each)[rows] for each in asked)
+        redrawn = (first != again).flatten(1).any(1)
+        same = ((first - other).abs() <= SAME).flatten(1).all(1)
+        places = rows.numpy()
+        self.probed[places] += 1
+        self.redrawn[places] += redrawn.numpy()
+        self.same[places] += same.numpy()
+        return bool(redrawn.any())
+
+    def count_draws(self, asked: Sequence[tuple[Tensor | None, Tensor]], running: Tensor) -> None:
+        """Count how often an attack asked about each distinct observation in a step.
+
+        Args:
+            asked: its queries: the episodes asked about, by their place among the running ones (None: all), and
+                observations [..., B, V, F].
+            running: bool [B].
+        """
+        places = running.nonzero().squeeze(-1)
+        keys = [_keys(rows, observation) for rows, observation in asked]
+        if not keys:
+            return
+        all_keys = torch.cat(keys)
+        asked_of = torch.bincount(all_keys[:, 0].long(), minlength=len(places))
+        distinct = torch.bincount(all_keys.unique(dim=0)[:, 0].long(), minlength=len(places))
+        here = places[asked_of > 0].numpy()
+        self.draws[here] += (asked_of / distinct.clamp(min=1))[asked_of > 0].numpy()
+        self.drawn[here] += 1
+
+    def columns(self) -> Mapping[str, NDArray[np.float64]]:
+        """Shares [B]; NaN where nothing was measured."""
+        with np.errstate(invalid="ignore"):
+            return {
+                "redrawn": self.redrawn / self.probed,
+                "same_answer": self.same / self.probed,
+                "draws": self.draws / self.drawn,
+            }
+
+
+def _keys(rows: Tensor | None, observation: Tensor) -> Tensor:
+    """[N, 2] episode and a number that stands for the observation, one a query."""
+    flat = observation.flatten(-2).double()
+    code = flat @ torch.linspace(1, 2, flat.shape[-1], dtype=torch.float64).sin()
+    episode = torch.arange(flat.shape[-2]) if rows is None else rows
+    return torch.stack((episode.double().expand(code.shape), code), -1).flatten(0, -2)

@@ -1,0 +1,248 @@
+"""Words like `attack=zo,noise attack.steps=50 lanes=3,4`, read and type-checked by hydra's compose API.
+
+Comma lists of lanes, density, weather and seeds select; every other comma list sweeps. A component's parameter is given
+to those of the chosen components that have it.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import re
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import field, fields, is_dataclass, make_dataclass
+from enum import Enum
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+from hydra import compose, initialize
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from bench.errors import UserError
+from bench.plugins import registry
+from bench.plugins.contracts import ThreatModel, Track
+from bench.plugins.pair import THREATS, Chosen, choose
+from bench.plugins.parameters import Parameter, parameters
+from bench.plugins.registry import Kind
+
+DEFAULTS: dict[Kind, str] = {"attack": "none", "defense": "none", "victim": "dqn"}
+WORLDS: dict[Track, str] = {"driving": "highway", "detection": "camera"}
+"""The default world of each track; the track is the victim's."""
+
+
+class Words:
+    """The words as given: the values of each key, in hydra's override grammar.
+
+    Args:
+        words: `key=value` each.
+        kinds: of components that may be chosen.
+        settings: dataclass of the other keys.
+    """
+
+    def __init__(self, words: Sequence[str], *, kinds: Sequence[Kind], settings: type[Any]) -> None:
+        self.kinds = tuple(kinds)
+        self.schema = settings
+        # A path is taken as it is: hydra's grammar gives meaning to many of the characters one may hold.
+        self.out = [word.partition("=")[2] for word in words if word.startswith("out=")]
+        self.values: dict[str, tuple[str, ...]] = {}
+        for override in _parsed([word for word in words if not word.startswith("out=")]):
+            key = override.key_or_group
+            if key in self.values or len(self.out) > 1:
+                raise UserError(f"{key} is given twice; write its values with commas: {key}=a,b")
+            self._check_key(key)
+            self.values[key] = _elements(override)
+
+    def _check_key(self, key: str) -> None:
+        head, _, parameter = key.partition(".")
+        threats = [f"threat.{item.name}" for item in fields(ThreatModel)] if "attack" in self.kinds else []
+        known = [*self.kinds, *(item.name for item in fields(self.schema)), *threats]
+        if key not in known and not (head in self.kinds and parameter):
+            raise UserError(registry.unknown(f"key {key!r}", key, known))
+
+    def settings(self) -> dict[str, Any]:
+        """The values of the keys that choose no component."""
+        store = ConfigStore.instance()
+        store.store(name="settings", node=self.schema)
+        lists = {item.name for item in fields(self.schema) if "list" in str(item.type)}
+        overrides = []
+        for key, values in self.values.items():
+            if key.partition(".")[0] in (*self.kinds, "threat"):
+                continue
+            if key not in lists and len(values) > 1:
+                raise UserError(f"{key} takes one value, got {','.join(values)}")
+            whole = values[0] if len(values) == 1 and values[0].startswith("[") else f"[{','.join(values)}]"
+            overrides.append(f"{key}={whole if key in lists else values[0]}")
+        found = OmegaConf.to_container(_composed(overrides, config_name="settings"))
+        assert isinstance(found, dict)
+        return {str(key): value for key, value in found.items()} | ({"out": self.out[0]} if self.out else {})
+
+    @cached_property
+    def track(self) -> Track:
+        """Of the victims asked for.
+
+        Raises:
+            UserError: if they are not all of one.
+        """
+        found = {chosen.component.tracks()[0]: chosen.name for chosen in self.chosen("victim")}
+        if len(found) > 1:
+            victims = " and ".join(f"{name!r} ({track})" for track, name in found.items())
+            raise UserError(
+                f"victims {victims} are of different tracks: run one after the other, with the same out= if you like"
+            )
+        return next(iter(found))
+
+    def chosen(self, kind: Kind) -> list[Chosen[Any]]:
+        """Every component of a kind that is asked for, with every combination of its parameters' values."""
+        names = self.values.get(kind) or (WORLDS[self.track] if kind == "world" else DEFAULTS[kind],)
+        # Hydra's grammar escapes the colon of NAME:CHOICE.
+        names = tuple(name.replace("\\:", ":") for name in names)
+        if kind != "victim":
+            names = tuple(registry.on_track(kind, name, self.track) for name in names)
+        known = {name: parameters(registry.load(kind, name)) for name in names}
+        swept = {key.partition(".")[2]: v for key, v in self.values.items() if key.startswith(f"{kind}.")}
+        for key in swept:
+            if not any(key.partition(".")[0] in owned for owned in known.values()):
+                what = f"parameter {kind}.{key} of {', '.join(names)}"
+                raise UserError(
+                    registry.unknown(what, key, dict.fromkeys(p for owned in known.values() for p in owned))
+                )
+        found: dict[str, Chosen[Any]] = {}
+        for name, owned in known.items():
+            keys = [key for key in swept if key.partition(".")[0] in owned]
+            for values in itertools.product(*(swept[key] for key in keys)):
+                one = configured(kind, name, dict(zip(keys, values, strict=True)))
+                found[f"{name} {one.params}"] = one
+        return list(found.values())
+
+    def threats(self) -> list[ThreatModel]:
+        """Every combination of the threat model's values."""
+        model = THREATS[self.track]
+        owned = parameters(model)
+        keys = [key for key in self.values if key.startswith("threat.")]
+        names = [key.removeprefix("threat.") for key in keys]
+        found = []
+        for values in itertools.product(*(self.values[key] for key in keys)):
+            arguments = _arguments("threat", "model", owned, dict(zip(names, values, strict=True)))
+            try:
+                found.append(model(**arguments))
+            except ValueError as error:
+                raise UserError(str(error)) from error
+        return found
+
+
+def configured(kind: Kind, name: str, values: Mapping[str, str]) -> Chosen[Any]:
+    """A component by name, its parameters read as on the command line.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    owned = parameters(registry.load(kind, name))
+    for key in values:
+        if key.partition(".")[0] not in owned:
+            raise UserError(registry.unknown(f"parameter {kind}.{key} of {name}", key, owned))
+    return choose(kind, name, **_arguments(kind, name, owned, values))
+
+
+def parameter_words(text: str) -> dict[str, str]:
+    """Parameters in one value, as `attack_params` of adversarial training has them: "steps=3 restarts=2".
+
+    Raises:
+        UserError: if a word is not of that kind.
+    """
+    found = {}
+    for word in text.split():
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise UserError(f"attack_params takes words like steps=3, got {word!r}")
+        found[name] = value
+    return found
+
+
+def _parsed(words: Sequence[str]) -> list[Override]:
+    parser = OverridesParser.create()
+    overrides = []
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not (equals and re.fullmatch(r"\w+(\.\w+)*", key)):
+            raise UserError(f"cannot read {word!r}: write key=value, for instance attack=zo or lanes=3,4")
+        try:
+            (override,) = parser.parse_overrides([word])
+        except HydraException:
+            # Not a value of hydra's grammar, so a plain text.
+            escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+            (override,) = parser.parse_overrides([f'{key}="{escaped}"'])
+        overrides.append(override)
+    return overrides
+
+
+def _elements(override: Override) -> tuple[str, ...]:
+    swept = override.is_sweep_override()
+    values = list(override.sweep_string_iterator()) if swept else [override.get_value_element_as_str()]
+    if "" in values:
+        raise UserError(f"{override.key_or_group} has no value; write {override.key_or_group}=value")
+    return tuple(dict.fromkeys(values))
+
+
+def _composed(overrides: list[str], config_name: str | None = None) -> DictConfig:
+    try:
+        with initialize(version_base="1.3", config_path=None):
+            return compose(config_name, overrides=overrides)
+    except (HydraException, OmegaConfBaseException) as error:
+        cause = error if error.__cause__ is None else error.__cause__
+        key = str(getattr(cause, "full_key", "") or "").partition("[")[0]
+        word = next((word for word in overrides if key and word.startswith(f"{key}=")), " ".join(overrides))
+        reason = str(cause).splitlines()[0]
+        raise UserError(f"cannot read {word}: {reason[:1].lower()}{reason[1:]}") from error
+
+
+def _schema(owned: dict[str, Parameter]) -> type[Any]:
+    """A structured config of a component's parameters, with types that OmegaConf knows."""
+    made: list[tuple[str, Any, Any]] = []
+    for parameter in owned.values():
+        value = parameter.default
+        default = field() if parameter.required else field(default_factory=partial(copy.copy, value))
+        made.append((parameter.name, _omegaconf_type(parameter.hint), default))
+    return make_dataclass("Parameters", made, kw_only=True)
+
+
+def _omegaconf_type(hint: Any) -> Any:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return type(arguments[0])
+    if origin in (Union, types.UnionType):
+        return Union[tuple(_omegaconf_type(argument) for argument in arguments)]  # noqa: UP007
+    if origin in (tuple, list):
+        return list[_omegaconf_type(arguments[0])]  # type: ignore[misc]
+    plain = isinstance(hint, type) and issubclass(hint, (bool, int, float, str, Path, Enum, types.NoneType))
+    return hint if plain or is_dataclass(hint) else Any
+
+
+def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping[str, str]) -> dict[str, Any]:
+    """Values in hydra's grammar as constructor arguments: typed, checked against the choices, tuples for lists."""
+    given_names = {key.partition(".")[0] for key in given}
+    if missing := [f"{kind}.{key}=…" for key, p in owned.items() if p.required and key not in given_names]:
+        raise UserError(f"{kind} {name!r} needs {', '.join(missing)}")
+    if not given:
+        return {}
+    try:
+        ConfigStore.instance().store(group=kind, name=name, node=_schema(owned))
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"the parameters of {kind} {name!r} cannot be set on the command line: {reason}") from error
+    composed = _composed([f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())])[kind]
+    arguments = OmegaConf.to_object(composed)
+    values = {item: getattr(arguments, item) for item in owned}
+    for key, value in values.items():
+        choices = owned[key].choices
+        if choices and value is not None and value not in choices:
+            raise UserError(registry.unknown(f"{kind}.{key} {value!r}", str(value), map(str, choices)))
+        if isinstance(value, list):
+            values[key] = tuple(value)
+    return values

@@ -1,0 +1,74 @@
+"""Which tracks a component serves, read from its source: listing components imports none of them."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+from functools import cache
+
+from bench.plugins import registry
+from bench.plugins.fingerprint import file_of
+from bench.plugins.registry import GROUPS, Kind
+
+
+def names(kind: Kind, track: str) -> list[str]:
+    """The components of a kind that serve a track."""
+    return [
+        name
+        for name, claims in registry.entries(GROUPS[kind]).items()
+        if any(track in tracks_of(claim.target) for claim in claims)
+    ]
+
+
+def tracks_of(target: str) -> list[str]:
+    """The tracks of the class that an entry point names, `module:Class`; empty where the source does not say.
+
+    They are every `track: ... = "..."` in the body of the class or of a base of it, as far as those can be followed by name.
+    """
+    module, _, name = target.partition(":")
+    waiting, seen, found = [(module, name)], set(), set()
+    while waiting:
+        module, name = place = waiting.pop()
+        if place in seen:
+            continue
+        seen.add(place)
+        classes, imported = _top_level(module)
+        if name not in classes:
+            waiting += [imported[name]] if name in imported else []
+            continue
+        for node in classes[name].body:
+            match node:
+                case ast.AnnAssign(target=ast.Name(id="track"), value=ast.Constant(value=str(track))):
+                    found.add(track)
+        for base in classes[name].bases:
+            match base:
+                case ast.Name(id=own):
+                    waiting.append((module, own))
+                case ast.Attribute(value=ast.Name(id=parent), attr=own):
+                    waiting.append((".".join(filter(None, imported.get(parent, (parent, "")))), own))
+    return sorted(found)
+
+
+@cache
+def _top_level(module: str) -> tuple[dict[str, ast.ClassDef], dict[str, tuple[str, str]]]:
+    """The classes of a module, and the module and name behind each name it imports."""
+    path = file_of(module)
+    if path is None or path.suffix != ".py":
+        return {}, {}
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    classes: dict[str, ast.ClassDef] = {}
+    imported: dict[str, tuple[str, str]] = {}
+    try:
+        body = ast.parse(path.read_bytes()).body
+    except (SyntaxError, ValueError):
+        return {}, {}
+    for node in body:
+        match node:
+            case ast.ClassDef():
+                classes[node.name] = node
+            case ast.Import():
+                imported |= {alias.asname or alias.name: (alias.name, "") for alias in node.names}
+            case ast.ImportFrom():
+                base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+                imported |= {alias.asname or alias.name: (base, alias.name) for alias in node.names}
+    return classes, imported

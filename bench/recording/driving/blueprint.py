@@ -1,0 +1,120 @@
+"""How a recording opens in the viewer: the road from above on top, decisions under it, curves below, and what it is of."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from bench.recording import about
+from bench.recording.driving import scene
+from bench.recording.driving.curves import group
+from bench.recording.driving.episode import STEPS_PER_SECOND, Episode
+
+
+def layout(episode: Episode) -> rrb.Blueprint:
+    """The blueprint of an episode; views that an episode has nothing for are left out."""
+    rows: list[rrb.Container | rrb.View] = []
+    shares: list[float] = []
+    if {"x", "y"} <= set(episode.features.names):
+        rows.append(_road(episode))
+        shares.append(2.6)
+    if episode.discrete:
+        rows.append(rrb.StateTimelineView(origin="decision", name=_decision(episode)))
+        shares.append(1.4 if episode.attacked else 1.0)
+    rows.append(_curves(episode))
+    shares.append(5.0)
+    return bare(rrb.Vertical(*rows, row_shares=shares), timeline="time", fps=STEPS_PER_SECOND)
+
+
+def bare(views: rrb.Container, *, timeline: str, fps: float) -> rrb.Blueprint:
+    """Nothing but these views, and under them a timeline that plays."""
+    return rrb.Blueprint(
+        views,
+        rrb.BlueprintPanel(state=rrb.PanelState.Hidden),
+        rrb.SelectionPanel(state=rrb.PanelState.Hidden),
+        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=timeline, fps=fps),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _road(episode: Episode) -> rrb.View:
+    x, y = scene.bounds(episode)
+    name = "Road from above: ego green, traffic as measured blue"
+    return rrb.Spatial2DView(
+        origin="/",
+        contents=["/road/**", "/traffic/**", "/ego/**"],
+        name=f"{name}, as shown to the policy orange" if episode.attacked else name,
+        background=(24, 25, 29),
+        visual_bounds=rrb.VisualBounds2D(x_range=x, y_range=y),
+    )
+
+
+def _decision(episode: Episode) -> str:
+    return "Decision: clean on what was measured, taken on what was shown" if episode.attacked else "Decision"
+
+
+def _curves(episode: Episode) -> rrb.Container:
+    """Three columns of curves, and the page that says what they are of."""
+    words = rrb.TextDocumentView(origin="about", name="About")
+    shown = _scores(episode, "scores/shown", " as shown to the policy" if episode.attacked else "")
+    drive = rrb.Tabs(
+        _plot("worth", "Reward", 0.0, 1.0),
+        _plot("speed", "Speed", 0.0, _top(episode.steps["speed"])),
+        _plot("ttc", "TTC", 0.0, 20.0),
+    )
+    if not episode.attacked:
+        return rrb.Horizontal(drive, shown, words)
+    moved = []
+    for path in dict.fromkeys(group(unit) for unit in episode.features.units):
+        own = [
+            name
+            for name, unit in zip(episode.features.names, episode.features.units, strict=True)
+            if group(unit) == path
+        ]
+        top = max(_top(values) for name in own for values in (episode.budget[name], episode.moved(name)))
+        moved.append(_plot(path, f"Perturbation of {path.rpartition('/')[2]} and its budget", 0.0, top))
+    queries = _plot("queries", "Queries", 0.0, _top(episode.steps["queries"]))
+    measured = _scores(episode, "scores/measured", " as measured", legend=False)
+    curves = rrb.Grid(*moved, shown, drive, queries, measured, grid_columns=3)
+    return rrb.Horizontal(curves, words, column_shares=[4, 1])
+
+
+def _scores(episode: Episode, path: str, of: str, *, legend: bool = True) -> rrb.View:
+    """Q-values or continuous actions; both of an episode's views have one axis and one legend, to be compared."""
+    if not episode.discrete:
+        return _plot(path, f"Action{of}", -1.0, 1.0, legend=legend)
+    values = np.concatenate([episode.steps["scores"], episode.steps["clean_scores"]])
+    return _plot(path, f"Q-values{of}", float(values.min()), float(values.max()), legend=legend)
+
+
+def _top(values: NDArray[np.generic]) -> float:
+    """The largest finite value, 1 where there is none above 0."""
+    finite = np.asarray(values, dtype=np.float64)
+    return max(float(finite[np.isfinite(finite)].max(initial=0.0)), 0.0) or 1.0
+
+
+def _plot(path: str, name: str, low: float, high: float, *, legend: bool = True) -> rrb.TimeSeriesView:
+    """Curves with room for their legend above them."""
+    span = max(high - low, 1e-6)
+    return rrb.TimeSeriesView(
+        origin=path,
+        name=name,
+        axis_y=rrb.ScalarAxis(range=(low - 0.05 * span, high + 0.6 * span)),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
+    )
+
+
+def page(episode: Episode) -> str:
+    """What came of the episode, and who drove it under what."""
+    steps = episode.steps
+    lines = [f"**{episode.end}** after {len(episode)} steps ({len(episode) / STEPS_PER_SECOND:.1f} s)"]
+    clean, taken = episode.choices
+    if episode.discrete and episode.attacked:
+        lines.append(f"- decisions changed: {100 * float((clean != taken).mean()):.0f} %")
+    lines.append(f"- mean speed: {float(steps['speed'].mean()):.1f} m/s")
+    lines.append(f"- return: {float(steps['reward'].sum()):.1f}")
+    if episode.attacked:
+        lines.append(f"- queries a step: {float(steps['queries'].mean()):.0f}")
+    return about.page(episode.meta, lines, queries="a step" if episode.attacked else "")

@@ -1,0 +1,202 @@
+"""What a run is, in frozen and typed configurations, made from `key=value` words."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bench.errors import UserError
+from bench.plugins import registry
+from bench.plugins.contracts import Track
+from bench.plugins.options import Words, configured
+from bench.plugins.pair import Chosen, Pair, check_track
+from bench.plugins.registry import KINDS, Kind
+from bench.scenarios.grid import GRIDS, WEATHERS, Grid
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """A run: every pair on every cell of the grid with every training seed.
+
+    Args:
+        pairs: what is run.
+        grid: the cells and the scenario seeds.
+        seeds: training seeds of the victims; of detectors also the seeds of the patches.
+        workers: worker processes; results do not depend on their number.
+        out: results folder.
+        record: episodes to record of every cell of each pair; None records one, of the first cell.
+        reference: whether the reference drivers, or the reference patches, are run too.
+
+    Raises:
+        ValueError: if a number is out of range.
+    """
+
+    pairs: tuple[Pair, ...]
+    grid: Grid = GRIDS["standard-v1"]
+    seeds: tuple[int, ...] = (0, 1, 2)
+    workers: int = field(default_factory=lambda: cores())
+    out: Path = Path("results")
+    record: int | None = None
+    reference: bool = True
+
+    def __post_init__(self) -> None:
+        check_seeds(self.seeds)
+        if self.workers < 1:
+            raise ValueError(f"workers must be at least 1, got {self.workers}")
+        if self.record is not None and not 0 <= self.record <= self.grid.episodes:
+            raise ValueError(f"record must be between 0 and the {self.grid.episodes} episodes, got {self.record}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """A training: one policy a training seed.
+
+    Args:
+        victim: what is trained.
+        defense: how it is hardened; `none` trains the victim itself.
+        world: where it practises.
+        seeds: training seeds.
+        out: the zoo to save to; None is the user's own.
+    """
+
+    victim: Chosen[Any]
+    defense: Chosen[Any]
+    world: Chosen[Any]
+    seeds: tuple[int, ...] = (0,)
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        check_seeds(self.seeds)
+        check_track(self.victim, self.defense, self.world)
+
+
+def check_seeds(seeds: tuple[int, ...]) -> None:
+    """Raise ValueError unless there is at least one training seed, none negative and none twice."""
+    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
+        raise ValueError(f"seeds must be different numbers of at least 0, got {','.join(map(str, seeds)) or 'none'}")
+
+
+def check_weather(name: str, track: Track) -> None:
+    """Refuse weather that is unknown, or that is only a matter of light where nothing looks at it.
+
+    Raises:
+        UserError: if it is.
+    """
+    if name not in WEATHERS:
+        raise UserError(registry.unknown(f"weather {name!r}", name, WEATHERS))
+    if track == "driving" and WEATHERS[name].sun_elevation_deg < 0:
+        raise UserError(f"weather {name!r} is for cameras: the sensors of the driving track bring their own light")
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass
+class RunWords:
+    """The words of `bench run` that choose no component, with their types and defaults."""
+
+    grid: str | None = None
+    lanes: list[int] | None = None
+    density: list[float] | None = None
+    weather: list[str] | None = None
+    episodes: int | None = None
+    seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
+    workers: int = field(default_factory=cores)
+    out: str = "results"
+    record: int | None = None
+    reference: bool = True
+
+
+@dataclass
+class TrainWords:
+    """The words of `bench train` that choose no component."""
+
+    seeds: list[int] = field(default_factory=lambda: [0])
+    out: str | None = None
+
+
+def run_config(words: Sequence[str]) -> RunConfig:
+    """The configuration of `bench run WORDS`.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    given = Words(words, kinds=KINDS, settings=RunWords)
+    settings = given.settings()
+    axes = {key: tuple(settings[key]) for key in ("lanes", "density", "weather") if settings[key] is not None}
+    if settings["episodes"] is not None:
+        axes["episodes"] = settings["episodes"]
+    known = [grid.name for grid in GRIDS.values() if grid.track == given.track]
+    name = settings["grid"] or known[0]
+    if name not in known:
+        raise UserError(registry.unknown(f"grid {name!r}", name, known))
+    for weather in axes.get("weather", ()):
+        check_weather(weather, given.track)
+    with _one_line():
+        grid: Grid = GRIDS[name].with_(**axes)
+        choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS]
+        pairs = [
+            Pair(attack=attack, defense=defense, victim=victim, world=world, threat=threat)
+            for attack, defense, victim, world, threat in itertools.product(*choices, given.threats())
+        ]
+        pairs = [pair.clean() if pair.is_clean else pair for pair in pairs]
+        return RunConfig(
+            pairs=tuple({pair.id: pair for pair in pairs}.values()),
+            grid=grid,
+            seeds=tuple(settings["seeds"]),
+            workers=settings["workers"],
+            out=Path(settings["out"]).expanduser(),
+            record=settings["record"],
+            reference=settings["reference"],
+        )
+
+
+def train_config(words: Sequence[str]) -> TrainConfig:
+    """The configuration of `bench train WORDS`; `seed` is another word for `seeds`.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    words = [f"seeds={word.removeprefix('seed=')}" if word.startswith("seed=") else word for word in words]
+    given = Words(words, kinds=("defense", "victim", "world"), settings=TrainWords)
+    settings = given.settings()
+    one: dict[Kind, Chosen[Any]] = {}
+    for kind in given.kinds:
+        found = given.chosen(kind)
+        if len(found) > 1:
+            raise UserError(
+                f"bench train trains one policy a seed, not {len(found)}: give one {kind} and one set of parameters"
+            )
+        one[kind] = found[0]
+    with _one_line():
+        return TrainConfig(
+            victim=one["victim"],
+            defense=one["defense"],
+            world=one["world"],
+            seeds=tuple(settings["seeds"]),
+            out=Path(settings["out"]).expanduser() if settings["out"] else None,
+        )
+
+
+def component(kind: Kind, name: str, values: Mapping[str, str]) -> Any:
+    """A component by name, its parameters read as on the command line: `component("attack", "pgd", {"steps": "3"})`.
+
+    Raises:
+        UserError: for anything that cannot be read or is not allowed, in one line.
+    """
+    return configured(kind, name, values).component
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(str(error).splitlines()[0]) from error

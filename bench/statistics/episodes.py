@@ -1,0 +1,289 @@
+"""What a set of episode records says: driving metrics and attack metrics, a cell or a grid at a time, with intervals.
+
+Records come as a `pyarrow.Table`, one row an episode (columns: `bench.records.store.SCHEMA`). `Episodes.arrange` puts the
+rows of one pair in order, training seeds x cells x scenario seeds; `summarise` measures them; `difference` compares
+two sets scenario by scenario. The statistics are those of `bench.statistics.estimates`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from itertools import compress, product
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from bench.scenarios.grid import WEATHERS, Cell
+from bench.statistics.estimates import Array, Interval, interval, wilson
+
+MAX_RETURN = 450.0
+"""Largest `return`: highway-env's normalised reward, 1 a step, over 450 steps (the thesis' scale)."""
+CONTROL_PERIOD_MS = 1000 / 15
+"""The time between two decisions at 15 Hz: an attack that takes longer cannot run on the road."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The episodes of one pair: every run has every cell, every cell every scenario seed.
+
+    Args:
+        table: the records, sorted by run, cell, scenario seed; [R * C * E] rows.
+        runs: training seeds [R].
+        cells: [C], by weather (in the order of `WEATHERS`), lanes, density.
+        seeds: scenario seeds [E], rising.
+        left_out: records given to `arrange` that were not used, because their cell or seed is missing from another run.
+    """
+
+    table: pa.Table
+    runs: tuple[int, ...]
+    cells: tuple[Cell, ...]
+    seeds: tuple[int, ...]
+    left_out: int = 0
+
+    @classmethod
+    def arrange(cls, records: pa.Table) -> Episodes:
+        """Sort the records of one pair; keep the cells that every run has and the seeds that all those cells have.
+
+        Raises:
+            ValueError: if there is no record, if a scenario is there twice, or if nothing is common to all runs.
+        """
+        if not records.num_rows:
+            raise ValueError("no records to measure")
+        runs, run = _distinct(records["training_seed"])
+        seeds, seed = _distinct(records["seed"])
+        cells, cell = _cells(records)
+        place = np.full((len(runs), len(cells), len(seeds)), -1)
+        place[run, cell, seed] = np.arange(records.num_rows)
+        driven = place >= 0
+        if driven.sum() < records.num_rows:
+            raise ValueError("a scenario is there twice: these are the records of more than one pair")
+        every_run: NDArray[np.bool_] = np.asarray(driven.any(2).all(0))
+        if not every_run.any():
+            raise ValueError("the training seeds have no cell in common")
+        every_cell: NDArray[np.bool_] = np.asarray(driven[:, every_run].all((0, 1)))
+        if not every_cell.any():
+            raise ValueError("the cells have no scenario seed in common")
+        rows = place[:, every_run][..., every_cell].ravel()
+        whole = len(rows) == records.num_rows and bool((rows[1:] > rows[:-1]).all())
+        return Episodes(
+            table=records if whole else records.take(pa.array(rows)),
+            runs=tuple(runs),
+            cells=tuple(one for one, kept in zip(cells, every_run, strict=True) if kept),
+            seeds=tuple(seed for seed, kept in zip(seeds, every_cell, strict=True) if kept),
+            left_out=records.num_rows - len(rows),
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """R runs, C cells, E episodes a run and cell."""
+        return len(self.runs), len(self.cells), len(self.seeds)
+
+    def column(self, name: str) -> Array:
+        """[R, C, E] a measurement as float64."""
+        values = self.table[name].to_numpy(zero_copy_only=False)
+        return np.asarray(values, dtype=np.float64).reshape(self.shape)
+
+    def only(
+        self,
+        *,
+        runs: Collection[int] | None = None,
+        cells: Collection[Cell] | None = None,
+        seeds: Collection[int] | None = None,
+    ) -> Episodes:
+        """The part with these runs, cells and scenario seeds; None keeps all.
+
+        Raises:
+            ValueError: if nothing is left.
+        """
+        axes = (_places(self.runs, runs), _places(self.cells, cells), _places(self.seeds, seeds))
+        if not all(axes):
+            raise ValueError("no episode is left")
+        if tuple(map(len, axes)) == self.shape:
+            return self
+        rows = np.arange(self.table.num_rows).reshape(self.shape)[np.ix_(*axes)].ravel()
+        return Episodes(
+            table=self.table.take(pa.array(rows)),
+            runs=tuple(self.runs[i] for i in axes[0]),
+            cells=tuple(self.cells[i] for i in axes[1]),
+            seeds=tuple(self.seeds[i] for i in axes[2]),
+            left_out=self.left_out,
+        )
+
+    def standing_for(self, runs: Sequence[int], cells: Sequence[Cell]) -> Episodes:
+        """The episodes of a driver that neither learns nor sees, under the names of other runs and weathers.
+
+        Args:
+            runs: training seeds, each given the episodes of the first run.
+            cells: those that were driven, and those that were driven in clear weather, which stands for all weathers.
+
+        Raises:
+            ValueError: if a cell was driven in neither its own nor in clear weather.
+        """
+        stand_ins = [cell if cell in self.cells else replace(cell, weather="clear") for cell in cells]
+        missing = [str(cell) for cell, stand_in in zip(cells, stand_ins, strict=True) if stand_in not in self.cells]
+        if missing:
+            raise ValueError(f"never driven: {'; '.join(missing)}")
+        each = len(self.seeds)
+        first_run = np.arange(self.table.num_rows).reshape(self.shape)[0]
+        rows = np.concatenate([first_run[self.cells.index(stand_in)] for stand_in in stand_ins])
+        table = self.table.take(pa.array(np.tile(rows, len(runs))))
+        labels = {
+            "training_seed": np.repeat(runs, len(cells) * each),
+            "weather": np.tile(np.repeat([cell.weather for cell in cells], each), len(runs)),
+        }
+        for name, values in labels.items():
+            field = table.schema.field(name)
+            table = table.set_column(table.schema.get_field_index(name), field, pa.array(values.tolist(), field.type))
+        return Episodes.arrange(table)
+
+
+def _places(own: Sequence[object], wanted: Collection[object] | None) -> list[int]:
+    kept = None if wanted is None else set(wanted)
+    return [place for place, value in enumerate(own) if kept is None or value in kept]
+
+
+def _distinct(column: pa.ChunkedArray, order: Sequence[Any] = ()) -> tuple[list[Any], NDArray[np.int64]]:
+    """The values of a column, rising or in this order, and the place of each record's among them."""
+    encoded = column.combine_chunks()
+    encoded = encoded if pa.types.is_dictionary(encoded.type) else encoded.dictionary_encode()
+    values, codes = encoded.dictionary.to_pylist(), encoded.indices.to_numpy()
+    there = np.flatnonzero(np.bincount(codes, minlength=len(values))).tolist()
+    rising = sorted(there, key=lambda code: order.index(values[code]) if order else values[code])
+    place = np.zeros(len(values), np.int64)
+    place[rising] = np.arange(len(rising))
+    return [values[code] for code in rising], place[codes]
+
+
+def _cells(records: pa.Table) -> tuple[list[Cell], NDArray[np.int64]]:
+    """The cells of some records, by weather, lanes, density, and the place of each record's."""
+    weathers, weather = _distinct(records["weather"], tuple(WEATHERS))
+    lanes, lane = _distinct(records["lanes"])
+    densities, density = _distinct(records["density"])
+    codes = (weather * len(lanes) + lane) * len(densities) + density
+    every = list(product(weathers, lanes, densities))
+    driven = np.bincount(codes, minlength=len(every)) > 0
+    cells = [Cell(weather=name, lanes=lane, density=factor) for name, lane, factor in compress(every, driven)]
+    return cells, (np.cumsum(driven) - 1)[codes]
+
+
+def shared(first: Episodes, second: Episodes) -> tuple[Episodes, Episodes]:
+    """Both, reduced to the runs, cells and scenario seeds that both have.
+
+    Raises:
+        ValueError: if they have nothing in common.
+    """
+    if (first.runs, first.cells, first.seeds) == (second.runs, second.cells, second.seeds):
+        return first, second
+    runs, cells, seeds = (set(getattr(first, name)) & set(getattr(second, name)) for name in ("runs", "cells", "seeds"))
+    return first.only(runs=runs, cells=cells, seeds=seeds), second.only(runs=runs, cells=cells, seeds=seeds)
+
+
+def difference(treated: Episodes, control: Episodes, name: str) -> Interval:
+    """Interquartile mean of `treated` - `control`, paired: same training seed, cell and scenario seed.
+
+    Raises:
+        ValueError: if runs, cells or scenario seeds differ: that would mix the traffic into the effect.
+    """
+    if (treated.runs, treated.cells, treated.seeds) != (control.runs, control.cells, control.seeds):
+        raise ValueError("not paired: the two sides differ in training seeds, cells or scenario seeds (see `shared`)")
+    return interval(treated.column(name) - control.column(name))
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The measurements of a set of episodes.
+
+    Args:
+        safe_progress: in [0, 1], the ranking metric: 0 where the episode crashes or leaves the road.
+        episode_return: in [0, 450], highway-env's normalised reward summed over the episode.
+        crash_rate: share of episodes that end in a crash, all runs pooled.
+        offroad_rate: share of episodes that leave the road, all runs pooled.
+        attack_success: share of steps in [0, 1] whose decision the attack changed.
+        queries_mean: victim evaluations a step, mean over steps.
+        queries_median: victim evaluations a step, median over episodes of the episode's median.
+        queries_max: most victim evaluations in one step.
+        attack_ms: the attack's wall time a step and episode, milliseconds.
+        min_ttc_s: smallest time to collision of an episode in seconds, median over episodes; inf: never a car ahead.
+        mean_speed: metres a second.
+        action_entropy: of discrete actions, in [0, 1] (1: all equally often, 0: always one); NaN for continuous ones.
+        runs: training seeds.
+        cells: cells of the grid.
+        episodes: a run and cell.
+    """
+
+    safe_progress: Interval
+    episode_return: Interval
+    crash_rate: Interval
+    offroad_rate: Interval
+    attack_success: float
+    queries_mean: float
+    queries_median: float
+    queries_max: float
+    attack_ms: float
+    min_ttc_s: float
+    mean_speed: float
+    action_entropy: float
+    runs: int
+    cells: int
+    episodes: int
+
+
+def summarise(episodes: Episodes) -> Summary:
+    """Measure a set of episodes: a whole grid, or one cell of it (`episodes.only(cells=[cell])`)."""
+    runs, cells, count = episodes.shape
+    return Summary(
+        safe_progress=unit_interval(episodes.column("safe_progress")),
+        episode_return=interval(episodes.column("return")),
+        crash_rate=rate(episodes, "crashed"),
+        offroad_rate=rate(episodes, "offroad"),
+        attack_success=step_mean(episodes, "changed"),
+        queries_mean=step_mean(episodes, "queries"),
+        queries_median=float(np.median(episodes.column("queries_median"))),
+        queries_max=float(episodes.column("queries_max").max()),
+        attack_ms=step_mean(episodes, "attack_ms"),
+        min_ttc_s=float(np.median(episodes.column("min_ttc_s"))),
+        mean_speed=step_mean(episodes, "mean_speed"),
+        action_entropy=action_entropy(episodes.table),
+        runs=runs,
+        cells=cells,
+        episodes=count,
+    )
+
+
+def unit_interval(scores: Array) -> Interval:
+    """`interval` for scores [R, C, E] in [0, 1].
+
+    Where every score is 0, or every score is 1, a bootstrap has nothing to vary; there the interval is Wilson's,
+    which is conservative for any variable in [0, 1].
+    """
+    estimate = interval(scores)
+    if np.all(scores == scores.flat[0]) and scores.flat[0] in (0.0, 1.0):
+        return wilson(float(scores.sum()), scores.size)
+    return estimate
+
+
+def rate(episodes: Episodes, name: str) -> Interval:
+    """The share of episodes, all runs and cells pooled, for which a boolean column is set, with its Wilson interval."""
+    values = episodes.column(name)
+    return wilson(float(values.sum()), values.size)
+
+
+def step_mean(episodes: Episodes, name: str) -> float:
+    """Mean over all driven steps of a column that holds a mean a step."""
+    steps = episodes.column("steps")
+    return float((episodes.column(name) * steps).sum() / max(float(steps.sum()), 1.0))
+
+
+def action_entropy(records: pa.Table) -> float:
+    """Shannon entropy of the actions taken, over its largest value log(A); NaN where no action is discrete."""
+    counts = [row for row in records["action_counts"].to_pylist() if row]
+    if not counts:
+        return float("nan")
+    totals = np.zeros(max(map(len, counts)))
+    for row in counts:
+        totals[: len(row)] += row
+    share = totals[totals > 0] / totals.sum()
+    return float(-(share * np.log(share)).sum() / np.log(len(totals)))

@@ -1,0 +1,291 @@
+"""YOLOv5 in its sizes n to x (architecture of release 6.0 and later) as a plain graph, written from its published layer table.
+
+The weights that were published are AGPL-3.0 and not ours to hand on: a user's own file is read (`bench.victims.detectors.yolov5_file`), and
+one that is trained here is in the zoo.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from textwrap import shorten
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import update_bn
+
+from bench.detection.contracts import CameraWorld, Detector, DetectorVictim, Predictions
+from bench.errors import UserError
+from bench.plugins.contracts import Progress, Trained
+from bench.victims import zoo
+from bench.victims.detectors import coco, yolo, yolov5_file
+from bench.victims.detectors.loss import supervised
+from bench.victims.detectors.training import descend
+from bench.victims.detectors.windows import Views, Windows
+
+Size = Literal["n", "s", "m", "l", "x"]
+MULTIPLES: dict[Size, tuple[float, float]] = {
+    "n": (0.33, 0.25),
+    "s": (0.33, 0.50),
+    "m": (0.67, 0.75),
+    "l": (1.0, 1.0),
+    "x": (1.33, 1.25),
+}
+"""Depth and width, as multiples of those of size l."""
+ANCHORS = (
+    ((10, 13), (16, 30), (33, 23)),
+    ((30, 61), (62, 45), (59, 119)),
+    ((116, 90), (156, 198), (373, 326)),
+)
+"""Width and height in pixels at 640 x 640, of the heads of strides 8, 16 and 32; a weights file brings its own."""
+STRIDES = (8, 16, 32)
+
+
+def _silu(inputs: int, outputs: int, size: int = 1, stride: int = 1) -> yolo.Convolution:
+    return yolo.Convolution(inputs, outputs, size, stride, eps=1e-3, activation=nn.SiLU(inplace=True))
+
+
+class Bottleneck(nn.Module):
+    """1 x 1 then 3 x 3, added to the input where `shortcut`."""
+
+    def __init__(self, width: int, *, shortcut: bool) -> None:
+        super().__init__()
+        self.cv1 = _silu(width, width)
+        self.cv2 = _silu(width, width, 3)
+        self.shortcut = shortcut
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.cv2(self.cv1(x))
+        return x + y if self.shortcut else y
+
+
+class C3(nn.Module):
+    """A cross-stage partial block (Wang et al. 2020): half the width through `depth` bottlenecks, half around them."""
+
+    def __init__(self, inputs: int, outputs: int, depth: int, *, shortcut: bool) -> None:
+        super().__init__()
+        half = outputs // 2
+        self.cv1 = _silu(inputs, half)
+        self.cv2 = _silu(inputs, half)
+        self.cv3 = _silu(2 * half, outputs)
+        self.m = nn.Sequential(*(Bottleneck(half, shortcut=shortcut) for _ in range(depth)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.cv3(torch.cat((self.m(self.cv1(x)), self.cv2(x)), 1))
+
+
+class SPPF(nn.Module):
+    """Spatial pyramid pooling (He et al. 2014): maxima over 5, 9 and 13 cells, by pooling over 5 once, twice and thrice."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.cv1 = _silu(width, width // 2)
+        self.cv2 = _silu(2 * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        levels = [self.cv1(x)]
+        for _ in range(3):
+            levels.append(nn.functional.max_pool2d(levels[-1], 5, stride=1, padding=2))
+        return self.cv2(torch.cat(levels, 1))
+
+
+class Detect(nn.Module):
+    """The three heads: a 1 x 1 convolution each, and the anchors in units of the head's stride."""
+
+    def __init__(self, widths: tuple[int, int, int], classes: int) -> None:
+        super().__init__()
+        self.m = nn.ModuleList(nn.Conv2d(width, len(ANCHORS[0]) * (5 + classes), 1) for width in widths)
+        self.anchors: Tensor
+        self.register_buffer("anchors", torch.tensor(ANCHORS) / torch.tensor(STRIDES)[:, None, None])
+
+    def forward(self, *features: Tensor) -> Predictions:
+        outputs = [head(x) for head, x in zip(self.m, features, strict=True)]
+        anchors = self.anchors * torch.tensor(STRIDES).to(self.anchors)[:, None, None]
+        return yolo.decode(outputs, anchors, STRIDES, _place)
+
+
+def _place(raw: Tensor, cell: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
+    """As in Scaled-YOLOv4 (Wang et al. 2021): centre 2 sigma(t) - 0.5 + c, size p (2 sigma(t))^2, at most four anchors."""
+    doubled = 2 * raw.sigmoid()
+    return doubled[..., :2] - 0.5 + cell, doubled[..., 2:].square() * anchor
+
+
+ZOOM = (0.6, 1.2)
+"""Sides of a training window: how much of a picture it shows, at least and at most."""
+AWAY = 0.3
+"""Share of the training windows that are anywhere in the picture, and not about the sign."""
+CALIBRATION = 40
+"""Batches that the statistics of the normalisations are taken from in the end."""
+RARE = (-5.0, -1.5)
+"""Bias of objectness and of classes in a network that has learned nothing: most predictions are of nothing (Lin et al. 2017)."""
+
+
+class YOLOv5Network(Detector):
+    """The graph. Layers are numbered as in the published table, so that its state dict has the names of the originals.
+
+    Args:
+        size: n, s, m, l or x.
+        names: of the classes.
+    """
+
+    stride = STRIDES[-1]
+
+    def __init__(self, size: Size, names: tuple[str, ...] = coco.NAMES) -> None:
+        super().__init__()
+        self.shape = {"size": size, "names": names}
+        self.names = tuple(names)
+        depth, width = MULTIPLES[size]
+        w64, w128, w256, w512, w1024 = (math.ceil(full * width / 8) * 8 for full in (64, 128, 256, 512, 1024))
+        d3, d6, d9 = (max(round(full * depth), 1) for full in (3, 6, 9))
+        layers = {
+            0: _silu(3, w64, 6, 2),
+            1: _silu(w64, w128, 3, 2),
+            2: C3(w128, w128, d3, shortcut=True),
+            3: _silu(w128, w256, 3, 2),
+            4: C3(w256, w256, d6, shortcut=True),
+            5: _silu(w256, w512, 3, 2),
+            6: C3(w512, w512, d9, shortcut=True),
+            7: _silu(w512, w1024, 3, 2),
+            8: C3(w1024, w1024, d3, shortcut=True),
+            9: SPPF(w1024),
+            10: _silu(w1024, w512),
+            13: C3(2 * w512, w512, d3, shortcut=False),
+            14: _silu(w512, w256),
+            17: C3(2 * w256, w256, d3, shortcut=False),
+            18: _silu(w256, w256, 3, 2),
+            20: C3(2 * w256, w512, d3, shortcut=False),
+            21: _silu(w512, w512, 3, 2),
+            23: C3(2 * w512, w1024, d3, shortcut=False),
+            24: Detect((w256, w512, w1024), len(names)),
+        }
+        self.model = nn.ModuleDict({str(number): layer for number, layer in layers.items()})
+
+    def expect_little(self) -> None:
+        """Make a network that has learned nothing say that there is next to nothing."""
+        detect = self.model["24"]
+        assert isinstance(detect, Detect)
+        for head in detect.m:
+            assert isinstance(head.bias, Tensor)
+            biases = head.bias.data.unflatten(0, (-1, 5 + len(self.names)))
+            biases[:, 4], biases[:, 5:] = RARE
+
+    def predict(self, pictures: Tensor) -> Predictions:
+        fine = self._through(pictures, 0, 1, 2, 3, 4)
+        middle = self._through(fine, 5, 6)
+        coarse = self._through(middle, 7, 8, 9, 10)
+        # What is seen coarsely goes down to the fine cells, and from there up again (Liu et al. 2018).
+        lateral = self._through(_doubled(coarse), 13, 14, beside=middle)
+        small = self._through(_doubled(lateral), 17, beside=fine)
+        medium = self._through(self._through(small, 18), 20, beside=lateral)
+        large = self._through(self._through(medium, 21), 23, beside=coarse)
+        return self.model["24"](small, medium, large)
+
+    def _through(self, x: Tensor, *numbers: int, beside: Tensor | None = None) -> Tensor:
+        if beside is not None:
+            x = torch.cat((x, beside), 1)
+        for number in numbers:
+            x = self.model[str(number)](x)
+        return x
+
+
+def _doubled(x: Tensor) -> Tensor:
+    return nn.functional.interpolate(x, scale_factor=2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class YOLOv5(DetectorVictim):
+    """YOLOv5 in one of its sizes: trained on the camera world's training places, or with the weights of a file of yours.
+
+    Args:
+        size: n, s, m, l or x: 1.9, 7.2, 21, 47 and 87 million parameters. The n ships trained.
+        path: a `yolov5*.pt` of release 6.0 or later, or a .safetensors of ours; empty for the one of the zoo.
+        trained: which of the zoo's, by its training seed; the seeds of a run are those of the patches.
+        updates: of the weights, when it is trained.
+        batch: windows an update.
+        window: their side in pixels, a multiple of 32.
+        learning_rate: of AdamW, the highest.
+    """
+
+    learns: ClassVar[bool] = True
+
+    size: Size = "n"
+    path: str = ""
+    trained: int = 0
+    updates: int = 1200
+    batch: int = 12
+    window: int = 320
+    learning_rate: float = 2e-3
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"yolov5.{name} must be at least 1, got {getattr(self, name)}")
+        if self.window < STRIDES[-1] or self.window % STRIDES[-1]:
+            raise ValueError(f"yolov5.window must be a multiple of {STRIDES[-1]}, got {self.window}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"yolov5.learning_rate must be above 0, got {self.learning_rate}")
+        if self.trained < 0:
+            raise ValueError(f"yolov5.trained must be at least 0, got {self.trained}")
+
+    def zoo_name(self) -> str:
+        return f"yolov5{self.size}"
+
+    def load(self, seed: int) -> YOLOv5Network:
+        """The detector in the file, or that of the zoo, whatever the seed."""
+        if not self.path:
+            if self.trained not in zoo.seeds(self.zoo_name()):
+                train = f"bench train victim=yolov5 victim.size={self.size} seeds={self.trained}"
+                raise UserError(
+                    f"the zoo has no {self.zoo_name()!r} of training seed {self.trained}; `{train}` makes one, "
+                    f"and victim.path=yolov5{self.size}.pt names a file of yours"
+                )
+            made_by = {"victim": self._recipe()}
+            return yolo.frozen(zoo.load(self.zoo_name(), self.trained, YOLOv5Network, made_by=made_by))
+        weights = yolov5_file.read(Path(self.path).expanduser())
+        network = YOLOv5Network(self.size, weights.names)
+        try:
+            network.load_state_dict(weights.tensors)
+        except RuntimeError as error:
+            reason = shorten(str(error).splitlines()[1], 200)
+            raise UserError(f"{self.path} does not hold a YOLOv5{self.size} (victim.size): {reason}") from None
+        network.weights_sha256 = weights.sha256
+        return yolo.frozen(network)
+
+    def train(self, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
+        """Train a detector from nothing on windows of the training scenes, with all that there is to find in them.
+
+        Raises:
+            UserError: if there is a file: that is trained already.
+        """
+        if self.path:
+            raise UserError("victim.path names a detector that is trained already; leave it out to train one")
+        scenes = world.training_scenes()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            network = YOLOv5Network(self.size, world.classes).train()
+            network.expect_little()
+            generator = torch.Generator().manual_seed(seed)
+            windows = Windows(scenes, self.window, zoom=ZOOM, away=AWAY, generator=generator)
+
+            def drawn() -> tuple[Views, Tensor]:
+                views = windows.draw(self.batch)
+                (shown,) = windows.lit(windows.cut(views))
+                return views, shown
+
+            def loss(update: int) -> Tensor:
+                views, shown = drawn()
+                return supervised(network(shown), *windows.objects(views, network.index))
+
+            trained, seconds = descend(
+                network, loss, updates=self.updates, learning_rate=self.learning_rate, progress=progress
+            )
+            # The statistics of the weights on the way are not those of their mean.
+            update_bn((drawn()[1] for _ in range(CALIBRATION)), trained)
+        card = {"victim": self._recipe(), "frames": len(scenes), "training_cpu_s": round(seconds)}
+        return Trained(trained.eval().requires_grad_(False), card)
+
+    def _recipe(self) -> dict[str, object]:
+        """Its parameters but those that choose among what is trained."""
+        return {name: value for name, value in asdict(self).items() if name not in ("path", "trained")}

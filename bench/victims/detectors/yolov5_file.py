@@ -1,0 +1,109 @@
+"""Reads the weights of a YOLOv5 from a user's file. Nothing in the file is run, and no class of it is imported.
+
+A published `yolov5*.pt` is not a table of tensors but a pickled model, whose classes are those of the AGPL-3.0 code that trained
+it. Torch's restricted unpickler reads it here with one inert class in the place of them all; the tensors lie in the same tree.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import shorten
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
+
+from bench.detection.contracts import Detector
+from bench.errors import UserError
+from bench.files import whole
+
+EXPECTED = re.compile(
+    r"models\.(yolo|common)\.\w+|torch\.nn\.modules\.\w+\.\w+"
+    r"|pathlib\.(_local\.)?\w*Path|argparse\.Namespace|numpy\.(dtype|ndarray)|numpy\._?core\.multiarray\.(scalar|_reconstruct)"
+)
+"""What a checkpoint names: the model's classes, and those of the training's options and figures."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What a file holds: tensors by their names in the state dict, the names of the classes, the sha256 of the file."""
+
+    tensors: dict[str, Tensor]
+    names: tuple[str, ...]
+    sha256: str
+
+
+class _Inert:
+    """Stands for every class of a checkpoint: takes what it is given and does nothing."""
+
+    def __init__(self, *arguments: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        if isinstance(state, dict):
+            vars(self).update(state)
+
+
+def read(path: Path) -> Weights:
+    """The weights in a file, by its ending: .safetensors as `save` writes them, or else a pickled checkpoint.
+
+    Raises:
+        UserError: if the file cannot be read, or names anything that such a checkpoint does not.
+    """
+    try:
+        tensors, names = _safetensors(path) if path.suffix == ".safetensors" else _checkpoint(path)
+        return Weights(tensors, names, hashlib.sha256(path.read_bytes()).hexdigest())
+    except UserError:
+        raise
+    # A file that is cut short or made to harm can fail anywhere in the unpickler.
+    except Exception as error:
+        reason = shorten(f"{type(error).__name__}: {error}", 200)
+        raise UserError(f"the weights {path} cannot be read: {reason}") from None
+
+
+def save(detector: Detector, path: Path) -> None:
+    """Write the weights of a detector whose batch-norms are not folded yet, atomically, with the names of its classes."""
+    tensors = {name: tensor.contiguous() for name, tensor in detector.state_dict().items()}
+    blob = save_tensors(tensors, metadata={"names": json.dumps(detector.names)})
+    with whole(path) as file:
+        file.write(blob)
+
+
+def _safetensors(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
+    with safe_open(path, "pt") as file:
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        return tensors, _names(json.loads((file.metadata() or {})["names"]))
+
+
+def _checkpoint(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
+    named = get_unsafe_globals_in_checkpoint(path)
+    if strange := sorted(name for name in named if not EXPECTED.fullmatch(name)):
+        raise UserError(f"the weights {path} are refused: they name {shorten(', '.join(strange), 200)}")
+    with safe_globals([(_Inert, name) for name in named]):
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    model = isinstance(checkpoint, dict) and (checkpoint.get("ema") or checkpoint.get("model"))
+    if not isinstance(model, _Inert):
+        raise UserError(f"the weights {path} cannot be read: they are no checkpoint with a model")
+    return dict(_tensors(model)), _names(vars(model)["names"])
+
+
+def _tensors(module: _Inert, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
+    """The parameters and buffers of an inert module tree, by the names of its state dict."""
+    state = vars(module)
+    for name, tensor in {**state["_parameters"], **state["_buffers"]}.items():
+        if tensor is not None:
+            yield prefix + name, tensor
+    for name, child in state["_modules"].items():
+        yield from _tensors(child, f"{prefix}{name}.")
+
+
+def _names(found: list[str] | dict[int, str]) -> tuple[str, ...]:
+    """The names of the classes, which older files keep as a list and newer ones by label."""
+    return tuple(found[label] for label in range(len(found)))

@@ -1,0 +1,145 @@
+"""The DDPG driver: TorchRL's deterministic policy gradient with the three tricks of TD3."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.envs import EnvBase
+from torchrl.modules import AdditiveGaussianModule
+from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
+
+from bench.driving.contracts import ActionType, AttackInLoop, Policy
+from bench.victims.drivers.networks import ActorPolicy
+from bench.victims.drivers.training import CHUNK, Learner, LearningDriver, Phase, target_state
+
+
+@dataclass(frozen=True, kw_only=True)
+class DDPG(LearningDriver):
+    """A deterministic actor (Lillicrap et al. 2016) that steers and accelerates by itself.
+
+    TorchRL's TD3Loss: twin critics, smoothed target actions and delayed actor updates (Fujimoto et al. 2018) on top of DDPG,
+    with n-step returns. Leaving the road ends an episode and costs as much as a crash, else the policy learns to drive in
+    circles beside it.
+
+    Args:
+        steering_limit: largest |steering| the actor can ask for, in shares of 45 degrees.
+        noise: standard deviation of the final exploration noise, in shares of the actor's own range.
+        actor_delay: critic updates an actor update.
+    """
+
+    policy_type = ActorPolicy
+
+    # Smaller and shorter than the DQN's: actor and critic learn in turns, and it is the clock that ends it.
+    decisions: int = 24_000
+    hidden: int = 64
+    steering_limit: float = 0.1
+    noise: float = 0.15
+    actor_delay: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.steering_limit <= 1:
+            raise ValueError(f"steering_limit must be in (0, 1], got {self.steering_limit}")
+        if self.noise < 0:
+            raise ValueError(f"noise must be at least 0, got {self.noise}")
+        if self.actor_delay < 1:
+            raise ValueError(f"actor_delay must be at least 1, got {self.actor_delay}")
+
+    @property
+    def action_type(self) -> ActionType:
+        return "continuous"
+
+    def zoo_name(self) -> str:
+        return "ddpg"
+
+    def learner(self, env: EnvBase, attack: AttackInLoop | None) -> Learner:
+        return _ActorCriticLearner(self, env, attack)
+
+
+class _ActorCriticLearner(Learner):
+    def __init__(self, recipe: DDPG, env: EnvBase, attack: AttackInLoop | None) -> None:
+        super().__init__(attack)
+        self.attacked = attack is not None
+        batch, _, features = env.observation_spec["observation"].shape
+        self.policy: ActorPolicy = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
+        self.mean = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
+        if self.start is not None:
+            self.policy.load_state_dict(self.start.state_dict())
+        self.delay, self.updates = recipe.actor_delay, 0
+        limit = self.policy.actor.limit
+        actor = TensorDictModule(self.policy.actor, in_keys=["observation"], out_keys=["action"])
+        critic = TensorDictModule(
+            self.policy.critic, in_keys=["observation", "action"], out_keys=["state_action_value"]
+        )
+        self.noise = AdditiveGaussianModule(
+            Bounded(-limit.expand(batch, 2), limit.expand(batch, 2)),
+            sigma_init=max(0.4, recipe.noise) if self.start is None else recipe.noise,
+            sigma_end=recipe.noise,
+            annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
+            std=limit,
+        )
+        self.explore = TensorDictSequential(actor, self.noise)
+        self.loss = TD3Loss(
+            actor,
+            critic,
+            bounds=(-limit, limit),
+            policy_noise=0.2 * limit,
+            noise_clip=0.5 * limit,
+            deactivate_vmap=True,
+        )
+        # The loss trains twins of its own; this one is their copy, for attacks to ask.
+        self.policy.critic.requires_grad_(False)
+        self.target = SoftUpdate(self.loss, tau=recipe.tau)
+        self.actor_adam = torch.optim.Adam(list(self.loss.actor_network_params.flatten_keys().values()))
+        self.critic_adam = torch.optim.Adam(list(self.loss.qvalue_network_params.flatten_keys().values()))
+
+    def enter(self, phase: Phase) -> None:
+        # Noise is drawn at every decision: frame by frame it averages out by itself, so its size stays.
+        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
+
+    def update(self, sample: TensorDictBase, learning_rate: float) -> None:
+        self.updates += 1
+        truth = sample.copy().set("observation", sample["truth"])
+        value, _ = self.loss.value_loss(truth)
+        _descend(self.critic_adam, value, learning_rate)
+        if self.updates % self.delay == 0:
+            actor = self._misled_loss(sample) if self.attacked else self.loss.actor_loss(sample)[0]
+            # Asked for under attack alone, it drives faster on the truth than the policy it is to be consistent with.
+            _descend(self.actor_adam, actor + self.inconsistency(sample) + self.inconsistency(truth), learning_rate)
+            self.target.step()
+
+    def _misled_loss(self, sample: TensorDictBase) -> Tensor:
+        """-Q(s, mu(s')): only the actor is misled, the critic that judges it knows the truth."""
+        return -self.policy.value(sample["truth"], self._decided(sample["observation"])).mean()
+
+    def _decided(self, observation: Tensor) -> Tensor:
+        """mu(s) [N, 2] of the weights that the loss trains, which are its own."""
+        with self.loss.actor_network_params.to_module(self.loss.actor_network):
+            return self.loss.actor_network.module(observation)
+
+    def divergence(self, observation: Tensor, wanted: Tensor) -> Tensor:
+        """Mean squared distance of the actions, in shares of the limits."""
+        return ((self._decided(observation) - wanted) / self.policy.actor.limit).square().sum(-1).mean()
+
+    def anneal(self) -> None:
+        self.noise.step()
+        self.policy.critic.load_state_dict(target_state(self.loss.qvalue_network_params, self.policy.critic))
+
+    def averaged(self) -> Policy:
+        self.mean.actor.load_state_dict(target_state(self.loss.target_actor_network_params, self.mean.actor))
+        self.mean.critic.load_state_dict(target_state(self.loss.target_qvalue_network_params, self.mean.critic))
+        return self.mean
+
+
+def _descend(adam: torch.optim.Adam, loss: Tensor, learning_rate: float) -> None:
+    adam.param_groups[0]["lr"] = learning_rate
+    adam.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(adam.param_groups[0]["params"], 10.0)
+    adam.step()

@@ -1,0 +1,142 @@
+"""A driver trained with Stable-Baselines3, rebuilt from its file. Nothing in the file is unpickled but tensors.
+
+A saved model is a zip: `policy.pth` holds the weights, which torch's restricted unpickler reads, and `data` is JSON in which
+every object stands twice: pickled, which is left alone, and in plain words, from which the spaces and the activation are read.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from bench.driving.contracts import ActionType
+from bench.errors import UserError
+from bench.victims.drivers.from_file import WIDTH, FileDriver, FilePolicy
+
+Algorithm = Literal["dqn", "ppo", "a2c", "sac", "td3", "ddpg"]
+STEMS: dict[Algorithm, tuple[str, ...]] = {
+    "dqn": ("q_net.q_net",),
+    "ppo": ("mlp_extractor.policy_net", "action_net"),
+    "a2c": ("mlp_extractor.policy_net", "action_net"),
+    "sac": ("actor.latent_pi", "actor.mu"),
+    "td3": ("actor.mu",),
+    "ddpg": ("actor.mu",),
+}
+"""Where the layers from the observation to the action are, in order."""
+EITHER = ("ppo", "a2c")
+"""Algorithms for both kinds of action; the others are for one."""
+CRITIC = "critic.qf0"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StableBaselines3(FileDriver):
+    """A policy trained with Stable-Baselines3 on highway-env, from the zip that `model.save` wrote; SB3 need not be installed.
+
+    `MlpPolicy` only: fully connected layers on the flattened observation. It acts as `predict(deterministic=True)` does. What
+    a `VecNormalize` around the environment did is not in the file: train without one. Nothing in the file but its tensors is
+    unpickled.
+
+    Args:
+        algo: that trained it.
+        actions: `discrete` or `continuous`; of PPO and A2C, the others have one kind each.
+    """
+
+    algo: Algorithm
+    actions: Literal["discrete", "continuous"] = "discrete"
+
+    @property
+    def action_type(self) -> ActionType:
+        if self.algo in EITHER:
+            return self.actions
+        return "discrete" if self.algo == "dqn" else "continuous"
+
+    def read(self, path: Path, sha256: str) -> FilePolicy:
+        with zipfile.ZipFile(path) as archive:
+            data = json.loads(archive.read("data"))
+            blob = io.BytesIO(archive.read("policy.pth"))
+        weights = torch.load(blob, map_location="cpu", weights_only=True)
+        shape = self._observation(data["observation_space"])
+        self._check_actions(data["action_space"])
+        options = data.get("policy_kwargs") or {}
+        if strange := sorted({"features_extractor_class", "squash_output"} & options.keys()):
+            raise UserError(
+                f"{self.path} has a policy with {', '.join(strange)}; victim 'sb3' reads a plain MlpPolicy only"
+            )
+        activation = _activation(options, default=nn.Tanh if self.algo in EITHER else nn.ReLU)
+        layers = [layer for stem in STEMS[self.algo] for layer in _layers(weights, stem)]
+        entries = self.rows * self.features
+        self._check_width(layers, entries)
+        squashed = self.action_type == "continuous" and self.algo not in EITHER
+        network = nn.Sequential(nn.Flatten(), *_stack(layers, activation), *([nn.Tanh()] if squashed else []))
+        critic = _layers(weights, CRITIC)
+        return FilePolicy(
+            network, shape, self.action_type, sha256, nn.Sequential(*_stack(critic, activation)) if critic else None
+        )
+
+    def _observation(self, space: dict[str, Any]) -> list[int]:
+        if not str(space.get(":type:")).endswith(".Box'>"):
+            raise UserError(f"{self.path} was trained on observations of {space.get(':type:')}; a driver reads a Box")
+        shape = [int(side) for side in space["_shape"]]
+        self.check_observation(shape)
+        return shape
+
+    def _check_actions(self, space: dict[str, Any]) -> None:
+        discrete = str(space.get(":type:")).endswith(".Discrete'>")
+        found = [int(space["n"])] if discrete else [int(side) for side in space.get("_shape") or []]
+        if discrete != (self.action_type == "discrete") or found != [WIDTH[self.action_type]]:
+            kind = f"{found[0]} discrete actions" if discrete else f"continuous actions {found}"
+            hint = "; say victim.actions=continuous" if self.algo in EITHER and not discrete else ""
+            wanted = f"{WIDTH[self.action_type]} {self.action_type} actions"
+            raise UserError(f"{self.path} was trained for {kind}, {self.algo} victims here have {wanted}{hint}")
+        if not discrete:
+            ends = [float(number) for key in ("low", "high") for number in re.findall(r"-?[\d.]+", str(space[key]))]
+            if ends != [-1.0, -1.0, 1.0, 1.0]:
+                raise UserError(
+                    f"{self.path} was trained for actions in {space['low']} to {space['high']}, not in [-1, 1]"
+                )
+
+    def _check_width(self, layers: list[tuple[Tensor, Tensor]], entries: int) -> None:
+        if not layers:
+            raise UserError(f"{self.path} holds no {self.algo} policy: {STEMS[self.algo][0]} is not among its weights")
+        if layers[0][0].shape[1] != entries:
+            raise UserError(
+                f"{self.path} has a policy of {layers[0][0].shape[1]} inputs for {entries} numbers; "
+                "victim 'sb3' reads a plain MlpPolicy only"
+            )
+
+
+def _activation(options: dict[str, Any], default: type[nn.Module]) -> type[nn.Module]:
+    named = options.get("activation_fn")
+    if named is None:
+        return default
+    found = re.fullmatch(r"<class 'torch\.nn\.modules\.activation\.(\w+)'>", str(named))
+    if found is None:
+        raise UserError(f"the activation {named} is not one of torch's")
+    return getattr(nn, found[1])
+
+
+def _layers(weights: dict[str, Tensor], stem: str) -> list[tuple[Tensor, Tensor]]:
+    """Weight and bias of the linear layers under a name, which are numbered or one alone."""
+    numbers = sorted(
+        int(found[1]) for key in weights if (found := re.fullmatch(rf"{re.escape(stem)}\.(\d+)\.weight", key))
+    )
+    names = [f"{stem}.{number}" for number in numbers] or ([stem] if f"{stem}.weight" in weights else [])
+    return [(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names]
+
+
+def _stack(layers: list[tuple[Tensor, Tensor]], activation: type[nn.Module]) -> list[nn.Module]:
+    """The layers with an activation between them."""
+    found: list[nn.Module] = []
+    for weight, bias in layers:
+        linear = nn.Linear(weight.shape[1], weight.shape[0])
+        linear.load_state_dict({"weight": weight, "bias": bias})
+        found += [linear, activation()]
+    return found[:-1]

@@ -1,0 +1,35 @@
+"""A driver exported by `torch.export`: a graph of tensor operations, without the code that made it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from bench.errors import UserError
+from bench.victims.drivers.from_file import FileDriver, FilePolicy
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorchExport(FileDriver):
+    """A policy of yours, written by `torch.export.save`; white-box attacks go through it.
+
+    It maps observations [batch, rows, features], or flattened ones, to scores or actions; its batch must be of any size
+    (`torch.export.Dim`).
+    """
+
+    def read(self, path: Path, sha256: str) -> FilePolicy:
+        program = torch.export.load(path)
+        inputs = program.graph_signature.user_inputs
+        nodes = [node for node in program.graph.nodes if node.op == "placeholder" and node.name in inputs]
+        if len(nodes) != 1:
+            raise UserError(f"{self.path} takes {len(inputs)} inputs, a driver takes one: the observation")
+        batch, *shape = nodes[0].meta["val"].shape
+        self.check_observation(shape)
+        if not isinstance(batch, torch.SymInt):
+            raise UserError(
+                f"{self.path} takes no batch but of {batch}: export it with "
+                'dynamic_shapes={"observation": {0: torch.export.Dim("batch")}}'
+            )
+        return FilePolicy(program.module(), shape, self.action_type, sha256)

