@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from bench.driving.contracts import AttackInLoop, DrivingDefense, DrivingVictim, DrivingWorld, Policy
+from bench.driving.contracts import (
+    DrivingAttack,
+    DrivingDefense,
+    DrivingVictim,
+    DrivingWorld,
+    Features,
+    Policy,
+    TrainingHooks,
+)
 from bench.driving.threat import Norm, ObservationThreat, Oracle
 from bench.errors import UserError
 from bench.plugins.contracts import Progress, Trained
 from bench.plugins.options import configured, parameter_words
 from bench.victims import zoo
+from bench.victims.drivers.networks import ActorPolicy
+
+CHANGES_LANE = torch.tensor([1.0, 0.0, 1.0, 0.0, 0.0])
+"""1 for LANE_LEFT and LANE_RIGHT among the discrete actions."""
+TEMPERATURE = 0.5
+"""Of the decisions that consistency compares, in standard deviations of the Q-values over the actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +49,19 @@ class AdversarialTraining(DrivingDefense):
         decisions: of the further training, on every road at once; with `scratch` it is the victim's own.
         consistency: weight, beside the victim's own loss, of deciding under attack what the victim it started from decides on
             the truth (TRADES, Zhang et al. 2019); 0 is the thesis' algorithm. Nothing to be consistent with from `scratch`.
-        margin: what a change of lane must be worth more than anything else, in the values of that policy (1 is perfect driving
-            for ever), for consistency to ask for it. One frame's wrong change of lane is a crash, one frame's delay is
-            nothing: this is the room between the two that an attack has to cross. Discrete victims only.
+        margin: subtracted from the lane-change values of that policy (1 is perfect driving for ever) in the consistency target.
+            A wrong lane change of one frame may be a crash, a delay of one frame costs nothing: an attack has to cross the
+            margin between the two. Discrete victims only.
         where: `acting` attacks the observations it acts on, which the replay buffer keeps as they were then, as in the thesis;
             `replay` attacks those drawn from the buffer, afresh against the policy as it is now; `both` does both.
         ramp_from: share of the training after which the budget begins to grow from 0.
         ramp_to: share of the training at which it is whole.
+        trained_in: parameters of the world it was trained in where they are not the default, for instance `vehicles=5`;
+            `bench train` sets it.
     """
+
+    training: ClassVar[int] = 1
+    """Version of the training; raised when a change of the code changes the weights that it makes."""
 
     skip: float = 0.3
     attack: str = "pgd"
@@ -54,6 +75,7 @@ class AdversarialTraining(DrivingDefense):
     where: Literal["acting", "replay", "both"] = "both"
     ramp_from: float = 0.0
     ramp_to: float = 0.3
+    trained_in: str = ""
 
     def __post_init__(self) -> None:
         if not 0 <= self.skip <= 1:
@@ -75,8 +97,7 @@ class AdversarialTraining(DrivingDefense):
     def load(self, victim: DrivingVictim, seed: int) -> Policy:
         if victim.policy_type is None:
             raise UserError("adversarial training needs a victim that learns")
-        made_by = {"victim": asdict(victim), "defense": asdict(self)}  # type: ignore[call-overload]
-        return zoo.load(self.zoo_name(victim), seed, victim.policy_type, made_by=made_by)
+        return zoo.load(zoo.Recipe.of(victim, self), seed, victim.policy_type)
 
     def train(self, victim: DrivingVictim, world: DrivingWorld, *, seed: int, progress: Progress) -> Trained[Policy]:
         """Train the hardened policy of training seed `seed`: the victim's own training with the attack in its loop.
@@ -87,24 +108,109 @@ class AdversarialTraining(DrivingDefense):
         attack = configured("attack", self.attack, parameter_words(self.attack_params)).component
         if victim.action_type not in attack.action_types:
             raise UserError(f"attack {self.attack!r} does not fit a victim with {victim.action_type} actions")
-        threat = ObservationThreat(norm=self.norm, budget=self.budget)
-        generator = torch.Generator().manual_seed(seed)
+        start = victim.load(seed) if self.start == "trained" else None
+        loop = AttackInLoop(self, attack, world.features, start, seed)
+        trained = victim.train(world, seed=seed, hooks=loop, progress=progress)
+        made_with = {"attack": asdict(attack), "threat": asdict(loop.threat), "attacked_decisions": loop.attacked}
+        return Trained(trained.network, {**trained.card, **made_with})
 
-        def perturb(observation: Tensor, policy: Policy, scale: float) -> Tensor:
-            oracle = Oracle(policy, threat, attack.access, world.features, generator)
-            oracle.begin_step(observation, scale)
-            return oracle.project(attack.perturb(observation, oracle)).detach()
 
-        loop = AttackInLoop(
-            attack=perturb,
-            skip=self.skip,
-            where=self.where,
-            ramp=(self.ramp_from, self.ramp_to),
-            start=victim.load(seed) if self.start == "trained" else None,
-            decisions=self.decisions,
-            consistency=self.consistency,
-            margin=self.margin,
-        )
-        trained = victim.train(world, seed=seed, attack=loop, progress=progress)
-        made_by = {"defense": asdict(self), "attack": asdict(attack), "threat": asdict(threat)}
-        return Trained(trained.network, {**trained.card, **made_by})
+class AttackInLoop(TrainingHooks):
+    """Algorithm 5: each decision is attacked, except that it is skipped with probability `skip`; and the loss under attack.
+
+    Args:
+        recipe: the defence.
+        attack: in the loop.
+        features: of the world's observations.
+        start: the policy to continue from and to stay consistent with; None trains from fresh weights.
+        seed: training seed.
+    """
+
+    off_policy = True
+    checkpoints = 0.5
+
+    def __init__(
+        self, recipe: AdversarialTraining, attack: DrivingAttack, features: Features, start: Policy | None, seed: int
+    ) -> None:
+        self.recipe, self.attack, self.features = recipe, attack, features
+        self.start, self.decisions = start, recipe.decisions
+        self.threat = ObservationThreat(norm=recipe.norm, budget=recipe.budget)
+        self.skips, self.noise = (torch.Generator().manual_seed(seed) for _ in range(2))
+        self.attacked = 0
+
+    def acting(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
+        return observation if self.recipe.where == "replay" else self.shown(observation, policy, share)
+
+    def remembered(self, observation: Tensor, shown: Tensor) -> Tensor:
+        return shown if self.recipe.where == "acting" else observation
+
+    def replayed(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
+        return observation if self.recipe.where == "acting" else self.shown(observation, policy, share)
+
+    def shown(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
+        """o' [B, V, F]: each row of the observation attacked with probability 1 - skip, at the budget of the ramp."""
+        recipe = self.recipe
+        if recipe.skip >= 1 or share < recipe.ramp_from:
+            return observation
+        hit = torch.rand(observation.shape[0], generator=self.skips) >= recipe.skip
+        if not bool(hit.any()):
+            return observation
+        scale = min(1.0, (share - recipe.ramp_from) / max(recipe.ramp_to - recipe.ramp_from, 1e-9))
+        result = observation.clone()
+        result[hit] = self.perturbed(observation[hit], policy, scale)
+        self.attacked += int(hit.sum())
+        return result
+
+    def perturbed(self, observation: Tensor, policy: Policy, scale: float = 1.0) -> Tensor:
+        """attack(policy, o) [B, V, F], within `scale` times the budget."""
+        oracle = Oracle(policy, self.threat, self.attack.access, self.features, self.noise)
+        oracle.begin_step(observation, scale)
+        return oracle.project(self.attack.perturb(observation, oracle)).detach()
+
+    def selection(self, policy: Policy) -> dict[str, Callable[[Tensor], Tensor]]:
+        return {"attacked": lambda observation: self.perturbed(observation, policy)} if self.recipe.skip < 1 else {}
+
+    def loss(self, policy: Policy, sample: TensorDictBase, own: Callable[[TensorDictBase], Tensor]) -> Tensor:
+        """Discrete: the victim's own loss on (o', a, r, s'). Continuous: -Q(o, mu(o')), judged by a critic that knows the truth.
+
+        Consistency is added. For continuous actions it is asked for on the truth as well: asked for under attack alone, the
+        policy drives faster on the truth than the one it started from.
+        """
+        shown, truth = sample["observation"], sample["truth"]
+        if policy.action_type == "discrete":
+            return own(sample) + self.inconsistency(policy, shown, truth)
+        misled = -policy.value(truth, policy.scores(shown)).mean()
+        return misled + self.inconsistency(policy, shown, truth) + self.inconsistency(policy, truth, truth)
+
+    def inconsistency(self, policy: Policy, shown: Tensor, truth: Tensor) -> Tensor | float:
+        """How far the decisions on `shown` are from those of `start` on `truth`, times the weight; 0 without a `start`.
+
+        The regulariser of TRADES (Zhang et al. 2019, Eq. 5), with a teacher that stays as it is.
+        """
+        if self.start is None or self.recipe.consistency == 0:
+            return 0.0
+        with torch.no_grad():
+            wanted = self.start.scores(truth)
+        if policy.action_type == "discrete":
+            return self.recipe.consistency * divergence(policy.scores(shown), wanted, self.recipe.margin)
+        limit = policy.actor.limit if isinstance(policy, ActorPolicy) else torch.ones(2)
+        return self.recipe.consistency * squared_distance(policy.scores(shown), wanted, limit)
+
+
+def divergence(values: Tensor, wanted: Tensor, margin: float) -> Tensor:
+    """Mean KL divergence of the decisions softmax(Q / tau) from those wanted, in which changes of lane are worth less.
+
+    Args:
+        values: Q [N, A] of the policy that is trained.
+        wanted: Q_0 [N, A]; tau is `TEMPERATURE` times its standard deviation over the actions.
+        margin: subtracted from the lane-change values of `wanted`.
+    """
+    tau = TEMPERATURE * wanted.std(-1, keepdim=True).clamp(min=torch.finfo(wanted.dtype).tiny)
+    decided = torch.log_softmax(values / tau, -1)
+    reluctant = torch.softmax((wanted - margin * CHANGES_LANE) / tau, -1)
+    return torch.nn.functional.kl_div(decided, reluctant, reduction="batchmean")
+
+
+def squared_distance(actions: Tensor, wanted: Tensor, limit: Tensor) -> Tensor:
+    """Mean squared distance of actions [N, 2] from those wanted, in shares of the largest action [2]."""
+    return ((actions - wanted) / limit).square().sum(-1).mean()

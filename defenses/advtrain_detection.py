@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import asdict, dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -54,7 +55,11 @@ class DetectorAdversarialTraining(DetectorDefense):
         learning_rate: of AdamW, the highest.
         fidelity: weight of saying what it said before, beside that of finding the sign.
         trained: which of the zoo's is loaded, by its training seed; the seeds of a run are those of the patches.
+        trained_in: parameters of the world it was trained in where they are not the default; `bench train` sets it.
     """
+
+    training: ClassVar[int] = 1
+    """Version of the training; raised when a change of the code changes the weights that it makes."""
 
     skip: float = 0.3
     attack: str = "eot"
@@ -68,6 +73,7 @@ class DetectorAdversarialTraining(DetectorDefense):
     learning_rate: float = 3e-4
     fidelity: float = 0.3
     trained: int = 0
+    trained_in: str = ""
 
     def __post_init__(self) -> None:
         if not 0 <= self.skip <= 1:
@@ -90,9 +96,7 @@ class DetectorAdversarialTraining(DetectorDefense):
         return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"
 
     def load(self, victim: DetectorVictim, seed: int) -> Detector:
-        own = {name: value for name, value in asdict(self).items() if name != "trained"}
-        made_by = {"victim": asdict(victim), "defense": own}  # type: ignore[call-overload]
-        return zoo.load(self.zoo_name(victim), self.trained, lambda **_: victim.load(seed), made_by=made_by)
+        return zoo.load(zoo.Recipe.of(victim, self), self.trained, lambda **_: victim.load(seed))
 
     def train(self, victim: DetectorVictim, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
         """Train the hardened detector of training seed `seed`."""
@@ -111,8 +115,7 @@ class DetectorAdversarialTraining(DetectorDefense):
                 learning_rate=self.learning_rate,
                 progress=progress,
             )
-        made_by = {"victim": asdict(victim), "defense": asdict(self), "attack": asdict(attack)}  # type: ignore[call-overload]
-        return Trained(detector.requires_grad_(False), {**made_by, "training_cpu_s": round(seconds)})
+        return Trained(detector.requires_grad_(False), {"attack": asdict(attack), "cpu_seconds": round(seconds)})
 
 
 class _Hardening:

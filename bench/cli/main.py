@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -113,33 +112,9 @@ def train(words: Words = None) -> None:
 
     For instance: bench train victim=dqn seeds=0,1,2, or bench train defense=advtrain defense.skip=0.3 victim=dqn
     """
-    from bench.cli.progress import TrainingProgress
-    from bench.run.config import train_config
-    from bench.run.process import settle
-    from bench.victims import zoo
+    from bench.cli import train as cli_train
 
-    settle()
-    config = train_config(words or [])
-    victim, defense, world = (part.component for part in (config.victim, config.defense, config.world))
-    hardens = config.defense.name != "none"
-    if not hardens and not victim.learns:
-        raise UserError(f"there is nothing to train: {config.victim.name} does not learn")
-    try:
-        name = defense.zoo_name(victim) if hardens else victim.zoo_name()
-    except NotImplementedError as error:
-        raise UserError(f"there is nothing to train: {error}") from error
-    for seed in config.seeds:
-        start = time.perf_counter()
-        with TrainingProgress(Console(stderr=True), f"{name}, seed {seed}") as progress:
-            if hardens:
-                trained = defense.train(victim, world, seed=seed, progress=progress)
-            else:
-                trained = victim.train(world, seed=seed, progress=progress)
-        if trained is None:
-            raise UserError(f"there is nothing to train: defense {config.defense.name!r} works at run time only")
-        path = zoo.save(trained.network, trained.card, name=name, seed=seed, root=config.out)
-        seconds = time.perf_counter() - start
-        Console().print(Text(f"{name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"), soft_wrap=True)
+    cli_train.train(words or [], Console())
 
 
 @app.command()

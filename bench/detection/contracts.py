@@ -78,6 +78,8 @@ class Detector(nn.Module, ABC):
     """Height and width of a picture must be multiples of it."""
     weights_sha256: str = ""
     """Hash of the weights file it was loaded from; empty where there is none."""
+    half_precision: ClassVar[bool] = True
+    """Whether the zoo stores its kernels in half precision."""
 
     @abstractmethod
     def predict(self, pictures: Tensor) -> Predictions:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from bench.plugins.contracts import Attack, Defense, Progress, Track, Trained, Victim, World
 
 if TYPE_CHECKING:
+    from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
     from bench.driving.threat import Oracle
@@ -137,36 +138,53 @@ class DrivingVictim(Victim):
         """
 
     def train(
-        self, world: DrivingWorld, *, seed: int, attack: AttackInLoop | None = None, progress: Progress
+        self, world: DrivingWorld, *, seed: int, hooks: TrainingHooks | None = None, progress: Progress
     ) -> Trained[Policy]:
-        """Train from scratch (or from `attack.start`), with an attack in the loop where a defence asks for it."""
+        """Train from fresh weights (or from `hooks.start`), with the changes that the hooks of a defence make."""
         raise NotImplementedError(f"{type(self).__name__} does not learn")
 
 
-@dataclass(frozen=True, kw_only=True)
-class AttackInLoop:
-    """Adversarial training, Algorithm 5 of the thesis: at each decision the attack is skipped with probability `skip`.
+class TrainingHooks:
+    """What a defence may change in the training of a driver; each default leaves the training as it is.
 
-    Args:
-        attack: called with (observation [B, V, F], policy, budget scale in (0, 1]) -> perturbed observation.
-        skip: probability in [0, 1] with which a decision is left unattacked.
-        where: `acting`: the observations it acts on, which the replay buffer then keeps; `replay`: those drawn from the
-            replay buffer, afresh against the victim as it is now; or `both`.
-        ramp: the shares of the training between which the budget grows from 0 to 1.
-        start: weights to go on from, frame by frame; None trains from scratch.
-        decisions: of the further training, where there is a `start`.
-        consistency: weight, beside the victim's own loss, of deciding under attack what `start` decides on the truth.
-        margin: what a change of lane must be worth more than anything else for a consistent decision to be for it, in values.
+    Observations are [B, V, F], `share` is the share of the training that is done, in [0, 1], and `policy` is the network that
+    is being trained: its `scores` have gradients to the weights, its `value` is a copy of the critic.
     """
 
-    attack: Callable[[Tensor, Policy, float], Tensor]
-    skip: float
-    where: Literal["acting", "replay", "both"] = "both"
-    ramp: tuple[float, float] = (0.2, 0.5)
     start: Policy | None = None
+    """The trained policy to continue from, frame by frame; None trains from fresh weights."""
     decisions: int = 0
-    consistency: float = 0.0
-    margin: float = 0.0
+    """Length of the training on every road, where there is a `start`."""
+    off_policy: bool = False
+    """Whether actions are often not those the policy would take: n-step returns then stay short."""
+    checkpoints: float = 1.0
+    """Share of the victim's checkpoints that are scored, in (0, 1]; for hooks whose scoring is expensive."""
+
+    def acting(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
+        """The observation that the learner acts on."""
+        return observation
+
+    def remembered(self, observation: Tensor, shown: Tensor) -> Tensor:
+        """The observation that the replay buffer keeps, of the true one and the one that was acted on."""
+        return shown
+
+    def replayed(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
+        """The observation that a transition drawn from the replay buffer is learned with."""
+        return observation
+
+    def loss(self, policy: Policy, sample: TensorDictBase, own: Callable[[TensorDictBase], Tensor]) -> Tensor:
+        """The loss of the policy on a batch of transitions; a critic always learns from the truth.
+
+        Args:
+            policy: being trained.
+            sample: transitions [N] with `observation` (after `replayed`), `truth` (as remembered), `action` and `next`.
+            own: the loss of the victim's algorithm on such a batch.
+        """
+        return own(sample)
+
+    def selection(self, policy: Policy) -> dict[str, Callable[[Tensor], Tensor]]:
+        """By name, further ways to show the observation when a checkpoint is scored; a checkpoint's score is the mean of all."""
+        return {}
 
 
 class DrivingAttack(Attack):

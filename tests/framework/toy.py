@@ -127,10 +127,12 @@ class ToyVictim(DrivingVictim):
 
     Args:
         actions: what it decides.
+        trained_in: the world it was trained in.
     """
 
     learns: ClassVar[bool] = True
     actions: Literal["discrete", "continuous"] = "discrete"
+    trained_in: str = ""
 
     @property
     def action_type(self) -> ActionType:
@@ -142,7 +144,7 @@ class ToyVictim(DrivingVictim):
     def load(self, seed: int) -> Policy:
         return ToyPolicy(self.actions, seed)
 
-    def train(self, world: DrivingWorld, *, seed: int, attack: object = None, progress: Progress) -> Trained[Policy]:
+    def train(self, world: DrivingWorld, *, seed: int, hooks: object = None, progress: Progress) -> Trained[Policy]:
         progress(0.5, "half way")
         progress(1.0, "there")
         return Trained(ToyPolicy(self.actions, seed), {"world": type(world).__name__})

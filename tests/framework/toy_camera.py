@@ -161,7 +161,13 @@ class Blank(PatchAttack):
 
 @dataclass(frozen=True, kw_only=True)
 class Harden(DetectorDefense):
-    """Another bias, drawn from the seed."""
+    """Another bias, drawn from the seed.
+
+    Args:
+        trained_in: the world it was trained in.
+    """
+
+    trained_in: str = ""
 
     def zoo_name(self, victim: DetectorVictim) -> str:
         return f"{victim.zoo_name()}-harden"
@@ -170,4 +176,4 @@ class Harden(DetectorDefense):
         return Trained(RedDetector(bias=-1.0 - seed / 10), {"scenes": len(world.training_scenes())})
 
     def load(self, victim: DetectorVictim, seed: int) -> Detector:
-        return zoo.load(self.zoo_name(victim), seed, RedDetector, made_by={})
+        return zoo.load(zoo.Recipe.of(victim, self), seed, RedDetector)

@@ -7,7 +7,7 @@ one that is trained here is in the zoo.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
 from typing import ClassVar, Literal
@@ -206,9 +206,12 @@ class YOLOv5(DetectorVictim):
         batch: windows an update.
         window: their side in pixels, a multiple of 32.
         learning_rate: of AdamW, the highest.
+        trained_in: parameters of the world it was trained in where they are not the default; `bench train` sets it.
     """
 
     learns: ClassVar[bool] = True
+    training: ClassVar[int] = 1
+    """Version of the training; raised when a change of the code changes the weights that it makes."""
 
     size: Size = "n"
     path: str = ""
@@ -217,6 +220,7 @@ class YOLOv5(DetectorVictim):
     batch: int = 12
     window: int = 320
     learning_rate: float = 2e-3
+    trained_in: str = ""
 
     def __post_init__(self) -> None:
         for name in ("updates", "batch"):
@@ -235,14 +239,11 @@ class YOLOv5(DetectorVictim):
     def load(self, seed: int) -> YOLOv5Network:
         """The detector in the file, or that of the zoo, whatever the seed."""
         if not self.path:
-            if self.trained not in zoo.seeds(self.zoo_name()):
-                train = f"bench train victim=yolov5 victim.size={self.size} seeds={self.trained}"
-                raise UserError(
-                    f"the zoo has no {self.zoo_name()!r} of training seed {self.trained}; `{train}` makes one, "
-                    f"and victim.path=yolov5{self.size}.pt names a file of yours"
-                )
-            made_by = {"victim": self._recipe()}
-            return yolo.frozen(zoo.load(self.zoo_name(), self.trained, YOLOv5Network, made_by=made_by))
+            recipe = zoo.Recipe.of(self)
+            if self.trained not in zoo.seeds(recipe):
+                own = f"victim.path=yolov5{self.size}.pt names a file of yours"
+                raise UserError(f"{zoo.missing(recipe, self.trained)}; or {own}")
+            return yolo.frozen(zoo.load(recipe, self.trained, YOLOv5Network))
         weights = yolov5_file.read(Path(self.path).expanduser())
         network = YOLOv5Network(self.size, weights.names)
         try:
@@ -283,9 +284,5 @@ class YOLOv5(DetectorVictim):
             )
             # The statistics of the weights on the way are not those of their mean.
             update_bn((drawn()[1] for _ in range(CALIBRATION)), trained)
-        card = {"victim": self._recipe(), "frames": len(scenes), "training_cpu_s": round(seconds)}
+        card = {"frames": len(scenes), "cpu_seconds": round(seconds)}
         return Trained(trained.eval().requires_grad_(False), card)
-
-    def _recipe(self) -> dict[str, object]:
-        """Its parameters but those that choose among what is trained."""
-        return {name: value for name, value in asdict(self).items() if name not in ("path", "trained")}

@@ -14,9 +14,10 @@ from torchrl.envs import EnvBase
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
-from bench.driving.contracts import ActionType, AttackInLoop, Policy
-from bench.victims.drivers.networks import ActorPolicy
-from bench.victims.drivers.training import CHUNK, Learner, LearningDriver, Phase, target_state
+from bench.driving.contracts import ActionType, Policy, TrainingHooks
+from bench.victims.drivers.learner import CHUNK, Learner, Phase, copy_weights
+from bench.victims.drivers.networks import Actor, ActorPolicy, Critic
+from bench.victims.drivers.training import LearningDriver
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,28 +59,24 @@ class DDPG(LearningDriver):
     def zoo_name(self) -> str:
         return "ddpg"
 
-    def learner(self, env: EnvBase, attack: AttackInLoop | None) -> Learner:
-        return _ActorCriticLearner(self, env, attack)
+    def learner(self, env: EnvBase, hooks: TrainingHooks) -> Learner:
+        return _ActorCriticLearner(self, env, hooks)
 
 
 class _ActorCriticLearner(Learner):
-    def __init__(self, recipe: DDPG, env: EnvBase, attack: AttackInLoop | None) -> None:
-        super().__init__(attack)
-        self.attacked = attack is not None
+    def __init__(self, recipe: DDPG, env: EnvBase, hooks: TrainingHooks) -> None:
+        super().__init__(hooks)
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: ActorPolicy = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
         self.mean = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
-        if self.start is not None:
-            self.policy.load_state_dict(self.start.state_dict())
+        if hooks.start is not None:
+            self.policy.load_state_dict(hooks.start.state_dict())
         self.delay, self.updates = recipe.actor_delay, 0
         limit = self.policy.actor.limit
-        actor = TensorDictModule(self.policy.actor, in_keys=["observation"], out_keys=["action"])
-        critic = TensorDictModule(
-            self.policy.critic, in_keys=["observation", "action"], out_keys=["state_action_value"]
-        )
+        actor = _actor(self.policy.actor)
         self.noise = AdditiveGaussianModule(
             Bounded(-limit.expand(batch, 2), limit.expand(batch, 2)),
-            sigma_init=max(0.4, recipe.noise) if self.start is None else recipe.noise,
+            sigma_init=max(0.4, recipe.noise) if hooks.start is None else recipe.noise,
             sigma_end=recipe.noise,
             annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
             std=limit,
@@ -87,13 +84,13 @@ class _ActorCriticLearner(Learner):
         self.explore = TensorDictSequential(actor, self.noise)
         self.loss = TD3Loss(
             actor,
-            critic,
+            _critic(self.policy.critic),
             bounds=(-limit, limit),
             policy_noise=0.2 * limit,
             noise_clip=0.5 * limit,
             deactivate_vmap=True,
         )
-        # The loss trains twins of its own; this one is their copy, for attacks to ask.
+        # The loss trains twin critics of its own; the policy's is a copy of the first.
         self.policy.critic.requires_grad_(False)
         self.target = SoftUpdate(self.loss, tau=recipe.tau)
         self.actor_adam = torch.optim.Adam(list(self.loss.actor_network_params.flatten_keys().values()))
@@ -105,36 +102,31 @@ class _ActorCriticLearner(Learner):
 
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
         self.updates += 1
-        truth = sample.copy().set("observation", sample["truth"])
-        value, _ = self.loss.value_loss(truth)
+        value, _ = self.loss.value_loss(sample.copy().set("observation", sample["truth"]))
         _descend(self.critic_adam, value, learning_rate)
         if self.updates % self.delay == 0:
-            actor = self._misled_loss(sample) if self.attacked else self.loss.actor_loss(sample)[0]
-            # Asked for under attack alone, it drives faster on the truth than the policy it is to be consistent with.
-            _descend(self.actor_adam, actor + self.inconsistency(sample) + self.inconsistency(truth), learning_rate)
+            _descend(self.actor_adam, self.hooks.loss(self.policy, sample, self._actor_loss), learning_rate)
             self.target.step()
 
-    def _misled_loss(self, sample: TensorDictBase) -> Tensor:
-        """-Q(s, mu(s')): only the actor is misled, the critic that judges it knows the truth."""
-        return -self.policy.value(sample["truth"], self._decided(sample["observation"])).mean()
-
-    def _decided(self, observation: Tensor) -> Tensor:
-        """mu(s) [N, 2] of the weights that the loss trains, which are its own."""
-        with self.loss.actor_network_params.to_module(self.loss.actor_network):
-            return self.loss.actor_network.module(observation)
-
-    def divergence(self, observation: Tensor, wanted: Tensor) -> Tensor:
-        """Mean squared distance of the actions, in shares of the limits."""
-        return ((self._decided(observation) - wanted) / self.policy.actor.limit).square().sum(-1).mean()
+    def _actor_loss(self, sample: TensorDictBase) -> Tensor:
+        return self.loss.actor_loss(sample)[0]
 
     def anneal(self) -> None:
         self.noise.step()
-        self.policy.critic.load_state_dict(target_state(self.loss.qvalue_network_params, self.policy.critic))
+        copy_weights(self.loss.qvalue_network_params[0], _critic(self.policy.critic))
 
     def averaged(self) -> Policy:
-        self.mean.actor.load_state_dict(target_state(self.loss.target_actor_network_params, self.mean.actor))
-        self.mean.critic.load_state_dict(target_state(self.loss.target_qvalue_network_params, self.mean.critic))
+        copy_weights(self.loss.target_actor_network_params, _actor(self.mean.actor))
+        copy_weights(self.loss.target_qvalue_network_params[0], _critic(self.mean.critic))
         return self.mean
+
+
+def _actor(actor: Actor) -> TensorDictModule:
+    return TensorDictModule(actor, in_keys=["observation"], out_keys=["action"])
+
+
+def _critic(critic: Critic) -> TensorDictModule:
+    return TensorDictModule(critic, in_keys=["observation", "action"], out_keys=["state_action_value"])
 
 
 def _descend(adam: torch.optim.Adam, loss: Tensor, learning_rate: float) -> None:

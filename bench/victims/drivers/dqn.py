@@ -14,15 +14,12 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
-from bench.driving.contracts import ActionType, AttackInLoop, Policy
-from bench.victims.drivers.networks import QPolicy
-from bench.victims.drivers.training import CHUNK, Learner, LearningDriver, Phase, target_state
+from bench.driving.contracts import ActionType, Policy, TrainingHooks
+from bench.victims.drivers.learner import CHUNK, Learner, Phase, copy_weights
+from bench.victims.drivers.networks import QNetwork, QPolicy
+from bench.victims.drivers.training import LearningDriver
 
 ACTIONS = 5
-CHANGES_LANE = torch.tensor([1.0, 0.0, 1.0, 0.0, 0.0])
-"""LANE_LEFT and LANE_RIGHT among them."""
-TEMPERATURE = 0.5
-"""Of the decisions compared in adversarial training, in standard deviations of the Q-values over the actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,25 +49,23 @@ class DQN(LearningDriver):
     def zoo_name(self) -> str:
         return "dqn"
 
-    def learner(self, env: EnvBase, attack: AttackInLoop | None) -> Learner:
-        return _QLearner(self, env, attack)
+    def learner(self, env: EnvBase, hooks: TrainingHooks) -> Learner:
+        return _QLearner(self, env, hooks)
 
 
 class _QLearner(Learner):
-    def __init__(self, recipe: DQN, env: EnvBase, attack: AttackInLoop | None) -> None:
-        super().__init__(attack)
-        self.recipe, self.gap, self.margin = recipe, 0.0, attack.margin if attack else 0.0
+    def __init__(self, recipe: DQN, env: EnvBase, hooks: TrainingHooks) -> None:
+        super().__init__(hooks)
+        self.recipe, self.gap = recipe, 0.0
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: QPolicy = QPolicy(features, ACTIONS, recipe.hidden)
         self.mean = QPolicy(features, ACTIONS, recipe.hidden)
-        if self.start is not None:
-            self.policy.load_state_dict(self.start.state_dict())
-        actor = QValueActor(
-            self.policy.network, in_keys=["observation"], spec=Categorical(ACTIONS), action_space="categorical"
-        )
+        if hooks.start is not None:
+            self.policy.load_state_dict(hooks.start.state_dict())
+        actor = _actor(self.policy.network)
         self.greedy = EGreedyModule(
             Categorical(ACTIONS, shape=(batch,)),
-            eps_init=1.0 if self.start is None else recipe.final_epsilon,
+            eps_init=1.0 if hooks.start is None else recipe.final_epsilon,
             eps_end=recipe.final_epsilon,
             annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
         )
@@ -91,11 +86,13 @@ class _QLearner(Learner):
             sample["next", "reward"] -= self.gap * self._disadvantage(sample)
         self.adam.param_groups[0]["lr"] = learning_rate
         self.adam.zero_grad()
-        loss = self.loss(sample)["loss"] + self.inconsistency(sample)
-        loss.backward()
+        self.hooks.loss(self.policy, sample, self._temporal_difference).backward()
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
         self.adam.step()
         self.target.step()
+
+    def _temporal_difference(self, sample: TensorDictBase) -> Tensor:
+        return self.loss(sample)["loss"]
 
     @torch.no_grad()
     def _disadvantage(self, sample: TensorDictBase) -> Tensor:
@@ -103,16 +100,13 @@ class _QLearner(Learner):
         values = self.policy.scores(sample["observation"])
         return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
 
-    def divergence(self, observation: Tensor, wanted: Tensor) -> Tensor:
-        """KL divergence of decisions softmax(Q / tau), tau a share of the spread of the values that are wanted."""
-        tau = TEMPERATURE * wanted.std(-1, keepdim=True).clamp(min=torch.finfo(wanted.dtype).tiny)
-        decided = torch.log_softmax(self.policy.scores(observation) / tau, -1)
-        reluctant = torch.softmax((wanted - self.margin * CHANGES_LANE) / tau, -1)
-        return torch.nn.functional.kl_div(decided, reluctant, reduction="batchmean")
-
     def anneal(self) -> None:
         self.greedy.step()
 
     def averaged(self) -> Policy:
-        self.mean.network.load_state_dict(target_state(self.loss.target_value_network_params, self.mean.network))
+        copy_weights(self.loss.target_value_network_params, _actor(self.mean.network))
         return self.mean
+
+
+def _actor(network: QNetwork) -> QValueActor:
+    return QValueActor(network, in_keys=["observation"], spec=Categorical(ACTIONS), action_space="categorical")

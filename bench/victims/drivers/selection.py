@@ -1,0 +1,92 @@
+"""Which checkpoint of a training is kept: the one that drives best on seeds that are never reported."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from bench.driving.contracts import DrivingWorld, Policy, TrainingHooks
+from bench.scenarios.grid import SeedBlock
+from bench.victims.drivers.practice import roads
+
+
+@torch.no_grad()
+def selection_score(
+    policy: Policy, world: DrivingWorld, episodes: int, show: Callable[[Tensor], Tensor] | None = None
+) -> dict[str, float]:
+    """Mean `safe_progress`, by road and over all, on the seeds that select checkpoints and are never reported.
+
+    Args:
+        policy: what drives.
+        world: where.
+        episodes: a road.
+        show: what the policy is shown for an observation [B, V, F]; None is the truth.
+    """
+    cells = roads(episodes)
+    env = world.make(cells, action_type=policy.action_type)
+    seeds = torch.arange(SeedBlock.SELECT, SeedBlock.SELECT + episodes).repeat(len(cells) // episodes)
+    td = env.reset(TensorDict({"seed": seeds}, batch_size=env.batch_size))
+    progress, failed = torch.zeros(len(cells)), torch.zeros(len(cells), dtype=torch.bool)
+    for _ in range(world.max_steps):
+        running = ~td["done"].squeeze(-1)
+        shown = td["observation"]
+        if show is not None:
+            shown = shown.clone()
+            shown[running] = show(shown[running])
+        td.set("action", policy.decide(shown))
+        td = env.step(td)["next"]
+        progress += td["info", "progress"].squeeze(-1) * running
+        failed |= (td["info", "crashed"] | td["info", "offroad"]).squeeze(-1) & running
+        if bool(td["done"].all()):
+            break
+    score = torch.where(failed, 0.0, progress / world.max_steps).view(-1, episodes).mean(1)
+    names = [f"{cell.lanes} lanes, density {cell.density:g}" for cell in cells[::episodes]]
+    return {"mean": float(score.mean()), **dict(zip(names, score.tolist(), strict=True))}
+
+
+@dataclass
+class Best:
+    """The best checkpoint so far, by the mean of its `selection_score` on the truth and on what `hooks.selection` shows.
+
+    Args:
+        world: where checkpoints drive.
+        hooks: of the training.
+        episodes: a road, on the truth; a third as many on what hooks show, which may cost ten times as much.
+    """
+
+    world: DrivingWorld
+    hooks: TrainingHooks
+    episodes: int
+    score: float = -1.0
+    scores: dict[str, dict[str, float]] = field(default_factory=dict)
+    share: float = 0.0
+    weights: dict[str, Tensor] = field(default_factory=dict)
+    history: list[tuple[float, float]] = field(default_factory=list)
+
+    def offer(self, policy: Policy, share: float) -> None:
+        """Score `policy` and keep its weights if none before was better."""
+        scores = {"clean": selection_score(policy, self.world, self.episodes)}
+        for name, show in self.hooks.selection(policy).items():
+            scores[name] = selection_score(policy, self.world, self.episodes // 3, show)
+        score = sum(found["mean"] for found in scores.values()) / len(scores)
+        self.history.append((round(share, 3), round(score, 4)))
+        if score > self.score:
+            self.score, self.scores, self.share = score, scores, share
+            self.weights = copy.deepcopy(policy.state_dict())
+
+    def restore(self, policy: Policy) -> Policy:
+        """`policy` with the best weights, frozen."""
+        policy.load_state_dict(self.weights)
+        return policy.requires_grad_(False).eval()
+
+    def card(self) -> dict[str, object]:
+        """What the card says of the selection."""
+        return {
+            "selection": {"safe_progress": self.scores, "share_of_training": self.share, "episodes": self.episodes},
+            "selection_history": self.history,
+        }

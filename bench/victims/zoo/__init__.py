@@ -1,0 +1,8 @@
+"""The zoo: trained policies and detectors, kept by the recipe that made them and by training seed."""
+
+from __future__ import annotations
+
+from bench.victims.zoo.recipe import Recipe, trained_in
+from bench.victims.zoo.store import card, load, missing, own, save, seeds
+
+__all__ = ["Recipe", "card", "load", "missing", "own", "save", "seeds", "trained_in"]

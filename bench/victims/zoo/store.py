@@ -1,0 +1,242 @@
+"""Entries of the zoo on disk: weights as safetensors with a card each, hash-checked when loaded. Nothing is unpickled.
+
+An entry is `<name>-<first digits of the recipe's digest>/seed<k>.safetensors`, with its card beside it as JSON.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from platformdirs import user_data_path
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from bench.errors import UserError
+from bench.files import whole
+from bench.plugins.contracts import World
+from bench.plugins.fingerprint import canonical, code_digest, libraries, machine
+from bench.victims.zoo.recipe import DIGITS, Part, Recipe, trained_in
+
+SHIPPED = Path(__file__).parents[1] / "policies"
+
+
+class Network(Protocol):
+    """What the zoo asks of a network: the methods of torch.nn.Module, and an attribute for the hash of its weights."""
+
+    weights_sha256: str
+
+    def state_dict(self) -> Mapping[str, Tensor]: ...
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> object: ...
+    def requires_grad_(self, requires_grad: bool) -> Any: ...
+    def eval(self) -> Any: ...
+
+
+class Shaped(Network, Protocol):
+    """A network that can be saved.
+
+    With a true attribute `half_precision` its tensors of two and more dimensions are stored in half precision.
+    """
+
+    @property
+    def shape(self) -> Mapping[str, object]:
+        """The keyword arguments that build it."""
+
+
+N = TypeVar("N", bound=Network)
+
+
+def own() -> Path:
+    """Where networks trained on this machine are kept: CAVBENCH_ZOO, or the user's data folder."""
+    return Path(os.environ.get("CAVBENCH_ZOO") or user_data_path("cavbench") / "zoo")
+
+
+def save(
+    network: Shaped, recipe: Recipe, *, seed: int, world: World, card: Mapping[str, object], root: Path | None = None
+) -> Path:
+    """Write the weights and the card of a trained network, atomically, and return the path of the weights.
+
+    Args:
+        network: to save.
+        recipe: that made it.
+        seed: training seed.
+        world: that it was trained in.
+        card: further facts of the training, for instance how the checkpoint was chosen.
+        root: a zoo; by default the user's own, which takes precedence over the shipped one.
+
+    Raises:
+        UserError: if the recipe does not name the world.
+    """
+    check_world(recipe, world)
+    folder = (root or own()) / recipe.key
+    folder.mkdir(parents=True, exist_ok=True)
+    state = {key: value.contiguous() for key, value in network.state_dict().items()}
+    if getattr(network, "half_precision", False):
+        state = {key: value.half() if value.ndim > 1 else value for key, value in state.items()}
+    blob = save_tensors(state)
+    where = Part.of("world", world)
+    full = {
+        **card,
+        "name": recipe.name,
+        "seed": seed,
+        "recipe": recipe.described(),
+        "world": {"name": where.name, "class": where.source, "parameters": where.parameters},
+        "command": recipe.train(seed),
+        "shape": network.shape,
+        "sha256": hashlib.sha256(blob).hexdigest(),
+        "made": _provenance((*recipe.parts, where)),
+    }
+    path = folder / f"seed{seed}.safetensors"
+    with whole(path) as file:
+        file.write(blob)
+    with whole(path.with_suffix(".json")) as file:
+        file.write(json.dumps(full, indent=1, sort_keys=True, default=str).encode() + b"\n")
+    return path
+
+
+def check_world(recipe: Recipe, world: World) -> None:
+    """Refuse a recipe that does not name the world of its training.
+
+    Raises:
+        UserError: if another world is named, or none where it is not the default.
+    """
+    if (wanted := trained_in(world)) != recipe.trained_in:
+        named = f"trained_in={recipe.trained_in!r}" if recipe.trained_in else "the default world"
+        raise UserError(
+            f"{recipe.name!r} is trained in {wanted or 'the default world'!r}, but its recipe says {named}: "
+            f"{recipe.trained.kind} {recipe.trained.name!r} needs a parameter trained_in with that value"
+        )
+
+
+def card(recipe: Recipe, seed: int) -> dict[str, Any]:
+    """The card of an entry.
+
+    Raises:
+        UserError: if there is none, with the command that trains it, or if it cannot be read.
+    """
+    path = _find(recipe, seed).with_suffix(".json")
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"the card {path} cannot be read: {error}") from None
+
+
+def load(recipe: Recipe, seed: int, build: Callable[..., N]) -> N:
+    """The network of an entry, frozen and in eval mode.
+
+    Args:
+        recipe: that made it.
+        seed: training seed.
+        build: makes the network that is filled with the weights, of the card's `shape`; its class, for instance.
+
+    Raises:
+        UserError: if there is no such entry, if a default has changed since, or if its weights are not those of its card.
+    """
+    path, entry = _find(recipe, seed), card(recipe, seed)
+    _check_parameters(recipe, seed, entry)
+    blob = path.read_bytes()
+    found = hashlib.sha256(blob).hexdigest()
+    if found != entry.get("sha256"):
+        raise UserError(
+            f"the weights {path} have sha256 {found[:12]}…, their card says {str(entry.get('sha256'))[:12]}…: "
+            "the file was changed; restore it or train it again"
+        )
+    try:
+        network: N = build(**entry["shape"])
+        network.load_state_dict(load_tensors(blob))
+    except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"the weights {path} do not fit {recipe.name!r}: {reason}") from None
+    network.weights_sha256 = found
+    network.requires_grad_(False).eval()
+    return network
+
+
+def seeds(recipe: Recipe) -> list[int]:
+    """The training seeds of a recipe, in the user's zoo and the shipped one."""
+    return _seeds(recipe.key)
+
+
+def missing(recipe: Recipe, seed: int) -> str:
+    """Why there is no entry, in a line: what was asked for, which variants and seeds there are, and what trains it."""
+    asked = " ".join([repr(recipe.name), *(["with", *recipe.options] if recipe.options else [])])
+    variants = "; ".join(_variants(recipe)) or "none"
+    return f"the zoo has no {asked} of training seed {seed}. Variants: {variants}. To train it: `{recipe.train(seed)}`"
+
+
+def _check_parameters(recipe: Recipe, seed: int, entry: Mapping[str, Any]) -> None:
+    """Refuse an entry made with other values than are asked for: a default that has changed since is not in the digest."""
+    for part in recipe.parts:
+        made = entry.get("recipe", {}).get(part.kind, {}).get("parameters", {})
+        for name, value in part.parameters.items():
+            if name in made and canonical(made[name]) != canonical(value):
+                raise UserError(
+                    f"the zoo's {recipe.name!r} of training seed {seed} was made with {part.kind}.{name}={made[name]}, "
+                    f"and the default is {value} now; `{recipe.train(seed)}` trains it again"
+                )
+
+
+def _find(recipe: Recipe, seed: int) -> Path:
+    for root in _roots():
+        path = root / recipe.key / f"seed{seed}.safetensors"
+        if path.exists():
+            return path
+    raise UserError(missing(recipe, seed))
+
+
+def _roots() -> tuple[Path, Path]:
+    return own(), SHIPPED
+
+
+def _seeds(key: str) -> list[int]:
+    files = [path for root in _roots() for path in (root / key).glob("seed*.safetensors")]
+    return sorted({int(path.stem.removeprefix("seed")) for path in files})
+
+
+def _variants(recipe: Recipe) -> Iterator[str]:
+    """Every recipe of this name in the zoo, with its seeds: `default (seeds 0, 1, 2)`, `victim.hidden=64 (seed 0)`."""
+    keys = {path.name for root in _roots() if root.is_dir() for path in root.iterdir()}
+    for key in sorted(keys):
+        if not re.fullmatch(f"{re.escape(recipe.name)}-[0-9a-f]{{{DIGITS}}}", key):
+            continue
+        cards = (root / key / f"seed{seed}.json" for seed in _seeds(key) for root in _roots())
+        if (path := next((path for path in cards if path.is_file()), None)) is None:
+            continue
+        numbers = ", ".join(map(str, _seeds(key)))
+        yield f"{_differences(recipe, path)} (seed{'s' if len(_seeds(key)) > 1 else ''} {numbers})"
+
+
+def _differences(recipe: Recipe, path: Path) -> str:
+    """What makes the entry of a card other than the default, in words."""
+    try:
+        made = json.loads(path.read_text())["recipe"]
+        words = []
+        for part in recipe.parts:
+            found = made[part.kind]
+            words += [f"{part.kind}.{name}={value}" for name, value in found["changed"].items()]
+            if found["training"] != part.training:
+                words.append(f"training version {found['training']} of {part.kind}, now {part.training}")
+        return ", ".join(words) or "default"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return f"{path.parent.name} with a card that cannot be read"
+
+
+def _provenance(parts: tuple[Part, ...]) -> dict[str, object]:
+    """The versions of everything that computed, the machine and the time."""
+    modules = sorted({part.module for part in parts} - {"__main__"})
+    return {
+        "cavbench": metadata.version("cavbench"),
+        "code": code_digest(tuple(modules)),
+        "libraries": libraries(tuple(sorted({name for part in parts for name in part.libraries}))),
+        "machine": machine(),
+        "at": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
