@@ -115,7 +115,7 @@ class DetectorAdversarialTraining(DetectorDefense):
                 learning_rate=self.learning_rate,
                 progress=progress,
             )
-        return Trained(detector.requires_grad_(False), {"attack": asdict(attack), "cpu_seconds": round(seconds)})
+        return Trained(detector.requires_grad_(False), {"attack": asdict(attack), "cpu_seconds": round(seconds)})  # type: ignore[call-overload]
 
 
 class _Hardening:

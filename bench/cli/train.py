@@ -43,9 +43,7 @@ def train(words: Sequence[str], console: Console) -> None:
         start = time.perf_counter()
         with TrainingProgress(Console(stderr=True), f"{recipe.name}, seed {seed}") as progress:
             made = _trained(config, component, hardens, seed, progress)
-        path = zoo.save(
-            made.network, recipe, seed=seed, world=config.world.component, card=made.card, root=config.out
-        )
+        path = zoo.save(made.network, recipe, seed=seed, world=config.world.component, card=made.card, root=config.out)
         seconds = time.perf_counter() - start
         said = f"{recipe.name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"
         console.print(Text(said), soft_wrap=True)
@@ -89,4 +87,6 @@ def _check_writable(root: Path) -> None:
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"the zoo {root} cannot be written: {error.strerror or error}; out= names another folder") from None
+        raise UserError(
+            f"the zoo {root} cannot be written: {error.strerror or error}; out= names another folder"
+        ) from None

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from importlib.resources import files
-
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -14,6 +11,9 @@ from tensordict import TensorDict
 from bench.driving.pipeline import AttackModule
 from bench.driving.threat import ObservationThreat
 from bench.plugins.pair import choose
+from bench.victims import zoo
+from bench.victims.drivers.dqn import DQN
+from defenses.advtrain import AdversarialTraining
 from docs.figures import style
 from docs.figures.driving import FEATURES, episode, policy
 from docs.figures.sightings import curve, frame_axes, patched
@@ -107,8 +107,8 @@ def _changed(attack: str, defense: str, budget: float) -> float:
 
 def _card(skip: str, seed: int) -> dict[str, float]:
     """Safe progress on the seeds that chose the checkpoint of a hardened DQN, by `clean` and `attacked`."""
-    card = files("bench") / "victims" / "policies" / f"dqn-advtrain-pgd-skip{skip}" / f"seed{seed}.json"
-    scores = json.loads(card.read_text())["selection"]["safe_progress"]
+    recipe = zoo.Recipe.of(DQN(), AdversarialTraining(skip=float(skip)))
+    scores = zoo.card(recipe, seed)["selection"]["safe_progress"]
     return {name: float(score["mean"]) for name, score in scores.items()}
 
 

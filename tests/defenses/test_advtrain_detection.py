@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -45,21 +46,23 @@ def test_it_hardens_the_detector_it_is_given_and_is_found_again_in_the_zoo(
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
     before, pictures = victim.load(0), torch.rand(1, 3, 64, 64)
-    defense = DetectorAdversarialTraining(**QUICK)
+    defense = DetectorAdversarialTraining(**QUICK, trained_in="DrawnStreet")
     made = defense.train(victim, DrawnStreet(), seed=0, progress=lambda share, text: None)
     assert all(
         torch.equal(a, b)
         for a, b in zip(before.state_dict().values(), victim.load(0).state_dict().values(), strict=True)
     )
-    zoo.save(made.network, made.card, name=defense.zoo_name(victim), seed=0)
+    zoo.save(made.network, zoo.Recipe.of(victim, defense), seed=0, world=DrawnStreet(), card=made.card)
     again = defense.load(victim, 5)
     torch.testing.assert_close(again(pictures).scores, made.network(pictures).scores, rtol=0.02, atol=1e-3)
     assert not torch.equal(again(pictures).scores, before(pictures).scores)
     assert not any(weight.requires_grad for weight in again.parameters())
-    with pytest.raises(UserError, match=r"was made with defense\.rounds=2, not 3"):
-        DetectorAdversarialTraining(**{**QUICK, "rounds": 3}).load(victim, 0)
-    with pytest.raises(UserError, match="`bench train` makes one"):
-        DetectorAdversarialTraining(**QUICK, trained=1).load(victim, 0)
+    with pytest.raises(UserError, match=r"defense\.rounds=3.*of training seed 0.*defense\.rounds=2"):
+        replace(defense, rounds=3).load(victim, 0)
+    with pytest.raises(
+        UserError, match=r"of training seed 1.*To train it: `bench train victim=yolov5 defense=advtrain"
+    ):
+        replace(defense, trained=1).load(victim, 0)
 
 
 def test_a_seed_is_a_training_and_the_control_is_never_attacked(victim: YOLOv5) -> None:

@@ -130,10 +130,21 @@ def test_training_saves_to_the_zoo_and_says_how_long_it_took(bench: Bench, tmp_p
     said = bench("train", "victim=toy", "world=toy", "seeds=0,1", f"out={tmp_path}")
     assert said.code == 0
     assert said.out.count("trained in 0 s, saved as") == 2
-    assert sorted(path.name for path in (tmp_path / "toy-discrete").glob("*.safetensors")) == [
-        "seed0.safetensors",
-        "seed1.safetensors",
-    ]
+    (folder,) = tmp_path.iterdir()
+    assert folder.name.startswith("toy-discrete-")
+    assert sorted(path.name for path in folder.glob("*.safetensors")) == ["seed0.safetensors", "seed1.safetensors"]
+    assert "To use it: bench run victim=toy victim.trained_in=toy" in said.out
+
+
+def test_a_zoo_that_cannot_be_written_is_refused_before_the_training(bench: Bench, tmp_path: Path) -> None:
+    (tmp_path / "afile").write_text("")
+    said = bench("train", "victim=toy", "world=toy", f"out={tmp_path / 'afile'}")
+    assert_one_line(said, "cannot be written")
+
+
+def test_a_training_names_its_own_world_and_no_other(bench: Bench, tmp_path: Path) -> None:
+    said = bench("train", "victim=toy", "world=toy", "victim.trained_in=elsewhere", f"out={tmp_path}")
+    assert_one_line(said, "victim.trained_in=elsewhere does not name the world of this training, toy")
 
 
 def test_what_does_not_learn_cannot_be_trained(bench: Bench) -> None:
@@ -152,7 +163,7 @@ def test_without_a_display_view_says_how_to_open_a_recording(
 
 
 def test_a_traceback_is_shown_to_who_asks_for_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    from bench.cli.main import main as cli
+    from bench.cli import main as cli
     from bench.errors import UserError
 
     monkeypatch.setattr(sys, "argv", ["bench", "run", "attack=nugde", "--debug"])

@@ -16,7 +16,7 @@ from bench.errors import UserError
 from bench.plugins.sources import names, tracks_of
 from bench.records import store as results
 from bench.run import plan, runner
-from bench.run.config import RunConfig, run_config, train_config
+from bench.run.config import RunConfig, component, run_config, train_config
 from bench.run.replay import find, replay
 from bench.run.unit import Crafting
 from bench.scenarios.grid import GRIDS
@@ -197,8 +197,10 @@ def test_a_hardened_detector_has_an_entry_a_seed(tmp_path: Path, monkeypatch: py
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
     said = bench("train", "victim=red", "defense=harden", "world=red_street", "seeds=0,1")
     assert said.code == 0, said.err
-    assert zoo.card("red-harden", 1)["scenes"] == 12
-    records, watcher = run(tmp_path, "defense=harden", "weather=clear")
+    assert "To use it: bench run victim=red defense=harden defense.trained_in=red_street" in said.out
+    recipe = zoo.Recipe.of(component("victim", "red", {}), component("defense", "harden", {"trained_in": "red_street"}))
+    assert zoo.card(recipe, 1)["scenes"] == 12
+    records, watcher = run(tmp_path, "defense=harden", "defense.trained_in=red_street", "weather=clear")
     assert len(crafted(watcher)) == 2
     assert records.num_rows == 2 * 2 * 3
     assert len(set(records["weights_sha256"].to_pylist())) == 2

@@ -12,6 +12,7 @@ import pytest
 from bench.records import store as results
 from bench.run.replay import find, replay
 from bench.victims import zoo
+from bench.victims.drivers.dqn import DQN
 from tests.framework.conftest import Said
 
 ROAD = ("lanes=3", "density=1", "weather=clear,fog", "episodes=3")
@@ -35,14 +36,13 @@ def test_a_blind_driver_is_scored_on_the_highway_and_its_episode_replayed(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not zoo.seeds("dqn"), reason="the zoo has no DQN")
 def test_noise_leaves_the_dqn_driving_on_the_highway(bench: Callable[..., Said], tmp_path: Path) -> None:
-    seed = f"seeds={zoo.seeds('dqn')[0]}"
+    seed = f"seeds={zoo.seeds(zoo.Recipe.of(DQN()))[0]}"
     said = bench("run", "attack=noise", *ROAD, seed, "workers=2", "reference=false", f"out={tmp_path}")
     assert said.code == 0, said.err
     records = results.read(tmp_path)
     assert records.num_rows == 2 * 2 * 3
-    assert set(records["weights_sha256"].to_pylist()) == {zoo.card("dqn", zoo.seeds("dqn")[0])["sha256"]}
+    assert set(records["weights_sha256"].to_pylist()) == {DQN().load(zoo.seeds(zoo.Recipe.of(DQN()))[0]).weights_sha256}
     attacked, clean = (records.filter(pc.field("attack") == name) for name in ("noise", "none"))
     assert min(attacked["linf"].to_pylist()) > 0
     assert set(clean["linf"].to_pylist()) == {0.0}

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
-from bench.driving.contracts import AttackInLoop, DrivingWorld
+from bench.driving.contracts import DrivingWorld, Policy, TrainingHooks
 from bench.plugins import registry
 from bench.victims import zoo
 from bench.victims.drivers.ddpg import DDPG
 from bench.victims.drivers.dqn import DQN
 from bench.victims.drivers.networks import ActorPolicy, QPolicy
-from bench.victims.drivers.training import LearningDriver, Practice, roads
-from defenses.advtrain import AdversarialTraining
+from bench.victims.drivers.practice import Practice, roads
+from bench.victims.drivers.training import LearningDriver
+from defenses.advtrain import AdversarialTraining, AttackInLoop
 
 SHORT = {"decisions": 160, "copies": 1, "hidden": 8, "batch": 16, "memory": 2000, "checkpoints": 1}
 VICTIMS = [DQN(**SHORT), DDPG(**SHORT)]
@@ -38,9 +41,8 @@ def test_a_training_depends_on_its_seed_alone(victim: LearningDriver, world: Dri
     assert not all(torch.equal(first[name], other[name]) for name in first)
 
 
-def test_the_card_says_what_was_trained_and_on_what_it_was_chosen(world: DrivingWorld) -> None:
+def test_the_card_says_how_the_checkpoint_was_chosen(world: DrivingWorld) -> None:
     card = VICTIMS[0].train(world, seed=0, progress=silent).card
-    assert card["victim"]["decisions"] == 160
     assert set(card["selection"]["safe_progress"]["clean"]) == {
         "mean",
         *(f"{n} lanes, density {d}" for n in (3, 4, 5) for d in (1, 2)),
@@ -49,12 +51,12 @@ def test_the_card_says_what_was_trained_and_on_what_it_was_chosen(world: Driving
 
 def test_returns_end_where_the_episode_ends(world: DrivingWorld) -> None:
     victim = DQN(**SHORT | {"copies": 4, "crash_penalty": 1000.0})
-    phase = victim.phases(None)[0]
+    phase = victim.phases(TrainingHooks())[0]
     env = world.make(roads(4), action_type="discrete", action_repeat=phase.repeat)
     env.set_seed(0)
-    learner = victim.learner(env, None)
+    learner = victim.learner(env, TrainingHooks())
     learner.enter(phase)
-    practice = Practice(env, learner, victim, phase, None, torch.Generator())
+    practice = Practice(env, learner, phase, crash_penalty=1000.0, memory=2000, batch=16)
     practice.drive(120, 0.0)
     seen = practice.buffer[:]
     short = seen["steps_to_next_obs"].squeeze(-1) < phase.n_step
@@ -68,12 +70,58 @@ def test_returns_end_where_the_episode_ends(world: DrivingWorld) -> None:
 
 @pytest.mark.parametrize("skip", [0.0, 0.5, 1.0])
 def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, world: DrivingWorld) -> None:
-    def attack(observation: torch.Tensor, policy: torch.nn.Module, scale: float) -> torch.Tensor:
-        return observation
-
-    loop = AttackInLoop(attack=attack, skip=skip, where="acting", ramp=(0.0, 0.0))
-    card = VICTIMS[0].train(world, seed=0, attack=loop, progress=silent).card
+    defense = AdversarialTraining(
+        start="scratch", where="acting", skip=skip, ramp_to=0.0, attack="none", attack_params=""
+    )
+    card = defense.train(VICTIMS[0], world, seed=0, progress=silent).card
     assert card["attacked_decisions"] / (160 * 6) == pytest.approx(1 - skip, abs=0.06)
+
+
+def test_the_budget_grows_along_the_ramp() -> None:
+    defense = AdversarialTraining(skip=0.0, attack="noise", attack_params="", ramp_from=0.2, ramp_to=0.6)
+    world = registry.load("world", "highway")()
+    loop = AttackInLoop(defense, registry.load("attack", "noise")(), world.features, None, seed=0)
+    policy, seen = QPolicy(5, 5, 8), 0.5 * torch.ones(16, 10, 5)
+    moved = [float((loop.shown(seen, policy, share) - seen).abs().max()) for share in (0.1, 0.3, 0.4, 0.6, 0.9)]
+    assert moved == pytest.approx([0.0, moved[4] / 4, moved[4] / 2, moved[4], moved[4]], rel=0.01)
+    assert moved[4] > 0
+
+
+class Calm(TrainingHooks):
+    """Another defence: small scores are preferred, and the replay is shown darker; it notes what it was asked."""
+
+    def __init__(self) -> None:
+        self.asked: set[str] = set()
+
+    def replayed(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
+        self.asked.add("replayed")
+        return 0.9 * observation
+
+    def loss(self, policy: Policy, sample: TensorDictBase, own: Callable[[TensorDictBase], Tensor]) -> Tensor:
+        torch.testing.assert_close(sample["observation"], 0.9 * sample["truth"])
+        return own(sample) + 100 * policy.scores(sample["truth"]).square().mean()
+
+    def selection(self, policy: Policy) -> dict[str, Callable[[Tensor], Tensor]]:
+        return {"darker": lambda observation: 0.9 * observation}
+
+
+@pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
+def test_any_defence_adds_its_own_loss_through_the_hooks(victim: LearningDriver, world: DrivingWorld) -> None:
+    hooks, x = Calm(), torch.rand(64, 10, 5)
+    plain = victim.train(world, seed=0, progress=silent).network.scores(x)
+    calm = victim.train(world, seed=0, hooks=hooks, progress=silent)
+    assert hooks.asked == {"replayed"}
+    assert set(calm.card["selection"]["safe_progress"]) == {"clean", "darker"}
+    assert float(calm.network.scores(x).square().mean()) < float(plain.square().mean())
+
+
+@pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
+def test_hooks_that_change_nothing_change_nothing(victim: LearningDriver, world: DrivingWorld) -> None:
+    plain, hooked = (
+        victim.train(world, seed=0, hooks=hooks, progress=silent).network.state_dict()
+        for hooks in (None, TrainingHooks())
+    )
+    assert all(torch.equal(plain[name], hooked[name]) for name in plain)
 
 
 class Lesson:
@@ -94,11 +142,13 @@ class Lesson:
             {"observation": self.shown, "truth": self.truth, "action": action, "next": after}, [64]
         )
 
-    def decided(self, **loop: float) -> torch.Tensor:
+    def decided(self, **params: float) -> torch.Tensor:
         """What the learner decides on what is shown after 150 updates: softmax probabilities, or the action."""
-        attack = AttackInLoop(attack=lambda o, p, s: o, skip=0.0, start=self.teacher, **loop)
-        learner = self.victim.learner(self.env, attack)
-        learner.enter(self.victim.phases(attack)[0])
+        defense = AdversarialTraining(**{"consistency": 0.0, "margin": 0.0, **params})
+        features = registry.load("world", "highway").features
+        hooks = AttackInLoop(defense, registry.load("attack", "none")(), features, self.teacher, seed=0)
+        learner = self.victim.learner(self.env, hooks)
+        learner.enter(self.victim.phases(hooks)[0])
         for _ in range(150):
             learner.update(self.sample.clone(), 3e-3)
         learner.anneal()
@@ -136,11 +186,11 @@ def test_adversarial_training_trains_saves_and_loads(
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
     trained = victim.train(world, seed=0, progress=silent)
-    zoo.save(trained.network, trained.card, name=victim.zoo_name(), seed=0)
+    zoo.save(trained.network, zoo.Recipe.of(victim), seed=0, world=world, card=trained.card)
     defense = AdversarialTraining(start=start, decisions=160, attack="zo", attack_params="steps=1 directions=2")
     hardened = defense.train(victim, world, seed=0, progress=silent)
     assert hardened.card["attacked_decisions"] > 0
-    zoo.save(hardened.network, hardened.card, name=defense.zoo_name(victim), seed=0)
+    zoo.save(hardened.network, zoo.Recipe.of(victim, defense), seed=0, world=world, card=hardened.card)
     loaded = defense.load(victim, 0)
     x = torch.rand(4, 10, 5)
     torch.testing.assert_close(loaded.scores(x), hardened.network.scores(x))

@@ -1,22 +1,30 @@
-"""The zoo: what is saved is what is loaded, and nothing else is."""
+"""The zoo: an entry is found by its recipe, what is saved is what is loaded, and a card is enough to train it again."""
 
 from __future__ import annotations
 
 import json
+import shlex
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from bench.detection.contracts import CameraWorld
+from bench.driving.contracts import DrivingWorld
 from bench.errors import UserError
+from bench.plugins import registry
+from bench.run.config import run_config, train_config
 from bench.victims import zoo
-from bench.victims.detectors.yolov5 import YOLOv5Network
+from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
 from bench.victims.drivers.ddpg import DDPG
 from bench.victims.drivers.dqn import DQN
 from bench.victims.drivers.networks import QPolicy
+from bench.victims.zoo.store import SHIPPED
 from defenses.advtrain import AdversarialTraining
 
-MADE_BY = {"victim": {"gamma": 0.9}}
+TINY = DQN(hidden=8)
+RECIPE = zoo.Recipe.of(TINY)
 
 
 @pytest.fixture
@@ -26,19 +34,28 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def saved(home: Path) -> Path:
-    torch.manual_seed(0)
-    return zoo.save(QPolicy(5, 5, 8), MADE_BY, name="tiny", seed=3)
+def highway() -> DrivingWorld:
+    return registry.load("world", "highway")()
+
+
+@pytest.fixture
+def saved(home: Path, highway: DrivingWorld) -> Path:
+    return save(TINY, highway, seed=3)
+
+
+def save(victim: DQN, world: DrivingWorld, *, seed: int, card: dict[str, object] | None = None) -> Path:
+    torch.manual_seed(seed)
+    return zoo.save(QPolicy(5, 5, victim.hidden), zoo.Recipe.of(victim), seed=seed, world=world, card=card or {})
 
 
 def test_a_policy_comes_back_as_it_was_saved(saved: Path) -> None:
-    torch.manual_seed(0)
-    before, after = QPolicy(5, 5, 8), zoo.load("tiny", 3, QPolicy, made_by=MADE_BY)
+    torch.manual_seed(3)
+    before, after = QPolicy(5, 5, 8), zoo.load(RECIPE, 3, QPolicy)
     x = torch.rand(4, 10, 5)
     torch.testing.assert_close(after.scores(x), before.scores(x), rtol=0, atol=0)
     assert not any(weight.requires_grad for weight in after.parameters())
-    assert after.weights_sha256 == zoo.card("tiny", 3)["sha256"]
-    assert zoo.seeds("tiny") == [3]
+    assert after.weights_sha256 == zoo.card(RECIPE, 3)["sha256"]
+    assert zoo.seeds(RECIPE) == [3]
 
 
 def test_tampered_weights_are_refused(saved: Path) -> None:
@@ -46,55 +63,191 @@ def test_tampered_weights_are_refused(saved: Path) -> None:
     blob[-1] ^= 1
     saved.write_bytes(bytes(blob))
     with pytest.raises(UserError, match="the file was changed"):
-        zoo.load("tiny", 3, QPolicy, made_by=MADE_BY)
+        TINY.load(3)
 
 
 def test_weights_that_do_not_fit_are_refused_in_one_line(saved: Path) -> None:
-    card = saved.with_suffix(".json")
-    entry = json.loads(card.read_text())
-    entry["shape"]["hidden"] = 9
-    card.write_text(json.dumps(entry))
-    with pytest.raises(UserError, match="do not fit 'tiny'") as error:
-        zoo.load("tiny", 3, QPolicy, made_by=MADE_BY)
+    changed(saved, lambda entry: entry["shape"].update(hidden=9))
+    with pytest.raises(UserError, match="do not fit 'dqn'") as error:
+        TINY.load(3)
     assert "\n" not in str(error.value)
-
-
-def test_another_recipe_than_the_one_asked_for_is_refused(saved: Path) -> None:
-    with pytest.raises(UserError, match=r"made with victim\.gamma=0\.9, not 0\.5"):
-        zoo.load("tiny", 3, QPolicy, made_by={"victim": {"gamma": 0.5}})
-
-
-def test_a_missing_policy_names_the_seeds_there_are(saved: Path) -> None:
-    with pytest.raises(UserError, match="it has seeds 3"):
-        zoo.load("tiny", 4, QPolicy, made_by={})
-    with pytest.raises(UserError, match="bench train"):
-        zoo.load("nobody", 0, QPolicy, made_by={})
 
 
 def test_a_broken_card_is_named(saved: Path) -> None:
     saved.with_suffix(".json").write_text("{")
     with pytest.raises(UserError, match=r"card .*seed3\.json cannot be read"):
-        zoo.load("tiny", 3, QPolicy, made_by={})
+        TINY.load(3)
+    with pytest.raises(UserError, match="with a card that cannot be read"):
+        TINY.load(4)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_shipped_policies_are_those_of_the_default_recipes(seed: int, home: Path) -> None:
+def test_training_a_variant_never_hides_the_default(home: Path, highway: DrivingWorld) -> None:
+    shipped = DQN().load(0).weights_sha256
+    save(DQN(hidden=64), highway, seed=0)
+    save(DQN(trained_in="vehicles=5"), replace(highway, vehicles=5), seed=0)
+    assert DQN().load(0).weights_sha256 == shipped
+    assert len({DQN(**own).load(0).weights_sha256 for own in ({}, {"hidden": 64}, {"trained_in": "vehicles=5"})}) == 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewDQN(DQN):
+    """The DQN of a later version, with a parameter more."""
+
+    warm_up: int = 40
+
+
+NewDQN.__qualname__ = "DQN"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlowDQN(DQN):
+    """The DQN with another default."""
+
+    gamma: float = 0.5
+
+
+SlowDQN.__qualname__ = "DQN"
+
+
+def as_of_bench(recipe: zoo.Recipe) -> zoo.Recipe:
+    """The recipe of a class of these tests as if it stood in bench."""
+    (part,) = recipe.parts
+    return replace(recipe, parts=(replace(part, source="bench.DQN"),))
+
+
+def test_a_new_parameter_with_a_default_refuses_no_shipped_policy(home: Path) -> None:
+    later = as_of_bench(zoo.Recipe.of(NewDQN()))
+    assert later.key == zoo.Recipe.of(DQN()).key
+    assert zoo.load(later, 0, QPolicy).weights_sha256 == DQN().load(0).weights_sha256
+    assert as_of_bench(zoo.Recipe.of(NewDQN(warm_up=1))).key != later.key
+
+
+def test_a_default_that_has_changed_refuses_the_policy_of_the_old_one(home: Path) -> None:
+    with pytest.raises(UserError, match=r"was made with victim\.gamma=0\.97, and the default is 0\.5 now"):
+        zoo.load(as_of_bench(zoo.Recipe.of(SlowDQN())), 0, QPolicy)
+
+
+def test_a_training_of_another_version_is_another_recipe(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = zoo.Recipe.of(DQN())
+    monkeypatch.setattr(DQN, "training", 2)
+    assert zoo.Recipe.of(DQN()).key != before.key
+    with pytest.raises(UserError, match="training version 1 of victim, now 2"):
+        DQN().load(0)
+
+
+def test_a_recipe_is_its_values_not_how_they_were_written() -> None:
+    assert zoo.Recipe.of(DQN(gamma=1)).key == zoo.Recipe.of(DQN(gamma=1.0)).key  # type: ignore[arg-type]
+    assert zoo.Recipe.of(DQN(hidden=128)).key == zoo.Recipe.of(DQN()).key
+    assert zoo.Recipe.of(YOLOv5(trained=3)).key == zoo.Recipe.of(YOLOv5()).key
+    of_another = zoo.Recipe.of(YOLOv5(trained=3), registry.load("defense", "advtrain_detection")())
+    assert of_another.key != zoo.Recipe.of(YOLOv5(), registry.load("defense", "advtrain_detection")()).key
+
+
+def test_a_missing_policy_says_what_there_is_and_what_trains_it(saved: Path) -> None:
+    with pytest.raises(UserError) as error:
+        DQN(hidden=16, gamma=0.9).load(4)
+    said = str(error.value)
+    assert "no 'dqn' with victim.hidden=16 victim.gamma=0.9 of training seed 4" in said
+    assert "default (seeds 0, 1, 2)" in said
+    assert "victim.hidden=8 (seed 3)" in said
+    assert "`bench train victim=dqn victim.hidden=16 victim.gamma=0.9 seeds=4`" in said
+    assert "advtrain" not in said
+
+
+def test_a_world_that_is_not_the_default_must_be_named(home: Path, highway: DrivingWorld) -> None:
+    with pytest.raises(UserError, match="is trained in 'vehicles=5', but its recipe says the default world"):
+        save(DQN(), replace(highway, vehicles=5), seed=0)
+    with pytest.raises(UserError, match="its recipe says trained_in='vehicles=5'"):
+        save(DQN(trained_in="vehicles=5"), highway, seed=0)
+
+
+def test_the_shipped_policies_are_those_of_the_default_recipes(home: Path) -> None:
     dqn, ddpg = DQN(), DDPG()
-    hardened = [AdversarialTraining(skip=skip).load(dqn, seed) for skip in (0.0, 0.3, 0.5, 1.0)]
-    for policy in (dqn.load(seed), *hardened):
-        assert policy.decide(torch.zeros(2, 10, 5)).shape == (2,)
-    assert ddpg.load(seed).decide(torch.zeros(2, 10, 5)).shape == (2, 2)
+    for seed in (0, 1, 2):
+        hardened = [AdversarialTraining(skip=skip).load(dqn, seed) for skip in (0.0, 0.3, 0.5, 1.0)]
+        for policy in (dqn.load(seed), *hardened):
+            assert policy.decide(torch.zeros(2, 10, 5)).shape == (2,)
+        for steering in (ddpg.load(seed), AdversarialTraining().load(ddpg, seed)):
+            assert steering.decide(torch.zeros(2, 10, 5)).shape == (2, 2)
 
 
-@pytest.mark.usefixtures("home")
-def test_a_detector_is_kept_like_a_policy_in_half_precision() -> None:
+SHIPPED_CARDS = sorted(SHIPPED.rglob("*.json"))
+
+
+@pytest.mark.parametrize("path", SHIPPED_CARDS, ids=[f"{path.parent.name}-{path.stem}" for path in SHIPPED_CARDS])
+def test_the_command_of_a_shipped_card_is_its_recipe(path: Path, home: Path) -> None:
+    entry = json.loads(path.read_text())
+    assert made_by(entry["command"]).key == path.parent.name
+    assert entry["recipe"]["digest"].startswith(path.parent.name.rpartition("-")[2])
+    assert path.stem == f"seed{entry['seed']}"
+
+
+@pytest.mark.parametrize(
+    ("victim", "defense", "world"),
+    [
+        (DQN(gamma=0.5, trained_in="vehicles=5"), None, {"vehicles": 5}),
+        (
+            DQN(trained_in="vehicles=5 'target_speeds=[20.0,25.5]'"),
+            None,
+            {"vehicles": 5, "target_speeds": (20.0, 25.5)},
+        ),
+        (DDPG(), AdversarialTraining(attack="zo", attack_params="steps=2 directions=3", skip=1), {}),
+        (DQN(), AdversarialTraining(trained_in="preset=thesis"), {"preset": "thesis"}),
+    ],
+)
+def test_the_command_of_a_card_trains_it_again_and_uses_it(
+    victim: DQN, defense: AdversarialTraining | None, world: dict[str, object], home: Path
+) -> None:
+    recipe, where = zoo.Recipe.of(victim, defense), registry.load("world", "highway")(**world)
+    zoo.save(QPolicy(5, 5, 8), recipe, seed=7, world=where, card={})
+    entry = zoo.card(recipe, 7)
+    assert made_by(entry["command"]).key == recipe.key
+    assert train_config(shlex.split(entry["command"])[2:]).seeds == (7,)
+    (pair,) = run_config(shlex.split(recipe.use)[2:]).pairs
+    assert (pair.victim.component, pair.defense.component) == (victim, defense or pair.defense.component)
+
+
+def made_by(command: str) -> zoo.Recipe:
+    """The recipe that a `bench train` command makes."""
+    program, train, *options = shlex.split(command)
+    assert (program, train) == ("bench", "train")
+    config = train_config(options)
+    hardens = config.defense.name != "none"
+    trained = config.defense.component if hardens else config.victim.component
+    placed = replace(trained, trained_in=zoo.trained_in(config.world.component))
+    return zoo.Recipe.of(*((config.victim.component, placed) if hardens else (placed,)))
+
+
+def test_a_card_says_all_that_is_needed_to_make_it_again(home: Path, highway: DrivingWorld) -> None:
+    save(TINY, highway, seed=3, card={"selection": "best of one"})
+    entry = zoo.card(RECIPE, 3)
+    assert entry["recipe"]["victim"]["changed"] == {"hidden": 8}
+    assert entry["recipe"]["victim"]["parameters"]["decisions"] == 36_000
+    assert entry["recipe"]["victim"]["training"] == 1
+    assert entry["world"]["parameters"]["vehicles"] == 20
+    assert entry["selection"] == "best of one"
+    assert entry["command"] == "bench train victim=dqn victim.hidden=8 seeds=3"
+    assert set(entry["made"]) == {"cavbench", "code", "libraries", "machine", "at"}
+    assert all(entry["made"].values())
+
+
+def test_a_detector_is_kept_like_a_policy_in_half_precision(home: Path) -> None:
     torch.manual_seed(0)
+    victim = YOLOv5(updates=1)
+    world: CameraWorld = registry.load("world", "camera")()
     network = YOLOv5Network("n", ("stop sign", "car")).eval()
-    zoo.save(network, {"scenes": 3}, name="yolov5n", seed=0)
-    again = zoo.load("yolov5n", 0, YOLOv5Network, made_by={})
+    path = zoo.save(network, zoo.Recipe.of(victim), seed=0, world=world, card={"scenes": 3})
+    again = victim.load(0)
     assert again.names == ("stop sign", "car")
-    assert again.weights_sha256 == zoo.card("yolov5n", 0)["sha256"]
+    assert again.weights_sha256 == zoo.card(zoo.Recipe.of(victim), 0)["sha256"]
     picture = torch.rand(1, 3, 64, 64)
-    torch.testing.assert_close(again(picture).scores, network(picture).scores, rtol=0.01, atol=0)
-    path = zoo.own() / "yolov5n" / "seed0.safetensors"
+    torch.testing.assert_close(again(picture).scores, network(picture).scores, rtol=0.01, atol=1e-4)
     assert path.stat().st_size < 2.1 * sum(weight.numel() for weight in network.state_dict().values())
+
+
+def changed(path: Path, change: object) -> None:
+    """Change the card beside the weights."""
+    card = path.with_suffix(".json")
+    entry = json.loads(card.read_text())
+    change(entry)  # type: ignore[operator]
+    card.write_text(json.dumps(entry))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -59,22 +60,22 @@ def test_without_a_file_it_says_how_to_name_one() -> None:
 
 def test_what_is_trained_is_found_in_the_zoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
-    victim = YOLOv5(updates=3, batch=2, window=64)
+    victim = YOLOv5(updates=3, batch=2, window=64, trained_in="DrawnStreet")
     told: list[str] = []
     made = victim.train(DrawnStreet(), seed=4, progress=lambda share, text: told.append(text))
     assert made.network.names == (STOP_SIGN,)
     assert made.card["frames"] == len(DrawnStreet().training_scenes())
     assert told[0].startswith("loss ")
-    zoo.save(made.network, made.card, name=victim.zoo_name(), seed=4)
-    loaded = YOLOv5(updates=3, batch=2, window=64, trained=4).load(0)
+    zoo.save(made.network, zoo.Recipe.of(victim), seed=4, world=DrawnStreet(), card=made.card)
+    loaded = replace(victim, trained=4).load(0)
     rounded = {
         name: value.half().float() if value.ndim > 1 else value for name, value in made.network.state_dict().items()
     }
     made.network.load_state_dict(rounded)
     pictures = torch.rand(1, 3, 64, 64)
     torch.testing.assert_close(loaded(pictures).scores, made.network(pictures).scores, rtol=1e-3, atol=1e-4)
-    with pytest.raises(UserError, match=r"was made with victim\.updates=3, not 4"):
-        YOLOv5(updates=4, batch=2, window=64, trained=4).load(0)
+    with pytest.raises(UserError, match=r"victim\.updates=4 .* Variants: .*victim\.updates=3.*seed 4"):
+        replace(victim, trained=4, updates=4).load(0)
     with pytest.raises(UserError, match="is trained already"):
         YOLOv5(path="own.pt").train(DrawnStreet(), seed=0, progress=lambda share, text: None)
 
