@@ -14,6 +14,7 @@ from rich.text import Text
 from bench.cli.progress import TrainingProgress
 from bench.errors import UserError
 from bench.plugins.contracts import Trained, World
+from bench.plugins.options import WORLDS
 from bench.plugins.pair import Chosen
 from bench.run.config import TrainConfig, train_config
 from bench.run.process import settle
@@ -66,7 +67,7 @@ def _placed(trained: Chosen[Any], world: World) -> Any:
     Raises:
         UserError: if it says another one, or has no parameter to say it.
     """
-    where = zoo.trained_in(world)
+    where = zoo.trained_in(world, default=WORLDS[world.tracks()[0]])
     said = getattr(trained.component, "trained_in", "")
     if said not in ("", where):
         raise UserError(

@@ -14,6 +14,8 @@ from bench.detection.contracts import CameraWorld
 from bench.driving.contracts import DrivingWorld
 from bench.errors import UserError
 from bench.plugins import registry
+from bench.plugins.fingerprint import sources
+from bench.plugins.options import WORLDS
 from bench.run.config import run_config, train_config
 from bench.victims import zoo
 from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
@@ -155,7 +157,7 @@ def test_a_missing_policy_says_what_there_is_and_what_trains_it(saved: Path) -> 
 
 
 def test_a_world_that_is_not_the_default_must_be_named(home: Path, highway: DrivingWorld) -> None:
-    with pytest.raises(UserError, match="is trained in 'vehicles=5', but its recipe says the default world"):
+    with pytest.raises(UserError, match=r"was trained in 'highway world\.vehicles=5', but its recipe says the default"):
         save(DQN(), replace(highway, vehicles=5), seed=0)
     with pytest.raises(UserError, match="its recipe says trained_in='vehicles=5'"):
         save(DQN(trained_in="vehicles=5"), highway, seed=0)
@@ -214,7 +216,8 @@ def made_by(command: str) -> zoo.Recipe:
     config = train_config(options)
     hardens = config.defense.name != "none"
     trained = config.defense.component if hardens else config.victim.component
-    placed = replace(trained, trained_in=zoo.trained_in(config.world.component))
+    world = config.world.component
+    placed = replace(trained, trained_in=zoo.trained_in(world, default=WORLDS[world.tracks()[0]]))
     return zoo.Recipe.of(*((config.victim.component, placed) if hardens else (placed,)))
 
 
@@ -229,6 +232,11 @@ def test_a_card_says_all_that_is_needed_to_make_it_again(home: Path, highway: Dr
     assert entry["command"] == "bench train victim=dqn victim.hidden=8 seeds=3"
     assert set(entry["made"]) == {"cavbench", "code", "libraries", "machine", "at"}
     assert all(entry["made"].values())
+
+
+def test_the_zoo_depends_on_no_track() -> None:
+    found = sources(["bench.victims.zoo.store"])
+    assert not [name for name in found if name.startswith(("bench.driving", "bench.detection"))]
 
 
 def test_a_detector_is_kept_like_a_policy_in_half_precision(home: Path) -> None:

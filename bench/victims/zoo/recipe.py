@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from bench.errors import UserError
 from bench.plugins import registry
 from bench.plugins.contracts import Component, Defense, Victim, World
 from bench.plugins.fingerprint import digest
-from bench.plugins.options import WORLDS
 from bench.plugins.parameters import Parameter, parameters
 from bench.plugins.registry import GROUPS, Kind
 
@@ -154,11 +154,36 @@ class Recipe:
         return [f"{part.kind}={part.name}" for part in self.parts]
 
 
-def trained_in(world: World) -> str:
-    """A world in one text: its name and parameters where they are not the default, `vehicles=5`; empty for the default world."""
+def trained_in(world: World, *, default: str) -> str:
+    """A world as `trained_in` has it: name and parameters where they are not the default; empty for the default world.
+
+    Args:
+        world: to name, for instance `vehicles=5`.
+        default: name of the track's default world.
+    """
     part = Part.of("world", world)
-    name = [] if part.name == WORLDS[world.tracks()[0]] else [part.name]
-    return shlex.join([*name, *(option.removeprefix("world.") for option in part.options)])
+    return _where(part.options, "" if part.name == default else part.name)
+
+
+def check_world(recipe: Recipe, world: World) -> None:
+    """Refuse a recipe that does not name the parameters of the world of its training.
+
+    Raises:
+        UserError: naming what `trained_in` should be.
+    """
+    part = Part.of("world", world)
+    fitting = (_where(part.options, ""), _where(part.options, part.name))
+    if recipe.trained_in not in fitting:
+        said = f"trained_in={recipe.trained_in!r}" if recipe.trained_in else "the default world"
+        raise UserError(
+            f"{recipe.name!r} was trained in {' '.join([part.name, *part.options])!r}, but its recipe says {said}: "
+            f"{recipe.trained.kind} {recipe.trained.name!r} needs a parameter trained_in={fitting[0]!r}"
+        )
+
+
+def _where(options: Sequence[str], name: str) -> str:
+    parameters = [option.removeprefix("world.") for option in options]
+    return shlex.join([name, *parameters] if name else parameters)
 
 
 def _value(component: Component, parameter: Parameter) -> Any:

@@ -25,7 +25,7 @@ from bench.errors import UserError
 from bench.files import whole
 from bench.plugins.contracts import World
 from bench.plugins.fingerprint import canonical, code_digest, libraries, machine
-from bench.victims.zoo.recipe import DIGITS, Part, Recipe, trained_in
+from bench.victims.zoo.recipe import DIGITS, Part, Recipe, check_world
 
 SHIPPED = Path(__file__).parents[1] / "policies"
 
@@ -74,7 +74,7 @@ def save(
         root: a zoo; by default the user's own, which takes precedence over the shipped one.
 
     Raises:
-        UserError: if the recipe does not name the world.
+        UserError: if the recipe does not name the parameters of the world.
     """
     check_world(recipe, world)
     folder = (root or own()) / recipe.key
@@ -101,20 +101,6 @@ def save(
     with whole(path.with_suffix(".json")) as file:
         file.write(json.dumps(full, indent=1, sort_keys=True, default=str).encode() + b"\n")
     return path
-
-
-def check_world(recipe: Recipe, world: World) -> None:
-    """Refuse a recipe that does not name the world of its training.
-
-    Raises:
-        UserError: if another world is named, or none where it is not the default.
-    """
-    if (wanted := trained_in(world)) != recipe.trained_in:
-        named = f"trained_in={recipe.trained_in!r}" if recipe.trained_in else "the default world"
-        raise UserError(
-            f"{recipe.name!r} is trained in {wanted or 'the default world'!r}, but its recipe says {named}: "
-            f"{recipe.trained.kind} {recipe.trained.name!r} needs a parameter trained_in with that value"
-        )
 
 
 def card(recipe: Recipe, seed: int) -> dict[str, Any]:
