@@ -19,11 +19,10 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from attacks.zo import ZOSignSGD
-from bench.driving.contracts import DrivingAttack, Policy
-from bench.driving.pipeline import AttackModule
-from bench.driving.threat import ObservationThreat
+from bench.driving import DrivingAttack, ObservationThreat, Policy
+from bench.driving.attacker import AttackModule
 from bench.run.process import settle
-from bench.scenarios.grid import Cell, SeedBlock
+from bench.scenarios import Cell, SeedBlock
 from bench.victims.drivers.networks import QPolicy
 from envs.highway.world import HighwayWorld
 

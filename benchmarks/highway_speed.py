@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 from tensordict import TensorDict
 
-from bench.scenarios.grid import Cell, SeedBlock
+from bench.scenarios import Cell, SeedBlock
 from envs.highway.batched import BatchedHighway
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.engine import HighwayEngine

@@ -17,12 +17,10 @@ import numpy as np
 import torch
 
 from attacks.eot import EOT
+from bench.detection import STOP_SIGN, Detector, PatchOracle, PatchThreat, Scenes
 from bench.detection.approach import look
-from bench.detection.contracts import Detector, Scenes
-from bench.detection.threat import STOP_SIGN, PatchThreat, VisionOracle
 from bench.errors import UserError
 from bench.run.process import settle
-from bench.scenarios.grid import GRIDS
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
 from envs.camera.world import StopSignApproach
 
@@ -58,7 +56,7 @@ def craft(detector: Detector, scenes: Scenes, rounds: int, steps: int) -> None:
             detector(shown).scores_of(label).amax(-1).mean().backward()
 
     def step() -> None:
-        attack.craft(VisionOracle(detector, THREAT, attack.access, generator), scenes, lambda share, text: None)
+        attack.craft(PatchOracle(detector, THREAT, attack.access, generator), scenes, lambda share, text: None)
 
     def first_look() -> None:
         for frame in torch.arange(len(scenes)).split(1):

@@ -25,7 +25,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bench.records.store import FOLDER, SCHEMA
-from bench.scenarios.grid import GRIDS
 
 SEEDS, EPISODES, ATTACKS = 3, 100, 8
 POLICY = {f"parameter_{number}": 0.125 for number in range(15)}

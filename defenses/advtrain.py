@@ -8,8 +8,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bench.driving.contracts import AttackInLoop, DrivingDefense, DrivingVictim, DrivingWorld, Policy
-from bench.driving.threat import Norm, ObservationThreat, Oracle
+from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, ObservationThreat, Oracle, Policy
+from bench.driving.contracts import AttackInLoop
+from bench.driving.threat import Norm
 from bench.errors import UserError
 from bench.plugins.contracts import Progress, Trained
 from bench.plugins.options import configured, parameter_words
@@ -72,7 +73,7 @@ class AdversarialTraining(DrivingDefense):
     def zoo_name(self, victim: DrivingVictim) -> str:
         return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"
 
-    def load(self, victim: DrivingVictim, seed: int) -> Policy:
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
         if victim.policy_type is None:
             raise UserError("adversarial training needs a victim that learns")
         made_by = {"victim": asdict(victim), "defense": asdict(self)}  # type: ignore[call-overload]
@@ -92,7 +93,7 @@ class AdversarialTraining(DrivingDefense):
 
         def perturb(observation: Tensor, policy: Policy, scale: float) -> Tensor:
             oracle = Oracle(policy, threat, attack.access, world.features, generator)
-            oracle.begin_step(observation, scale)
+            oracle.begin_step(observation, scale=scale)
             return oracle.project(attack.perturb(observation, oracle)).detach()
 
         loop = AttackInLoop(
@@ -100,7 +101,7 @@ class AdversarialTraining(DrivingDefense):
             skip=self.skip,
             where=self.where,
             ramp=(self.ramp_from, self.ramp_to),
-            start=victim.load(seed) if self.start == "trained" else None,
+            start=victim.load(seed, world.facts) if self.start == "trained" else None,
             decisions=self.decisions,
             consistency=self.consistency,
             margin=self.margin,

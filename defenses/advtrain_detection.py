@@ -8,18 +8,19 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import (
+from bench.detection import (
     STOP_SIGN,
     CameraWorld,
     Detector,
     DetectorDefense,
     DetectorVictim,
     PatchAttack,
+    PatchOracle,
+    PatchThreat,
     Scenes,
 )
-from bench.detection.threat import PatchThreat, VisionOracle
 from bench.errors import UserError
-from bench.plugins.contracts import Progress, Trained
+from bench.plugins.contracts import Facts, Progress, Trained
 from bench.plugins.options import configured, parameter_words
 from bench.victims import zoo
 from bench.victims.detectors.loss import missed, unlike
@@ -89,10 +90,10 @@ class DetectorAdversarialTraining(DetectorDefense):
     def zoo_name(self, victim: DetectorVictim) -> str:
         return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"
 
-    def load(self, victim: DetectorVictim, seed: int) -> Detector:
+    def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
         own = {name: value for name, value in asdict(self).items() if name != "trained"}
         made_by = {"victim": asdict(victim), "defense": own}  # type: ignore[call-overload]
-        return zoo.load(self.zoo_name(victim), self.trained, lambda **_: victim.load(seed), made_by=made_by)
+        return zoo.load(self.zoo_name(victim), self.trained, lambda **_: victim.load(seed, facts), made_by=made_by)
 
     def train(self, victim: DetectorVictim, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
         """Train the hardened detector of training seed `seed`."""
@@ -103,7 +104,9 @@ class DetectorAdversarialTraining(DetectorDefense):
             )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            hardening = _Hardening(self, attack, victim.load(seed), world.training_scenes(), seed, progress)
+            hardening = _Hardening(
+                self, attack, victim.load(seed, world.facts), world.training_scenes(), seed, progress
+            )
             detector, seconds = descend(
                 hardening.detector,
                 hardening.loss,
@@ -156,7 +159,7 @@ class _Hardening:
             self.progress(number / self.recipe.rounds, f"patch {number + 1}, {share:.0%}: {text}")
 
         threat = PatchThreat(budget=self.recipe.budget)
-        oracle = VisionOracle(self.detector.requires_grad_(False), threat, self.attack.access, self.generator)
+        oracle = PatchOracle(self.detector.requires_grad_(False), threat, self.attack.access, self.generator)
         patch = self.attack.craft(oracle, self.scenes, tell)
         self.detector.requires_grad_(True)
         if patch is None:

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from bench.statistics.episodes import Episodes, Summary, difference, shared, summarise, unit_interval
 from bench.statistics.estimates import Interval, iqm
 

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from rliable import metrics as rliable_metrics
 from scipy.stats import binomtest
 
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from bench.statistics.episodes import Episodes, action_entropy, difference, shared, summarise, unit_interval
 from bench.statistics.estimates import interval, iqm, wilson
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from rerun.chunk import Chunk, RrdReader
 
-from bench.driving.contracts import Features
+from bench.driving import Features, ObservationThreat
 from bench.driving.rollout import Trace
-from bench.driving.threat import ObservationThreat, project
+from bench.driving.threat import project
 from bench.recording import RerunLogger, save
 from bench.recording.driving.episode import ACTIONS, Episode
 

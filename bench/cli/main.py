@@ -20,6 +20,8 @@ from bench.errors import UserError
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from bench.plugins.track import Track
+
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
 Words = Annotated[
@@ -92,7 +94,8 @@ def run(words: Words = None) -> None:
     For instance: bench run attack=zo defense=advtrain
     """
     from bench.cli.progress import RunProgress
-    from bench.records import store as results
+    from bench.plugins.track import track_of
+    from bench.records import reading
     from bench.run import runner
     from bench.run.config import run_config
 
@@ -103,7 +106,8 @@ def run(words: Words = None) -> None:
         except KeyboardInterrupt:
             kept = f"{progress.done} of {progress.total} episodes are kept"
             raise UserError(f"interrupted; {kept}, and the same command goes on from there") from None
-    _print_report("run", results.read(config.out, units, track=config.pairs[0].track))
+    own = track_of(config.pairs[0])
+    _print_report(own, reading.read(config.out, units, track=own))
     Console().print(Text(f"Records in {config.out}: `bench show {config.out}` says what made them."), soft_wrap=True)
 
 
@@ -154,7 +158,7 @@ def render(
     It needs the renderer: pip install 'cavbench[render]'. The frames of the standard grid ship with the project.
     """
     from bench.cli.progress import TrainingProgress
-    from bench.detection.contracts import CameraWorld
+    from bench.detection import CameraWorld
     from bench.run.config import component
 
     found = component("world", world, {})
@@ -222,12 +226,11 @@ def fetch(
     cli_fetch.print_fetched(names, Console()) if names else cli_fetch.print_downloads(Console())
 
 
-def _print_report(name: str, records: pa.Table) -> None:
+def _print_report(track: Track, records: pa.Table) -> None:
     from bench.plugins import registry
-    from bench.records import store as results
 
-    report = registry.resolve(registry.REPORTS, name, "report")
-    report({results.track_of(records.column_names): records}, Console())
+    report = registry.resolve(registry.REPORTS, "run", "report")
+    report({track.name: records}, Console())
 
 
 def main() -> None:

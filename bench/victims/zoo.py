@@ -14,8 +14,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from bench.detection.contracts import Detector
-from bench.driving.contracts import Policy
+from bench.detection import Detector
+from bench.driving import Policy
 from bench.errors import UserError
 from bench.files import whole
 

@@ -13,11 +13,12 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bench.detection import STOP_SIGN, Approach, Detector
 from bench.detection.approach import Sight, look
-from bench.detection.contracts import STOP_SIGN, Approach, Detector, confidence
+from bench.detection.boxes import confidence
 from bench.detection.stopping import THRESHOLD
 from bench.plugins.pair import choose
-from bench.scenarios.grid import GRIDS, Cell
+from bench.scenarios import Cell
 from docs.figures import style
 from docs.figures.patches import SHARE
 from leaderboard.approaches import Patched, read_patched

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from bench.driving.contracts import ActionType, Driver, DrivingWorld, Features
-from bench.scenarios.grid import Cell
+from bench.driving import ActionType, Driver, DrivingWorld, Features
+from bench.scenarios import Axes, Cell
+from envs.highway.axes import AXES, STANDARD_V1
 from envs.highway.config import (
+    ACTIONS,
     STANDARD_FEATURES,
     STANDARD_TARGET_SPEEDS,
     THESIS_FEATURES,
@@ -42,7 +44,11 @@ class HighwayWorld(DrivingWorld):
         ValueError: with one line, for what neither environment can do.
     """
 
+    axes: ClassVar[Axes] = AXES
+    grid: ClassVar[str] = STANDARD_V1.name
     features: ClassVar[Features] = STANDARD_FEATURES
+    actions: ClassVar[tuple[str, ...]] = ACTIONS
+    drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm")
 
     preset: Preset = "standard"
     vehicles: int = 20
@@ -65,7 +71,11 @@ class HighwayWorld(DrivingWorld):
         if self.preset == "thesis":
             # The class says the standard's ranges; this object's own are others.
             object.__setattr__(self, "features", THESIS_FEATURES)
-        self.config((Cell(lanes=3, density=1.0),))
+        self.config((AXES.cell(lanes=3, density=1.0),))
+
+    @property
+    def decision_hz(self) -> float:
+        return self.policy_frequency
 
     def config(
         self,
@@ -102,7 +112,7 @@ class HighwayWorld(DrivingWorld):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        """See `bench.driving.contracts.DrivingWorld.make`."""
+        """See `bench.driving.DrivingWorld.make`."""
         config = self.config(cells, action_type=action_type, driver=driver, action_repeat=action_repeat)
         # Imported here: both load torchrl and numba or pygame, which listing components must not.
         if self.backend == "batched":

@@ -13,8 +13,8 @@ from attacks.noise import Noise
 from attacks.none import NoAttack
 from attacks.pgd import PGD
 from attacks.zo import ZOSignSGD
-from bench.driving.contracts import ActionType, DrivingAttack
-from bench.driving.threat import Norm, ObservationThreat
+from bench.driving import ActionType, DrivingAttack, ObservationThreat
+from bench.driving.threat import Norm
 from tests.attacks.victims import FEATURES, observations, perturb, victim
 
 OBJECTIVES = ("collision", "expected", "margin", "target")

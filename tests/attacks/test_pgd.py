@@ -11,8 +11,8 @@ from attacks.noise import Noise
 from attacks.none import NoAttack
 from attacks.objectives import Objective
 from attacks.pgd import PGD
-from bench.driving.contracts import ActionType
-from bench.driving.threat import ObservationThreat, project
+from bench.driving import ActionType, ObservationThreat
+from bench.driving.threat import project
 from tests.attacks.victims import FEATURES, Linear, left, loss_of, observations, perturb, victim
 
 OBJECTIVES: tuple[Objective, ...] = ("collision", "expected", "margin", "target")

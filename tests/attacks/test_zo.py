@@ -14,8 +14,7 @@ from attacks.noise import Noise
 from attacks.none import NoAttack
 from attacks.objectives import Objective, distortion
 from attacks.zo import ZOObjective, ZOSignSGD, _directions
-from bench.driving.contracts import ActionType, Policy
-from bench.driving.threat import ObservationThreat
+from bench.driving import ActionType, ObservationThreat, Policy
 from tests.attacks.victims import Linear, left, loss_of, observations, perturb, victim
 
 

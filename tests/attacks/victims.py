@@ -6,8 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from attacks.objectives import DiscreteLoss, Objective
-from bench.driving.contracts import ActionType, DrivingAttack, Features, Policy
-from bench.driving.threat import ObservationThreat, Oracle
+from bench.driving import ActionType, DrivingAttack, Features, ObservationThreat, Oracle, Policy
 from bench.victims.drivers.networks import ActorPolicy, QPolicy
 
 FEATURES = Features(

@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from bench.errors import UserError
-from bench.scenarios.grid import WEATHERS, Cell
+from bench.scenarios import Cell
 from envs.camera import poses
 from envs.camera.bank import SHIPPED
 from envs.camera.street.layout import LOCATIONS
 from envs.camera.world import StopSignApproach
+from envs.weather import WEATHERS
 
 WORLD = StopSignApproach()
 

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from bench.errors import UserError
 from bench.plugins.registry import load
 from bench.run.config import RunConfig, component, run_config, train_config
-from bench.scenarios.grid import GRIDS
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 

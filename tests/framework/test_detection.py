@@ -19,7 +19,6 @@ from bench.run import plan, runner
 from bench.run.config import RunConfig, run_config, train_config
 from bench.run.replay import find, replay
 from bench.run.unit import Crafting
-from bench.scenarios.grid import GRIDS
 from bench.victims import zoo
 from tests.framework.conftest import Said
 from tests.framework.distributions import install

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from envs.highway.config import THESIS_TARGET_SPEEDS, HighwayConfig
 from envs.highway.engine import HighwayEngine
 from envs.highway.reference import SensedHighwayEnv

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from bench.driving.contracts import DrivingWorld, Features
-from bench.scenarios.grid import Cell
+from bench.driving import DrivingWorld, Features
+from bench.scenarios import Cell
 from envs.highway.config import STANDARD_FEATURES, THESIS_FEATURES, HighwayConfig
 from envs.highway.world import HighwayWorld
 
@@ -84,7 +84,7 @@ def test_the_engine_runs_where_no_compiled_code_can_be_kept() -> None:
         # As on a read-only installation without a home: numba finds nowhere to write.
         "for locator in caching.CacheImpl._locator_classes: locator.from_function = classmethod(lambda *a: None)\n"
         "from envs.highway.world import HighwayWorld\n"
-        "from bench.scenarios.grid import Cell\n"
+        "from bench.scenarios import Cell\n"
         "env = HighwayWorld().make([Cell(lanes=3, density=1.0)])\n"
         "print(env.rollout(3)['next', 'reward'].shape)\n"
     )

@@ -14,8 +14,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
-from bench.driving.contracts import ActionType, Driver
-from bench.scenarios.grid import Cell, SeedBlock
+from bench.driving import ActionType, Driver
+from bench.scenarios import Cell, SeedBlock
 from envs.highway.world import Backend, HighwayWorld
 
 CLEAR = Cell(lanes=3, density=1.0)

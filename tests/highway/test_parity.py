@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from numpy._core._multiarray_umath import __cpu_dispatch__ as numpy_kernels  # type: ignore[attr-defined]
 
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from tests.highway.side_by_side import Case, compare, differences, discrete
 
 ROOT = Path(__file__).parents[2]

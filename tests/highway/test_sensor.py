@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from bench.scenarios.grid import WEATHERS, Cell, Weather
+from bench.scenarios import Cell
 from envs.highway.config import HighwayConfig
 from envs.highway.engine import HighwayEngine
 from envs.highway.sensor import add_noise, noise_sigma, sensor_range_m
+from envs.weather import WEATHERS, Weather
 
 visibilities = st.floats(10, 1e6)
 rains = st.floats(0, 150)

@@ -8,7 +8,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bench.driving.contracts import AttackInLoop, DrivingWorld
+from bench.driving import DrivingWorld
+from bench.driving.contracts import AttackInLoop
 from bench.plugins import registry
 from bench.victims import zoo
 from bench.victims.drivers.ddpg import DDPG

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.detection.contracts import STOP_SIGN, confidence
+from bench.detection import STOP_SIGN
+from bench.detection.boxes import confidence
 from bench.errors import UserError
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from bench.victims import zoo
 from bench.victims.detectors import yolov5_file
 from bench.victims.detectors.yolov5 import MULTIPLES, Size, YOLOv5, YOLOv5Network

@@ -14,7 +14,8 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
-from bench.driving.contracts import ActionType, AttackInLoop, Policy
+from bench.driving import ActionType, Policy
+from bench.driving.contracts import AttackInLoop
 from bench.victims.drivers.networks import QPolicy
 from bench.victims.drivers.training import CHUNK, Learner, LearningDriver, Phase, target_state
 

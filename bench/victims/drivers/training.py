@@ -17,9 +17,11 @@ from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, ExplorationType, MultiStepTransform, set_exploration_type
 
-from bench.driving.contracts import AttackInLoop, DrivingVictim, DrivingWorld, Policy
+from bench.driving import DrivingFacts, DrivingVictim, DrivingWorld, Policy
+from bench.driving.contracts import AttackInLoop
+from bench.plugins import registry
 from bench.plugins.contracts import Progress, Trained
-from bench.scenarios.grid import GRIDS, Cell, SeedBlock
+from bench.scenarios import Cell, SeedBlock
 from bench.victims import zoo
 
 CHUNK = 8
@@ -30,9 +32,9 @@ WARM_UP = 40
 
 def roads(copies: int) -> list[Cell]:
     """The roads of the standard grid in clear weather, `copies` of each: one batch practises on all of them."""
-    grid = GRIDS["standard-v1"]
-    pairs = itertools.product(grid.lanes, grid.density)
-    return [Cell(lanes=lanes, density=density) for lanes, density in pairs for _ in range(copies)]
+    grid = registry.grid("standard-v1")
+    pairs = itertools.product(grid.values["lanes"], grid.values["density"])
+    return [Cell(lanes=lanes, density=density, weather="clear") for lanes, density in pairs for _ in range(copies)]
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class LearningDriver(DrivingVictim):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
 
-    def load(self, seed: int) -> Policy:
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
         return zoo.load(self.zoo_name(), seed, self.policy_type, made_by={"victim": asdict(self)})
 
     def phases(self, attack: AttackInLoop | None) -> list[Phase]:
