@@ -6,7 +6,7 @@ import time
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from bench.driving.contracts import DrivingAttack, Features, Policy
@@ -83,12 +83,3 @@ class PolicyModule(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         with torch.no_grad():
             return tensordict.set("action", self.policy.decide(tensordict.get(self.in_keys[0])))
-
-
-def attacked(
-    attack: DrivingAttack, policy: Policy, threat: ObservationThreat, features: Features, *, seed: int
-) -> TensorDictSequential:
-    """The victim under attack, as one TorchRL policy."""
-    return TensorDictSequential(
-        AttackModule(attack, policy, threat, features, seed=seed), PolicyModule(policy, in_key="perturbed")
-    )

@@ -21,14 +21,13 @@ from bench.recording.detection import approach
 from bench.recording.detection import blueprint as approach_blueprint
 from bench.recording.driving import blueprint, curves, scene
 from bench.recording.driving.episode import Episode
-from bench.recording.logger import RerunLogger
 
 if TYPE_CHECKING:
     from bench.detection.approach import Sighting
     from bench.driving.contracts import Features
     from bench.driving.rollout import Trace
 
-__all__ = ["RerunLogger", "save", "save_approach"]
+__all__ = ["save", "save_approach"]
 
 
 def save(trace: Trace, *, features: Features, meta: Mapping[str, object], path: Path) -> None:

@@ -1,9 +1,8 @@
-"""What is driven: weather, cells, scenarios, and the named grids every pair is scored on."""
+"""What is driven: weather, cells, and the named grids every pair is scored on."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -96,13 +95,6 @@ class Cell:
         return f"{self.lanes} lanes, density {self.density:g}, {self.weather}"
 
 
-@dataclass(frozen=True, order=True, kw_only=True)
-class Scenario(Cell):
-    """A cell and the seed that fixes its traffic: the same scenario is met by every attack and every defence."""
-
-    seed: int
-
-
 @dataclass(frozen=True, kw_only=True)
 class Grid:
     """A named, versioned list of scenarios of a track: the product of lanes, density and weather, `episodes` seeds a cell."""
@@ -135,12 +127,6 @@ class Grid:
     def seeds(self) -> range:
         """The scenario seeds of every cell."""
         return range(self.first_seed, self.first_seed + self.episodes)
-
-    def scenarios(self) -> Iterator[Scenario]:
-        """Every scenario of the grid, cell by cell."""
-        for cell in self.cells():
-            for seed in self.seeds():
-                yield Scenario(lanes=cell.lanes, density=cell.density, weather=cell.weather, seed=seed)
 
     def with_(self, **changes: object) -> Grid:
         """A copy with other values; its name says that it is no longer the standard grid."""
