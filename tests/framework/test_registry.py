@@ -86,7 +86,7 @@ def test_a_name_that_two_packages_claim_is_refused_and_both_are_named(plugins: P
 
 def test_listing_names_imports_no_torch() -> None:
     code = (
-        "import sys; from bench import cli; sys.argv = ['bench', 'list']\n"
+        "import sys; from bench.cli import main as cli; sys.argv = ['bench', 'list']\n"
         "try: cli.main()\nexcept SystemExit: pass\n"
         "heavy = {'torch', 'hydra', 'numpy', 'duckdb', 'attacks.noise'} & set(sys.modules)\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
