@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-LIBRARIES = ("torch", "torchrl", "tensordict", "highway-env", "numba", "numpy")
+LIBRARIES = ("torch", "torchrl", "tensordict", "numba", "numpy")
 
 BESIDE_THE_RESULT = frozenset(
     [
@@ -34,6 +34,7 @@ BESIDE_THE_RESULT = frozenset(
         "replay",
         "results",
         "runner",
+        "shadow",
         "statistics",
         "tracks",
         "words",
