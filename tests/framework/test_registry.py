@@ -54,7 +54,8 @@ BROKEN = {
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(DrivingAttack): ...\n"
     ),
     "is not a frozen dataclass": (
-        "from bench.driving.contracts import DrivingAttack\nclass Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
+        "from bench.driving.contracts import DrivingAttack\n"
+        "class Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
     ),
     "takes steps by position": (
         "from dataclasses import dataclass\nfrom bench.driving.contracts import DrivingAttack\n"
