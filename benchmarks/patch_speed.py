@@ -86,7 +86,7 @@ def score(detector: Detector, world: StopSignApproach, rounds: int) -> None:
             rounds=rounds,
         ) / len(every)
     height, width = scenes().size
-    frames = len(list(GRID.scenarios())) * len(every)
+    frames = len(GRID.cells()) * len(GRID.seeds()) * len(every)
     print(f"scoring a texture: yolov3_tiny, batch {len(every)}, pictures of {width} x {height}, one thread")
     for clock, name in enumerate(CLOCKS):
         rendered, seen = np.median((rendering[clock], looking[clock]), 1)

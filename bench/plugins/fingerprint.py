@@ -15,10 +15,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-LIBRARIES = ("torch", "torchrl", "tensordict", "highway-env", "numba", "numpy")
+LIBRARIES = ("torch", "torchrl", "tensordict", "numba", "numpy")
 
 BESIDE_THE_RESULT = frozenset(
-    ["cli", "conformance", "errors", "files", "plugins", "recording", "records", "run", "statistics", "tracks"]
+    ["cli", "conformance", "errors", "files", "plugins", "recording", "records", "run", "shadow", "statistics", "tracks"]
 )
 """Rooms of `bench` that choose, store or show results: editing them outdates no record."""
 

@@ -92,3 +92,8 @@ def test_the_engine_runs_where_no_compiled_code_can_be_kept() -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "[1, 3, 1]" in done.stdout
+
+
+def test_records_of_the_reference_backend_name_highway_envs_version() -> None:
+    assert HighwayWorld(backend="reference").libraries == ("highway-env",)
+    assert HighwayWorld().libraries == ()
