@@ -22,9 +22,10 @@ from bench.detection.approach import look
 from bench.errors import UserError
 from bench.run.process import settle
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
+from envs.camera.axes import APPROACH_V1
 from envs.camera.world import StopSignApproach
 
-GRID, THREAT, WORKERS = GRIDS["approach-v1"], PatchThreat(), 2
+GRID, THREAT, WORKERS = APPROACH_V1, PatchThreat(), 2
 CLOCKS = ("processor", "wall")
 
 

@@ -26,7 +26,7 @@ class Counting(Policy):
         self.action_type, self.policy = policy.action_type, policy
         self.asked: list[Tensor] = []
 
-    def scores(self, observation: Tensor) -> Tensor:
+    def forward(self, observation: Tensor) -> Tensor:
         self.asked.append(observation)
         return self.policy.scores(observation)
 

@@ -14,6 +14,7 @@ FEATURES = Features(
     low=(-100.0, -20.0, -40.0, -20.0),
     high=(100.0, 20.0, 40.0, 20.0),
     units=("m", "m", "m/s", "m/s"),
+    floors=(0.5, 0.2, 0.3, 0.2),
 )
 
 
@@ -28,7 +29,7 @@ class Linear(Policy):
         self.layer = nn.Linear(rows * 5, 2)
         self.requires_grad_(False)
 
-    def scores(self, observation: Tensor) -> Tensor:
+    def forward(self, observation: Tensor) -> Tensor:
         return self.layer(observation.flatten(-2))
 
 
