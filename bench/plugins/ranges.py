@@ -9,7 +9,7 @@ import math
 import types
 import typing
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import cache
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from annotated_types import Ge, GroupedMetadata, Gt, Le, Lt
@@ -56,7 +56,7 @@ def words(hint: Any) -> str:
     return f"{'at most' if isinstance(high, Le) else 'below'} {highest}" if high else ""
 
 
-@lru_cache(maxsize=None)
+@cache
 def _hints(kind: type) -> dict[str, Any]:
     """The annotations of the fields that restrict their values."""
     hints = typing.get_type_hints(kind, include_extras=True)
