@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.driving.contracts import ActionType, DrivingAttack
+from bench.driving import ActionType, DrivingAttack
 from bench.errors import UserError
 from bench.plugins.contracts import Access
 
 if TYPE_CHECKING:
-    from bench.driving.threat import Oracle
+    from bench.driving import Oracle
 
 ATTACKS: dict[str, Access] = {
     "BoundaryAttack": "decisions",

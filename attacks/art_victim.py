@@ -20,7 +20,7 @@ from torch.nn import functional
 from attacks.objectives import margin
 
 if TYPE_CHECKING:
-    from bench.driving.threat import Oracle
+    from bench.driving import Oracle
 
 logging.getLogger("art").setLevel(logging.ERROR)
 """ART warns of every attack that comes to nothing, which here is every step and every episode."""

@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import PatchAttack, Scenes
-from bench.detection.threat import VisionOracle, check_texels
+from bench.detection import PatchAttack, PatchOracle, Scenes
+from bench.detection.threat import check_texels
 from bench.plugins.contracts import Access, Progress
 
 SEEN = 0.5
@@ -85,7 +85,7 @@ class EOT(PatchAttack):
         if not 0 <= self.hue <= 0.5:
             raise ValueError(f"eot.hue must be between 0 and 0.5, got {self.hue}")
 
-    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
+    def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         from attacks.transformations import Transformations
 
         seen = (scenes.visible >= SEEN).nonzero().squeeze(1)

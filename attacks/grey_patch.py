@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import PatchAttack, Scenes
+from bench.detection import PatchAttack, Scenes
 from bench.plugins.contracts import Access, Progress
 
 if TYPE_CHECKING:
-    from bench.detection.threat import VisionOracle
+    from bench.detection import PatchOracle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,5 +32,5 @@ class GreyPatch(PatchAttack):
         if not 0 <= self.level <= 1:
             raise ValueError(f"grey_patch.level must be between 0 and 1, got {self.level}")
 
-    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
+    def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         return torch.full((3, 8, 8), self.level)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 import torch
 from torch import Tensor
 
-from bench.driving.contracts import DrivingAttack
+from bench.driving import DrivingAttack
 from bench.plugins.contracts import Access
 
 if TYPE_CHECKING:
-    from bench.driving.threat import Oracle
+    from bench.driving import Oracle
 
 Distribution = Literal["uniform", "gaussian"]
 

@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import PatchAttack, Scenes
-from bench.detection.threat import VisionOracle, check_texels
+from bench.detection import PatchAttack, PatchOracle, Scenes
+from bench.detection.threat import check_texels
 from bench.plugins.contracts import Access, Progress
 
 
@@ -28,5 +28,5 @@ class NoisePatch(PatchAttack):
     def __post_init__(self) -> None:
         check_texels("noise_patch", self.texels)
 
-    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
+    def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         return torch.rand(3, self.texels, self.texels, generator=oracle.generator)

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Objective
-from bench.driving.contracts import DrivingAttack
+from bench.driving import DrivingAttack
 from bench.plugins.contracts import Access
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bench.driving.threat import Oracle
+    from bench.driving import Oracle
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion
-from bench.driving.contracts import DrivingAttack
+from bench.driving import DrivingAttack
 from bench.plugins.contracts import Access
 
 if TYPE_CHECKING:
-    from bench.driving.threat import Oracle
+    from bench.driving import Oracle
 
 ZOObjective = Literal["collision", "expected", "margin", "target", "thesis"]
 

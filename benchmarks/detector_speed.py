@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import torch
 
-from bench.detection.contracts import Detector
+from bench.detection import Detector
 from bench.run.process import settle
 from bench.victims.detectors.yolo import frozen
 from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork

@@ -17,16 +17,15 @@ import numpy as np
 import torch
 
 from attacks.eot import EOT
+from bench.detection import STOP_SIGN, Detector, PatchOracle, PatchThreat, Scenes
 from bench.detection.approach import look
-from bench.detection.contracts import Detector, Scenes
-from bench.detection.threat import STOP_SIGN, PatchThreat, VisionOracle
 from bench.errors import UserError
 from bench.run.process import settle
-from bench.scenarios.grid import GRIDS
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
+from envs.camera.axes import APPROACH_V1
 from envs.camera.world import StopSignApproach
 
-GRID, THREAT, WORKERS = GRIDS["approach-v1"], PatchThreat(), 2
+GRID, THREAT, WORKERS = APPROACH_V1, PatchThreat(), 2
 CLOCKS = ("processor", "wall")
 
 
@@ -58,7 +57,7 @@ def craft(detector: Detector, scenes: Scenes, rounds: int, steps: int) -> None:
             detector(shown).scores_of(label).amax(-1).mean().backward()
 
     def step() -> None:
-        attack.craft(VisionOracle(detector, THREAT, attack.access, generator), scenes, lambda share, text: None)
+        attack.craft(PatchOracle(detector, THREAT, attack.access, generator), scenes, lambda share, text: None)
 
     def first_look() -> None:
         for frame in torch.arange(len(scenes)).split(1):
@@ -88,7 +87,7 @@ def score(detector: Detector, world: StopSignApproach, rounds: int) -> None:
             rounds=rounds,
         ) / len(every)
     height, width = scenes().size
-    frames = len(list(GRID.scenarios())) * len(every)
+    frames = len(GRID.cells()) * len(GRID.seeds()) * len(every)
     print(f"scoring a texture: yolov3_tiny, batch {len(every)}, pictures of {width} x {height}, one thread")
     for clock, name in enumerate(CLOCKS):
         rendered, seen = np.median((rendering[clock], looking[clock]), 1)

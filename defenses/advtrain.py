@@ -10,24 +10,26 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from bench.driving.contracts import (
+from bench.driving import (
     DrivingAttack,
     DrivingDefense,
+    DrivingFacts,
     DrivingVictim,
     DrivingWorld,
-    Features,
+    ObservationThreat,
+    Oracle,
     Policy,
     TrainingHooks,
 )
-from bench.driving.threat import Norm, ObservationThreat, Oracle
+from bench.driving.threat import Norm
 from bench.errors import UserError
 from bench.plugins.contracts import Progress, Trained
 from bench.plugins.options import configured, parameter_words
 from bench.victims import zoo
 from bench.victims.drivers.networks import ActorPolicy
 
-CHANGES_LANE = torch.tensor([1.0, 0.0, 1.0, 0.0, 0.0])
-"""1 for LANE_LEFT and LANE_RIGHT among the discrete actions."""
+CHANGES_LANE = ("LANE_LEFT", "LANE_RIGHT")
+"""The discrete actions that consistency asks for with reluctance."""
 TEMPERATURE = 0.5
 """Of the decisions that consistency compares, in standard deviations of the Q-values over the actions."""
 
@@ -94,7 +96,7 @@ class AdversarialTraining(DrivingDefense):
     def zoo_name(self, victim: DrivingVictim) -> str:
         return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"
 
-    def load(self, victim: DrivingVictim, seed: int) -> Policy:
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
         if victim.policy_type is None:
             raise UserError("adversarial training needs a victim that learns")
         return zoo.load(zoo.Recipe.of(victim, self), seed, victim.policy_type)
@@ -108,8 +110,10 @@ class AdversarialTraining(DrivingDefense):
         attack = configured("attack", self.attack, parameter_words(self.attack_params)).component
         if victim.action_type not in attack.action_types:
             raise UserError(f"attack {self.attack!r} does not fit a victim with {victim.action_type} actions")
-        start = victim.load(seed) if self.start == "trained" else None
-        loop = AttackInLoop(self, attack, world.features, start, seed)
+        if type(attack).perturb is DrivingAttack.perturb:
+            raise UserError(f"attack {self.attack!r} has a memory: adversarial training needs one without")
+        start = victim.load(seed, world.facts) if self.start == "trained" else None
+        loop = AttackInLoop(self, attack, world.facts, start, seed)
         trained = victim.train(world, seed=seed, hooks=loop, progress=progress)
         made_with = {"attack": asdict(attack), "threat": asdict(loop.threat), "attacked_decisions": loop.attacked}
         return Trained(trained.network, {**trained.card, **made_with})
@@ -121,7 +125,7 @@ class AttackInLoop(TrainingHooks):
     Args:
         recipe: the defence.
         attack: in the loop.
-        features: of the world's observations.
+        facts: of the world: features of the observation, names of the actions.
         start: the policy to continue from and to stay consistent with; None trains from fresh weights.
         seed: training seed.
     """
@@ -130,9 +134,10 @@ class AttackInLoop(TrainingHooks):
     checkpoints = 0.5
 
     def __init__(
-        self, recipe: AdversarialTraining, attack: DrivingAttack, features: Features, start: Policy | None, seed: int
+        self, recipe: AdversarialTraining, attack: DrivingAttack, facts: DrivingFacts, start: Policy | None, seed: int
     ) -> None:
-        self.recipe, self.attack, self.features = recipe, attack, features
+        self.recipe, self.attack, self.facts = recipe, attack, facts
+        self.changes_lane = torch.tensor([float(action in CHANGES_LANE) for action in facts.actions])
         self.start, self.decisions = start, recipe.decisions
         self.threat = ObservationThreat(norm=recipe.norm, budget=recipe.budget)
         self.skips, self.noise = (torch.Generator().manual_seed(seed) for _ in range(2))
@@ -163,8 +168,8 @@ class AttackInLoop(TrainingHooks):
 
     def perturbed(self, observation: Tensor, policy: Policy, scale: float = 1.0) -> Tensor:
         """attack(policy, o) [B, V, F], within `scale` times the budget."""
-        oracle = Oracle(policy, self.threat, self.attack.access, self.features, self.noise)
-        oracle.begin_step(observation, scale)
+        oracle = Oracle(policy, self.threat, self.attack.access, self.facts.features, self.noise)
+        oracle.begin_step(observation, scale=scale)
         return oracle.project(self.attack.perturb(observation, oracle)).detach()
 
     def selection(self, policy: Policy) -> dict[str, Callable[[Tensor], Tensor]]:
@@ -192,22 +197,23 @@ class AttackInLoop(TrainingHooks):
         with torch.no_grad():
             wanted = self.start.scores(truth)
         if policy.action_type == "discrete":
-            return self.recipe.consistency * divergence(policy.scores(shown), wanted, self.recipe.margin)
+            margin = self.recipe.margin * self.changes_lane
+            return self.recipe.consistency * divergence(policy.scores(shown), wanted, margin)
         limit = policy.actor.limit if isinstance(policy, ActorPolicy) else torch.ones(2)
         return self.recipe.consistency * squared_distance(policy.scores(shown), wanted, limit)
 
 
-def divergence(values: Tensor, wanted: Tensor, margin: float) -> Tensor:
-    """Mean KL divergence of the decisions softmax(Q / tau) from those wanted, in which changes of lane are worth less.
+def divergence(values: Tensor, wanted: Tensor, margin: Tensor) -> Tensor:
+    """Mean KL divergence of the decisions softmax(Q / tau) from those wanted, softmax((Q_0 - margin) / tau).
 
     Args:
         values: Q [N, A] of the policy that is trained.
         wanted: Q_0 [N, A]; tau is `TEMPERATURE` times its standard deviation over the actions.
-        margin: subtracted from the lane-change values of `wanted`.
+        margin: [A], subtracted from `wanted`.
     """
     tau = TEMPERATURE * wanted.std(-1, keepdim=True).clamp(min=torch.finfo(wanted.dtype).tiny)
     decided = torch.log_softmax(values / tau, -1)
-    reluctant = torch.softmax((wanted - margin * CHANGES_LANE) / tau, -1)
+    reluctant = torch.softmax((wanted - margin) / tau, -1)
     return torch.nn.functional.kl_div(decided, reluctant, reduction="batchmean")
 
 

@@ -9,18 +9,19 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import (
+from bench.detection import (
     STOP_SIGN,
     CameraWorld,
     Detector,
     DetectorDefense,
     DetectorVictim,
     PatchAttack,
+    PatchOracle,
+    PatchThreat,
     Scenes,
 )
-from bench.detection.threat import PatchThreat, VisionOracle
 from bench.errors import UserError
-from bench.plugins.contracts import Progress, Trained
+from bench.plugins.contracts import Facts, Progress, Trained
 from bench.plugins.options import configured, parameter_words
 from bench.victims import zoo
 from bench.victims.detectors.loss import missed, unlike
@@ -95,8 +96,8 @@ class DetectorAdversarialTraining(DetectorDefense):
     def zoo_name(self, victim: DetectorVictim) -> str:
         return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"
 
-    def load(self, victim: DetectorVictim, seed: int) -> Detector:
-        return zoo.load(zoo.Recipe.of(victim, self), self.trained, lambda **_: victim.load(seed))
+    def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
+        return zoo.load(zoo.Recipe.of(victim, self), self.trained, lambda **_: victim.load(seed, facts))
 
     def train(self, victim: DetectorVictim, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
         """Train the hardened detector of training seed `seed`."""
@@ -107,7 +108,9 @@ class DetectorAdversarialTraining(DetectorDefense):
             )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            hardening = _Hardening(self, attack, victim.load(seed), world.training_scenes(), seed, progress)
+            hardening = _Hardening(
+                self, attack, victim.load(seed, world.facts), world.training_scenes(), seed, progress
+            )
             detector, seconds = descend(
                 hardening.detector,
                 hardening.loss,
@@ -159,7 +162,7 @@ class _Hardening:
             self.progress(number / self.recipe.rounds, f"patch {number + 1}, {share:.0%}: {text}")
 
         threat = PatchThreat(budget=self.recipe.budget)
-        oracle = VisionOracle(self.detector.requires_grad_(False), threat, self.attack.access, self.generator)
+        oracle = PatchOracle(self.detector.requires_grad_(False), threat, self.attack.access, self.generator)
         patch = self.attack.craft(oracle, self.scenes, tell)
         self.detector.requires_grad_(True)
         if patch is None:

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import Detector, DetectorDefense, DetectorVictim
+from bench.detection import Detector, DetectorDefense, DetectorVictim
+from bench.plugins.contracts import Facts
 from defenses.smoothing import Guarded
 
 
@@ -45,5 +46,5 @@ class JPEG(DetectorDefense):
         if not 1 <= self.quality <= 100:
             raise ValueError(f"jpeg.quality must be between 1 and 100, got {self.quality}")
 
-    def load(self, victim: DetectorVictim, seed: int) -> Detector:
-        return _Compressed(victim.load(seed), self.quality).eval()
+    def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
+        return _Compressed(victim.load(seed, facts), self.quality).eval()

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
-from bench.detection.contracts import DetectorDefense
-from bench.driving.contracts import DrivingDefense
-from bench.plugins.contracts import Victim
+from bench.plugins.contracts import Defense, Facts, Victim
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoDefense(DrivingDefense, DetectorDefense):
-    """Leaves the victim as it is."""
+class NoDefense(Defense):
+    """Leaves the victim as it is, on every track."""
 
-    def load(self, victim: Victim, seed: int) -> Any:
-        return victim.load(seed)
+    track: ClassVar[str] = "any"
+
+    def load(self, victim: Victim, seed: int, facts: Facts) -> Any:
+        return victim.load(seed, facts)

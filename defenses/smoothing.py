@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import Detector, DetectorDefense, DetectorVictim, Predictions
+from bench.detection import Detector, DetectorDefense, DetectorVictim, Predictions
+from bench.plugins.contracts import Facts
 
 
 class Guarded(Detector):
@@ -58,5 +59,5 @@ class MedianSmoothing(DetectorDefense):
         if self.size % 2 == 0 or not 3 <= self.size <= 11:
             raise ValueError(f"median.size must be odd and between 3 and 11, got {self.size}")
 
-    def load(self, victim: DetectorVictim, seed: int) -> Detector:
-        return _Median(victim.load(seed), self.size).eval()
+    def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
+        return _Median(victim.load(seed, facts), self.size).eval()

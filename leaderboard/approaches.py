@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from bench.plugins.contracts import REFERENCE_PATCHES
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from bench.statistics.episodes import Episodes, difference, rate, unit_interval
 from bench.statistics.estimates import Interval, interval
 from leaderboard.pairs import ATTACKER, DEFENDED, groups, newest

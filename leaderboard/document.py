@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bench.plugins.contracts import Track
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from bench.statistics.episodes import Episodes, rate, unit_interval
 from bench.statistics.estimates import Array, Interval, interval, task_intervals
 from leaderboard.cards import card

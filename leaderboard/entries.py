@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from bench.plugins.contracts import REFERENCE_PATCHES, Track
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from bench.statistics.episodes import Episodes, unit_interval
 from bench.statistics.estimates import Array, Interval, interval
 from leaderboard.approaches import NO_PATCH, read_patched

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from bench.plugins.contracts import Track
-from bench.scenarios.grid import GRIDS, Grid
+from bench.scenarios import Grid
 from bench.statistics.estimates import Interval
 from leaderboard.entries import Entry, gap, mean
 from leaderboard.trend import ENOUGH_SEEDS

@@ -13,7 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 
 Subject = TypeVar("Subject")
 STRIP = 25

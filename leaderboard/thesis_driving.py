@@ -11,7 +11,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from leaderboard.pairs import IDM
 from leaderboard.text import ATTACKED, CLEAN, estimate, share
 from leaderboard.thesis_numbers import PUBLISHED, THESIS, Beside, as_printed

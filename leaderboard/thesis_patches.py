@@ -10,7 +10,6 @@ import pyarrow as pa
 from rich.console import Console
 from rich.text import Text
 
-from bench.scenarios.grid import GRIDS
 from leaderboard.approaches import NO_PATCH
 from leaderboard.layout import Column, Section, fitted
 from leaderboard.text import ATTACKED, BLIND, CLEAN, MISSING, bounds, change, estimate, share, signed

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from bench.statistics.episodes import Episodes, unit_interval
 from bench.statistics.estimates import Interval, interval
 from leaderboard.entries import MEASUREMENTS

@@ -8,9 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.scenarios.grid import WEATHERS, Cell
+from bench.scenarios import Cell
 from bench.statistics.episodes import unit_interval
 from bench.statistics.estimates import Array, Interval, interval
+from envs.weather import WEATHERS
 from leaderboard.entries import Aligned, Entry, align
 
 

@@ -12,10 +12,9 @@ import torch
 from rerun.chunk import Chunk, RrdReader
 from torch import Tensor
 
-from bench.detection import stopping
+from bench.detection import Approach, stopping
 from bench.detection.approach import Sighting, look
-from bench.detection.contracts import Approach
-from bench.detection.threat import Evolution, Patch
+from bench.detection.patch import Evolution, Patch
 from bench.recording import save_approach
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.test_recording import META, read, values

@@ -98,7 +98,8 @@ def fits(kind: Kind, component: type[Any]) -> str:
         return f"{track} Answers {component.answers} at most: attacks that need gradients are refused."
     if kind != "attack":
         return track
-    actions = f" and {' or '.join(component.action_types)} actions" if "driving" in component.tracks() else ""
+    types = getattr(component, "action_types", ())
+    actions = f" and {' or '.join(types)} actions" if types else ""
     return f"{track} Needs access {component.access}{actions}."
 
 

@@ -23,11 +23,11 @@ from rich.progress import (
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from bench.run.runner import Work
+    from bench.run.unit import Preparation, Unit
 
 
 class RunProgress:
-    """The progress of a run (`bench.run.runner.Watcher`): a bar on a terminal, a line a finished unit elsewhere.
+    """The progress of a run (`bench.run.runner.RunWatcher`): a bar on a terminal, a line a finished unit elsewhere.
 
     Args:
         console: where it is drawn; standard error, so that tables can be piped.
@@ -56,17 +56,17 @@ class RunProgress:
         if finished:
             self.console.print(f"{finished} of {episodes} episodes were there already", style="dim", highlight=False)
 
-    def working(self, works: Sequence[Work]) -> None:
+    def working(self, works: Sequence[Unit | Preparation]) -> None:
         self.working_on = {str(work): self.working_on.get(str(work), "") for work in works}
         self._describe()
 
-    def crafting(self, work: str, share: float, text: str) -> None:
+    def preparing(self, work: str, share: float, text: str) -> None:
         self.working_on[work] = f" {share:.0%} {text}"
         self._describe()
 
-    def finished(self, work: Work, wall_s: float) -> None:
-        # A patch is no episode: it is counted with those that show it.
-        self.done += len(getattr(work, "seeds", ()))
+    def finished(self, work: Unit | Preparation, wall_s: float) -> None:
+        # What was prepared is no episode: it is counted with those that use it.
+        self.done += len(work.seeds) if hasattr(work, "grid") else 0
         if self.task is not None:
             self.bar.update(self.task, completed=self.done)
         if not self.console.is_terminal:

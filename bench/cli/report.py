@@ -9,7 +9,7 @@ from rich.console import Console
 
 from bench.errors import UserError
 from bench.plugins import registry
-from bench.records import store as results
+from bench.records import reading
 
 PAGES = "cavbench.pages"
 KEYS = ("out", "html")
@@ -45,7 +45,7 @@ def print_report(words: Sequence[str], console: Console) -> None:
         return
     name = names[0] if names else "run"
     function = registry.resolve(registry.REPORTS, name, "report")
-    function({} if name != "run" and unasked else results.read_all(out), console)
+    function({} if name != "run" and unasked else reading.read_all(out), console)
 
 
 _TAKES = (

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import json
-import operator
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -17,10 +15,13 @@ from rich.text import Text
 
 from bench.errors import UserError
 from bench.plugins import registry
-from bench.plugins.contracts import REFERENCE_PATCHES
-from bench.records import store as results
+from bench.plugins.track import Track, track
+from bench.records import reading
+from bench.records.schema import IDENTITY
+from bench.scenarios import Value
+from bench.scenarios.axes import written
 
-Report = Callable[[str, pa.Table], None]
+Report = Callable[[Track, pa.Table], None]
 
 
 def print_run(run: str, out: Path, console: Console, report: Report) -> None:
@@ -30,18 +31,18 @@ def print_run(run: str, out: Path, console: Console, report: Report) -> None:
         run: a results folder, or the beginning of the name of a pair in `out`.
         out: results folder.
         console: where to print.
-        report: prints a table by its name, from records.
+        report: prints the table of a track, from records.
 
     Raises:
         UserError: if there is no such run.
     """
     folder, pair = located(run, out)
     name = None
-    for records in records_of(folder, pair):
+    for own, records in records_of(folder, pair):
         name = pair_named(pair, records) if pair else None
         shown = records.filter(pc.field("pair") == name if name else pc.field("sees"))
         _print_facts(shown if shown.num_rows else records, console)
-        report("run", _with_controls(shown, records) if name else records)
+        report(own, _with_controls(shown, records, own) if name else records)
     for path in recordings(folder, name):
         console.print(Text(f"recording: bench view {path}"), soft_wrap=True)
 
@@ -59,10 +60,10 @@ def located(run: str, out: Path) -> tuple[Path, str]:
     return out, run
 
 
-def records_of(folder: Path, pair: str = "") -> list[pa.Table]:
+def records_of(folder: Path, pair: str = "") -> list[tuple[Track, pa.Table]]:
     """The records of each track in a folder; where a pair's name begins with `pair`, those of its track alone."""
-    found = list(results.read_all(folder).values())
-    with_it = [records for records in found if pc.any(pc.starts_with(records["pair"], pair)).as_py()]
+    found = [(track(name), records) for name, records in reading.read_all(folder).items()]
+    with_it = [one for one in found if pc.any(pc.starts_with(one[1]["pair"], pair)).as_py()]
     return with_it[:1] if pair and with_it else found
 
 
@@ -77,16 +78,19 @@ def pair_named(beginning: str, records: pa.Table) -> str:
     raise UserError(registry.unknown(f"pair {beginning!r}", beginning, known))
 
 
-def _with_controls(pairs: pa.Table, records: pa.Table) -> pa.Table:
-    """A pair's records with its clean control and what it is held against: reference drivers, or reference patches."""
-
-    def same(*names: str) -> pc.Expression:
-        return functools.reduce(operator.and_, [pc.field(name) == pairs[name][0].as_py() for name in names])
-
-    driver = same("victim", "victim_params", "defense", "defense_params")
-    patches = pc.field("attack").isin(REFERENCE_PATCHES) & same("threat_norm", "threat_budget")
-    control = (((pc.field("attack") == "none") | patches) & driver) | ~pc.field("sees")
-    return records.filter(same("pair") | (same("world", "world_params") & control))
+def _with_controls(pairs: pa.Table, records: pa.Table, own: Track) -> pa.Table:
+    """A pair's records with its clean control and its baselines."""
+    identity = [
+        field.name for field in IDENTITY if field.name not in ("unit", "pair", "cell", "seed", "training_seed", "grid")
+    ]
+    mine = pairs.slice(0, 1).to_pylist()[0]
+    same = [name for name in identity if name.startswith(("defense", "victim", "world"))]
+    kept = {str(mine["pair"])}
+    for other in records.group_by([*identity, "pair"]).aggregate([]).to_pylist():
+        control = other["attack"] == "none" and all(other[name] == mine[name] for name in same)
+        if control or own.baseline_of(other, mine):
+            kept.add(str(other["pair"]))
+    return records.filter(pc.field("pair").isin(sorted(kept)))
 
 
 def _print_facts(records: pa.Table, console: Console) -> None:
@@ -100,7 +104,7 @@ def _print_facts(records: pa.Table, console: Console) -> None:
         facts.add_row(kind, _each(records, (kind, f"{kind}_params", f"{kind}_shipped_by"), _component))
     threat = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
     facts.add_row("threat", _each(records, threat, "{} {:g}, access {}, {} queries".format))
-    facts.add_row("cells", "; ".join(f"{axis} {_listed(records[axis])}" for axis in ("lanes", "density", "weather")))
+    facts.add_row("cells", _axes(records["cell"]))
     seeds = pc.min_max(records["seed"]).as_py()
     facts.add_row("scenario seeds", f"{seeds['min']} to {seeds['max']} ({_listed(records['grid'])})")
     facts.add_row("training seeds", _listed(records["training_seed"]))
@@ -116,6 +120,15 @@ def _print_facts(records: pa.Table, console: Console) -> None:
     )
     console.print(facts, highlight=False)
     console.print()
+
+
+def _axes(column: pa.ChunkedArray) -> str:
+    """The values that there are on each axis."""
+    found: dict[str, dict[Value, None]] = {}
+    for cell in pc.unique(column).to_pylist():
+        for name, value in json.loads(cell).items():
+            found.setdefault(name, {})[value] = None
+    return "; ".join(f"{name} {', '.join(map(written, values))}" for name, values in found.items())
 
 
 def _each(records: pa.Table, names: tuple[str, ...], describe: Callable[..., str]) -> Text:

@@ -14,8 +14,8 @@ from rich.text import Text
 from bench.cli.progress import TrainingProgress
 from bench.errors import UserError
 from bench.plugins.contracts import Trained, World
-from bench.plugins.options import WORLDS
 from bench.plugins.pair import Chosen
+from bench.plugins.track import track
 from bench.run.config import TrainConfig, train_config
 from bench.run.process import settle
 from bench.victims import zoo
@@ -67,7 +67,7 @@ def _placed(trained: Chosen[Any], world: World) -> Any:
     Raises:
         UserError: if it says another one, or has no parameter to say it.
     """
-    where = zoo.trained_in(world, default=WORLDS[world.tracks()[0]])
+    where = zoo.trained_in(world, default=track(world.tracks()[0]).world)
     said = getattr(trained.component, "trained_in", "")
     if said not in ("", where):
         raise UserError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from rich.text import Text
 
 from bench.cli.show import located, pair_named, recordings, records_of
 from bench.errors import UserError
+from bench.scenarios.axes import written
 
 
 def open_recording(run: str, where: Sequence[str], out: Path, console: Console) -> None:
@@ -47,7 +49,7 @@ def open_recording(run: str, where: Sequence[str], out: Path, console: Console) 
 
 def _listed(folder: Path, beginning: str, console: Console) -> Path | None:
     """The only recording there is; if there are more, they are listed."""
-    records = records_of(folder, beginning)[0]
+    (_, records), *_ = records_of(folder, beginning)
     pair = pair_named(beginning, records) if beginning else None
     found = recordings(folder, pair)
     if len(found) == 1:
@@ -64,14 +66,14 @@ def _listed(folder: Path, beginning: str, console: Console) -> Path | None:
 
 def _example(folder: Path, pair: str | None, records: pa.Table) -> str:
     first = records.filter(pc.field("pair") == (pair or records["pair"][0])).slice(0, 1).to_pylist()[0]
-    where = f"lanes={first['lanes']} density={first['density']:g} weather={first['weather']} seed={first['seed']}"
-    return f"bench view {first['pair']} {where} --out {folder}"
+    where = " ".join(f"{axis}={written(value)}" for axis, value in json.loads(first["cell"]).items())
+    return f"bench view {first['pair']} {where} seed={first['seed']} --out {folder}"
 
 
 def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Console) -> Path:
     from bench.run.replay import find, replay
 
-    records = records_of(folder, beginning)[0]
+    (_, records), *_ = records_of(folder, beginning)
     words = dict(word.partition("=")[::2] for word in where)
     if beginning:
         words = {"pair": pair_named(beginning, records)} | words

@@ -12,8 +12,7 @@ from torch import Tensor
 from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
 from bench.conformance.randomness import stir_others
 from bench.conformance.traffic import observations, victim
-from bench.driving.contracts import ActionType, DrivingAttack, Features, Policy
-from bench.driving.threat import ObservationThreat, Oracle
+from bench.driving import ActionType, DrivingAttack, Features, ObservationThreat, Oracle, Policy
 from bench.errors import UserError
 from bench.plugins.contracts import QueryBudgetError
 from bench.plugins.fingerprint import state_digest

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from bench.conformance.check import Check, Suite, require
-from bench.detection.contracts import STOP_SIGN, CameraWorld, Scenes
-from bench.scenarios.grid import Cell
+from bench.detection import STOP_SIGN, CameraWorld, Scenes
+from bench.scenarios import Cell
 
 CELL = Cell(lanes=3, density=1.0)
 FRAMES = 3

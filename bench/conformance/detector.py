@@ -12,7 +12,7 @@ from torch import Tensor
 from bench.conformance.check import Check, Suite, require
 from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.conformance.street import Street
-from bench.detection.contracts import STOP_SIGN, Detector, DetectorVictim
+from bench.detection import STOP_SIGN, Detector, DetectorVictim
 
 PICTURES = 3
 

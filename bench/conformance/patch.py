@@ -10,8 +10,7 @@ from torch import Tensor
 from bench.conformance.check import BrokenRuleError, Check, NotApplicableError, Suite, one_line, require
 from bench.conformance.randomness import stir_others
 from bench.conformance.street import SignDetector, Street
-from bench.detection.contracts import PatchAttack
-from bench.detection.threat import PatchThreat, VisionOracle
+from bench.detection import PatchAttack, PatchOracle, PatchThreat
 from bench.errors import UserError
 from bench.plugins.contracts import QueryBudgetError
 from bench.plugins.fingerprint import state_digest
@@ -119,11 +118,11 @@ class PatchSuite(Suite):
         told: list[float] | None = None,
         detector: SignDetector | None = None,
         scenes: Street | None = None,
-    ) -> tuple[Tensor | None, VisionOracle]:
+    ) -> tuple[Tensor | None, PatchOracle]:
         threat = threat or PatchThreat(queries=QUERIES)
         told = [] if told is None else told
         generator = torch.Generator().manual_seed(seed)
-        oracle = VisionOracle(detector or SignDetector(), threat, self.component.access, generator)
+        oracle = PatchOracle(detector or SignDetector(), threat, self.component.access, generator)
         with torch.random.fork_rng(devices=[]):
             # A run seeds torch before it crafts, and no other library.
             torch.manual_seed(seed)

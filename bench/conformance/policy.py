@@ -12,8 +12,8 @@ from torch import Tensor
 from bench.conformance.check import Check, NotApplicableError, Suite, require
 from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.conformance.traffic import observations
-from bench.driving.contracts import DrivingVictim, DrivingWorld, Policy
-from bench.scenarios.grid import Cell
+from bench.driving import DrivingVictim, DrivingWorld, Policy
+from bench.scenarios import Cell
 
 EPISODES = 6
 

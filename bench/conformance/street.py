@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from bench.detection.contracts import STOP_SIGN, Detector, Predictions, Scenes
+from bench.detection import STOP_SIGN, Detector, Predictions, Scenes
 
 SIDE, FRAMES, CELL = 96, 12, 16
 PIXELS_M = 320.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.driving.contracts import ActionType, Features, Policy
+from bench.driving import ActionType, Features, Policy
 
 ACTIONS, HIDDEN = 5, 16
 

@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from bench.conformance.check import Check, Suite, require
-from bench.driving.contracts import ActionType, DrivingWorld
-from bench.scenarios.grid import Cell
+from bench.driving import ActionType, DrivingWorld
+from bench.scenarios import Cell
 
 MEASURES = ("progress", "speed", "x", "ttc", "crashed", "offroad")
 CELL = Cell(lanes=3, density=1.0)

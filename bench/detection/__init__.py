@@ -1,1 +1,23 @@
-""""""
+"""The detection track: detectors that look for a stop sign, attacked by a patch on it. What plug-ins need is here."""
+
+from bench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
+from bench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions
+from bench.detection.oracle import PatchOracle
+from bench.detection.scenes import Approach, Scenes
+from bench.detection.threat import PatchThreat
+
+__all__ = [
+    "STOP_SIGN",
+    "Approach",
+    "CameraWorld",
+    "Detections",
+    "Detector",
+    "DetectorDefense",
+    "DetectorVictim",
+    "Objects",
+    "PatchAttack",
+    "PatchOracle",
+    "PatchThreat",
+    "Predictions",
+    "Scenes",
+]

@@ -1,4 +1,4 @@
-"""The work of a unit of the detection track: a defended detector on every approach of a cell, with the patch on the sign."""
+"""A defended detector on approaches to a stop sign, with a patch on the sign: what it sees, and what comes of it."""
 
 from __future__ import annotations
 
@@ -11,19 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.detection import stopping
-from bench.detection.contracts import (
-    STOP_SIGN,
-    Approach,
-    Detections,
-    Detector,
-    Predictions,
-    Scenes,
-    confidence,
-    detections,
-    overlap,
-)
-from bench.detection.threat import Patch
-from bench.run.unit import Unit
+from bench.detection.boxes import confidence, detections, overlap
+from bench.detection.detector import STOP_SIGN, Detections, Detector, Predictions
+from bench.detection.patch import Patch
+from bench.detection.scenes import Approach, Scenes
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -32,7 +23,7 @@ BATCH = 16
 SAME_CONFIDENCE = 0.01
 """Confidences no farther apart than this are the same answer."""
 NMS_IOU, SAME_IOU = 0.45, 0.3
-"""Of non-maximum suppression (YOLOv5's default), and from which a detection is of the sign itself (`vision.confidence`)."""
+"""Of non-maximum suppression (YOLOv5's default), and from which a detection is of the sign itself (`boxes.confidence`)."""
 
 
 @dataclass(frozen=True)
@@ -80,24 +71,25 @@ class Trace:
     sightings: list[Sighting] = field(default_factory=list)
 
 
-def score(unit: Unit, patch: Patch | None, trace: Trace | None = None) -> Columns:
-    """Do the work of a unit and return the measurements of its approaches, [A] each.
+def score(
+    detector: Detector,
+    approaches: Sequence[Approach],
+    patch: Patch | None,
+    *,
+    share: float,
+    trace: Trace | None = None,
+) -> Columns:
+    """Show a detector every frame of A approaches and return the measurements, [A] each.
 
     Args:
-        unit: what to drive up to.
-        patch: what `unit.crafting` made; None where there is none.
+        detector: the (defended) victim.
+        approaches: what is driven up to.
+        patch: what is on the sign; None for nothing.
+        share: side of the patch in shares of the sign's.
         trace: filled with what was seen on its episodes.
-
-    Raises:
-        ValueError: if the world does not give an approach a seed, all of one number of frames, farthest first.
     """
-    _, defense, victim, world = (part.component for part in unit.parts)
-    with torch.random.fork_rng(devices=[]), torch.no_grad():
-        torch.manual_seed(unit.attack_seed)
-        detector = defense.load(victim, unit.training_seed)
-        approaches = world.approaches(unit.cell, unit.seeds)
-        _check(approaches, unit.seeds, type(world).__name__)
-        texels, share = patch.texels if patch else None, unit.pair.threat.budget
+    texels = patch.texels if patch else None
+    with torch.no_grad():
         seen = [look(detector, approach.scenes, texels, share) for approach in approaches]
         if trace:
             for place in trace.episodes:
@@ -105,7 +97,6 @@ def score(unit: Unit, patch: Patch | None, trace: Trace | None = None) -> Column
                 trace.sightings.append(Sighting(approaches[place], patch, share, seen[place], clean))
     crafted = patch or Patch(texels=None)
     constant = {
-        "patch": unit.crafting.fingerprint if unit.crafting else "",
         "patch_sha256": crafted.sha256,
         "queries": crafted.queries,
         "gradients": crafted.gradients,
@@ -117,7 +108,7 @@ def score(unit: Unit, patch: Patch | None, trace: Trace | None = None) -> Column
         **probed(detector, approaches[0].scenes),
     }
     return {
-        "seed": np.array(unit.seeds, np.int64),
+        "seed": np.array([approach.seed for approach in approaches], np.int64),
         "location": np.array([approach.location for approach in approaches]),
         **{name: np.array([value] * len(approaches)) for name, value in constant.items()},
         **measured(seen, [approach.scenes for approach in approaches]),
@@ -205,7 +196,8 @@ def measure(confidence: stopping.Array, distance_m: stopping.Array, visible: sto
     }
 
 
-def _check(approaches: Sequence[Approach], seeds: range, world: str) -> None:
+def check_approaches(approaches: Sequence[Approach], seeds: range, world: str) -> None:
+    """Raise ValueError unless a world gives an approach a seed, all of one number of frames, farthest first."""
     if [approach.seed for approach in approaches] != list(seeds):
         raise ValueError(f"{world}.approaches gave seeds {[a.seed for a in approaches]}, asked for {list(seeds)}")
     if len({len(approach.scenes) for approach in approaches}) != 1:

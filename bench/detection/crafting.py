@@ -1,4 +1,4 @@
-"""Crafts a patch: the work of `bench.run.unit.Crafting`."""
+"""Crafts a patch: an attack on a defended detector, on the training scenes of a world."""
 
 from __future__ import annotations
 
@@ -6,30 +6,45 @@ import time
 
 import torch
 
-from bench.detection.threat import Patch, PatchThreat, VisionOracle
+from bench.detection.contracts import CameraWorld, PatchAttack
+from bench.detection.detector import Detector
+from bench.detection.oracle import PatchOracle
+from bench.detection.patch import Patch
+from bench.detection.scenes import Scenes
+from bench.detection.threat import PatchThreat
 from bench.errors import UserError
 from bench.plugins.contracts import Progress
 from bench.plugins.fingerprint import state_digest
-from bench.run.unit import Crafting
+from bench.plugins.track import Job
 
 
-def craft(crafting: Crafting, progress: Progress) -> Patch:
-    """The patch of an attack on a defended detector; only the training scenes of the world are looked at.
+def craft(
+    attack: PatchAttack,
+    detector: Detector,
+    scenes: Scenes,
+    threat: PatchThreat,
+    *,
+    attack_seed: int,
+    progress: Progress,
+) -> Patch:
+    """The patch of an attack on a defended detector.
+
+    Args:
+        attack: the attack.
+        detector: its victim.
+        scenes: to craft on.
+        threat: enforced on the attack.
+        attack_seed: of the attack's random generator.
+        progress: told how far it is.
 
     Raises:
         UserError: if the attack asks for too much, returns what is no patch, or changes the detector's weights.
     """
-    attack, defense, victim, world = (part.component for part in crafting.parts)
-    threat = crafting.pair.threat
-    assert isinstance(threat, PatchThreat)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(crafting.attack_seed)
-        detector = defense.load(victim, crafting.training_seed)
-        generator = torch.Generator().manual_seed(crafting.attack_seed)
-        oracle = VisionOracle(detector, threat, attack.access, generator)
-        scenes, before, start = world.training_scenes(), state_digest(detector), time.perf_counter()
-        answer = attack.craft(oracle, scenes, progress)
-        seconds = time.perf_counter() - start
+    generator = torch.Generator().manual_seed(attack_seed)
+    oracle = PatchOracle(detector, threat, attack.access, generator)
+    before, start = state_digest(detector), time.perf_counter()
+    answer = attack.craft(oracle, scenes, progress)
+    seconds = time.perf_counter() - start
     if state_digest(detector) != before:
         raise UserError("the attack changed the detector's weights")
     texels, excess = threat.project(answer) if answer is not None else (None, 0.0)
@@ -42,3 +57,18 @@ def craft(crafting: Crafting, progress: Progress) -> Patch:
         excess=excess,
         evolution=oracle.evolution,
     )
+
+
+def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
+    """The file of the patch of a job's pair and training seed (`bench.detection.patch`)."""
+    pair = job.pair
+    attack, world, threat = pair.attack.component, pair.world.component, pair.threat
+    assert isinstance(attack, PatchAttack)
+    assert isinstance(world, CameraWorld)
+    assert isinstance(threat, PatchThreat)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(job.attack_seed)
+        detector = pair.load(job.training_seed)
+        scenes = world.training_scenes()
+        patch = craft(attack, detector, scenes, threat, attack_seed=job.attack_seed, progress=progress)
+    return patch.written(made_by)

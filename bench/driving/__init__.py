@@ -1,1 +1,23 @@
-""""""
+"""The driving track: drivers on a road, attacked through what they measure. What plug-ins need is here."""
+
+from bench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, DrivingWorld, TrainingHooks
+from bench.driving.features import ActionType, Driver, DrivingFacts, Features
+from bench.driving.oracle import Oracle
+from bench.driving.policy import Policy, State
+from bench.driving.threat import ObservationThreat
+
+__all__ = [
+    "ActionType",
+    "Driver",
+    "DrivingAttack",
+    "DrivingDefense",
+    "DrivingFacts",
+    "DrivingVictim",
+    "DrivingWorld",
+    "Features",
+    "ObservationThreat",
+    "Oracle",
+    "Policy",
+    "State",
+    "TrainingHooks",
+]

@@ -2,43 +2,22 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from bench.plugins.contracts import Attack, Defense, Progress, Track, Trained, Victim, World
+from bench.driving.features import ActionType, Driver, DrivingFacts, Features
+from bench.driving.oracle import Oracle
+from bench.driving.policy import Policy, State
+from bench.driving.threat import ObservationThreat
+from bench.plugins.contracts import Attack, Defense, Progress, ThreatModel, Trained, Victim, World
+from bench.scenarios import Cell
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
-
-    from bench.driving.threat import Oracle
-    from bench.scenarios.grid import Cell
-
-ActionType = Literal["discrete", "continuous"]
-Driver = Literal["agent", "idm"]
-
-
-@dataclass(frozen=True)
-class Features:
-    """The measured features of an observation row, in order, with the range that maps to [-1, 1].
-
-    An observation is a float tensor [B, V, F]: V vehicles (row 0 is the ego, absolute; the rest relative to it, nearest
-    first, all zero where absent), F = 1 + len(names): `presence` in {0, 1}, then each measured feature over its range.
-    """
-
-    names: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    units: tuple[str, ...]
-
-    def half_range(self) -> Tensor:
-        """[F - 1] physical units that one unit of the normalised observation stands for."""
-        return (torch.tensor(self.high) - torch.tensor(self.low)) / 2
 
 
 class DrivingWorld(World):
@@ -52,9 +31,30 @@ class DrivingWorld(World):
     `crashed` and `offroad` bool [B, 1].
     """
 
-    track: ClassVar[Track] = "driving"
+    track: ClassVar[str] = "driving"
     features: ClassVar[Features]
+    actions: ClassVar[tuple[str, ...]]
+    """Names of the discrete actions, by number."""
     max_steps: int
+    """Decisions of an episode that runs to its end."""
+    drivers: ClassVar[tuple[Driver, ...]] = ("agent",)
+    """Who may be at the wheel, see `make`."""
+
+    @property
+    @abstractmethod
+    def decision_hz(self) -> float:
+        """Decisions a second."""
+
+    @property
+    def facts(self) -> DrivingFacts:
+        return DrivingFacts(
+            axes=self.axes,
+            decision_hz=self.decision_hz,
+            max_steps=self.max_steps,
+            actions=self.actions,
+            features=self.features,
+            drivers=self.drivers,
+        )
 
     @abstractmethod
     def make(
@@ -70,57 +70,18 @@ class DrivingWorld(World):
         Args:
             cells: the cell of each episode of the batch.
             action_type: discrete lane-changing actions, or continuous [acceleration, steering] in [-1, 1].
-            driver: `idm` lets highway-env's own IDM/MOBIL driver steer the ego and ignores the actions.
+            driver: `agent` obeys the actions; `idm` lets the world's own rule-based driver steer and ignores them.
             action_repeat: frames a decision is held (training only): lane changes are sent once, the rest is repeated;
                 reward and progress are summed over the frames, an episode stops where it ends.
         """
 
 
-class Policy(nn.Module, ABC):
-    """A victim at the wheel: a differentiable map from observations to scores, and from scores to an action."""
-
-    action_type: ActionType
-    driver: Driver = "agent"
-    weights_sha256: str = ""
-    """Hash of the weights file it was loaded from; empty where there is none."""
-
-    @abstractmethod
-    def scores(self, observation: Tensor) -> Tensor:
-        """What a score-based attacker reads: Q-values [..., A] (discrete) or the action itself [..., 2] (continuous).
-
-        Args:
-            observation: float [..., V, F].
-        """
-
-    def decide(self, observation: Tensor) -> Tensor:
-        """The action taken: int64 [...] (discrete, the greedy one) or float [..., 2] in [-1, 1] (continuous)."""
-        return self.choose(self.scores(observation))
-
-    def choose(self, scores: Tensor) -> Tensor:
-        """The action that goes with scores; without a side effect, so that measurements may ask what would have been done."""
-        return scores.argmax(-1) if self.action_type == "discrete" else scores
-
-    def value(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Q(observation, action) [...], differentiable in both; for white-box attacks on continuous actions.
-
-        Raises:
-            NotImplementedError: if the victim has no critic.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has no critic")
-
-    def reset(self, seeds: Tensor) -> None:
-        """Called before an episode batch with its scenario seeds [B]; for policies with a state or their own randomness."""
-
-    def forward(self, observation: Tensor) -> Tensor:
-        return self.decide(observation)
-
-
 class DrivingVictim(Victim):
     """A kind of driver; fields are its hyper-parameters."""
 
-    track: ClassVar[Track] = "driving"
-    sees: ClassVar[bool] = True
-    """False for drivers that ignore the observation: attacks and weather cannot touch them."""
+    track: ClassVar[str] = "driving"
+    network: ClassVar[type[Policy]] = Policy
+    threat: ClassVar[type[ThreatModel]] = ObservationThreat
     policy_type: ClassVar[type[Policy] | None] = None
     """The class of its trained policies, which the zoo builds from a card."""
 
@@ -130,8 +91,12 @@ class DrivingVictim(Victim):
         """Whether it takes discrete lane-changing decisions or steers itself."""
 
     @abstractmethod
-    def load(self, seed: int) -> Policy:
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
         """The policy of training seed `seed`, in eval mode, without gradients on its weights.
+
+        Args:
+            seed: training seed.
+            facts: of the world it is going to drive in.
 
         Raises:
             bench.errors.UserError: if the zoo has no such policy, saying which command trains it.
@@ -188,27 +153,60 @@ class TrainingHooks:
 
 
 class DrivingAttack(Attack):
-    """Changes what a driver measures. Batched over episodes; stateless between steps."""
+    """Changes what a driver measures. Batched over episodes.
 
-    track: ClassVar[Track] = "driving"
+    One without a memory writes `perturb` and nothing else. One that remembers something of every episode writes `initial` and
+    `step`; the run keeps its state, so that the attack object itself stays as it is.
+    """
+
+    track: ClassVar[str] = "driving"
     action_types: ClassVar[tuple[ActionType, ...]] = ("discrete", "continuous")
 
-    @abstractmethod
+    def misfit(self, victim: DrivingVictim) -> str:
+        if victim.action_type in self.action_types:
+            return ""
+        return f"whose actions are {victim.action_type}: it needs {' or '.join(self.action_types)} ones"
+
+    def initial(self, observation: Tensor, oracle: Oracle) -> State:
+        """What is remembered before the first step: a TensorDict of batch size [B], or None.
+
+        Args:
+            observation: the first true observation, [B, V, F].
+            oracle: as of `perturb`; here it may be asked nothing.
+        """
+        return None
+
+    def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor, State]:
+        """What the victim is shown, as `perturb` returns it, and what is remembered from then on.
+
+        Args:
+            observation, oracle: as of `perturb`.
+            state: of the same episodes, of batch size [B].
+        """
+        return self.perturb(observation, oracle), state
+
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
-        """The observation the victim is shown instead, [B, V, F].
+        """The observation the victim is shown instead, [B, V, F]; of an attack without a memory.
 
         Args:
             observation: the true observation, float32 [B, V, F], of the episodes that are still running.
             oracle: the only door to the victim; it holds the perturbation set (`radius`, `project`), the query budget
                 (`remaining`), and the run's random generator (`generator`).
         """
+        raise NotImplementedError(f"{type(self).__name__} has neither perturb nor step")
 
 
 class DrivingDefense(Defense):
     """Protects a driver."""
 
-    track: ClassVar[Track] = "driving"
+    track: ClassVar[str] = "driving"
 
     @abstractmethod
-    def load(self, victim: DrivingVictim, seed: int) -> Policy:
-        """The defended policy, ready to drive: from the zoo, wrapped, or both."""
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
+        """The defended policy, ready to drive: from the zoo, wrapped, or both.
+
+        Args:
+            victim: what is protected.
+            seed: training seed.
+            facts: of the world: features with units, ranges and resolutions, decision period, meaning of actions.
+        """

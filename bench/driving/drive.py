@@ -1,40 +1,43 @@
-"""The work of a unit of the driving track: one pair at the wheel, on every scenario of a cell."""
+"""The work of the driving track: one pair at the wheel, on every scenario of a cell."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
-from bench.driving.rollout import Columns, Trace, rollout
+from bench.driving.contracts import DrivingAttack, DrivingWorld
+from bench.driving.rollout import Trace, rollout
 from bench.driving.threat import ObservationThreat
-from bench.run.unit import Unit
+from bench.plugins.track import Driven, Job
 
 
-def drive(unit: Unit, trace: Trace | None = None) -> Columns:
-    """Do the work of a unit and return the measurements of its episodes, [B] each (`bench.driving.rollout.rollout`).
+def drive(job: Job, traced: Sequence[int]) -> Driven:
+    """The measurements of a job's episodes, [B] each (`bench.driving.rollout.rollout`).
 
     Args:
-        unit: what to drive.
-        trace: filled with every step of its episodes.
+        job: what to drive.
+        traced: scenario seeds of the episodes that a recording is wanted of.
     """
-    attack, defense, victim, world = (part.component for part in unit.parts)
-    threat = unit.pair.threat
-    assert isinstance(threat, ObservationThreat)
+    pair, world, attack = job.pair, job.pair.world.component, job.pair.attack.component
+    assert isinstance(world, DrivingWorld)
+    assert isinstance(pair.threat, ObservationThreat)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(unit.attack_seed)
-        policy = defense.load(victim, unit.training_seed)
-        cells = [unit.cell] * len(unit.seeds)
-        env = world.make(cells, action_type=policy.action_type, driver=policy.driver)
+        torch.manual_seed(job.attack_seed)
+        policy = pair.load(job.training_seed)
+        env = world.make([job.cell] * len(job.seeds), action_type=policy.action_type, driver=policy.driver)
+        trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
         try:
-            return rollout(
+            columns = rollout(
                 env,
                 policy,
-                attack,
-                threat,
-                unit.seeds,
-                features=world.features,
-                max_steps=world.max_steps,
-                attack_seed=unit.attack_seed,
+                attack if isinstance(attack, DrivingAttack) else None,
+                pair.threat,
+                job.seeds,
+                facts=world.facts,
+                attack_seed=job.attack_seed,
                 trace=trace,
             )
         finally:
             env.close(raise_if_closed=False)
+    return Driven(columns, trace.by_episode(traced) if trace else {})

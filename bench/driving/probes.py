@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.driving.contracts import Policy
+from bench.driving.policy import Policy, State
 
 EVERY = 15
 """Steps between two probes: a second of driving."""
@@ -30,22 +30,22 @@ class Probe:
         self.draws, self.drawn = np.zeros(batch), np.zeros(batch)
 
     @torch.no_grad()
-    def look(self, observation: Tensor, running: Tensor) -> bool:
+    def look(self, observation: Tensor, running: Tensor, state: State) -> bool:
         """Probe the running episodes [B] of a step; whether any was answered otherwise when asked again.
 
         Args:
             observation: true, [B, V, F].
             running: bool [B].
+            state: what the policy remembers.
         """
         rows = running.nonzero().squeeze(-1)
         if len(rows) < 2:
             return False
-        # All episodes are asked, so that a policy may keep something for each.
         others = observation.clone()
         others[rows] = observation[rows].roll(len(rows) // 2, 0)
         with torch.random.fork_rng(devices=[]):
             asked = (observation, observation, others)
-            first, again, other = (self.policy.scores(each)[rows] for each in asked)
+            first, again, other = (self.policy.scores(each, state)[rows] for each in asked)
         redrawn = (first != again).flatten(1).any(1)
         same = ((first - other).abs() <= SAME).flatten(1).all(1)
         places = rows.numpy()

@@ -8,45 +8,42 @@ import importlib.util
 import json
 import os
 import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, is_dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-LIBRARIES = ("torch", "torchrl", "tensordict", "highway-env", "numba", "numpy")
+LIBRARIES = ("torch", "torchrl", "tensordict", "numba", "numpy")
 
 BESIDE_THE_RESULT = frozenset(
     [
-        "config",
-        "console",
+        "cli",
+        "conformance",
         "errors",
-        "fingerprint",
-        "metrics",
-        "pair",
-        "parameters",
-        "patches",
-        "plan",
-        "process",
+        "files",
+        "plugins",
         "recording",
-        "registry",
-        "replay",
-        "results",
-        "runner",
+        "records",
+        "run",
+        "shadow",
         "statistics",
         "tracks",
-        "words",
     ]
 )
-"""Modules of `bench` that choose, store or show results: editing them outdates no record."""
+"""Rooms of `bench` that choose, store or show results: editing them outdates no record."""
 
 
 def canonical(value: Any) -> str:
-    """The one JSON text of a value: sorted keys, no spaces; dataclasses by their fields, other objects by str()."""
+    """The one JSON text of a value: sorted keys, no spaces; dataclasses and mappings as objects, the rest by str()."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), default=str)
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if isinstance(value, Mapping) else str(value)
 
 
 def digest(value: Any) -> str:
@@ -56,9 +53,23 @@ def digest(value: Any) -> str:
 
 @cache
 def code_digest(modules: tuple[str, ...]) -> str:
-    """sha256 over the names and contents of `sources(modules)`."""
-    files = sources(modules)
-    return digest({name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()})
+    """sha256 over the names and the code of `sources(modules)`: comments, docstrings and layout do not count."""
+    return digest({name: _code(path) for name, path in sources(modules).items()})
+
+
+@cache
+def _code(path: Path) -> str:
+    """sha256 of what a file does: its syntax tree without docstrings."""
+    tree = ast.parse(path.read_bytes())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [kept for kept in node.body if not _is_text(kept)] or [ast.Pass()]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+def _is_text(node: ast.stmt) -> bool:
+    """Whether a statement is a docstring, of a definition or below an attribute."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
 def sources(modules: Iterable[str]) -> dict[str, Path]:

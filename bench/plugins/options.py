@@ -1,7 +1,7 @@
-"""Words like `attack=zo,noise attack.steps=50 lanes=3,4`, read and type-checked by hydra's compose API.
+"""Options like `attack=zo,noise attack.steps=50 lanes=3,4`, read and type-checked by hydra's compose API.
 
-Comma lists of lanes, density, weather and seeds select; every other comma list sweeps. A component's parameter is given
-to those of the chosen components that have it.
+Comma lists of seeds and of the axes of a world (lanes, weather) select; every other comma list sweeps. A component's parameter is
+given to those of the chosen components that have it.
 """
 
 from __future__ import annotations
@@ -27,27 +27,30 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import UserError
 from bench.plugins import registry
-from bench.plugins.contracts import ThreatModel, Track
-from bench.plugins.pair import THREATS, Chosen, choose
+from bench.plugins.contracts import ThreatModel
+from bench.plugins.pair import Chosen, choose
 from bench.plugins.parameters import Parameter, parameters
 from bench.plugins.registry import Kind
+from bench.plugins.track import track
+from bench.scenarios import Axes, Axis, Value
 
 DEFAULTS: dict[Kind, str] = {"attack": "none", "defense": "none", "victim": "dqn"}
-WORLDS: dict[Track, str] = {"driving": "highway", "detection": "camera"}
-"""The default world of each track; the track is the victim's."""
 
 
-class Words:
-    """The words as given: the values of each key, in hydra's override grammar.
+class Options:
+    """The options as given: the values of each key, in hydra's override grammar.
 
     Args:
         words: `key=value` each.
         kinds: of components that may be chosen.
         settings: dataclass of the other keys.
+        axes: names of the axes that may be chosen from, of any world.
     """
 
-    def __init__(self, words: Sequence[str], *, kinds: Sequence[Kind], settings: type[Any]) -> None:
-        self.kinds = tuple(kinds)
+    def __init__(
+        self, words: Sequence[str], *, kinds: Sequence[Kind], settings: type[Any], axes: Sequence[str] = ()
+    ) -> None:
+        self.kinds, self.axes = tuple(kinds), tuple(axes)
         self.schema = settings
         # A path is taken as it is: hydra's grammar gives meaning to many of the characters one may hold.
         self.out = [word.partition("=")[2] for word in words if word.startswith("out=")]
@@ -62,7 +65,7 @@ class Words:
     def _check_key(self, key: str) -> None:
         head, _, parameter = key.partition(".")
         threats = [f"threat.{item.name}" for item in fields(ThreatModel)] if "attack" in self.kinds else []
-        known = [*self.kinds, *(item.name for item in fields(self.schema)), *threats]
+        known = [*self.kinds, *(item.name for item in fields(self.schema)), *self.axes, *threats]
         if key not in known and not (head in self.kinds and parameter):
             raise UserError(registry.unknown(f"key {key!r}", key, known))
 
@@ -73,7 +76,7 @@ class Words:
         lists = {item.name for item in fields(self.schema) if "list" in str(item.type)}
         overrides = []
         for key, values in self.values.items():
-            if key.partition(".")[0] in (*self.kinds, "threat"):
+            if key.partition(".")[0] in (*self.kinds, *self.axes, "threat"):
                 continue
             if key not in lists and len(values) > 1:
                 raise UserError(f"{key} takes one value, got {','.join(values)}")
@@ -83,9 +86,20 @@ class Words:
         assert isinstance(found, dict)
         return {str(key): value for key, value in found.items()} | ({"out": self.out[0]} if self.out else {})
 
+    def cell_values(self, axes: Axes) -> dict[str, tuple[Value, ...]]:
+        """The values on the axes of the world that is driven in, as far as they are given.
+
+        Raises:
+            UserError: if the world has no such axis, or if a value is not allowed.
+        """
+        given = [key for key in self.values if key in self.axes]
+        if strange := [key for key in given if key not in axes]:
+            raise UserError(registry.unknown(f"axis {strange[0]!r} of the world", strange[0], axes))
+        return {key: tuple(_axis_value(axes[key], text) for text in _listed(self.values[key])) for key in given}
+
     @cached_property
-    def track(self) -> Track:
-        """Of the victims asked for.
+    def track(self) -> str:
+        """Name of the track of the victims asked for.
 
         Raises:
             UserError: if they are not all of one.
@@ -100,7 +114,7 @@ class Words:
 
     def chosen(self, kind: Kind) -> list[Chosen[Any]]:
         """Every component of a kind that is asked for, with every combination of its parameters' values."""
-        names = self.values.get(kind) or (WORLDS[self.track] if kind == "world" else DEFAULTS[kind],)
+        names = self.values.get(kind) or (track(self.track).world if kind == "world" else DEFAULTS[kind],)
         # Hydra's grammar escapes the colon of NAME:CHOICE.
         names = tuple(name.replace("\\:", ":") for name in names)
         if kind != "victim":
@@ -123,7 +137,7 @@ class Words:
 
     def threats(self) -> list[ThreatModel]:
         """Every combination of the threat model's values."""
-        model = THREATS[self.track]
+        model = self.chosen("victim")[0].component.threat
         owned = parameters(model)
         keys = [key for key in self.values if key.startswith("threat.")]
         names = [key.removeprefix("threat.") for key in keys]
@@ -188,6 +202,22 @@ def _elements(override: Override) -> tuple[str, ...]:
     if "" in values:
         raise UserError(f"{override.key_or_group} has no value; write {override.key_or_group}=value")
     return tuple(dict.fromkeys(values))
+
+
+def _listed(values: Sequence[str]) -> Sequence[str]:
+    """The values of `key=a,b`, and of `key=[a,b]` too."""
+    if len(values) == 1 and values[0].startswith("[") and values[0].endswith("]"):
+        return [value.strip() for value in values[0][1:-1].split(",")]
+    return values
+
+
+def _axis_value(axis: Axis, text: str) -> Value:
+    try:
+        return axis.read(text)
+    except ValueError as error:
+        if axis.kind == "str" and axis.choices:
+            raise UserError(registry.unknown(f"{axis.name} {text!r}", text, map(str, axis.choices))) from error
+        raise UserError(str(error)) from error
 
 
 def _composed(overrides: list[str], config_name: str | None = None) -> DictConfig:

@@ -5,30 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from torch import nn
-
-from bench.detection.contracts import Detector, DetectorVictim, PatchAttack
-from bench.detection.threat import PatchThreat
-from bench.driving.contracts import DrivingAttack, DrivingVictim, Policy
-from bench.driving.threat import ObservationThreat
 from bench.errors import UserError, reason
-from bench.plugins import registry
-from bench.plugins import sources as tracks
-from bench.plugins.contracts import Attack, Defense, ThreatModel, Track, Victim, World, permits
+from bench.plugins import registry, sources
+from bench.plugins.contracts import Attack, Defense, ThreatModel, Victim, World, permits
 from bench.plugins.fingerprint import canonical, digest, state_digest
 from bench.plugins.parameters import parameters
 from bench.plugins.registry import Kind
 
 C = TypeVar("C", Attack, Defense, Victim, World)
-
-THREATS: dict[Track, type[ThreatModel]] = {"driving": ObservationThreat, "detection": PatchThreat}
-UNATTACKED: dict[Track, ThreatModel] = {
-    "driving": ObservationThreat(budget=0.0, access="oblivious", queries=0),
-    "detection": PatchThreat(budget=0.0, access="oblivious", queries=0),
-}
-"""The threat model of every clean run, so that runs with different threats share it."""
-NETWORKS: dict[Track, type[nn.Module]] = {"driving": Policy, "detection": Detector}
-"""What victims and defences of a track load."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +65,8 @@ def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:
     """
     track = victim.component.tracks()[0]
     for part in parts:
-        if track not in part.component.tracks():
-            fitting = ", ".join(tracks.names(part.kind, track)) or "none is installed"
+        if not part.component.serves(track):
+            fitting = ", ".join(sources.names(part.kind, track)) or "none is installed"
             raise UserError(
                 f"{part.kind} {part.name!r} does not fit victim {victim.name!r} of the {track} track; what fits: {fitting}"
             )
@@ -106,10 +90,10 @@ class Pair:
     def __post_init__(self) -> None:
         attack, victim = self.attack.component, self.victim.component
         check_track(self.victim, self.attack, self.defense, self.world)
-        if not isinstance(self.threat, THREATS[self.track]):
+        if not isinstance(self.threat, victim.threat):
             raise UserError(f"a {type(self.threat).__name__} is no threat model of the {self.track} track")
-        if isinstance(victim, DrivingVictim):
-            self._check_driving(victim)
+        if not self.is_clean and (why := attack.misfit(victim) or ("" if victim.sees else "which ignores its input")):
+            raise UserError(f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}, {why}")
         if not permits(victim.answers, attack.access):
             raise UserError(
                 f"attack {self.attack.name!r} needs access {attack.access!r}, victim {self.victim.name!r} answers "
@@ -121,32 +105,20 @@ class Pair:
                 f"{self.threat.access!r} at most; say threat.access={attack.access} to allow it"
             )
 
-    def _check_driving(self, victim: DrivingVictim) -> None:
-        attack = self.attack.component
-        assert isinstance(attack, DrivingAttack)
-        if victim.action_type not in attack.action_types:
-            raise UserError(
-                f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}: "
-                f"it needs {' or '.join(attack.action_types)} actions, the victim's are {victim.action_type}"
-            )
-        if not victim.sees and not self.is_clean:
-            raise UserError(
-                f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}, which ignores what it is shown"
-            )
-
     @property
-    def track(self) -> Track:
-        """The victim's."""
+    def track(self) -> str:
+        """Name of the victim's track."""
         return self.victim.component.tracks()[0]
 
     @property
+    def parts(self) -> tuple[Chosen[Any], ...]:
+        """The four components."""
+        return self.attack, self.defense, self.victim, self.world
+
+    @property
     def is_seeded(self) -> bool:
-        """Whether training seeds make a difference: to the victim, to its defence or, of a detector, to the patch."""
-        attack, victim = self.attack.component, self.victim.component
-        if self.track == "driving":
-            return victim.learns
-        assert isinstance(victim, DetectorVictim)
-        return victim.seeded or self.defense.component.trains or (isinstance(attack, PatchAttack) and attack.seeded)
+        """Whether training seeds make a difference: to the victim, its defence, or what the attack prepares."""
+        return self.victim.component.seeded or self.defense.component.trains or self.attack.component.seeded
 
     @property
     def is_clean(self) -> bool:
@@ -156,9 +128,8 @@ class Pair:
     @property
     def identity(self) -> dict[str, str]:
         """Names and parameters of everything in the pair."""
-        parts: tuple[Chosen[Any], ...] = (self.attack, self.defense, self.victim, self.world)
-        named = {part.kind: part.name for part in parts}
-        return named | {f"{part.kind}_params": part.params for part in parts} | {"threat": canonical(self.threat)}
+        named = {part.kind: part.name for part in self.parts}
+        return named | {f"{part.kind}_params": part.params for part in self.parts} | {"threat": canonical(self.threat)}
 
     @property
     def id(self) -> str:
@@ -168,7 +139,12 @@ class Pair:
 
     def clean(self) -> Pair:
         """The same victim and defence without the attack: the control of every attacked pair."""
-        return replace(self, attack=choose("attack", "none"), threat=UNATTACKED[self.track])
+        return replace(self, attack=choose("attack", "none"), threat=type(self.threat).of_nobody())
+
+    def load(self, training_seed: int) -> Any:
+        """The defended network of a training seed."""
+        facts = self.world.component.facts
+        return self.defense.component.load(self.victim.component, training_seed, facts)
 
     def weights_sha256(self, training_seed: int) -> str:
         """The hash that the defended network carries of its weights or, where it carries none, the hash of what it has.
@@ -177,7 +153,7 @@ class Pair:
             UserError: if it cannot be loaded, or is no network of the track.
         """
         try:
-            network = self.defense.component.load(self.victim.component, training_seed)
+            network = self.load(training_seed)
         except UserError:
             raise
         # Third-party code may fail in any way; the person at the terminal is told which component did.
@@ -185,9 +161,11 @@ class Pair:
             raise UserError(
                 f"{self.defense} + {self.victim} cannot be loaded: {reason(error)} (--debug shows where)"
             ) from error
-        if not isinstance(network, NETWORKS[self.track]):
-            wanted = NETWORKS[self.track].__name__
-            raise UserError(f"{self.defense} + {self.victim} is a {type(network).__name__} where a {wanted} is needed")
+        wanted = self.victim.component.network
+        if not isinstance(network, wanted):
+            raise UserError(
+                f"{self.defense} + {self.victim} is a {type(network).__name__} where a {wanted.__name__} is needed"
+            )
         carried = str(getattr(network, "weights_sha256", ""))
         return carried if carried or not network.state_dict() else state_digest(network)
 

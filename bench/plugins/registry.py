@@ -11,9 +11,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from importlib import metadata
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from bench import shadow
 from bench.errors import UserError, reason
+from bench.scenarios import Grid
+
+if TYPE_CHECKING:
+    pass
 
 Kind = Literal["attack", "defense", "victim", "world"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -23,7 +28,7 @@ GROUPS: dict[Kind, str] = {
     "victim": "cavbench.victims",
     "world": "cavbench.worlds",
 }
-REPORTS = "cavbench.reports"
+REPORTS, TRACKS, GRIDS = "cavbench.reports", "cavbench.tracks", "cavbench.grids"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +128,8 @@ def resolve(group: str, name: str, noun: str) -> Any:
         return point.load()
     # A plug-in may fail in any way while it is imported, end the program too, and must not take the others with it.
     except (Exception, SystemExit) as error:
-        raise UserError(f"{_where(group, name, noun)} cannot be imported: {reason(error)}") from error
+        why = shadow.explanation(point.module, entry.distribution) or reason(error)
+        raise UserError(f"{_where(group, name, noun)} cannot be imported: {why}") from error
 
 
 def declared(kind: Kind, name: str) -> type[Any]:
@@ -143,9 +149,31 @@ def declared(kind: Kind, name: str) -> type[Any]:
     known: type[Any] = component
     if not known.tracks():
         raise UserError(
-            f"{where} is of no track: derive it from a base class of bench.driving.contracts or bench.detection.contracts"
+            f"{where} is of no track: derive it from a base class of one, as there are in bench.driving and bench.detection"
         )
     return known
+
+
+def grid(name: str) -> Grid:
+    """The grid of this name.
+
+    Raises:
+        UserError: if there is none, or if what its entry point names is no grid.
+    """
+    found = resolve(GRIDS, name, "grid")
+    if not isinstance(found, Grid) or found.name != name:
+        raise UserError(f"{_where(GRIDS, name, 'grid')} is not a bench.scenarios.Grid of that name")
+    return found
+
+
+def all_grids() -> list[Grid]:
+    """The grids of all worlds, by name; this imports no torch."""
+    return [grid(name) for name in entries(GRIDS)]
+
+
+def grids(world: str) -> list[Grid]:
+    """The grids of a world, by name."""
+    return [found for found in all_grids() if found.world == world]
 
 
 def offers(kind: Kind, name: str) -> dict[str, str]:

@@ -7,6 +7,7 @@ import importlib.util
 from functools import cache
 
 from bench.plugins import registry
+from bench.plugins.contracts import ANY_TRACK
 from bench.plugins.fingerprint import file_of
 from bench.plugins.registry import GROUPS, Kind
 
@@ -16,7 +17,7 @@ def names(kind: Kind, track: str) -> list[str]:
     return [
         name
         for name, claims in registry.entries(GROUPS[kind]).items()
-        if any(track in tracks_of(claim.target) for claim in claims)
+        if any({track, ANY_TRACK} & set(tracks_of(claim.target)) for claim in claims)
     ]
 
 

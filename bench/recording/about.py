@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 
+from bench.scenarios import Cell
+
 
 def title(meta: Mapping[str, object]) -> str:
     """One line: who drives or looks, under which attack, where."""
@@ -12,8 +14,8 @@ def title(meta: Mapping[str, object]) -> str:
     if meta.get("defense", "none") != "none":
         words.append(f"+ {meta['defense']}")
     words.append("without attack" if meta.get("attack", "none") == "none" else f"under {meta['attack']}")
-    if "lanes" in meta:
-        words.append(f"· {meta['lanes']} lanes × {float(str(meta['density'])):g}, {meta['weather']}")
+    if "cell" in meta:
+        words.append(f"· {Cell(**json.loads(str(meta['cell'])))}")
     return " ".join(words) + (f" · seed {meta['seed']}" if "seed" in meta else "")
 
 

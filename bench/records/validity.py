@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from bench.plugins.contracts import Access
-from bench.scenarios.grid import Cell
+from bench.scenarios import Axes
 
 JSON = ("attack_params", "defense_params", "victim_params", "world_params", "libraries")
 
@@ -19,7 +19,7 @@ def complaint(records: pa.Table, schema: pa.Schema) -> tuple[int, str] | None:
     """The first row whose values cannot be, and why; None if all can.
 
     Args:
-        records: columns of a schema in `bench.records.store.SCHEMAS`; text may be dictionaries.
+        records: columns of `bench.records.schema`; text may be dictionaries.
         schema: theirs; a column may be missing.
     """
     found = [*_out_of_range(records, schema), *_unreadable(records)]
@@ -43,7 +43,7 @@ def _out_of_range(records: pa.Table, schema: pa.Schema) -> Iterator[tuple[int, s
 
 def _unreadable(records: pa.Table) -> Iterator[tuple[int, str]]:
     """Of texts and cells, each distinct value once."""
-    yield from _refused(records, ("lanes", "density", "weather"), _cell)
+    yield from _refused(records, ("cell", "world_facts"), _cell)
     yield from _refused(records, ("threat_access",), _access)
     for name in JSON:
         yield from _refused(records, (name,), _object)
@@ -64,11 +64,14 @@ def _refused(records: pa.Table, names: Sequence[str], check: Callable[..., objec
         try:
             check(*values)
         except ValueError as error:
-            yield row, f"{'/'.join(names)} {'/'.join(map(str, values))}: {error}"
+            yield row, f"{names[0]} {values[0]}: {error}"
 
 
-def _cell(lanes: int, density: float, weather: str) -> None:
-    Cell(lanes=lanes, density=density, weather=weather)
+def _cell(cell: str, facts: str) -> None:
+    values, said = json.loads(cell), json.loads(facts)
+    if not (isinstance(values, dict) and isinstance(said, dict) and isinstance(said.get("axes"), list)):
+        raise ValueError("not a cell of a world that says its axes")
+    Axes.read(said["axes"]).cell(**values)
 
 
 def _access(name: str) -> None:

@@ -12,11 +12,10 @@ from typing import Any
 
 from bench.errors import UserError
 from bench.plugins import registry
-from bench.plugins.contracts import Track
-from bench.plugins.options import Words, configured
+from bench.plugins.options import Options, configured
 from bench.plugins.pair import Chosen, Pair, check_track
 from bench.plugins.registry import KINDS, Kind
-from bench.scenarios.grid import GRIDS, WEATHERS, Grid
+from bench.scenarios import Grid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +36,7 @@ class RunConfig:
     """
 
     pairs: tuple[Pair, ...]
-    grid: Grid = GRIDS["standard-v1"]
+    grid: Grid
     seeds: tuple[int, ...] = (0, 1, 2)
     workers: int = field(default_factory=lambda: cores())
     out: Path = Path("results")
@@ -81,31 +80,16 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
         raise ValueError(f"seeds must be different numbers of at least 0, got {','.join(map(str, seeds)) or 'none'}")
 
 
-def check_weather(name: str, track: Track) -> None:
-    """Refuse weather that is unknown, or that is only a matter of light where nothing looks at it.
-
-    Raises:
-        UserError: if it is.
-    """
-    if name not in WEATHERS:
-        raise UserError(registry.unknown(f"weather {name!r}", name, WEATHERS))
-    if track == "driving" and WEATHERS[name].sun_elevation_deg < 0:
-        raise UserError(f"weather {name!r} is for cameras: the sensors of the driving track bring their own light")
-
-
 def cores() -> int:
     """Cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass
-class RunWords:
-    """The words of `bench run` that choose no component, with their types and defaults."""
+class RunOptions:
+    """The options of `bench run` that choose no component and no cell, with their types and defaults."""
 
     grid: str | None = None
-    lanes: list[int] | None = None
-    density: list[float] | None = None
-    weather: list[str] | None = None
     episodes: int | None = None
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
     workers: int = field(default_factory=cores)
@@ -115,8 +99,8 @@ class RunWords:
 
 
 @dataclass
-class TrainWords:
-    """The words of `bench train` that choose no component."""
+class TrainOptions:
+    """The options of `bench train` that choose no component."""
 
     seeds: list[int] = field(default_factory=lambda: [0])
     out: str | None = None
@@ -128,19 +112,12 @@ def run_config(words: Sequence[str]) -> RunConfig:
     Raises:
         UserError: for anything that cannot be read or is not allowed, in one line.
     """
-    given = Words(words, kinds=KINDS, settings=RunWords)
+    axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
+    given = Options(words, kinds=KINDS, settings=RunOptions, axes=list(axes))
     settings = given.settings()
-    axes = {key: tuple(settings[key]) for key in ("lanes", "density", "weather") if settings[key] is not None}
-    if settings["episodes"] is not None:
-        axes["episodes"] = settings["episodes"]
-    known = [grid.name for grid in GRIDS.values() if grid.track == given.track]
-    name = settings["grid"] or known[0]
-    if name not in known:
-        raise UserError(registry.unknown(f"grid {name!r}", name, known))
-    for weather in axes.get("weather", ()):
-        check_weather(weather, given.track)
     with _one_line():
-        grid: Grid = GRIDS[name].with_(**axes)
+        standard = _grid(given, settings["grid"])
+        grid = standard.with_(episodes=settings["episodes"], **given.cell_values(standard.axes))
         choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS]
         pairs = [
             Pair(attack=attack, defense=defense, victim=victim, world=world, threat=threat)
@@ -158,6 +135,23 @@ def run_config(words: Sequence[str]) -> RunConfig:
         )
 
 
+def _grid(given: Options, name: str | None) -> Grid:
+    """The grid of this name, or the world's own.
+
+    Raises:
+        UserError: if there is none of this name, or if it is of another world.
+    """
+    worlds = {world.name: world.component for world in given.chosen("world")}
+    if len(worlds) > 1:
+        raise UserError(f"one run drives one world, got {' and '.join(worlds)}: run one after the other")
+    ((own, world),) = worlds.items()
+    known = [grid.name for grid in registry.grids(own)]
+    wanted = name or world.grid
+    if wanted not in known:
+        raise UserError(registry.unknown(f"grid {wanted!r} of the world {own!r}", wanted, known))
+    return registry.grid(wanted)
+
+
 def train_config(words: Sequence[str]) -> TrainConfig:
     """The configuration of `bench train WORDS`; `seed` is another word for `seeds`.
 
@@ -165,7 +159,7 @@ def train_config(words: Sequence[str]) -> TrainConfig:
         UserError: for anything that cannot be read or is not allowed, in one line.
     """
     words = [f"seeds={word.removeprefix('seed=')}" if word.startswith("seed=") else word for word in words]
-    given = Words(words, kinds=("defense", "victim", "world"), settings=TrainWords)
+    given = Options(words, kinds=("defense", "victim", "world"), settings=TrainOptions)
     settings = given.settings()
     one: dict[Kind, Chosen[Any]] = {}
     for kind in given.kinds:

@@ -12,17 +12,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.detection import patches
 from bench.errors import UserError
 from bench.plugins import registry
-from bench.plugins.pair import THREATS, Chosen, Pair, choose
-from bench.records import store as results
-from bench.run.runner import measured, recording_path, save_recordings
+from bench.plugins.pair import Chosen, Pair, choose
+from bench.plugins.track import track
+from bench.records import reading
+from bench.records.schema import IDENTITY
+from bench.run import artefacts
+from bench.run.runner import keep_recording, recording_path
 from bench.run.unit import Unit
-from bench.scenarios.grid import Cell
-
-BESIDE = ("attack_ms", "patch")
-"""Measurements that no replay can repeat, and the name of the patch, which changes with the code that crafts it."""
+from bench.run.work import Task, perform
+from bench.scenarios import Cell
 
 
 @dataclass(frozen=True)
@@ -41,27 +41,40 @@ class Replay:
 
 
 def find(records: pa.Table, where: Mapping[str, str]) -> dict[str, Any]:
-    """The first record whose columns have these values, for instance {"lanes": "3", "seed": "1000017"}.
+    """The first record with these values in its columns or on the axes of its cell, as {"lanes": "3", "seed": "1000017"}.
 
     Raises:
         UserError: if a column is unknown or no record fits.
     """
     for name, value in where.items():
-        if name not in records.column_names:
-            known = [field.name for field in results.IDENTITY] + ["location"] * ("location" in records.column_names)
+        column = records[name] if name in records.column_names else _on_axis(records, name)
+        if column is None:
+            known = [*(column.name for column in IDENTITY), *_axes(records)]
             raise UserError(registry.unknown(f"column {name!r}", name, known))
-        kind = records.schema.field(name).type
         try:
-            wanted = pa.scalar(value).cast(kind)
+            wanted = pa.scalar(value).cast(column.type)
         except (pa.ArrowException, ValueError):
-            raise UserError(f"cannot read {name}={value}: the column holds {kind}") from None
-        left = records.filter(pc.field(name) == wanted)
+            raise UserError(f"cannot read {name}={value}: the column holds {column.type}") from None
+        left = records.filter(pc.equal(column, wanted))
         if not left.num_rows:
-            known = sorted(set(records[name].to_pylist()))
-            shown = ", ".join(map(str, known[:12])) + (f", … {known[-1]}" if len(known) > 12 else "")
+            values = sorted(set(column.drop_null().to_pylist()))
+            shown = ", ".join(map(str, values[:12])) + (f", … {values[-1]}" if len(values) > 12 else "")
             raise UserError(f"no record has {name}={value}; there are {shown}")
         records = left
     return records.slice(0, 1).to_pylist()[0]
+
+
+def _axes(records: pa.Table) -> list[str]:
+    return list(dict.fromkeys(name for cell in pc.unique(records["cell"]).to_pylist() for name in json.loads(cell)))
+
+
+def _on_axis(records: pa.Table, name: str) -> pa.ChunkedArray | None:
+    """The values of an axis; None where no cell has it."""
+    if name not in _axes(records):
+        return None
+    encoded = records["cell"].combine_chunks().dictionary_encode()
+    values = pa.array([json.loads(cell).get(name) for cell in encoded.dictionary.to_pylist()])
+    return pa.chunked_array([values.take(encoded.indices)])
 
 
 def replay(out: Path, record: Mapping[str, Any]) -> Replay:
@@ -74,43 +87,51 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     Raises:
         UserError: if a component or the policy is not there any more.
     """
-    track = results.track_of(record)
-    before = results.read(out, [record["unit"]], track=track).sort_by("seed")
-    unit = _unit(record, before["seed"].to_pylist())
-    patch = patches.read(out, record["patch"]) if record.get("patch") else None
-    now = unit.constants(0.0)
-    measurements, trace = measured(unit, patch, [unit.seeds.index(record["seed"])])
-    after = results.table(now, measurements, track=track)
-    columns = [field.name for field in results.MEASUREMENTS[track] if field.name not in BESIDE]
+    unit, before = _unit(out, record)
+    noun, folder = unit.track.artefact or ("", "")
+    path = out / folder / f"{record[noun]}.safetensors" if record.get(noun) else None
+    task = Task(work=unit, artefact=artefacts.read(path) if path else None, recorded=[record["seed"]])
+    outcome = perform(task, lambda *news: None)
+    after = outcome.records
+    assert after is not None
+    if not outcome.recordings:
+        raise UserError("; ".join(outcome.warnings) or "nothing was recorded")
+    saved = recording_path(out, unit, record["seed"])
+    keep_recording(saved, outcome.recordings[record["seed"]])
+    columns = [column.name for column in unit.track.measurements if column.name not in unit.track.unrepeatable]
     differences = tuple(name for name in columns if not _equal(before[name], after[name]))
-    assert trace is not None
-    save_recordings(out, unit, trace)
+    now = after.slice(0, 1).to_pylist()[0]
     origin = ("weights_sha256", "code_digest", "libraries", "machine")
     changed = ", ".join(name for name in origin if now[name] != record[name])
-    return Replay(recording_path(out, unit, record["seed"]), changed, differences)
+    return Replay(saved, changed, differences)
 
 
-def _unit(record: Mapping[str, Any], seeds: list[int]) -> Unit:
-    threat = THREATS[results.track_of(record)]
+def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
+    """The unit of a record, and all its records."""
+    victim = _chosen("victim", record)
+    own = track(victim.component.tracks()[0])
+    before = reading.read(out, [record["unit"]], track=own).sort_by("seed")
+    seeds = before["seed"].to_pylist()
     pair = Pair(
         attack=_chosen("attack", record),
         defense=_chosen("defense", record),
-        victim=_chosen("victim", record),
+        victim=victim,
         world=_chosen("world", record),
-        threat=threat(
+        threat=victim.component.threat(
             norm=record["threat_norm"],
             budget=record["threat_budget"],
             access=record["threat_access"],
             queries=record["threat_queries"],
         ),
     )
-    return Unit(
+    unit = Unit(
         pair=pair,
-        cell=Cell(lanes=record["lanes"], density=record["density"], weather=record["weather"]),
+        cell=Cell(**json.loads(record["cell"])),
         training_seed=record["training_seed"],
         seeds=range(min(seeds), max(seeds) + 1),
         weights_sha256=pair.weights_sha256(record["training_seed"]),
     )
+    return unit, before
 
 
 def _chosen(kind: registry.Kind, record: Mapping[str, Any]) -> Chosen[Any]:

@@ -1,31 +1,26 @@
-"""The units of work, pure functions of their configuration: a pair on every scenario seed of a cell, and crafting a patch."""
+"""The units of work, pure functions of their configuration: a pair on every scenario seed of a cell, and what it needs before."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from functools import cached_property
 
-from bench.driving.contracts import DrivingVictim
 from bench.plugins import registry
-from bench.plugins.contracts import Track
 from bench.plugins.fingerprint import canonical, code_digest, digest, libraries, machine
 from bench.plugins.pair import Chosen, Pair
-from bench.scenarios.grid import GRIDS, Cell
-
-WORK: dict[Track, str] = {"driving": "bench.driving.drive", "detection": "bench.detection.approach"}
-"""The module that does the work of a track's units."""
-CRAFT = "bench.detection.crafting"
-"""The module that crafts patches."""
+from bench.plugins.track import Job, Track, track_of
+from bench.scenarios import Cell
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Work:
+class Work:
     """What units of both kinds have.
 
     Args:
         pair: attack, defence, victim, world, threat model.
-        training_seed: of the victim; of a patch too.
+        training_seed: of the victim; of what is prepared too.
         weights_sha256: of the victim's weights.
     """
 
@@ -34,29 +29,34 @@ class _Work:
     weights_sha256: str
 
     @property
+    def track(self) -> Track:
+        """The pair's."""
+        return track_of(self.pair)
+
+    @property
     def module(self) -> str:
         """The module that does the work."""
         raise NotImplementedError
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Those whose source computes it, with all they import."""
-        return (__name__, self.module, *sorted(type(part.component).__module__ for part in self.parts))
+        """Modules that are hashed into the code digest, with what they import."""
+        return (self.module, *sorted(type(part.component).__module__ for part in self.pair.parts))
 
     @property
     def code_digest(self) -> str:
-        """Of the source that computes it: the framework's and its components', with what they import."""
+        """Of the source that computes it: the track's and its components', with what they import."""
         return code_digest(self.modules)
-
-    @property
-    def parts(self) -> tuple[Chosen[Any], ...]:
-        """The four components."""
-        return self.pair.attack, self.pair.defense, self.pair.victim, self.pair.world
 
     @property
     def libraries(self) -> dict[str, str]:
         """Versions of what computes it beside that source."""
-        return libraries(tuple(sorted({name for part in self.parts for name in part.component.libraries})))
+        return libraries(tuple(sorted({name for part in self.pair.parts for name in part.component.libraries})))
+
+    @property
+    def attack_seed(self) -> int:
+        """Of the attack's random generator."""
+        raise NotImplementedError
 
     @property
     def origin(self) -> dict[str, object]:
@@ -64,39 +64,62 @@ class _Work:
         return {
             "pair": self.pair.identity,
             "training_seed": self.training_seed,
+            "attack_seed": self.attack_seed,
             "weights": self.weights_sha256,
             "code": self.code_digest,
-            "shipped_by": [_entry(part).shipped_by for part in self.parts],
+            "shipped_by": [_entry(part).shipped_by for part in self.pair.parts],
             "libraries": self.libraries,
         }
 
 
 @dataclass(frozen=True, kw_only=True)
-class Crafting(_Work):
-    """One patch of an attack on a defended detector, crafted on the training scenes of a world."""
+class Preparation(Work):
+    """What an attack makes once for a defended victim, before any cell is driven: a patch, for instance.
 
-    module = CRAFT
+    Args:
+        cell, seeds: of the unit it is made for; they do not matter.
+    """
+
+    cell: Cell
+    seeds: range
 
     @property
+    def module(self) -> str:
+        return self.track.preparation
+
+    @cached_property
     def fingerprint(self) -> str:
-        """sha256 of everything that decides the patch."""
+        """sha256 of everything that decides it."""
         return digest(self.origin)
 
     @property
     def attack_seed(self) -> int:
-        """Of the attack's random generator: the same for every pair."""
-        return int(digest(["patch", self.training_seed])[:15], 16)
+        """The same for every pair."""
+        assert self.track.artefact
+        return int(digest([self.track.artefact[0], self.training_seed])[:15], 16)
+
+    @property
+    def job(self) -> Job:
+        """What its track is asked to do."""
+        return Job(
+            pair=self.pair,
+            training_seed=self.training_seed,
+            attack_seed=self.attack_seed,
+            cell=self.cell,
+            seeds=self.seeds,
+        )
 
     def __str__(self) -> str:
-        return f"{self.pair} | patch, seed {self.training_seed}"
+        noun = self.track.artefact[0] if self.track.artefact else "preparation"
+        return f"{self.pair} | {noun}, seed {self.training_seed}"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unit(_Work):
+class Unit(Work):
     """One batch of episodes: a pair on every scenario seed of a cell, with one training seed.
 
     Args:
-        cell: lanes, density, weather.
+        cell: one value on each axis of the world.
         seeds: the scenario seed of each episode.
     """
 
@@ -105,55 +128,73 @@ class Unit(_Work):
 
     @property
     def module(self) -> str:
-        return WORK[self.pair.track]
+        return self.track.work
 
     @property
     def attack_seed(self) -> int:
-        """Of the attack's random generator: the same for every pair and every order of work."""
+        """The same for every pair and every order of work."""
         return int(digest([canonical(self.cell), self.training_seed])[:15], 16)
 
-    @property
-    def crafting(self) -> Crafting | None:
-        """What makes the patch it shows; None where there is none to make."""
-        if self.pair.track != "detection" or self.pair.is_clean:
+    @cached_property
+    def preparation(self) -> Preparation | None:
+        """What must be there before; None where there is nothing to prepare."""
+        if not self.track.artefact or self.pair.is_clean:
             return None
-        return Crafting(pair=self.pair, training_seed=self.training_seed, weights_sha256=self.weights_sha256)
+        return Preparation(
+            pair=self.pair,
+            training_seed=self.training_seed,
+            weights_sha256=self.weights_sha256,
+            cell=self.cell,
+            seeds=self.seeds,
+        )
 
-    @property
+    @cached_property
     def fingerprint(self) -> str:
         """sha256 of everything that decides the result."""
-        patch = {"patch": self.crafting.fingerprint} if self.crafting else {}
+        before = {"artefact": self.preparation.fingerprint} if self.preparation else {}
         scenarios = {"cell": canonical(self.cell), "seeds": [self.seeds.start, self.seeds.stop]}
-        return digest(self.origin | scenarios | patch)
+        return digest(self.origin | scenarios | before)
+
+    @property
+    def job(self) -> Job:
+        """What its track is asked to do."""
+        return Job(
+            pair=self.pair,
+            training_seed=self.training_seed,
+            attack_seed=self.attack_seed,
+            cell=self.cell,
+            seeds=self.seeds,
+            artefact=self.preparation.fingerprint if self.preparation else "",
+        )
 
     @property
     def grid(self) -> str:
-        """The named grid that has this cell and these seeds; `custom` if none has."""
-        own = (grid for grid in GRIDS.values() if grid.track == self.pair.track)
+        """The named grid of its world that has this cell and these seeds; `custom` if none has."""
+        own = registry.grids(self.pair.world.name)
         return next((grid.name for grid in own if self.cell in grid.cells() and self.seeds == grid.seeds()), "custom")
 
     def constants(self, wall_s: float) -> dict[str, object]:
-        """What every record of the unit says: the columns IDENTITY (but `seed`) and PROVENANCE of `bench.records.store`."""
-        pair, cell, threat = self.pair, self.cell, self.pair.threat
-        victim = pair.victim.component
-        driver = victim if isinstance(victim, DrivingVictim) else None
+        """What every record of the unit says: the columns IDENTITY (but `seed`) and PROVENANCE of `bench.records.schema`.
+
+        Called where the work was done: machine, code and libraries are those of that place.
+        """
+        pair, threat = self.pair, self.pair.threat
         return {
             "unit": self.fingerprint,
             "pair": pair.id,
-            **{part.kind: part.name for part in self.parts},
-            **{f"{part.kind}_params": part.params for part in self.parts},
-            "action_type": driver.action_type if driver else "",
-            "sees": driver.sees if driver else True,
+            **{part.kind: part.name for part in pair.parts},
+            **{f"{part.kind}_params": part.params for part in pair.parts},
+            **self.track.identity(pair),
+            "sees": pair.victim.component.sees,
             "training_seed": self.training_seed,
             "threat_norm": threat.norm,
             "threat_budget": float(threat.budget),
             "threat_access": threat.access,
             "threat_queries": threat.queries,
             "grid": self.grid,
-            "lanes": cell.lanes,
-            "density": float(cell.density),
-            "weather": cell.weather,
-            **{f"{part.kind}_shipped_by": _entry(part).shipped_by for part in self.parts},
+            "cell": json.dumps(dict(self.cell), separators=(",", ":")),
+            "world_facts": json.dumps(pair.world.component.facts.written(), separators=(",", ":")),
+            **{f"{part.kind}_shipped_by": _entry(part).shipped_by for part in pair.parts},
             "weights_sha256": self.weights_sha256,
             "code_digest": self.code_digest,
             "libraries": canonical(self.libraries),
@@ -167,5 +208,5 @@ class Unit(_Work):
         return f"{self.pair} | {self.cell}{seed}"
 
 
-def _entry(part: Chosen[Any]) -> registry.Entry:
+def _entry(part: Chosen[object]) -> registry.Entry:  # type: ignore[type-var]
     return registry.find(registry.GROUPS[part.kind], part.name, part.kind)

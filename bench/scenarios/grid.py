@@ -1,64 +1,13 @@
-"""What is driven: weather, cells, scenarios, and the named grids every pair is scored on."""
+"""Named, versioned grids of scenarios, and the blocks that scenario seeds are taken from."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from bench.plugins.contracts import Track
-
-
-@dataclass(frozen=True, kw_only=True)
-class Weather:
-    """The air between a sensor and the road, in the units a weather station reports.
-
-    Args:
-        name: how tables and command lines call it.
-        visibility_m: meteorological optical range in metres (the distance at which contrast falls to 5 %); inf is clean air.
-        precipitation_mm_h: rain rate in millimetres an hour.
-        sun_elevation_deg: height of the sun over the horizon in degrees; below 0 is night. Only cameras look at it.
-
-    Raises:
-        ValueError: if a quantity is outside its physical range.
-    """
-
-    name: str
-    visibility_m: float = math.inf
-    precipitation_mm_h: float = 0.0
-    sun_elevation_deg: float = 45.0
-
-    def __post_init__(self) -> None:
-        if not self.visibility_m > 0:
-            raise ValueError(f"visibility_m must be positive, got {self.visibility_m}")
-        if not 0 <= self.precipitation_mm_h < math.inf:
-            raise ValueError(f"precipitation_mm_h must be a finite number of at least 0, got {self.precipitation_mm_h}")
-        if not -90 <= self.sun_elevation_deg <= 90:
-            raise ValueError(f"sun_elevation_deg must be in [-90, 90], got {self.sun_elevation_deg}")
-
-    @property
-    def extinction_per_m(self) -> float:
-        """Optical extinction coefficient in 1/m: Koschmieder's law for the visibility, plus the rain's own.
-
-        Koschmieder at the 5 % contrast of the meteorological optical range: sigma = 3.0 / visibility. Rain: 1.076 R^0.67 dB/km
-        (Carbonneau and Wisely 1998, adopted by ITU-R P.1814).
-        """
-        rain_db_per_km = 1.076 * self.precipitation_mm_h**0.67
-        return 3.0 / self.visibility_m + rain_db_per_km / (10 * math.log10(math.e)) / 1000
-
-
-WEATHERS: dict[str, Weather] = {
-    w.name: w
-    for w in (
-        Weather(name="clear"),
-        Weather(name="rain", visibility_m=2000.0, precipitation_mm_h=25.0, sun_elevation_deg=30.0),
-        Weather(name="fog", visibility_m=120.0, sun_elevation_deg=30.0),
-        Weather(name="night", sun_elevation_deg=-10.0),
-    )
-}
+from bench.scenarios.axes import Axes, Cell, Value
 
 
 class SeedBlock(IntEnum):
@@ -70,98 +19,50 @@ class SeedBlock(IntEnum):
     TRAIN = 10_000_000
 
 
-@dataclass(frozen=True, order=True, kw_only=True)
-class Cell:
-    """One square of a grid: a kind of road and weather, without a seed.
-
-    Args:
-        lanes: number of lanes (2 to 8).
-        density: traffic density factor of highway-env (spacing is divided by it), in (0, 4].
-        weather: a name in `WEATHERS`.
-    """
-
-    lanes: int
-    density: float
-    weather: str = "clear"
-
-    def __post_init__(self) -> None:
-        if not 2 <= self.lanes <= 8:
-            raise ValueError(f"lanes must be between 2 and 8, got {self.lanes}")
-        if not 0 < self.density <= 4:
-            raise ValueError(f"density must be in (0, 4], got {self.density}")
-        if self.weather not in WEATHERS:
-            raise ValueError(f"unknown weather {self.weather!r}; known: {', '.join(WEATHERS)}")
-
-    def __str__(self) -> str:
-        return f"{self.lanes} lanes, density {self.density:g}, {self.weather}"
-
-
-@dataclass(frozen=True, order=True, kw_only=True)
-class Scenario(Cell):
-    """A cell and the seed that fixes its traffic: the same scenario is met by every attack and every defence."""
-
-    seed: int
-
-
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """A named, versioned list of scenarios of a track: the product of lanes, density and weather, `episodes` seeds a cell."""
+    """A named, versioned list of scenarios in a world: every combination of values, with `episodes` seeds a cell.
+
+    Args:
+        name: as on the command line, for instance `standard-v1`; `custom` for one that was put together there.
+        world: name of the world that it is of.
+        axes: of that world.
+        values: of each axis, at least one.
+        episodes: scenario seeds a cell.
+        first_seed: the first of them.
+
+    Raises:
+        ValueError: in one line, if a value is not allowed or missing.
+    """
 
     name: str
-    lanes: tuple[int, ...]
-    density: tuple[float, ...]
-    weather: tuple[str, ...]
+    world: str
+    axes: Axes
+    values: Mapping[str, Sequence[Value]]
     episodes: int
     first_seed: int = SeedBlock.REPORT
-    track: Track = "driving"
 
     def __post_init__(self) -> None:
         if not 1 <= self.episodes <= SeedBlock.SELECT - SeedBlock.REPORT:
             raise ValueError(f"episodes must be between 1 and 1000000, got {self.episodes}")
-        for name in ("lanes", "density", "weather"):
-            if not getattr(self, name):
+        for name in self.axes:
+            if not self.values.get(name):
                 raise ValueError(f"a grid needs at least one value of {name}")
         self.cells()
 
     def cells(self) -> tuple[Cell, ...]:
-        """The cells of the grid, weather outermost."""
-        return tuple(
-            Cell(lanes=lanes, density=density, weather=weather)
-            for weather in self.weather
-            for lanes in self.lanes
-            for density in self.density
-        )
+        """The cells of the grid in the order of tables, each once."""
+        combined = itertools.product(*(self.values[name] for name in self.axes))
+        cells = {self.axes.cell(**dict(zip(self.axes, values, strict=True))) for values in combined}
+        return tuple(sorted(cells, key=self.axes.place))
 
     def seeds(self) -> range:
         """The scenario seeds of every cell."""
         return range(self.first_seed, self.first_seed + self.episodes)
 
-    def scenarios(self) -> Iterator[Scenario]:
-        """Every scenario of the grid, cell by cell."""
-        for cell in self.cells():
-            for seed in self.seeds():
-                yield Scenario(lanes=cell.lanes, density=cell.density, weather=cell.weather, seed=seed)
-
-    def with_(self, **changes: object) -> Grid:
-        """A copy with other values; its name says that it is no longer the standard grid."""
-        changed = replace(self, **changes)  # type: ignore[arg-type]
-        return self if changed == self else replace(changed, name="custom")
-
-
-GRIDS: dict[str, Grid] = {
-    "standard-v1": Grid(
-        name="standard-v1",
-        lanes=(3, 4, 5),
-        density=(1.0, 2.0),
-        weather=("clear", "rain", "fog"),
-        episodes=100,
-    ),
-    "approach-v1": Grid(
-        name="approach-v1",
-        lanes=(3, 4, 5),
-        density=(1.0, 2.0),
-        weather=("clear", "rain", "fog"),
-        episodes=3,
-        track="detection",
-    ),
-}
+    def with_(self, *, episodes: int | None = None, **values: Sequence[Value]) -> Grid:
+        """The grid with other values or another number of episodes; its name then says that it is none of the named ones."""
+        wanted = self.episodes if episodes is None else episodes
+        changed = replace(self, values={**self.values, **values}, episodes=wanted)
+        same = changed.episodes == self.episodes and changed.cells() == self.cells()
+        return self if same else replace(changed, name="custom")

@@ -7,22 +7,17 @@ two sets scenario by scenario. The statistics are those of `bench.statistics.est
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
-from itertools import compress, product
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from bench.scenarios.grid import WEATHERS, Cell
+from bench.scenarios import Axes, Cell
 from bench.statistics.estimates import Array, Interval, interval, wilson
-
-MAX_RETURN = 450.0
-"""Largest `return`: highway-env's normalised reward, 1 a step, over 450 steps (the thesis' scale)."""
-CONTROL_PERIOD_MS = 1000 / 15
-"""The time between two decisions at 15 Hz: an attack that takes longer cannot run on the road."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +27,8 @@ class Episodes:
     Args:
         table: the records, sorted by run, cell, scenario seed; [R * C * E] rows.
         runs: training seeds [R].
-        cells: [C], by weather (in the order of `WEATHERS`), lanes, density.
+        cells: [C], in the order of tables (`Axes.place`).
+        axes: that the cells differ in.
         seeds: scenario seeds [E], rising.
         left_out: records given to `arrange` that were not used, because their cell or seed is missing from another run.
     """
@@ -41,6 +37,7 @@ class Episodes:
     runs: tuple[int, ...]
     cells: tuple[Cell, ...]
     seeds: tuple[int, ...]
+    axes: Axes
     left_out: int = 0
 
     @classmethod
@@ -54,7 +51,8 @@ class Episodes:
             raise ValueError("no records to measure")
         runs, run = _distinct(records["training_seed"])
         seeds, seed = _distinct(records["seed"])
-        cells, cell = _cells(records)
+        axes = axes_of(records)
+        cells, cell = _cells(records, axes)
         place = np.full((len(runs), len(cells), len(seeds)), -1)
         place[run, cell, seed] = np.arange(records.num_rows)
         driven = place >= 0
@@ -73,6 +71,7 @@ class Episodes:
             runs=tuple(runs),
             cells=tuple(one for one, kept in zip(cells, every_run, strict=True) if kept),
             seeds=tuple(seed for seed, kept in zip(seeds, every_cell, strict=True) if kept),
+            axes=axes,
             left_out=records.num_rows - len(rows),
         )
 
@@ -109,20 +108,21 @@ class Episodes:
             runs=tuple(self.runs[i] for i in axes[0]),
             cells=tuple(self.cells[i] for i in axes[1]),
             seeds=tuple(self.seeds[i] for i in axes[2]),
+            axes=self.axes,
             left_out=self.left_out,
         )
 
     def standing_for(self, runs: Sequence[int], cells: Sequence[Cell]) -> Episodes:
-        """The episodes of a driver that neither learns nor sees, under the names of other runs and weathers.
+        """The episodes of a victim that neither learns nor sees, under the names of other runs and cells.
 
         Args:
             runs: training seeds, each given the episodes of the first run.
-            cells: those that were driven, and those that were driven in clear weather, which stands for all weathers.
+            cells: each driven itself, or with its perceptual axes at their first value, which stands for all of theirs.
 
         Raises:
-            ValueError: if a cell was driven in neither its own nor in clear weather.
+            ValueError: if a cell was driven in neither way.
         """
-        stand_ins = [cell if cell in self.cells else replace(cell, weather="clear") for cell in cells]
+        stand_ins = [cell if cell in self.cells else self.axes.unperceived(cell) for cell in cells]
         missing = [str(cell) for cell, stand_in in zip(cells, stand_ins, strict=True) if stand_in not in self.cells]
         if missing:
             raise ValueError(f"never driven: {'; '.join(missing)}")
@@ -132,7 +132,7 @@ class Episodes:
         table = self.table.take(pa.array(np.tile(rows, len(runs))))
         labels = {
             "training_seed": np.repeat(runs, len(cells) * each),
-            "weather": np.tile(np.repeat([cell.weather for cell in cells], each), len(runs)),
+            "cell": np.tile(np.repeat([as_text(cell) for cell in cells], each), len(runs)),
         }
         for name, values in labels.items():
             field = table.schema.field(name)
@@ -145,28 +145,37 @@ def _places(own: Sequence[object], wanted: Collection[object] | None) -> list[in
     return [place for place, value in enumerate(own) if kept is None or value in kept]
 
 
-def _distinct(column: pa.ChunkedArray, order: Sequence[Any] = ()) -> tuple[list[Any], NDArray[np.int64]]:
-    """The values of a column, rising or in this order, and the place of each record's among them."""
+def _distinct(column: pa.ChunkedArray) -> tuple[list[Any], NDArray[np.int64]]:
+    """The values of a column, rising, and the place of each record's among them."""
     encoded = column.combine_chunks()
     encoded = encoded if pa.types.is_dictionary(encoded.type) else encoded.dictionary_encode()
     values, codes = encoded.dictionary.to_pylist(), encoded.indices.to_numpy()
     there = np.flatnonzero(np.bincount(codes, minlength=len(values))).tolist()
-    rising = sorted(there, key=lambda code: order.index(values[code]) if order else values[code])
+    rising = sorted(there, key=lambda code: values[code])
     place = np.zeros(len(values), np.int64)
     place[rising] = np.arange(len(rising))
     return [values[code] for code in rising], place[codes]
 
 
-def _cells(records: pa.Table) -> tuple[list[Cell], NDArray[np.int64]]:
-    """The cells of some records, by weather, lanes, density, and the place of each record's."""
-    weathers, weather = _distinct(records["weather"], tuple(WEATHERS))
-    lanes, lane = _distinct(records["lanes"])
-    densities, density = _distinct(records["density"])
-    codes = (weather * len(lanes) + lane) * len(densities) + density
-    every = list(product(weathers, lanes, densities))
-    driven = np.bincount(codes, minlength=len(every)) > 0
-    cells = [Cell(weather=name, lanes=lane, density=factor) for name, lane, factor in compress(every, driven)]
-    return cells, (np.cumsum(driven) - 1)[codes]
+def axes_of(records: pa.Table) -> Axes:
+    """The axes of the world that records are of."""
+    facts = json.loads(records["world_facts"][0].as_py())
+    return Axes.read(facts["axes"])
+
+
+def as_text(cell: Cell) -> str:
+    """A cell as records have it."""
+    return json.dumps(dict(cell), separators=(",", ":"))
+
+
+def _cells(records: pa.Table, axes: Axes) -> tuple[list[Cell], NDArray[np.int64]]:
+    """The cells of some records in the order of tables, and the place of each record's."""
+    texts, code = _distinct(records["cell"])
+    cells = [Cell(**json.loads(text)) for text in texts]
+    order = sorted(range(len(cells)), key=lambda place: axes.place(cells[place]))
+    place = np.empty(len(cells), np.int64)
+    place[order] = np.arange(len(cells))
+    return [cells[number] for number in order], place[code]
 
 
 def shared(first: Episodes, second: Episodes) -> tuple[Episodes, Episodes]:
@@ -203,11 +212,8 @@ class Summary:
         offroad_rate: share of episodes that leave the road, all runs pooled.
         attack_success: share of steps in [0, 1] whose decision the attack changed.
         queries_mean: victim evaluations a step, mean over steps.
-        queries_median: victim evaluations a step, median over episodes of the episode's median.
-        queries_max: most victim evaluations in one step.
         attack_ms: the attack's wall time a step and episode, milliseconds.
         min_ttc_s: smallest time to collision of an episode in seconds, median over episodes; inf: never a car ahead.
-        mean_speed: metres a second.
         action_entropy: of discrete actions, in [0, 1] (1: all equally often, 0: always one); NaN for continuous ones.
         runs: training seeds.
         cells: cells of the grid.
@@ -220,11 +226,8 @@ class Summary:
     offroad_rate: Interval
     attack_success: float
     queries_mean: float
-    queries_median: float
-    queries_max: float
     attack_ms: float
     min_ttc_s: float
-    mean_speed: float
     action_entropy: float
     runs: int
     cells: int
@@ -241,11 +244,8 @@ def summarise(episodes: Episodes) -> Summary:
         offroad_rate=rate(episodes, "offroad"),
         attack_success=step_mean(episodes, "changed"),
         queries_mean=step_mean(episodes, "queries"),
-        queries_median=float(np.median(episodes.column("queries_median"))),
-        queries_max=float(episodes.column("queries_max").max()),
         attack_ms=step_mean(episodes, "attack_ms"),
         min_ttc_s=float(np.median(episodes.column("min_ttc_s"))),
-        mean_speed=step_mean(episodes, "mean_speed"),
         action_entropy=action_entropy(episodes.table),
         runs=runs,
         cells=cells,

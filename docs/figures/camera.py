@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from bench.scenarios.grid import WEATHERS
 from docs.figures import style
 from docs.figures.sightings import FRAME, approaches, picture, show
+from envs.weather import WEATHERS
 
 WINDOW = 400, 230
 """Width and height in pixels of what is shown of each frame."""

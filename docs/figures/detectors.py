@@ -6,11 +6,11 @@ import torch
 from matplotlib.figure import Figure
 
 from bench.detection.approach import NMS_IOU
-from bench.detection.contracts import detections
+from bench.detection.boxes import detections
 from bench.detection.stopping import THRESHOLD
-from bench.scenarios.grid import WEATHERS
 from docs.figures import style
 from docs.figures.sightings import FRAME, approaches, box, detector, frame_axes, picture, show, sight
+from envs.weather import WEATHERS
 
 COLOURS = {"clear": style.ORANGE, "rain": style.BLUE, "fog": style.GREY, "night": style.INK}
 DASHES = {"clear": "-", "rain": "--", "fog": "-.", "night": ":"}

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from bench.driving.contracts import DrivingAttack, Policy
+from bench.driving import DrivingAttack, ObservationThreat, Policy
+from bench.driving.attacker import AttackModule
 from bench.driving.drive import drive
-from bench.driving.pipeline import AttackModule
 from bench.driving.rollout import Columns, Trace
-from bench.driving.threat import ObservationThreat
 from bench.plugins.pair import choose
 from bench.run.config import run_config
 from bench.run.plan import plan

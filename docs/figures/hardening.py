@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tensordict import TensorDict
 
-from bench.driving.pipeline import AttackModule
-from bench.driving.threat import ObservationThreat
+from bench.driving import ObservationThreat
+from bench.driving.attacker import AttackModule
 from bench.plugins.pair import choose
 from bench.victims import zoo
 from bench.victims.drivers.dqn import DQN

@@ -5,9 +5,9 @@ from __future__ import annotations
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from bench.detection import patches
+from bench.detection import PatchThreat, patches
 from bench.detection.crafting import craft
-from bench.detection.threat import Patch, PatchThreat
+from bench.detection.patch import Patch
 from bench.errors import UserError
 from bench.plugins.pair import Pair, choose
 from bench.run.unit import Crafting

@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Discrete
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from bench.driving.contracts import Policy
+from bench.driving import Policy
 from bench.plugins.pair import choose
 from docs.figures import style
 from docs.figures.driving import STEPS_PER_SECOND, episode, policy

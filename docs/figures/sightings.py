@@ -13,13 +13,14 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bench.detection import STOP_SIGN, Approach, Detector
 from bench.detection.approach import Sight, look
-from bench.detection.contracts import STOP_SIGN, Approach, Detector, confidence
+from bench.detection.boxes import confidence
 from bench.detection.stopping import THRESHOLD
 from bench.plugins.pair import choose
-from bench.scenarios.grid import GRIDS, Cell
 from docs.figures import style
 from docs.figures.patches import SHARE
+from envs.camera.axes import APPROACH_V1, AXES
 from leaderboard.approaches import Patched, read_patched
 from leaderboard.published import published
 
@@ -34,7 +35,7 @@ MARGIN = 1.1
 def approaches(weather: str = "clear") -> list[Approach]:
     """One approach a place."""
     return choose("world", "camera").component.approaches(
-        Cell(lanes=LANES, density=DENSITY, weather=weather), GRIDS["approach-v1"].seeds()
+        AXES.cell(lanes=LANES, density=DENSITY, weather=weather), APPROACH_V1.seeds()
     )
 
 

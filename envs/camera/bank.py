@@ -16,16 +16,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
 
-from bench.detection.contracts import Objects, Scenes
+from bench.detection import Objects, Scenes
 from bench.errors import UserError
 from bench.files import whole
-from bench.scenarios.grid import WEATHERS
 from envs.camera import sign
 from envs.camera.frame import Frame, noise_level
 from envs.camera.objects import objects
 from envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
+from envs.weather import WEATHERS
 
 SHIPPED = Path(__file__).parent / "data"
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.detection.contracts import Scenes
+from bench.detection import Scenes
 from bench.detection.stopping import SPEED_MPS
 
 HARDEST_MPS2 = 8.0

@@ -13,13 +13,13 @@ import torch
 from numpy.typing import NDArray
 
 from bench.detection.stopping import SPEED_MPS
-from bench.scenarios.grid import Weather
 from envs.camera import develop, sign
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
 from envs.camera.street.light import lighting
 from envs.camera.street.render import Traced
 from envs.camera.weather import air
+from envs.weather import Weather
 
 QUALITY = 85
 """Of the WebP picture; the sign's crop does not go through it."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.detection.contracts import STOP_SIGN
+from bench.detection import STOP_SIGN
 from envs.camera import sign
 from envs.camera.camera import Array
 from envs.camera.poses import Pose

@@ -9,12 +9,14 @@ from typing import get_args
 
 import numpy as np
 
+from envs.camera.axes import AXES
 from envs.camera.camera import Camera
 from envs.camera.street import occlusion
 from envs.camera.street.layout import DISTANCES, LOCATIONS, sign_x, traffic
 from envs.camera.street.light import Lighting
 
-LANES, DENSITIES = (3, 4, 5), (1.0, 2.0)
+LANES = [int(lanes) for lanes in AXES["lanes"].choices]
+DENSITIES = [float(density) for density in AXES["density"].choices]
 TRAINING_VIEWS = 12
 """Of each training place under each lighting."""
 TRAINING_LIGHTINGS: tuple[Lighting, ...] = ("sun", "overcast")

@@ -13,13 +13,13 @@ import numpy as np
 
 from bench.errors import UserError
 from bench.files import whole
-from bench.scenarios.grid import WEATHERS
 from envs.camera import bank
 from envs.camera.frame import frame
 from envs.camera.poses import Pose
 from envs.camera.street import layout, render
 from envs.camera.street.light import light, lighting
 from envs.camera.street.render import Traced, trace, variant
+from envs.weather import WEATHERS
 
 VERSION = 2
 """Of everything that decides what is traced; raised when the street or its light change."""

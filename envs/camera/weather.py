@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.scenarios.grid import Weather
+from envs.weather import Weather
 
 Image = NDArray[np.float32]
 

@@ -9,11 +9,12 @@ from typing import ClassVar
 
 from platformdirs import user_cache_path
 
-from bench.detection.contracts import Approach, CameraWorld
+from bench.detection import Approach, CameraWorld
 from bench.errors import UserError
 from bench.plugins.contracts import Progress
-from bench.scenarios.grid import Cell
+from bench.scenarios import Axes, Cell
 from envs.camera import bank, poses
+from envs.camera.axes import APPROACH_V1, AXES
 from envs.camera.bank import BankScenes
 from envs.camera.objects import NAMES
 from envs.camera.street.layout import LOCATIONS
@@ -29,6 +30,8 @@ class StopSignApproach(CameraWorld):
         bank: folder of the rendered frames; empty for those that ship with the project.
     """
 
+    axes: ClassVar[Axes] = AXES
+    grid: ClassVar[str] = APPROACH_V1.name
     locations: ClassVar[tuple[str, ...]] = tuple(place.name for place in LOCATIONS.values() if not place.training)
 
     classes: ClassVar[tuple[str, ...]] = NAMES
@@ -48,11 +51,6 @@ class StopSignApproach(CameraWorld):
         return _training(self.folder)
 
     def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
-        if cell.lanes not in poses.LANES or cell.density not in poses.DENSITIES:
-            raise UserError(
-                f"the camera world has no {cell}: lanes must be one of {', '.join(map(str, poses.LANES))} "
-                f"and density one of {', '.join(f'{density:g}' for density in poses.DENSITIES)}"
-            )
         return [self._approach(cell, seed) for seed in seeds]
 
     def _approach(self, cell: Cell, seed: int) -> Approach:

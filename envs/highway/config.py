@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, get_args
 
-from bench.driving.contracts import ActionType, Driver, Features
-from bench.scenarios.grid import Cell
+from bench.driving.features import ActionType, Driver, Features
+from bench.scenarios import Cell
+from envs.highway.axes import AXES
 
 Preset = Literal["standard", "thesis"]
 
@@ -17,11 +18,21 @@ ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 """Discrete actions by number, as in highway-env's DiscreteMetaAction (envs/common/action.py)."""
 
 UNITS = ("m", "m", "m/s", "m/s")
+FLOORS = (0.5, 0.2, 0.3, 0.2)
+"""A sensor's own resolution."""
 STANDARD_FEATURES = Features(
-    names=("x", "y", "vx", "vy"), low=(-100.0, -20.0, -40.0, -20.0), high=(100.0, 20.0, 40.0, 20.0), units=UNITS
+    names=("x", "y", "vx", "vy"),
+    low=(-100.0, -20.0, -40.0, -20.0),
+    high=(100.0, 20.0, 40.0, 20.0),
+    units=UNITS,
+    floors=FLOORS,
 )
 THESIS_FEATURES = Features(
-    names=("x", "y", "vx", "vy"), low=(-100.0, -100.0, 0.0, 0.0), high=(100.0, 100.0, 20.0, 20.0), units=UNITS
+    names=("x", "y", "vx", "vy"),
+    low=(-100.0, -100.0, 0.0, 0.0),
+    high=(100.0, 100.0, 20.0, 20.0),
+    units=UNITS,
+    floors=FLOORS,
 )
 STANDARD_TARGET_SPEEDS = (10.0, 15.0, 20.0, 25.0, 30.0)
 THESIS_TARGET_SPEEDS = (20.0, 25.0, 30.0)
@@ -54,7 +65,7 @@ class HighwayConfig:
         ValueError: with one line that says what is wrong and what is allowed.
     """
 
-    cells: tuple[Cell, ...] = (Cell(lanes=3, density=1.0),)
+    cells: tuple[Cell, ...] = (AXES.cell(lanes=3, density=1.0),)
     vehicles: int = 20
     ego_spacing: float = 2.0
     simulation_frequency: int = 15

@@ -10,7 +10,6 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.scenarios.grid import WEATHERS
 from envs.highway.collision import find_collisions
 from envs.highway.compiled import entry_point, inner
 from envs.highway.config import ACTIONS, HighwayConfig
@@ -32,6 +31,7 @@ from envs.highway.state import (
     parameters,
 )
 from envs.highway.traffic import act, sort_by_position
+from envs.weather import WEATHERS
 
 
 class Number(IntEnum):

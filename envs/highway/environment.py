@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.scenarios.grid import SeedBlock
+from bench.scenarios import SeedBlock
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.engine import Flag, Number
 

@@ -14,13 +14,14 @@ from highway_env.envs.highway_env import HighwayEnv as FaramaHighwayEnv
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
-from bench.scenarios.grid import WEATHERS, Cell
+from bench.scenarios import Cell
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.dynamics import VEHICLE_LENGTH
 from envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED
 from envs.highway.engine import Flag, Number, check_seeds
 from envs.highway.environment import HighwayEnv
 from envs.highway.sensor import FEATURES, add_noise, noise_sigma, sensor_range_m
+from envs.weather import WEATHERS
 
 IDLE = ACTIONS.index("IDLE")
 LANE_CHANGES = (ACTIONS.index("LANE_LEFT"), ACTIONS.index("LANE_RIGHT"))

@@ -13,8 +13,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.scenarios.grid import Weather
 from envs.highway.compiled import entry_point, inner
+from envs.weather import Weather
 
 CLEAR_RANGE_M = 200.0
 """AbstractEnv.PERCEPTION_DISTANCE: 5 x the greatest speed."""

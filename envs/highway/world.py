@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from bench.driving.contracts import ActionType, Driver, DrivingWorld, Features
-from bench.scenarios.grid import Cell
+from bench.driving import ActionType, Driver, DrivingWorld, Features
+from bench.scenarios import Axes, Cell
+from envs.highway.axes import AXES, STANDARD_V1
 from envs.highway.config import (
+    ACTIONS,
     STANDARD_FEATURES,
     STANDARD_TARGET_SPEEDS,
     THESIS_FEATURES,
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
 Backend = Literal["batched", "reference"]
+REFERENCE = "highway-env"
+"""The distribution that the backend `reference` runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,13 +41,18 @@ class HighwayWorld(DrivingWorld):
         simulation_frequency, policy_frequency: physics frames and decisions a second.
         max_steps: decisions until an episode is truncated.
         offroad_terminal: whether leaving the road ends the episode.
-        backend: `batched`, our engine, or `reference`, the real highway-env (equal, and several hundred times slower).
+        backend: `batched`, our engine, or `reference`, the real highway-env (equal, and several hundred times slower; needs
+            pip install 'cavbench[reference]').
 
     Raises:
         ValueError: with one line, for what neither environment can do.
     """
 
+    axes: ClassVar[Axes] = AXES
+    grid: ClassVar[str] = STANDARD_V1.name
     features: ClassVar[Features] = STANDARD_FEATURES
+    actions: ClassVar[tuple[str, ...]] = ACTIONS
+    drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm")
 
     preset: Preset = "standard"
     vehicles: int = 20
@@ -65,7 +75,15 @@ class HighwayWorld(DrivingWorld):
         if self.preset == "thesis":
             # The class says the standard's ranges; this object's own are others.
             object.__setattr__(self, "features", THESIS_FEATURES)
-        self.config((Cell(lanes=3, density=1.0),))
+        if self.backend == "reference":
+            if find_spec("highway_env") is None:
+                raise ValueError(f"backend=reference needs {REFERENCE}: pip install 'cavbench[reference]'")
+            object.__setattr__(self, "libraries", (REFERENCE,))
+        self.config((AXES.cell(lanes=3, density=1.0),))
+
+    @property
+    def decision_hz(self) -> float:
+        return self.policy_frequency
 
     def config(
         self,
@@ -102,7 +120,7 @@ class HighwayWorld(DrivingWorld):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        """See `bench.driving.contracts.DrivingWorld.make`."""
+        """See `bench.driving.DrivingWorld.make`."""
         config = self.config(cells, action_type=action_type, driver=driver, action_repeat=action_repeat)
         # Imported here: both load torchrl and numba or pygame, which listing components must not.
         if self.backend == "batched":

@@ -13,8 +13,7 @@ from attacks.art import ATTACKS, _component
 from attacks.noise import Noise
 from attacks.pgd import PGD
 from bench.conformance import complaints
-from bench.driving.contracts import DrivingAttack
-from bench.driving.threat import ObservationThreat
+from bench.driving import DrivingAttack, ObservationThreat
 from bench.errors import UserError
 from bench.plugins.pair import choose
 from tests.attacks.victims import FEATURES, Linear, observations, perturb, victim

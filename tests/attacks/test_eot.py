@@ -13,8 +13,8 @@ from torch import Tensor
 from attacks.eot import EOT, total_variation
 from attacks.grey_patch import GreyPatch
 from attacks.noise_patch import NoisePatch
-from bench.detection.contracts import Detector, Scenes, confidence
-from bench.detection.threat import PatchThreat, VisionOracle
+from bench.detection import Detector, PatchOracle, PatchThreat, Scenes
+from bench.detection.boxes import confidence
 from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.vision.drawn_street import DrawnStreet
@@ -24,10 +24,10 @@ SCENES = RedScenes(torch.linspace(30, 8, 5))
 
 def crafted(
     attack: EOT | NoisePatch | GreyPatch, seed: int = 0, queries: int = 20_000, detector: Detector | None = None
-) -> tuple[Tensor, VisionOracle]:
+) -> tuple[Tensor, PatchOracle]:
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    oracle = VisionOracle(detector or RedDetector(), PatchThreat(queries=queries), attack.access, generator)
+    oracle = PatchOracle(detector or RedDetector(), PatchThreat(queries=queries), attack.access, generator)
     scenes: Scenes = SCENES if detector is None else DrawnStreet().training_scenes()
     return attack.craft(oracle, scenes, lambda share, text: None), oracle
 
@@ -64,7 +64,7 @@ def test_what_it_reports_is_its_losses_and_changes_no_patch(monkeypatch: pytest.
     assert set(reported.losses) == {"found", "total_variation"}
     variation = torch.stack([total_variation(texels / 255) for texels in reported.texels])
     assert torch.allclose(reported.losses["total_variation"], variation, atol=0.01)
-    monkeypatch.setattr(VisionOracle, "report", lambda *_, **__: None)
+    monkeypatch.setattr(PatchOracle, "report", lambda *_, **__: None)
     assert torch.equal(crafted(attack)[0], patch)
 
 

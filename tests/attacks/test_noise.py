@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from attacks.noise import Distribution, Noise
-from bench.driving.threat import ObservationThreat
+from bench.driving import ObservationThreat
 from tests.attacks.victims import FEATURES, observations, perturb, victim
 
 

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.errors import UserError
-from bench.scenarios.grid import WEATHERS, Weather
 from envs.camera import bank, sign
 from envs.camera.frame import frame
 from envs.camera.plate import detail, filtered
 from envs.camera.poses import approach
 from envs.camera.weather import air, streaks
+from envs.weather import WEATHERS, Weather
 from tests.camera.scenes import lit, scenes
 
 SCENES = scenes()

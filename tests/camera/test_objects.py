@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from bench.detection.contracts import STOP_SIGN
+from bench.detection import STOP_SIGN
 from envs.camera import sign
 from envs.camera.objects import NAMES, objects
 from envs.camera.poses import scored, training

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from attacks.eot import EOT
-from bench.detection.contracts import STOP_SIGN, Detector, confidence
-from bench.detection.threat import PatchThreat, VisionOracle
+from bench.detection import STOP_SIGN, Detector, PatchOracle, PatchThreat
+from bench.detection.boxes import confidence
 from bench.errors import UserError
 from bench.run.config import component, run_config
 from bench.victims import zoo
@@ -108,7 +108,7 @@ def test_the_one_that_ships_withstands_what_blinds_the_other(published: YOLOv3Ti
     left = {}
     for name, detector in (("undefended", published), ("hardened", hardened)):
         torch.manual_seed(0)
-        oracle = VisionOracle(detector, PatchThreat(), "gradients", torch.Generator().manual_seed(0))
+        oracle = PatchOracle(detector, PatchThreat(), "gradients", torch.Generator().manual_seed(0))
         attack = EOT(steps=30, batch=4, window=224, learning_rate=0.1)
         left[name] = seen(detector, attack.craft(oracle, scenes, lambda share, text: None))
     assert left["hardened"] > 0.8 > 0.5 > left["undefended"]

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import DetectorDefense
+from bench.detection import DetectorDefense
 from defenses.jpeg import JPEG
 from defenses.smoothing import Guarded, MedianSmoothing
 from tests.framework.toy_camera import RedVictim

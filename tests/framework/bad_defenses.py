@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.driving.contracts import DrivingDefense, DrivingVictim, Policy
+from bench.driving import DrivingDefense, DrivingVictim, Policy
 
 
 class _Wrapped(Policy):

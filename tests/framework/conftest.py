@@ -51,6 +51,9 @@ class Said:
     err: str
 
 
+Bench = Callable[..., Said]
+
+
 @pytest.fixture
 def bench(toy_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
     """The command line in this process: bench("run", "attack=nudge") -> Said."""

@@ -20,7 +20,7 @@ HEAD = """
 from dataclasses import dataclass
 from typing import ClassVar
 from bench.plugins.contracts import Access, Attack
-from bench.driving.contracts import DrivingAttack
+from bench.driving import DrivingAttack
 """
 GOOD = """
 @dataclass(frozen=True, kw_only=True)

@@ -50,9 +50,9 @@ import numpy as np
 import torch
 
 from bench.plugins.contracts import Access
-from bench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, Policy
-from bench.detection.threat import VisionOracle
-from bench.detection.contracts import PatchAttack
+from bench.driving import DrivingAttack, DrivingDefense, DrivingVictim, Policy
+from bench.detection import PatchOracle
+from bench.detection import PatchAttack
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, make_dataclass
 from typing import ClassVar
 
 from bench.plugins.contracts import Access
-from bench.driving.contracts import DrivingAttack
+from bench.driving import DrivingAttack
 
 
 @dataclass(frozen=True, kw_only=True)

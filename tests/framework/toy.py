@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.driving.contracts import (
+from bench.driving import (
     ActionType,
     Driver,
     DrivingAttack,
@@ -23,11 +23,11 @@ from bench.driving.contracts import (
     DrivingVictim,
     DrivingWorld,
     Features,
+    Oracle,
     Policy,
 )
-from bench.driving.threat import Oracle
 from bench.plugins.contracts import Access, Progress, Trained
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 
 FLAGS = ("crashed", "offroad")
 MEASURES = ("progress", "speed", "x", "ttc")

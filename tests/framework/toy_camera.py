@@ -11,20 +11,21 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from bench.detection.contracts import (
+from bench.detection import (
     Approach,
     CameraWorld,
     Detector,
     DetectorDefense,
     DetectorVictim,
     PatchAttack,
+    PatchOracle,
     Predictions,
     Scenes,
 )
-from bench.detection.threat import VisionOracle
 from bench.plugins.contracts import Access, Progress, Trained
-from bench.scenarios.grid import WEATHERS, Cell
+from bench.scenarios import Cell
 from bench.victims import zoo
+from envs.weather import WEATHERS
 
 SIDE, SIGN = 32, slice(8, 24)
 """Of the pictures, and where the sign is in them, in both directions."""
@@ -126,7 +127,7 @@ class Paint(PatchAttack):
     pause: float = 0.0
     mood: Literal["calm", "loud", "void", "crooked", "greedy", "tamper", "raise", "kill"] = "calm"
 
-    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor | None:
+    def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor | None:
         if self.mood == "raise":
             raise ZeroDivisionError("the attack is at a loss")
         if self.mood == "kill":
@@ -155,7 +156,7 @@ class Blank(PatchAttack):
     access: ClassVar[Access] = "oblivious"
     seeded: ClassVar[bool] = False
 
-    def craft(self, oracle: VisionOracle, scenes: Scenes, progress: Progress) -> Tensor:
+    def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         return torch.full((3, 8, 8), 0.5)
 
 

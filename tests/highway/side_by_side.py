@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.scenarios.grid import Cell
+from bench.scenarios import Cell
 from envs.highway.config import HighwayConfig
 from envs.highway.engine import Flag, HighwayEngine, Number
 from envs.highway.reference import SensedHighwayEnv

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from bench.plugins.pair import choose
 from bench.records.store import SCHEMA, SCHEMAS
-from bench.scenarios.grid import GRIDS, Cell
+from bench.scenarios import Cell
 
 CLEAR = tuple(cell for cell in GRIDS["standard-v1"].cells() if cell.weather == "clear")
 

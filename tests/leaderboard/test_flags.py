@@ -7,7 +7,6 @@ import pytest
 from full_house import PGD, SEEN
 from synthetic import CLEAR, approach, drive, probed, reference_drivers
 
-from bench.scenarios.grid import GRIDS
 from leaderboard.entries import read_entries
 from leaderboard.flags import FLAGS, Flag
 from leaderboard.ranking import Board, boards

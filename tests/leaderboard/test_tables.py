@@ -13,7 +13,7 @@ from rich.console import Console
 from synthetic import CLEAR, drive, reference_drivers
 
 from bench.records.store import SCHEMA
-from bench.scenarios.grid import GRIDS, Cell
+from bench.scenarios import Cell
 from bench.statistics.estimates import Interval
 from leaderboard.pairs import BEST_BLIND, read_pairs
 from leaderboard.tables import remarks, run_report

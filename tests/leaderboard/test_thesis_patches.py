@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from synthetic import approach
 
-from bench.detection.threat import PatchThreat
+from bench.detection import PatchThreat
 from bench.plugins.pair import choose
 from bench.records.store import SCHEMAS
 from bench.run.config import run_config

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.driving.contracts import Policy
+from bench.driving import Policy
 from bench.victims.drivers.networks import ActorPolicy, QPolicy
 
 

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.driving.contracts import DrivingWorld, Policy, TrainingHooks
+from bench.driving import DrivingWorld, Policy, TrainingHooks
 from bench.plugins import registry
 from bench.victims import zoo
 from bench.victims.drivers.ddpg import DDPG
@@ -80,7 +80,7 @@ def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, w
 def test_the_budget_grows_along_the_ramp() -> None:
     defense = AdversarialTraining(skip=0.0, attack="noise", attack_params="", ramp_from=0.2, ramp_to=0.6)
     world = registry.load("world", "highway")()
-    loop = AttackInLoop(defense, registry.load("attack", "noise")(), world.features, None, seed=0)
+    loop = AttackInLoop(defense, registry.load("attack", "noise")(), world.facts, None, seed=0)
     policy, seen = QPolicy(5, 5, 8), 0.5 * torch.ones(16, 10, 5)
     moved = [float((loop.shown(seen, policy, share) - seen).abs().max()) for share in (0.1, 0.3, 0.4, 0.6, 0.9)]
     assert moved == pytest.approx([0.0, moved[4] / 4, moved[4] / 2, moved[4], moved[4]], rel=0.01)
@@ -145,8 +145,8 @@ class Lesson:
     def decided(self, **params: float) -> torch.Tensor:
         """What the learner decides on what is shown after 150 updates: softmax probabilities, or the action."""
         defense = AdversarialTraining(**{"consistency": 0.0, "margin": 0.0, **params})
-        features = registry.load("world", "highway").features
-        hooks = AttackInLoop(defense, registry.load("attack", "none")(), features, self.teacher, seed=0)
+        facts = registry.load("world", "highway")().facts
+        hooks = AttackInLoop(defense, registry.load("attack", "none")(), facts, self.teacher, seed=0)
         learner = self.victim.learner(self.env, hooks)
         learner.enter(self.victim.phases(hooks)[0])
         for _ in range(150):
@@ -191,7 +191,7 @@ def test_adversarial_training_trains_saves_and_loads(
     hardened = defense.train(victim, world, seed=0, progress=silent)
     assert hardened.card["attacked_decisions"] > 0
     zoo.save(hardened.network, zoo.Recipe.of(victim, defense), seed=0, world=world, card=hardened.card)
-    loaded = defense.load(victim, 0)
+    loaded = defense.load(victim, 0, world.facts)
     x = torch.rand(4, 10, 5)
     torch.testing.assert_close(loaded.scores(x), hardened.network.scores(x))
-    assert not torch.equal(loaded.scores(x), victim.load(0).scores(x))
+    assert not torch.equal(loaded.scores(x), victim.load(0, world.facts).scores(x))

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.detection.contracts import CameraWorld
-from bench.driving.contracts import DrivingWorld
+from bench.detection import CameraWorld
+from bench.driving import DrivingWorld
 from bench.errors import UserError
 from bench.plugins import registry
 from bench.plugins.fingerprint import sources
-from bench.plugins.options import WORLDS
+from bench.plugins.track import track
 from bench.run.config import run_config, train_config
 from bench.victims import zoo
 from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
@@ -27,6 +27,7 @@ from defenses.advtrain import AdversarialTraining
 
 TINY = DQN(hidden=8)
 RECIPE = zoo.Recipe.of(TINY)
+FACTS = registry.load("world", "highway")().facts
 
 
 @pytest.fixture
@@ -65,30 +66,33 @@ def test_tampered_weights_are_refused(saved: Path) -> None:
     blob[-1] ^= 1
     saved.write_bytes(bytes(blob))
     with pytest.raises(UserError, match="the file was changed"):
-        TINY.load(3)
+        TINY.load(3, FACTS)
 
 
 def test_weights_that_do_not_fit_are_refused_in_one_line(saved: Path) -> None:
     changed(saved, lambda entry: entry["shape"].update(hidden=9))
     with pytest.raises(UserError, match="do not fit 'dqn'") as error:
-        TINY.load(3)
+        TINY.load(3, FACTS)
     assert "\n" not in str(error.value)
 
 
 def test_a_broken_card_is_named(saved: Path) -> None:
     saved.with_suffix(".json").write_text("{")
     with pytest.raises(UserError, match=r"card .*seed3\.json cannot be read"):
-        TINY.load(3)
+        TINY.load(3, FACTS)
     with pytest.raises(UserError, match="with a card that cannot be read"):
-        TINY.load(4)
+        TINY.load(4, FACTS)
 
 
 def test_training_a_variant_never_hides_the_default(home: Path, highway: DrivingWorld) -> None:
-    shipped = DQN().load(0).weights_sha256
+    shipped = DQN().load(0, FACTS).weights_sha256
     save(DQN(hidden=64), highway, seed=0)
     save(DQN(trained_in="vehicles=5"), replace(highway, vehicles=5), seed=0)
-    assert DQN().load(0).weights_sha256 == shipped
-    assert len({DQN(**own).load(0).weights_sha256 for own in ({}, {"hidden": 64}, {"trained_in": "vehicles=5"})}) == 3
+    assert DQN().load(0, FACTS).weights_sha256 == shipped
+    assert (
+        len({DQN(**own).load(0, FACTS).weights_sha256 for own in ({}, {"hidden": 64}, {"trained_in": "vehicles=5"})})
+        == 3
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +124,7 @@ def as_of_bench(recipe: zoo.Recipe) -> zoo.Recipe:
 def test_a_new_parameter_with_a_default_refuses_no_shipped_policy(home: Path) -> None:
     later = as_of_bench(zoo.Recipe.of(NewDQN()))
     assert later.key == zoo.Recipe.of(DQN()).key
-    assert zoo.load(later, 0, QPolicy).weights_sha256 == DQN().load(0).weights_sha256
+    assert zoo.load(later, 0, QPolicy).weights_sha256 == DQN().load(0, FACTS).weights_sha256
     assert as_of_bench(zoo.Recipe.of(NewDQN(warm_up=1))).key != later.key
 
 
@@ -134,7 +138,7 @@ def test_a_training_of_another_version_is_another_recipe(home: Path, monkeypatch
     monkeypatch.setattr(DQN, "training", 2)
     assert zoo.Recipe.of(DQN()).key != before.key
     with pytest.raises(UserError, match="training version 1 of victim, now 2"):
-        DQN().load(0)
+        DQN().load(0, FACTS)
 
 
 def test_a_recipe_is_its_values_not_how_they_were_written() -> None:
@@ -147,7 +151,7 @@ def test_a_recipe_is_its_values_not_how_they_were_written() -> None:
 
 def test_a_missing_policy_says_what_there_is_and_what_trains_it(saved: Path) -> None:
     with pytest.raises(UserError) as error:
-        DQN(hidden=16, gamma=0.9).load(4)
+        DQN(hidden=16, gamma=0.9).load(4, FACTS)
     said = str(error.value)
     assert "no 'dqn' with victim.hidden=16 victim.gamma=0.9 of training seed 4" in said
     assert "default (seeds 0, 1, 2)" in said
@@ -166,10 +170,10 @@ def test_a_world_that_is_not_the_default_must_be_named(home: Path, highway: Driv
 def test_the_shipped_policies_are_those_of_the_default_recipes(home: Path) -> None:
     dqn, ddpg = DQN(), DDPG()
     for seed in (0, 1, 2):
-        hardened = [AdversarialTraining(skip=skip).load(dqn, seed) for skip in (0.0, 0.3, 0.5, 1.0)]
-        for policy in (dqn.load(seed), *hardened):
+        hardened = [AdversarialTraining(skip=skip).load(dqn, seed, FACTS) for skip in (0.0, 0.3, 0.5, 1.0)]
+        for policy in (dqn.load(seed, FACTS), *hardened):
             assert policy.decide(torch.zeros(2, 10, 5)).shape == (2,)
-        for steering in (ddpg.load(seed), AdversarialTraining().load(ddpg, seed)):
+        for steering in (ddpg.load(seed, FACTS), AdversarialTraining().load(ddpg, seed, FACTS)):
             assert steering.decide(torch.zeros(2, 10, 5)).shape == (2, 2)
 
 
@@ -217,7 +221,7 @@ def made_by(command: str) -> zoo.Recipe:
     hardens = config.defense.name != "none"
     trained = config.defense.component if hardens else config.victim.component
     world = config.world.component
-    placed = replace(trained, trained_in=zoo.trained_in(world, default=WORLDS[world.tracks()[0]]))
+    placed = replace(trained, trained_in=zoo.trained_in(world, default=track(world.tracks()[0]).world))
     return zoo.Recipe.of(*((config.victim.component, placed) if hardens else (placed,)))
 
 
@@ -245,7 +249,7 @@ def test_a_detector_is_kept_like_a_policy_in_half_precision(home: Path) -> None:
     world: CameraWorld = registry.load("world", "camera")()
     network = YOLOv5Network("n", ("stop sign", "car")).eval()
     path = zoo.save(network, zoo.Recipe.of(victim), seed=0, world=world, card={"scenes": 3})
-    again = victim.load(0)
+    again = victim.load(0, world.facts)
     assert again.names == ("stop sign", "car")
     assert again.weights_sha256 == zoo.card(zoo.Recipe.of(victim), 0)["sha256"]
     picture = torch.rand(1, 3, 64, 64)

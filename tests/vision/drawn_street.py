@@ -8,8 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from bench.detection.contracts import Approach, CameraWorld, Scenes
-from bench.scenarios.grid import WEATHERS, Cell
+from bench.detection import Approach, CameraWorld, Scenes
+from bench.scenarios import Cell
+from envs.weather import WEATHERS
 from tests.vision.pictures import stop_sign
 
 SIDE = 416

@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from bench.detection import stopping
+from bench.detection import Predictions, stopping
 from bench.detection.approach import false_alarms, found_of, look, measure
-from bench.detection.contracts import Predictions
 from tests.framework.toy_camera import RedDetector, RedScenes
 
 DISTANCE = np.linspace(30, 8, 10)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import Predictions, detections
+from bench.detection import Predictions
+from bench.detection.boxes import detections
 from bench.victims.detectors.loss import complete_overlap, missed, supervised, unlike
 
 BOXES = torch.tensor([[10.0, 10.0, 40.0, 40.0], [50.0, 20.0, 70.0, 60.0]])

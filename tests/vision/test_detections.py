@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.detection.contracts import Detector, Predictions, confidence, detections, overlap
+from bench.detection import Detector, Predictions
+from bench.detection.boxes import confidence, detections, overlap
 from bench.errors import UserError
 
 relaxed = settings(deadline=None)

@@ -8,14 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.detection.threat import GREY, MOMENTS, PatchThreat, VisionOracle
+from bench.detection import PatchOracle, PatchThreat
+from bench.detection.patch import MOMENTS
+from bench.detection.threat import GREY
 from bench.errors import UserError
 from bench.plugins.contracts import Access, QueryBudgetError
 from tests.framework.toy_camera import RedDetector
 
 
-def oracle(access: Access = "gradients", queries: int = 100) -> VisionOracle:
-    return VisionOracle(RedDetector(), PatchThreat(queries=queries), access, torch.Generator())
+def oracle(access: Access = "gradients", queries: int = 100) -> PatchOracle:
+    return PatchOracle(RedDetector(), PatchThreat(queries=queries), access, torch.Generator())
 
 
 def pictures(count: int) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bench.detection.contracts import STOP_SIGN
+from bench.detection import STOP_SIGN
 from bench.victims.detectors.windows import Views, Windows
 from tests.vision.drawn_street import DrawnStreet
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from bench.detection.contracts import Detector
+from bench.detection import Detector
 from bench.victims.detectors import yolo
 from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
 from bench.victims.detectors.yolov5 import YOLOv5Network

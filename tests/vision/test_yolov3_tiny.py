@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import batch_norm, conv2d, interpolate, leaky_relu, max_pool2d, pad
 
-from bench.detection.contracts import confidence, detections
+from bench.detection.boxes import confidence, detections
 from bench.errors import UserError
 from bench.victims import fetch
 from bench.victims.detectors import yolo

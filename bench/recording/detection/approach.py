@@ -13,10 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection import stopping
+from bench.detection import Scenes, stopping
 from bench.detection.approach import Sight, Sighting
-from bench.detection.contracts import Scenes
-from bench.detection.threat import Evolution
+from bench.detection.patch import Evolution
 from bench.recording.columns import Colour, Columns
 from bench.recording.detection import blueprint as approach_blueprint
 from bench.recording.detection.blueprint import GAP, sights

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from bench.recording import about
 from bench.recording.driving import scene
 from bench.recording.driving.curves import group
-from bench.recording.driving.episode import STEPS_PER_SECOND, Episode
+from bench.recording.driving.episode import Episode
 
 
 def layout(episode: Episode) -> rrb.Blueprint:
@@ -24,7 +24,7 @@ def layout(episode: Episode) -> rrb.Blueprint:
         shares.append(1.4 if episode.attacked else 1.0)
     rows.append(_curves(episode))
     shares.append(5.0)
-    return bare(rrb.Vertical(*rows, row_shares=shares), timeline="time", fps=STEPS_PER_SECOND)
+    return bare(rrb.Vertical(*rows, row_shares=shares), timeline="time", fps=episode.facts.decision_hz)
 
 
 def bare(views: rrb.Container, *, timeline: str, fps: float) -> rrb.Blueprint:
@@ -109,7 +109,7 @@ def _plot(path: str, name: str, low: float, high: float, *, legend: bool = True)
 def page(episode: Episode) -> str:
     """What came of the episode, and who drove it under what."""
     steps = episode.steps
-    lines = [f"**{episode.end}** after {len(episode)} steps ({len(episode) / STEPS_PER_SECOND:.1f} s)"]
+    lines = [f"**{episode.end}** after {len(episode)} steps ({episode.seconds:.1f} s)"]
     clean, taken = episode.choices
     if episode.discrete and episode.attacked:
         lines.append(f"- decisions changed: {100 * float((clean != taken).mean()):.0f} %")

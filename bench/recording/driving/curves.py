@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import colorsys
+from itertools import cycle
 
 import numpy as np
 
 from bench.recording.columns import Colour, Columns
-from bench.recording.driving.episode import ACTIONS, CONTROLS, Episode
+from bench.recording.driving.episode import CONTROLS, Episode
 from bench.recording.driving.scene import CRASHED, EGO, MEASURED, SHOWN
 
 ACTION_COLOURS: tuple[Colour, ...] = (
@@ -49,14 +50,14 @@ def _decisions(episode: Episode, columns: Columns) -> None:
     if not episode.discrete:
         return
     if episode.attacked:
-        columns.states("decision/clean", clean, ACTIONS, ACTION_COLOURS)
-    columns.states("decision/taken", taken, ACTIONS, ACTION_COLOURS)
+        columns.states("decision/clean", clean, episode.facts.actions, ACTION_COLOURS)
+    columns.states("decision/taken", taken, episode.facts.actions, ACTION_COLOURS)
 
 
 def _scores(episode: Episode, columns: Columns) -> None:
-    names = ACTIONS if episode.discrete else CONTROLS
+    names = episode.facts.actions if episode.discrete else CONTROLS
     colours = ACTION_COLOURS if episode.discrete else (EGO, MEASURED)
-    for place, (name, colour) in enumerate(zip(names, colours, strict=True)):
+    for place, (name, colour) in enumerate(zip(names, cycle(colours), strict=False)):
         columns.curve(f"scores/shown/{name}", episode.steps["scores"][:, place], name, colour)
         if episode.attacked:
             values = episode.steps["clean_scores"][:, place]

@@ -10,13 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bench.driving.contracts import Features
+from bench.driving import DrivingFacts, Features, ObservationThreat
 from bench.driving.rollout import Trace
-from bench.driving.threat import ObservationThreat
 
-STEPS_PER_SECOND = 15.0
-ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
-"""highway-env's DiscreteMetaAction, by number."""
 CONTROLS = ("acceleration", "steering")
 """What a continuous action sets, in [-1, 1]."""
 
@@ -29,16 +25,16 @@ class Episode:
 
     Args:
         steps: arrays [T, ...] by name, as `bench.driving.rollout.Trace` has them, without the batch dimension.
-        features: of the observation.
+        facts: of the world.
         meta: the record of the episode (`bench.records.store.SCHEMA`), as far as it is known.
     """
 
     steps: Mapping[str, NDArray[np.generic]]
-    features: Features
+    facts: DrivingFacts
     meta: Mapping[str, object]
 
     @classmethod
-    def of(cls, trace: Trace, features: Features, meta: Mapping[str, object]) -> Episode:
+    def of(cls, trace: Trace, facts: DrivingFacts, meta: Mapping[str, object]) -> Episode:
         """The one episode of a trace, up to its end.
 
         Raises:
@@ -49,7 +45,7 @@ class Episode:
                 f"a recording needs one episode with at least one step, got {len(trace.episodes)} episodes"
             )
         running = np.stack(trace.steps["running"])[:, 0].astype(bool)
-        return cls({name: np.stack(steps)[running, 0] for name, steps in trace.steps.items()}, features, meta)
+        return cls({name: np.stack(steps)[running, 0] for name, steps in trace.steps.items()}, facts, meta)
 
     def __len__(self) -> int:
         return len(self.steps["running"])
@@ -58,7 +54,17 @@ class Episode:
     def timelines(self) -> dict[str, NDArray[np.generic]]:
         """`step`, and `time` in seconds."""
         steps = np.arange(len(self))
-        return {"step": steps, "time": steps / STEPS_PER_SECOND}
+        return {"step": steps, "time": steps / self.facts.decision_hz}
+
+    @property
+    def features(self) -> Features:
+        """Of the observation."""
+        return self.facts.features
+
+    @property
+    def seconds(self) -> float:
+        """How long it is."""
+        return len(self) / self.facts.decision_hz
 
     @property
     def discrete(self) -> bool:

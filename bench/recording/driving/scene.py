@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,7 @@ def bounds(episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
 
 def _edges(episode: Episode) -> tuple[float, float]:
     """y of the road's left and right edge."""
-    lanes = episode.meta.get("lanes")
+    lanes = json.loads(str(episode.meta.get("cell", "{}"))).get("lanes")
     if lanes is None:
         ego = episode.physical("observation", "y")[:, 0]
         lanes = max(1, round(float(ego.max()) / LANE_WIDTH) + 1)

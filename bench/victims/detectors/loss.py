@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import Predictions, overlap
+from bench.detection import Predictions
+from bench.detection.boxes import overlap
 
 ASSIGNED = 10
 """Predictions that answer for an object."""

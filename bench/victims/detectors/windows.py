@@ -9,7 +9,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import Scenes
+from bench.detection import Scenes
 
 BATCH = 16
 """Frames rendered at once."""

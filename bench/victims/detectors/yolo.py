@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from bench.detection.contracts import Predictions
+from bench.detection import Predictions
 
 Network = TypeVar("Network", bound=nn.Module)
 Place = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]

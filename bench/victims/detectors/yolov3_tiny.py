@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bench.detection.contracts import Detector, DetectorVictim, Predictions
+from bench.detection import Detector, DetectorVictim, Predictions
 from bench.errors import UserError
+from bench.plugins.contracts import Facts
 from bench.victims import fetch
 from bench.victims.detectors import coco, yolo
 
@@ -110,7 +111,7 @@ class YOLOv3Tiny(DetectorVictim):
     def zoo_name(self) -> str:
         return "yolov3_tiny"
 
-    def load(self, seed: int) -> YOLOv3TinyNetwork:
+    def load(self, seed: int, facts: Facts) -> YOLOv3TinyNetwork:
         """The one detector there is, whatever the seed."""
         path = fetch.weights("yolov3_tiny")
         network = YOLOv3TinyNetwork()

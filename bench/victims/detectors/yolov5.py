@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import update_bn
 
-from bench.detection.contracts import CameraWorld, Detector, DetectorVictim, Predictions
+from bench.detection import CameraWorld, Detector, DetectorVictim, Predictions
 from bench.errors import UserError
-from bench.plugins.contracts import Progress, Trained
+from bench.plugins.contracts import Facts, Progress, Trained
 from bench.victims import zoo
 from bench.victims.detectors import coco, yolo, yolov5_file
 from bench.victims.detectors.loss import supervised
@@ -236,7 +236,7 @@ class YOLOv5(DetectorVictim):
     def zoo_name(self) -> str:
         return f"yolov5{self.size}"
 
-    def load(self, seed: int) -> YOLOv5Network:
+    def load(self, seed: int, facts: Facts) -> YOLOv5Network:
         """The detector in the file, or that of the zoo, whatever the seed."""
         if not self.path:
             recipe = zoo.Recipe.of(self)

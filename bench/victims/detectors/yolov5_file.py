@@ -20,7 +20,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
-from bench.detection.contracts import Detector
+from bench.detection import Detector
 from bench.errors import UserError
 from bench.files import whole
 

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
-from bench.driving.contracts import ActionType, Policy, TrainingHooks
+from bench.driving import ActionType, Policy, TrainingHooks
 from bench.victims.drivers.learner import CHUNK, Learner, Phase, copy_weights
 from bench.victims.drivers.networks import Actor, ActorPolicy, Critic
 from bench.victims.drivers.training import LearningDriver

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
-from bench.driving.contracts import ActionType, Policy, TrainingHooks
+from bench.driving import ActionType, Policy, TrainingHooks
 from bench.victims.drivers.learner import CHUNK, Learner, Phase, copy_weights
 from bench.victims.drivers.networks import QNetwork, QPolicy
 from bench.victims.drivers.training import LearningDriver

@@ -12,11 +12,11 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from bench.driving.contracts import ActionType, DrivingVictim, Policy
+from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from bench.errors import UserError, reason
 
-WIDTH: dict[ActionType, int] = {"discrete": 5, "continuous": 2}
-"""What a policy gives for an observation: Q-values or logits of highway-env's five decisions, or acceleration and steering."""
+CONTROLS = 2
+"""Numbers of a continuous action: acceleration and steering."""
 TRIED = (1, 2, 1500)
 """Batches that a policy is tried on: attacks ask about many points of many episodes at once."""
 
@@ -28,6 +28,7 @@ class FilePolicy(Policy):
         network: from observations [N, *shape] to [N, A] scores, or [N, 2] actions, which are clipped to [-1, 1].
         shape: of what it takes: [V, F] or, flattened, [V * F].
         action_type: what it decides.
+        width: numbers it gives for an observation.
         sha256: of the file.
         critic: from (observations, actions) to [N, 1] values, for white-box attacks on continuous actions; None if there is none.
     """
@@ -37,12 +38,14 @@ class FilePolicy(Policy):
         network: Callable[[Tensor], Tensor],
         shape: Sequence[int],
         action_type: ActionType,
+        width: int,
         sha256: str,
         critic: nn.Module | None = None,
     ) -> None:
         super().__init__()
         self.network, self.critic = network, critic
-        self.shape, self.action_type, self.weights_sha256 = tuple(shape), action_type, sha256
+        self.shape, self.width = tuple(shape), width
+        self.action_type, self.weights_sha256 = action_type, sha256
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> FilePolicy:
@@ -50,17 +53,17 @@ class FilePolicy(Policy):
         self.training = False
         return self
 
-    def scores(self, observation: Tensor) -> Tensor:
+    def forward(self, observation: Tensor) -> Tensor:
         leading = observation.shape[:-2]
         if not leading.numel():
-            return observation.new_zeros(*leading, WIDTH[self.action_type])
+            return observation.new_zeros(*leading, self.width)
         answer = self.network(observation.reshape(-1, *self.shape))
         answer = answer if self.action_type == "discrete" else answer.clamp(-1, 1)
         return answer.reshape(*leading, answer.shape[-1])
 
-    def value(self, observation: Tensor, action: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         if self.critic is None:
-            return super().value(observation, action)
+            return super().value(observation, action, state)
         return self.critic(torch.cat((observation.flatten(-2), action), -1)).squeeze(-1)
 
 
@@ -70,8 +73,8 @@ class FileDriver(DrivingVictim):
 
     Args:
         path: the file.
-        actions: `discrete`: it gives values or logits of LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER, and the largest is done;
-            `continuous`: it gives [acceleration, steering] in [-1, 1].
+        actions: `discrete`: it gives values or logits of the world's actions (on the highway LANE_LEFT, IDLE, LANE_RIGHT,
+            FASTER, SLOWER), and the largest is done; `continuous`: it gives [acceleration, steering] in [-1, 1].
         rows: of the observation it was trained on, the ego's own among them; the world must show as many.
         features: numbers in a row: presence and the measured ones.
     """
@@ -90,7 +93,7 @@ class FileDriver(DrivingVictim):
     def action_type(self) -> ActionType:
         return self.actions
 
-    def load(self, seed: int) -> Policy:
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
         """The policy in the file, whatever the seed.
 
         Raises:
@@ -100,7 +103,8 @@ class FileDriver(DrivingVictim):
         if not path.is_file():
             raise UserError(f"there is no file {self.path}; say victim.path=… where it is")
         try:
-            policy = self.read(path, hashlib.sha256(path.read_bytes()).hexdigest())
+            width = len(facts.actions) if self.action_type == "discrete" else CONTROLS
+            policy = self.read(path, hashlib.sha256(path.read_bytes()).hexdigest(), width)
         except UserError:
             raise
         # A file that is cut short or of another kind can fail anywhere in the library that reads it.
@@ -110,8 +114,13 @@ class FileDriver(DrivingVictim):
         return policy
 
     @abstractmethod
-    def read(self, path: Path, sha256: str) -> FilePolicy:
+    def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
         """The policy in a file.
+
+        Args:
+            path: of the file.
+            sha256: of its content.
+            width: numbers that the policy must give for an observation.
 
         Raises:
             UserError: if it is not what the parameters say.
@@ -126,7 +135,7 @@ class FileDriver(DrivingVictim):
                 "the world must show the same"
             )
 
-    def _try(self, policy: Policy) -> None:
+    def _try(self, policy: FilePolicy) -> None:
         for batch in TRIED:
             try:
                 with torch.no_grad():
@@ -135,7 +144,7 @@ class FileDriver(DrivingVictim):
                 raise UserError(
                     f"{self.path} takes no batch of {batch}: export it with a batch of any size ({reason(error)})"
                 ) from error
-            wanted = [batch, WIDTH[self.action_type]]
+            wanted = [batch, policy.width]
             if list(answer.shape) != wanted:
                 raise UserError(
                     f"{self.path} gives {list(answer.shape)} for {batch} observations, {self.action_type} actions are {wanted}"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
-from bench.driving.contracts import Policy, TrainingHooks
+from bench.driving import Policy, TrainingHooks
 
 CHUNK = 8
 """Decisions taken between two rounds of gradient updates."""

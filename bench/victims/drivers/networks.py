@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from bench.driving.contracts import Policy
+from bench.driving import Policy, State
 
 
 class Encoder(nn.Module):
@@ -64,10 +64,10 @@ class QPolicy(Policy):
         self.shape = {"features": features, "actions": actions, "hidden": hidden}
         self.network = QNetwork(features, actions, hidden)
 
-    def scores(self, observation: Tensor) -> Tensor:
+    def forward(self, observation: Tensor) -> Tensor:
         return self.network(observation)
 
-    def value(self, observation: Tensor, action: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         return self.scores(observation).gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
@@ -122,8 +122,8 @@ class ActorPolicy(Policy):
         self.actor = Actor(features, hidden, limit)
         self.critic = Critic(features, hidden, limit)
 
-    def scores(self, observation: Tensor) -> Tensor:
+    def forward(self, observation: Tensor) -> Tensor:
         return self.actor(observation)
 
-    def value(self, observation: Tensor, action: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         return self.critic(observation, action).squeeze(-1)

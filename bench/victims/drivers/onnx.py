@@ -24,7 +24,7 @@ class ONNX(FileDriver):
 
     answers: ClassVar[Access] = "scores"
 
-    def read(self, path: Path, sha256: str) -> FilePolicy:
+    def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
         try:
             import onnxruntime
         except ImportError:
@@ -46,4 +46,4 @@ class ONNX(FileDriver):
             (answer,) = session.run([output], {name: observation.detach().contiguous().numpy()})
             return torch.from_numpy(answer)
 
-        return FilePolicy(network, shape, self.action_type, sha256)
+        return FilePolicy(network, shape, self.action_type, width, sha256)

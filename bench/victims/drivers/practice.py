@@ -9,15 +9,16 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, ExplorationType, MultiStepTransform, set_exploration_type
 
-from bench.scenarios.grid import GRIDS, Cell
+from bench.plugins import registry
+from bench.scenarios import Cell
 from bench.victims.drivers.learner import Learner, Phase
 
 
 def roads(copies: int) -> list[Cell]:
     """The roads of the standard grid in clear weather, `copies` of each: one batch practises on all of them."""
-    grid = GRIDS["standard-v1"]
-    pairs = itertools.product(grid.lanes, grid.density)
-    return [Cell(lanes=lanes, density=density) for lanes, density in pairs for _ in range(copies)]
+    grid = registry.grid("standard-v1")
+    pairs = itertools.product(grid.values["lanes"], grid.values["density"])
+    return [Cell(lanes=lanes, density=density, weather="clear") for lanes, density in pairs for _ in range(copies)]
 
 
 class Practice:

@@ -1,4 +1,4 @@
-"""Drivers that learn nothing: what any victim must beat to be worth attacking."""
+"""Baseline drivers that ignore their input: any victim must beat them to be worth attacking."""
 
 from __future__ import annotations
 
@@ -6,98 +6,105 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
-from bench.driving.contracts import ActionType, Driver, DrivingVictim, Policy
+from bench.driving import ActionType, Driver, DrivingFacts, DrivingVictim, Policy, State
+from bench.driving.features import CONSTANT_CONTROLS, RIGHT_THEN_SLOWER
+from bench.errors import UserError
+from bench.plugins.registry import unknown
 
-LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
-"""highway-env's discrete meta-actions."""
+RIGHT_S = 4.0
+"""Seconds of changing to the right: enough to cross four lanes at 25 m/s, one after the other."""
+DRAWS = 1024
+"""Actions drawn for an episode; a longer one begins with the first again."""
 
-DISCRETE = {"lane_left": LANE_LEFT, "idle": IDLE, "lane_right": LANE_RIGHT, "faster": FASTER, "slower": SLOWER}
-CONTINUOUS = {"throttle": (1.0, 0.0), "coast": (0.0, 0.0), "brake": (-1.0, 0.0)}
 
+class _Constant(Policy):
+    """The same scores at every step."""
 
-class _BlindPolicy(Policy):
-    """The same action at every step, or LANE_RIGHT at the first `lane_changes` steps and SLOWER from then on."""
-
-    def __init__(
-        self, action: Tensor, action_type: ActionType, lane_changes: int = 0, driver: Driver = "agent"
-    ) -> None:
+    def __init__(self, scores: Tensor, action_type: ActionType, driver: Driver = "agent") -> None:
         super().__init__()
-        self.action, self.action_type, self.driver = action, action_type, driver
-        self.lane_changes, self.steps = lane_changes, 0
+        self.always, self.action_type, self.driver = scores, action_type, driver
 
-    def reset(self, seeds: Tensor) -> None:
-        self.steps = 0
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.always.expand(*observation.shape[:-2], len(self.always))
 
-    def scores(self, observation: Tensor) -> Tensor:
-        action = torch.tensor(LANE_RIGHT) if self.steps < self.lane_changes else self.action
-        if self.action_type == "discrete":
-            action = torch.nn.functional.one_hot(action, 5).float()
-        return action.expand(*observation.shape[:-2], action.shape[-1])
 
-    def decide(self, observation: Tensor) -> Tensor:
-        action = super().decide(observation)
-        self.steps += 1
-        return action
+class _FirstThen(Policy):
+    """One action for a number of steps, then another; its state counts the steps."""
+
+    action_type = "discrete"
+
+    def __init__(self, first: Tensor, steps: int, then: Tensor) -> None:
+        super().__init__()
+        self.first, self.steps, self.then = first, steps, then
+
+    def initial(self, episodes: Tensor) -> State:
+        return TensorDict({"step": torch.zeros_like(episodes)}, batch_size=episodes.shape)
+
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        assert state is not None
+        return torch.where(state["step"].unsqueeze(-1) < self.steps, self.first, self.then)
+
+    def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
+        assert state is not None
+        return TensorDict({"step": state["step"] + 1}, batch_size=state.batch_size)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Blind(DrivingVictim):
     """A driver that ignores what it sees: a constant action, or the rightmost lane and then the brake.
 
-    The best of these in a cell is the bar under attack: a victim below it would do better with its eyes shut.
+    The best of these in a cell is the bar under attack: a victim below it would do better without its input.
 
     Args:
-        policy: the action; `throttle`, `coast` and `brake` are continuous, the rest discrete. `right_then_slower` changes
-            to the right for as long as it takes from any lane, then slows down.
+        policy: `throttle`, `coast` and `brake` are continuous. Any other is the name of a discrete action of the world, in small
+            letters; `right_then_slower` changes to the right for as long as it takes from any lane, then slows down.
     """
 
     sees: ClassVar[bool] = False
-    policy: Literal[
-        "lane_left", "idle", "lane_right", "faster", "slower", "right_then_slower", "throttle", "coast", "brake"
-    ] = "right_then_slower"
+    policy: str = RIGHT_THEN_SLOWER
 
     @property
     def action_type(self) -> ActionType:
-        return "continuous" if self.policy in CONTINUOUS else "discrete"
+        return "continuous" if self.policy in CONSTANT_CONTROLS else "discrete"
 
-    def load(self, seed: int) -> Policy:
-        if self.policy in CONTINUOUS:
-            return _BlindPolicy(torch.tensor(CONTINUOUS[self.policy]), "continuous").eval()
-        if self.policy == "right_then_slower":
-            return _BlindPolicy(torch.tensor(SLOWER), "discrete", lane_changes=RIGHT_STEPS).eval()
-        return _BlindPolicy(torch.tensor(DISCRETE[self.policy]), "discrete").eval()
-
-
-RIGHT_STEPS = 60
-"""Four seconds at 15 Hz: enough to cross four lanes at 25 m/s, one after the other."""
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        known = facts.blind_policies(self.action_type)
+        if self.policy not in known:
+            raise UserError(unknown(f"victim.policy {self.policy!r}", self.policy, [*known, *CONSTANT_CONTROLS]))
+        if self.action_type == "continuous":
+            return _Constant(torch.tensor(CONSTANT_CONTROLS[self.policy]), "continuous").eval()
+        actions = torch.eye(len(facts.actions))
+        place = [name.lower() for name in facts.actions].index
+        if self.policy == RIGHT_THEN_SLOWER:
+            steps = round(RIGHT_S * facts.decision_hz)
+            return _FirstThen(actions[place("lane_right")], steps, actions[place("slower")]).eval()
+        return _Constant(actions[place(self.policy)], "discrete").eval()
 
 
 class _RandomPolicy(Policy):
-    """Actions drawn from a generator of each episode's own, so that they depend on the scenario seed alone."""
+    """Actions drawn from a generator of each episode's own, so that they do not depend on the rest of the batch."""
 
-    def __init__(self, action_type: ActionType) -> None:
+    def __init__(self, action_type: ActionType, actions: int) -> None:
         super().__init__()
-        self.action_type = action_type
-        self.draws = torch.empty(0)
-        self.steps = 0
+        self.action_type, self.actions = action_type, actions
 
-    def reset(self, seeds: Tensor) -> None:
-        self.steps = 0
-        self.draws = torch.stack(
-            [torch.rand(1024, 5, generator=torch.Generator().manual_seed(int(seed))) for seed in seeds], 1
-        )
+    def initial(self, episodes: Tensor) -> State:
+        each = [torch.Generator().manual_seed(int(episode)) for episode in episodes]
+        draws = torch.stack([torch.rand(DRAWS, self.actions, generator=generator) for generator in each])
+        return TensorDict({"step": torch.zeros_like(episodes), "draws": draws}, batch_size=episodes.shape)
 
-    def scores(self, observation: Tensor) -> Tensor:
-        draw = self.draws[self.steps % len(self.draws)]
-        draw = draw if self.action_type == "discrete" else 2 * draw[:, :2] - 1
-        return draw.expand(*observation.shape[:-2], draw.shape[-1])
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        assert state is not None
+        step = (state["step"] % DRAWS).view(-1, 1, 1).expand(-1, 1, self.actions)
+        draw = state["draws"].gather(1, step).squeeze(1)
+        return draw if self.action_type == "discrete" else 2 * draw[:, :2] - 1
 
-    def decide(self, observation: Tensor) -> Tensor:
-        action = super().decide(observation)
-        self.steps += 1
-        return action
+    def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
+        assert state is not None
+        return TensorDict({"step": state["step"] + 1, "draws": state["draws"]}, batch_size=state.batch_size)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,13 +122,13 @@ class RandomDriver(DrivingVictim):
     def action_type(self) -> ActionType:
         return self.actions
 
-    def load(self, seed: int) -> Policy:
-        return _RandomPolicy(self.actions).eval()
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        return _RandomPolicy(self.actions, max(len(facts.actions), 2)).eval()
 
 
 @dataclass(frozen=True, kw_only=True)
 class IDMDriver(DrivingVictim):
-    """highway-env's own traffic driver at the wheel: IDM for speed, MOBIL for lanes (Treiber et al. 2000, Kesting et al. 2007).
+    """The world's own traffic driver at the wheel: IDM for speed, MOBIL for lanes (Treiber et al. 2000, Kesting et al. 2007).
 
     It reads the simulator's true state, not the observation, so that attacks and weather cannot touch it.
     """
@@ -132,5 +139,8 @@ class IDMDriver(DrivingVictim):
     def action_type(self) -> ActionType:
         return "discrete"
 
-    def load(self, seed: int) -> Policy:
-        return _BlindPolicy(torch.tensor(IDLE), "discrete", driver="idm").eval()
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        if "idm" not in facts.drivers:
+            raise UserError("the world has no IDM driver")
+        idle = facts.actions.index("IDLE") if "IDLE" in facts.actions else 0
+        return _Constant(torch.eye(len(facts.actions))[idle], "discrete", driver="idm").eval()

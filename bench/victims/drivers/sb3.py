@@ -17,9 +17,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from bench.driving.contracts import ActionType
+from bench.driving import ActionType
 from bench.errors import UserError
-from bench.victims.drivers.from_file import WIDTH, FileDriver, FilePolicy
+from bench.victims.drivers.from_file import FileDriver, FilePolicy
 
 Algorithm = Literal["dqn", "ppo", "a2c", "sac", "td3", "ddpg"]
 STEMS: dict[Algorithm, tuple[str, ...]] = {
@@ -58,13 +58,13 @@ class StableBaselines3(FileDriver):
             return self.actions
         return "discrete" if self.algo == "dqn" else "continuous"
 
-    def read(self, path: Path, sha256: str) -> FilePolicy:
+    def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
         with zipfile.ZipFile(path) as archive:
             data = json.loads(archive.read("data"))
             blob = io.BytesIO(archive.read("policy.pth"))
         weights = torch.load(blob, map_location="cpu", weights_only=True)
         shape = self._observation(data["observation_space"])
-        self._check_actions(data["action_space"])
+        self._check_actions(data["action_space"], width)
         options = data.get("policy_kwargs") or {}
         if strange := sorted({"features_extractor_class", "squash_output"} & options.keys()):
             raise UserError(
@@ -77,9 +77,8 @@ class StableBaselines3(FileDriver):
         squashed = self.action_type == "continuous" and self.algo not in EITHER
         network = nn.Sequential(nn.Flatten(), *_stack(layers, activation), *([nn.Tanh()] if squashed else []))
         critic = _layers(weights, CRITIC)
-        return FilePolicy(
-            network, shape, self.action_type, sha256, nn.Sequential(*_stack(critic, activation)) if critic else None
-        )
+        valued = nn.Sequential(*_stack(critic, activation)) if critic else None
+        return FilePolicy(network, shape, self.action_type, width, sha256, valued)
 
     def _observation(self, space: dict[str, Any]) -> list[int]:
         if not str(space.get(":type:")).endswith(".Box'>"):
@@ -88,13 +87,13 @@ class StableBaselines3(FileDriver):
         self.check_observation(shape)
         return shape
 
-    def _check_actions(self, space: dict[str, Any]) -> None:
+    def _check_actions(self, space: dict[str, Any], width: int) -> None:
         discrete = str(space.get(":type:")).endswith(".Discrete'>")
         found = [int(space["n"])] if discrete else [int(side) for side in space.get("_shape") or []]
-        if discrete != (self.action_type == "discrete") or found != [WIDTH[self.action_type]]:
+        if discrete != (self.action_type == "discrete") or found != [width]:
             kind = f"{found[0]} discrete actions" if discrete else f"continuous actions {found}"
             hint = "; say victim.actions=continuous" if self.algo in EITHER and not discrete else ""
-            wanted = f"{WIDTH[self.action_type]} {self.action_type} actions"
+            wanted = f"{width} {self.action_type} actions"
             raise UserError(f"{self.path} was trained for {kind}, {self.algo} victims here have {wanted}{hint}")
         if not discrete:
             ends = [float(number) for key in ("low", "high") for number in re.findall(r"-?[\d.]+", str(space[key]))]

@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from bench.driving.contracts import DrivingWorld, Policy, TrainingHooks
-from bench.scenarios.grid import SeedBlock
+from bench.driving import DrivingWorld, Policy, TrainingHooks
+from bench.scenarios import SeedBlock
 from bench.victims.drivers.practice import roads
 
 

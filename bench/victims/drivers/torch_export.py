@@ -19,7 +19,7 @@ class TorchExport(FileDriver):
     (`torch.export.Dim`).
     """
 
-    def read(self, path: Path, sha256: str) -> FilePolicy:
+    def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
         program = torch.export.load(path)
         inputs = program.graph_signature.user_inputs
         nodes = [node for node in program.graph.nodes if node.op == "placeholder" and node.name in inputs]
@@ -32,4 +32,4 @@ class TorchExport(FileDriver):
                 f"{self.path} takes no batch but of {batch}: export it with "
                 'dynamic_shapes={"observation": {0: torch.export.Dim("batch")}}'
             )
-        return FilePolicy(program.module(), shape, self.action_type, sha256)
+        return FilePolicy(program.module(), shape, self.action_type, width, sha256)

@@ -11,9 +11,9 @@ from typing import ClassVar
 import torch
 from torchrl.envs import EnvBase
 
-from bench.driving.contracts import DrivingVictim, DrivingWorld, Policy, TrainingHooks
+from bench.driving import DrivingFacts, DrivingVictim, DrivingWorld, Policy, TrainingHooks
 from bench.plugins.contracts import Progress, Trained
-from bench.scenarios.grid import SeedBlock
+from bench.scenarios import SeedBlock
 from bench.victims import zoo
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
 from bench.victims.drivers.practice import Practice, roads
@@ -78,7 +78,7 @@ class LearningDriver(DrivingVictim):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
 
-    def load(self, seed: int) -> Policy:
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
         return zoo.load(zoo.Recipe.of(self), seed, self.policy_type)
 
     def phases(self, hooks: TrainingHooks) -> list[Phase]:

@@ -1,0 +1,71 @@
+"""What is made of a detector's predictions: objects after non-maximum suppression, and the confidence in one of them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from bench.detection.detector import Detections, Predictions
+
+
+def overlap(a: Tensor, b: Tensor) -> Tensor:
+    """Intersection over union of boxes [..., 4] and [..., 4], broadcast, in [0, 1]; 0 where neither has an area."""
+    low, high = torch.maximum(a[..., :2], b[..., :2]), torch.minimum(a[..., 2:], b[..., 2:])
+    intersection = (high - low).clamp(min=0).prod(-1)
+    union = _area(a) + _area(b) - intersection
+    return intersection / union.clamp(min=torch.finfo(union.dtype).tiny)
+
+
+def _area(boxes: Tensor) -> Tensor:
+    return (boxes[..., 2:] - boxes[..., :2]).prod(-1)
+
+
+@torch.no_grad()
+def detections(predictions: Predictions, *, threshold: float, iou: float) -> list[Detections]:
+    """The objects in each picture, after greedy non-maximum suppression within each class.
+
+    A box may be found as more than one class. The time grows with the number of boxes kept, so with a falling threshold.
+
+    Args:
+        predictions: of N pictures.
+        threshold: a score must be above it, in [0, 1].
+        iou: a box that overlaps a better one of its class by more than this is dropped, in [0, 1].
+    """
+    return [
+        _suppressed(boxes, scores, threshold, iou)
+        for boxes, scores in zip(predictions.boxes, predictions.scores, strict=True)
+    ]
+
+
+def _suppressed(boxes: Tensor, scores: Tensor, threshold: float, iou: float) -> Detections:
+    """Of one picture: boxes [K, 4], scores [K, C]."""
+    place, labels = (scores > threshold).nonzero(as_tuple=True)
+    order = scores[place, labels].argsort(descending=True, stable=True)
+    place, labels = place[order], labels[order]
+    kept, left = [], torch.arange(len(place), device=boxes.device)
+    while len(left):
+        best, left = left[0], left[1:]
+        kept.append(best)
+        covered = overlap(boxes[place[best]], boxes[place[left]]) > iou
+        left = left[~covered | (labels[left] != labels[best])]
+    chosen = torch.stack(kept) if kept else left
+    place, labels = place[chosen], labels[chosen]
+    return Detections(boxes[place], scores[place, labels], labels)
+
+
+@torch.no_grad()
+def confidence(predictions: Predictions, label: int, boxes: Tensor, *, iou: float = 0.3) -> Tensor:
+    """The best score [N] of a class at the object's true place; 0 where no prediction lies there.
+
+    The default of `iou` is that of a box moved by half its width: what YOLOv3-tiny says of a stop sign that nobody attacks
+    overlaps it by 0.75 and more, and an attack shall make the sign go away, not nudge its box.
+
+    Args:
+        predictions: of N pictures.
+        label: of the class.
+        boxes: [N, 4], the true box in each picture.
+        iou: how much a prediction must overlap the true box to count.
+    """
+    there = overlap(predictions.boxes, boxes.unsqueeze(1)) >= iou
+    scores = predictions.scores_of(label) * there
+    return nn.functional.pad(scores, (0, 1)).amax(-1)

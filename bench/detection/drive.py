@@ -1,0 +1,45 @@
+"""The work of the detection track: a defended detector on every approach of a cell, with the patch on the sign."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from bench.detection.approach import Trace, check_approaches, score
+from bench.detection.contracts import CameraWorld
+from bench.detection.patch import Patch
+from bench.errors import UserError
+from bench.plugins.track import Driven, Job
+
+
+def drive(job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
+    """The measurements of a job's approaches, [A] each (`bench.detection.approach.score`).
+
+    Args:
+        job: what to drive up to.
+        artefact: the file of the patch; None where there is none.
+        traced: scenario seeds of the approaches that a recording is wanted of.
+    """
+    pair, world = job.pair, job.pair.world.component
+    assert isinstance(world, CameraWorld)
+    patch = _patch(artefact, job.artefact) if artefact else None
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(job.attack_seed)
+        detector = pair.load(job.training_seed)
+        approaches = world.approaches(job.cell, job.seeds)
+        check_approaches(approaches, job.seeds, type(world).__name__)
+        trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
+        columns = score(detector, approaches, patch, share=pair.threat.budget, trace=trace)
+    made = {"patch": np.array([job.artefact] * len(approaches))}
+    return Driven(columns | made, dict(zip(traced, trace.sightings, strict=True)) if trace else {})
+
+
+def _patch(artefact: bytes, fingerprint: str) -> Patch:
+    try:
+        return Patch.read(artefact)
+    except UserError as error:
+        raise UserError(
+            f"the patch {fingerprint}.safetensors is {error}; delete it and run again to craft it anew"
+        ) from error

@@ -1,0 +1,137 @@
+"""Running sums over a batch of episodes, and the measurements that they end in."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from bench.driving.attacker import Shown
+from bench.driving.features import DrivingFacts
+from bench.driving.metrics import safe_progress
+from bench.driving.policy import Policy, State, rows_of
+
+CHANGED = 0.1
+"""A continuous action counts as changed when it is off by more than this on its [-1, 1] scale."""
+
+Columns = dict[str, NDArray[np.generic]]
+
+
+class Meter:
+    """Running sums of a batch of episodes; an episode counts until it is done.
+
+    In NumPy: a step is some forty operations on [B] numbers, and what each costs is its call.
+    """
+
+    SUMS = ("steps", "return", "progress", "mean_speed", "changed", "linf", "l2", "linf_m", "linf_mps", "attack_ms")
+
+    def __init__(self, batch: int, policy: Policy, facts: DrivingFacts) -> None:
+        self.policy, self.facts = policy, facts
+        features = facts.features
+        self.half_range = features.half_range().numpy()
+        self.positions = np.array([unit == "m" for unit in features.units])
+        self.sums = np.zeros((len(self.SUMS), batch))
+        self.linf_max, self.excess_max = np.zeros(batch, np.float32), np.zeros(batch, np.float32)
+        self.min_ttc = np.full(batch, np.inf, np.float32)
+        self.crashed, self.offroad = np.zeros(batch, np.bool_), np.zeros(batch, np.bool_)
+        self.start_x, self.end_x = np.full(batch, np.nan, np.float32), np.zeros(batch, np.float32)
+        self.gradients, self.zero_gradients = np.zeros(batch), np.zeros(batch)
+        self.queries: list[NDArray[np.int64]] = []
+        self.actions: list[NDArray[np.int64]] = []
+
+    def step(
+        self, truth: Tensor, shown: Shown, action: Tensor, driven: Tensor, state: State, after: TensorDictBase
+    ) -> None:
+        """Count one step.
+
+        Args:
+            truth: the true observation [B, V, F].
+            shown: what the victim was shown instead.
+            action: what it did.
+            driven: bool [B] the episodes that were running before the step.
+            state: what the victim remembered before it.
+            after: the environment's answer.
+        """
+        running = driven.numpy()
+        info = {name: value.squeeze(-1).numpy() for name, value in after["info"].items()}
+        offset = (shown.observation - truth).abs().numpy()[..., 1:]
+        physical = offset * self.half_range
+        linf = offset.max((1, 2))
+        measured = (
+            np.ones(len(running)),
+            after["reward"].squeeze(-1).numpy(),
+            info["progress"],
+            info["speed"],
+            self._changed(truth, action, state, running & (linf > 0)),
+            linf,
+            np.sqrt(np.square(offset).sum((1, 2))),
+            physical[..., self.positions].max((1, 2), initial=0.0),
+            physical[..., ~self.positions].max((1, 2), initial=0.0),
+            np.full(len(running), shown.milliseconds / max(running.sum(), 1)),
+        )
+        self.sums += np.where(running, np.stack(measured), 0.0)
+        np.maximum(self.linf_max, linf, out=self.linf_max, where=running)
+        np.maximum(self.excess_max, shown.excess.numpy(), out=self.excess_max)
+        np.minimum(self.min_ttc, info["ttc"], out=self.min_ttc, where=running)
+        self.crashed |= info["crashed"] & running
+        self.offroad |= info["offroad"] & running
+        np.copyto(self.start_x, info["x"], where=np.isnan(self.start_x))
+        np.copyto(self.end_x, info["x"], where=running)
+        self.gradients += shown.gradients.numpy()
+        self.zero_gradients += shown.zero_gradients.numpy()
+        self.queries.append(np.where(running, shown.queries.numpy(), -1))
+        if self.policy.action_type == "discrete":
+            self.actions.append(np.where(running, action.numpy(), -1))
+
+    def _changed(self, truth: Tensor, action: Tensor, state: State, touched: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """[B] 1 where the attack changed the victim's decision; it can have only where the observation is `touched` [B]."""
+        changed = np.zeros(len(touched))
+        if touched.any():
+            rows = torch.from_numpy(touched)
+            done, clean = action[rows], self.policy.decide(truth[rows], rows_of(state, rows))
+            if self.policy.action_type == "discrete":
+                changed[touched] = (clean != done).numpy()
+            else:
+                changed[touched] = ((clean - done).abs().amax(-1) > CHANGED).numpy()
+        return changed
+
+    def columns(self) -> Columns:
+        """The measurements of each episode."""
+        sums = dict(zip(self.SUMS, self.sums, strict=True))
+        steps = np.maximum(sums["steps"], 1)
+        failed = self.crashed | self.offroad
+        queries = np.stack(self.queries).astype(np.float64)
+        queries[queries < 0] = np.nan
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # An episode that was never driven has no queries.
+            mean, median = np.nanmean(queries, 0), np.nanquantile(queries, 0.5, 0, method="lower")
+        return {
+            "steps": sums["steps"].astype(np.int32),
+            "return": sums["return"],
+            "safe_progress": safe_progress(sums["progress"], failed, self.facts.max_steps),
+            "crashed": self.crashed,
+            "offroad": self.offroad,
+            "distance_m": (self.end_x - self.start_x).astype(np.float64),
+            "min_ttc_s": self.min_ttc.astype(np.float64),
+            "queries": mean,
+            "queries_median": median,
+            "queries_max": np.nan_to_num(queries).max(0),
+            "linf_max": self.linf_max.astype(np.float64),
+            "excess_max": self.excess_max.astype(np.float64),
+            **{name: sums[name] / steps for name in self.SUMS[3:]},
+            "action_counts": self._action_counts(),
+            "gradient_queries": self.gradients / steps,
+            "zero_gradients": np.where(self.gradients > 0, self.zero_gradients / np.maximum(self.gradients, 1), np.nan),
+        }
+
+    def _action_counts(self) -> NDArray[np.generic]:
+        """[B, A] how often each discrete action was taken; [B, 0] for continuous ones."""
+        if not self.actions:
+            return np.zeros((len(self.crashed), 0), np.int32)
+        actions = np.stack(self.actions, 1)
+        count = max(int(actions.max()) + 1, len(self.facts.actions))
+        return np.stack([(actions == a).sum(1) for a in range(count)], 1).astype(np.int32)

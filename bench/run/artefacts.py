@@ -1,0 +1,44 @@
+"""What was prepared, in a results folder: a file each, whole or not there, found by its fingerprint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bench import files
+from bench.errors import UserError
+from bench.run.unit import Preparation
+
+
+def path_of(out: Path, preparation: Preparation) -> Path:
+    """Where the artefact of a preparation is."""
+    artefact = preparation.track.artefact
+    assert artefact
+    return out / artefact[1] / f"{preparation.fingerprint}.safetensors"
+
+
+def write(out: Path, preparation: Preparation, content: bytes) -> Path:
+    """Write an artefact and return its file; it appears whole or not at all.
+
+    Raises:
+        UserError: if it cannot be written.
+    """
+    path = path_of(out, preparation)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with files.whole(path) as file:
+            file.write(content)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror}") from error
+    return path
+
+
+def read(path: Path) -> bytes:
+    """The content of an artefact.
+
+    Raises:
+        UserError: if it is not there.
+    """
+    try:
+        return path.read_bytes()
+    except OSError:
+        raise UserError(f"{path} is not there; the same run again makes it") from None

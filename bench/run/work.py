@@ -1,0 +1,102 @@
+"""Carries out one piece of work. All that it made comes back in its outcome, so that no shared disk is needed."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import pyarrow as pa
+
+from bench.errors import UserError, reason
+from bench.plugins.fingerprint import canonical
+from bench.records.store import table
+from bench.run.unit import Preparation, Unit
+
+Tell = Callable[[str, float, str], None]
+"""Told of which work how far it is, in [0, 1], in a few words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A piece of work, with all that it needs.
+
+    Args:
+        work: what to do.
+        artefact: the file of the unit's preparation; None where it has none.
+        recorded: scenario seeds of the episodes to record.
+    """
+
+    work: Unit | Preparation
+    artefact: bytes | None = None
+    recorded: Sequence[int] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a task made.
+
+    Args:
+        wall_s: seconds that it took.
+        records: of a unit, with their provenance; None of a preparation.
+        artefact: the file of a preparation; None of a unit.
+        recordings: the `.rrd` files of a unit, by scenario seed.
+        warnings: what went wrong that does not touch the records.
+    """
+
+    wall_s: float
+    records: pa.Table | None = None
+    artefact: bytes | None = None
+    recordings: Mapping[int, bytes] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+def perform(task: Task, tell: Tell) -> Outcome:
+    """Carry out a task.
+
+    Raises:
+        UserError: if a component fails, in one line that names the work.
+    """
+    work = task.work
+    try:
+        return _prepared(work, tell) if isinstance(work, Preparation) else _driven(work, task)
+    except UserError as error:
+        raise UserError(f"{work}: {error}") from error
+    # Third-party code may fail in any way; the person at the terminal is told which component did.
+    except Exception as error:
+        raise UserError(f"{work} failed: {reason(error)} (--debug shows where)") from error
+
+
+def _prepared(work: Preparation, tell: Tell) -> Outcome:
+    start = time.perf_counter()
+    artefact = work.track.prepare(work.job, canonical(work.origin), partial(tell, str(work)))
+    return Outcome(wall_s=time.perf_counter() - start, artefact=artefact)
+
+
+def _driven(unit: Unit, task: Task) -> Outcome:
+    start = time.perf_counter()
+    driven = unit.track.drive(unit.job, task.artefact, task.recorded)
+    wall_s = time.perf_counter() - start
+    constants = unit.constants(wall_s)
+    records = table(constants, driven.columns, track=unit.track)
+    recordings, warnings = _recordings(unit, driven.traces, constants)
+    return Outcome(wall_s=wall_s, records=records, recordings=recordings, warnings=warnings)
+
+
+def _recordings(
+    unit: Unit, traces: Mapping[int, object], constants: Mapping[str, object]
+) -> tuple[dict[int, bytes], tuple[str, ...]]:
+    """The recordings of a unit, and why one failed: the records are the result, and a view of them must not lose them."""
+    found: dict[int, bytes] = {}
+    with tempfile.TemporaryDirectory(prefix="cavbench-") as folder:
+        for seed, trace in traces.items():
+            path = Path(folder) / f"{seed}.rrd"
+            try:
+                unit.track.record(unit.job, trace, {**constants, "seed": seed}, path)
+                found[seed] = path.read_bytes()
+            except Exception as error:
+                return found, (f"{unit} was not recorded: {reason(error)}",)
+    return found, ()

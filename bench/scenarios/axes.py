@@ -1,0 +1,204 @@
+"""The axes of a world, and the cell: one value on each of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Value = int | float | str
+KINDS: dict[str, type] = {"int": int, "float": float, "str": str}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    """One thing in which the cells of a world differ: the number of lanes, the density of traffic, the weather.
+
+    Args:
+        name: as on the command line and in records, for instance `lanes`; a Python identifier.
+        kind: type of its values.
+        meaning: what it is, in a few words.
+        unit: of its values; empty for names and counts.
+        low, high: smallest and largest value of a number.
+        above: a number must be larger than this.
+        choices: the values there are; of names, in the order of tables. Empty: any within the bounds.
+        default: value of a cell that does not say; None where every cell must.
+        perceptual: whether it changes what is observed and nothing else, as fog does: a driver that ignores its observation is
+            driven at the first value only.
+    """
+
+    name: str
+    kind: Literal["int", "float", "str"]
+    meaning: str
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    above: float = -math.inf
+    choices: tuple[Value, ...] = ()
+    default: Value | None = None
+    perceptual: bool = False
+
+    def checked(self, value: Value) -> Value:
+        """The value in the axis' own type.
+
+        Raises:
+            ValueError: in one line, if it is not allowed.
+        """
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if self.kind == "str":
+            fits = isinstance(value, str)
+        else:
+            fits = number and (self.kind == "float" or value == int(value))
+        found = KINDS[self.kind](value) if fits else value
+        if not fits or not self._holds(found):
+            raise ValueError(f"{self.name} must be {self.allowed}, got {value}")
+        return found
+
+    def read(self, text: str) -> Value:
+        """A value as it is written on the command line.
+
+        Raises:
+            ValueError: in one line, if it cannot be read or is not allowed.
+        """
+        try:
+            return self.checked(KINDS[self.kind](text))
+        except ValueError:
+            raise ValueError(f"{self.name} must be {self.allowed}, got {text}") from None
+
+    @property
+    def allowed(self) -> str:
+        """The values there may be, in words."""
+        if self.choices:
+            return f"one of {', '.join(map(written, self.choices))}"
+        noun = {"int": "a whole number", "float": "a number", "str": "a name"}[self.kind]
+        if -math.inf < self.low and self.high < math.inf:
+            return f"{noun} between {self.low:g} and {self.high:g}"
+        low = f"of at least {self.low:g}" if self.low > -math.inf else ""
+        low = f"above {self.above:g}" if self.above > -math.inf else low
+        high = f"at most {self.high:g}" if self.high < math.inf else ""
+        return " ".join([noun, " and ".join(filter(None, (low, high)))]).strip()
+
+    def _holds(self, value: Value) -> bool:
+        if self.choices:
+            return value in self.choices
+        return isinstance(value, str) or (self.low <= value <= self.high and value > self.above)
+
+    def place(self, value: Value) -> tuple[float, str]:
+        """What values are sorted by: numbers by size, names in the order of `choices`."""
+        if isinstance(value, str):
+            return (self.choices.index(value) if value in self.choices else len(self.choices), value)
+        return (float(value), "")
+
+
+class Cell(Mapping[str, Value]):
+    """One square of a grid: a value on each axis of a world, without a seed. `cell.lanes` is `cell["lanes"]`."""
+
+    __slots__ = ("_hash", "_values")
+    _values: dict[str, Value]
+    _hash: int
+
+    def __init__(self, **values: Value) -> None:
+        object.__setattr__(self, "_values", values)
+        object.__setattr__(self, "_hash", hash(frozenset(values.items())))
+
+    def __getitem__(self, name: str) -> Value:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self._values[name]
+        except KeyError:
+            raise AttributeError(f"the cell {self} has no axis {name!r}") from None
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError("a cell cannot be changed: make another one with `replaced`")
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _made, (self._values,)
+
+    def __repr__(self) -> str:
+        return f"Cell({', '.join(f'{name}={value!r}' for name, value in self.items())})"
+
+    def __str__(self) -> str:
+        return ", ".join(value if isinstance(value, str) else f"{name} {value:g}" for name, value in self.items())
+
+    def replaced(self, **values: Value) -> Cell:
+        """The same cell with other values on some axes."""
+        return Cell(**{**self._values, **values})
+
+
+def _made(values: Mapping[str, Value]) -> Cell:
+    return Cell(**values)
+
+
+@dataclass(frozen=True)
+class Axes(Mapping[str, Axis]):
+    """The axes of a world, in the order of its cells."""
+
+    axes: tuple[Axis, ...]
+    _by_name: dict[str, Axis] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_by_name", {axis.name: axis for axis in self.axes})
+
+    def __getitem__(self, name: str) -> Axis:
+        return self._by_name[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._by_name)
+
+    def __len__(self) -> int:
+        return len(self.axes)
+
+    @classmethod
+    def read(cls, written: Sequence[Mapping[str, Any]]) -> Axes:
+        """The axes that records speak of (`bench.plugins.contracts.Facts.written`).
+
+        Raises:
+            ValueError: if they are none.
+        """
+        try:
+            return cls(tuple(Axis(**{**axis, "choices": tuple(axis.get("choices", ()))}) for axis in written))
+        except TypeError as error:
+            raise ValueError(f"no axes: {error}") from None
+
+    def cell(self, **values: Value) -> Cell:
+        """A cell with a checked value on every axis, the default where none is given.
+
+        Raises:
+            ValueError: in one line, if a value is missing, not allowed, or of an axis that the world does not have.
+        """
+        if unknown := [name for name in values if name not in self]:
+            raise ValueError(f"unknown axis {unknown[0]!r}; known: {', '.join(self)}")
+        found = {}
+        for axis in self.axes:
+            value = values.get(axis.name, axis.default)
+            if value is None:
+                raise ValueError(f"a cell needs a value of {axis.name}: {axis.allowed}")
+            found[axis.name] = axis.checked(value)
+        return Cell(**found)
+
+    def unperceived(self, cell: Cell) -> Cell:
+        """The cell with every perceptual axis at its first value: what a driver that ignores its observation is driven in."""
+        first = {axis.name: axis.choices[0] for axis in self.axes if axis.perceptual and axis.choices}
+        return cell.replaced(**first)
+
+    def place(self, cell: Cell) -> tuple[tuple[float, str], ...]:
+        """What cells are sorted by: the perceptual axes first, so that tables group by weather."""
+        ordered = sorted(self.axes, key=lambda axis: not axis.perceptual)
+        return tuple(axis.place(cell[axis.name]) for axis in ordered)
+
+
+def written(value: Value) -> str:
+    """A value as tables and commands show it."""
+    return value if isinstance(value, str) else f"{value:g}"

@@ -1,0 +1,148 @@
+"""The driving track: a policy at the wheel, whose observations are attacked at every step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import pyarrow as pa
+
+from bench.plugins.pair import Pair, choose
+from bench.plugins.track import Driven, Job, Measure, Track
+from bench.records.schema import FLOAT, PROBES, field
+
+if TYPE_CHECKING:
+    from bench.driving import DrivingVictim, DrivingWorld
+
+BEST_BLIND, IDM, RANDOM = "best blind", "idm", "random"
+
+MEASUREMENTS: tuple[pa.Field, ...] = (
+    field("steps", pa.int32(), "decisions driven until the episode ended", "steps"),
+    field("return", FLOAT, "reward of the world, summed over the episode", "reward"),
+    field(
+        "safe_progress",
+        FLOAT,
+        "0 if crashed or off the road, else mean progress over the steps of a whole episode",
+        "share, 0 to 1",
+    ),
+    field("crashed", pa.bool_(), "the ego hit another vehicle"),
+    field("offroad", pa.bool_(), "the ego left the road"),
+    field("distance_m", FLOAT, "driven along the road", "m"),
+    field("min_ttc_s", FLOAT, "smallest time to collision with the car ahead; inf if there was none", "s"),
+    field("mean_speed", FLOAT, "mean over the steps", "m/s"),
+    field("queries", FLOAT, "victim evaluations a step, mean", "queries"),
+    field("queries_median", FLOAT, "victim evaluations a step, median", "queries"),
+    field("queries_max", FLOAT, "victim evaluations a step, largest", "queries"),
+    field("changed", FLOAT, "steps on which the attack changed the decision", "share, 0 to 1"),
+    field("linf", FLOAT, "largest deviation of a step, mean over the steps", "normalised, 2 is the full range"),
+    field("linf_max", FLOAT, "largest deviation of the episode", "normalised, 2 is the full range"),
+    field("l2", FLOAT, "L2 norm of a step's deviation, mean over the steps", "normalised"),
+    field("linf_m", FLOAT, "largest deviation of a position in a step, mean over the steps", "m"),
+    field("linf_mps", FLOAT, "largest deviation of a velocity in a step, mean over the steps", "m/s"),
+    field("excess_max", FLOAT, "farthest the attack's answer was outside its set, before projection", "normalised"),
+    field("attack_ms", FLOAT, "the attack's wall time a step and episode (its batch's time shared out)", "ms"),
+    field("action_counts", pa.list_(pa.int32()), "times each discrete action was taken; empty for continuous ones"),
+)
+
+
+class DrivingTrack(Track):
+    """Lane-changing policies on a road, attacked through what they measure, ranked by `safe_progress`."""
+
+    name: ClassVar[str] = "driving"
+    world: ClassVar[str] = "highway"
+    victim: ClassVar[str] = "dqn"
+
+    unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
+    measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
+    probes: ClassVar[tuple[pa.Field, ...]] = PROBES
+    metric: ClassVar[str] = "safe_progress"
+    metric_title: ClassVar[str] = "safe progress"
+    failure: ClassVar[str] = "crashed"
+    measures: ClassVar[tuple[Measure, ...]] = (
+        Measure(column="return", heading="return"),
+        Measure(column="crashed", heading="crashed", how="rate", unit="share"),
+        Measure(column="offroad", heading="off\nroad", how="rate", unit="share", spare=4),
+        Measure(column="min_ttc_s", heading="min\nTTC s", how="median", digits=1, spare=6),
+        Measure(column="changed", heading="success\n/ step", how="step mean", unit="share", of_attack=True, spare=2),
+        Measure(column="queries", heading="queries\n/ step", how="step mean", of_attack=True),
+        Measure(column="attack_ms", heading="ms\n/ step", how="step mean", digits=1, of_attack=True, spare=3),
+    )
+    legend: ClassVar[str] = (
+        "safe progress: 0 if the episode crashes or leaves the road, else its mean progress. success: share of steps whose "
+        "decision the attack changed. TTC: time to collision with the car ahead."
+    )
+    baseline_titles: ClassVar[Mapping[str, str]] = {
+        BEST_BLIND: "best blind policy",
+        RANDOM: "random",
+        IDM: "IDM and MOBIL",
+    }
+    best_baseline: ClassVar[str] = BEST_BLIND
+    facts_of_v1: ClassVar[Mapping[str, object]] = {
+        "decision_hz": 15,
+        "max_steps": 450,
+        "actions": ["LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER"],
+        "axes": [
+            {"name": "lanes", "kind": "int", "meaning": "number of lanes", "low": 2, "high": 8},
+            {"name": "density", "kind": "float", "meaning": "traffic density", "above": 0.0, "high": 4.0},
+            {
+                "name": "weather",
+                "kind": "str",
+                "meaning": "how far the ego sees and how noisy it measures",
+                "choices": ["clear", "rain", "fog"],
+                "default": "clear",
+                "perceptual": True,
+            },
+        ],
+        "features": {
+            "names": ["x", "y", "vx", "vy"],
+            "units": ["m", "m", "m/s", "m/s"],
+            "floors": [0.5, 0.2, 0.3, 0.2],
+        },
+    }
+
+    work: ClassVar[str] = "bench.driving.drive"
+
+    def baselines(self, pair: Pair) -> Iterator[Pair]:
+        """Drivers that ignore their input: those of the pair's action type that its world has, and the IDM driver."""
+        victim, world = _parts(pair)
+        facts, action_type = world.facts, victim.action_type
+        words = [("blind", {"policy": policy}) for policy in facts.blind_policies(action_type)]
+        words += [("random", {"actions": action_type})]
+        words += [(IDM, {})] if IDM in facts.drivers else []
+        for name, params in words:
+            none = {"attack": choose("attack", "none"), "defense": choose("defense", "none")}
+            yield replace(pair, **none, victim=choose("victim", name, **params), threat=type(pair.threat).of_nobody())
+
+    def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
+        same_world = all(own[name] == other[name] for name in ("world", "world_params"))
+        same_actions = own["action_type"] == other["action_type"] or other["victim"] == IDM
+        if (
+            other["sees"]
+            or other["defense"] != "none"
+            or other["attack"] != "none"
+            or not (same_world and same_actions)
+        ):
+            return ""
+        return BEST_BLIND if other["victim"] == "blind" else str(other["victim"])
+
+    def identity(self, pair: Pair) -> Mapping[str, object]:
+        return {"action_type": _parts(pair)[0].action_type}
+
+    def drive(self, job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
+        from bench.driving.drive import drive
+
+        return drive(job, traced)
+
+    def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
+        from bench.recording.driving import save
+
+        save(trace, facts=_parts(job.pair)[1].facts, meta=meta, path=path)
+
+
+def _parts(pair: Pair) -> tuple[DrivingVictim, DrivingWorld]:
+    """The victim and the world of a pair, in the types of this track."""
+    victim: Any = pair.victim.component
+    world: Any = pair.world.component
+    return victim, world

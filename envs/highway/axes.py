@@ -1,0 +1,34 @@
+"""The axes of the highway world, and its standard grid."""
+
+from __future__ import annotations
+
+from bench.scenarios import Axes, Axis, Grid
+
+AXES = Axes(
+    (
+        Axis(name="lanes", kind="int", meaning="number of lanes", low=2, high=8),
+        Axis(
+            name="density",
+            kind="float",
+            meaning="traffic density: highway-env's vehicles_density, which spacing is divided by",
+            above=0.0,
+            high=4.0,
+        ),
+        Axis(
+            name="weather",
+            kind="str",
+            meaning="how far the ego sees and how noisy it measures; night is a matter of light, and only cameras look at light",
+            choices=("clear", "rain", "fog"),
+            default="clear",
+            perceptual=True,
+        ),
+    )
+)
+
+STANDARD_V1 = Grid(
+    name="standard-v1",
+    world="highway",
+    axes=AXES,
+    values={"lanes": (3, 4, 5), "density": (1.0, 2.0), "weather": ("clear", "rain", "fog")},
+    episodes=100,
+)
