@@ -108,10 +108,10 @@ class AdversarialTraining(DrivingDefense):
             UserError: if the attack does not fit the victim, or `start=trained` and the zoo has no such victim.
         """
         attack = configured("attack", self.attack, parameter_words(self.attack_params)).component
-        if victim.action_type not in attack.action_types:
-            raise UserError(f"attack {self.attack!r} does not fit a victim with {victim.action_type} actions")
-        if type(attack).perturb is DrivingAttack.perturb:
-            raise UserError(f"attack {self.attack!r} has a memory: adversarial training needs one without")
+        if not isinstance(attack, DrivingAttack) or type(attack).perturb is DrivingAttack.perturb:
+            raise UserError(f"adversarial training needs an attack on drivers without a memory, {self.attack!r} is none")
+        if misfit := attack.misfit(victim):
+            raise UserError(f"attack {self.attack!r} does not fit the victim, {misfit}")
         start = victim.load(seed, world.facts) if self.start == "trained" else None
         loop = AttackInLoop(self, attack, world.facts, start, seed)
         trained = victim.train(world, seed=seed, hooks=loop, progress=progress)

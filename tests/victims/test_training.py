@@ -71,7 +71,7 @@ def test_returns_end_where_the_episode_ends(world: DrivingWorld) -> None:
 @pytest.mark.parametrize("skip", [0.0, 0.5, 1.0])
 def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, world: DrivingWorld) -> None:
     defense = AdversarialTraining(
-        start="scratch", where="acting", skip=skip, ramp_to=0.0, attack="none", attack_params=""
+        start="scratch", where="acting", skip=skip, ramp_to=0.0, attack="noise", attack_params=""
     )
     card = defense.train(VICTIMS[0], world, seed=0, progress=silent).card
     assert card["attacked_decisions"] / (160 * 6) == pytest.approx(1 - skip, abs=0.06)
