@@ -109,7 +109,9 @@ class AdversarialTraining(DrivingDefense):
         """
         attack = configured("attack", self.attack, parameter_words(self.attack_params)).component
         if not isinstance(attack, DrivingAttack) or type(attack).perturb is DrivingAttack.perturb:
-            raise UserError(f"adversarial training needs an attack on drivers without a memory, {self.attack!r} is none")
+            raise UserError(
+                f"adversarial training needs an attack on drivers without a memory, {self.attack!r} is none"
+            )
         if misfit := attack.misfit(victim):
             raise UserError(f"attack {self.attack!r} does not fit the victim, {misfit}")
         start = victim.load(seed, world.facts) if self.start == "trained" else None

@@ -22,6 +22,7 @@ from defenses.advtrain_detection import DetectorAdversarialTraining
 from envs.camera.world import StopSignApproach
 from tests.vision.drawn_street import DrawnStreet
 
+FACTS = StopSignApproach().facts
 QUICK = {"rounds": 2, "updates": 2, "batch": 2, "attack_params": "steps=2 batch=2 window=224"}
 
 
@@ -45,24 +46,24 @@ def test_it_hardens_the_detector_it_is_given_and_is_found_again_in_the_zoo(
     victim: YOLOv5, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
-    before, pictures = victim.load(0), torch.rand(1, 3, 64, 64)
+    before, pictures = victim.load(0, FACTS), torch.rand(1, 3, 64, 64)
     defense = DetectorAdversarialTraining(**QUICK, trained_in="DrawnStreet")
     made = defense.train(victim, DrawnStreet(), seed=0, progress=lambda share, text: None)
     assert all(
         torch.equal(a, b)
-        for a, b in zip(before.state_dict().values(), victim.load(0).state_dict().values(), strict=True)
+        for a, b in zip(before.state_dict().values(), victim.load(0, FACTS).state_dict().values(), strict=True)
     )
     zoo.save(made.network, zoo.Recipe.of(victim, defense), seed=0, world=DrawnStreet(), card=made.card)
-    again = defense.load(victim, 5)
+    again = defense.load(victim, 5, FACTS)
     torch.testing.assert_close(again(pictures).scores, made.network(pictures).scores, rtol=0.02, atol=1e-3)
     assert not torch.equal(again(pictures).scores, before(pictures).scores)
     assert not any(weight.requires_grad for weight in again.parameters())
     with pytest.raises(UserError, match=r"defense\.rounds=3.*of training seed 0.*defense\.rounds=2"):
-        replace(defense, rounds=3).load(victim, 0)
+        replace(defense, rounds=3).load(victim, 0, FACTS)
     with pytest.raises(
         UserError, match=r"of training seed 1.*To train it: `bench train victim=yolov5 defense=advtrain"
     ):
-        replace(defense, trained=1).load(victim, 0)
+        replace(defense, trained=1).load(victim, 0, FACTS)
 
 
 def test_a_seed_is_a_training_and_the_control_is_never_attacked(victim: YOLOv5) -> None:
@@ -96,7 +97,7 @@ def test_one_name_is_what_it_is_on_each_track() -> None:
 def test_the_one_that_ships_withstands_what_blinds_the_other(published: YOLOv3TinyNetwork) -> None:
     """Patches crafted against each of them on the training places, 30 steps."""
     scenes = StopSignApproach().training_scenes()
-    hardened = DetectorAdversarialTraining().load(YOLOv3Tiny(), 0)
+    hardened = DetectorAdversarialTraining().load(YOLOv3Tiny(), 0, FACTS)
     frames = (scenes.visible > 0.9).nonzero().squeeze(1)[::9]
 
     def seen(detector: Detector, patch: Tensor | None) -> float:

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from bench.detection import Approach, CameraWorld, Scenes
-from bench.scenarios import Cell
+from bench.scenarios import Axes, Cell
+from envs.camera.axes import AXES
 from envs.weather import WEATHERS
 from tests.vision.pictures import stop_sign
 
@@ -53,6 +54,7 @@ class DrawnScenes(Scenes):
 class DrawnStreet(CameraWorld):
     """Ten frames from 30 to 8 metres, at one of two places."""
 
+    axes: ClassVar[Axes] = AXES
     locations: ClassVar[tuple[str, ...]] = ("left", "right")
 
     def training_scenes(self) -> Scenes:
