@@ -117,8 +117,8 @@ class AdversarialTraining(DrivingDefense):
         start = victim.load(seed, world.facts) if self.start == "trained" else None
         loop = AttackInLoop(self, attack, world.facts, start, seed)
         trained = victim.train(world, seed=seed, hooks=loop, progress=progress)
-        made_with = {"attack": asdict(attack), "threat": asdict(loop.threat), "attacked_decisions": loop.attacked}
-        return Trained(trained.network, {**trained.card, **made_with})
+        of_attack = {"attack": asdict(attack), "attacked_decisions": loop.attacked}  # type: ignore[call-overload]
+        return Trained(trained.network, {**trained.card, **of_attack, "threat": asdict(loop.threat)})
 
 
 class AttackInLoop(TrainingHooks):
