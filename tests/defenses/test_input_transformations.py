@@ -11,7 +11,7 @@ from torch import Tensor
 from bench.detection import DetectorDefense
 from defenses.jpeg import JPEG
 from defenses.smoothing import Guarded, MedianSmoothing
-from tests.framework.toy_camera import RedVictim
+from tests.framework.toy_camera import RedStreet, RedVictim
 
 BOTH = [MedianSmoothing(size=5), JPEG(quality=30)]
 
@@ -21,7 +21,7 @@ def pictures(count: int = 2) -> Tensor:
 
 
 def guarded(defense: DetectorDefense) -> Guarded:
-    found = defense.load(RedVictim(), 0)
+    found = defense.load(RedVictim(), 0, RedStreet().facts)
     assert isinstance(found, Guarded)
     return found
 
