@@ -1,43 +1,51 @@
-# make run: from nothing to the first score. make test, make lint, make docs: what CI runs. make bench: the speed figures.
+# make run: from nothing to the first score; installs what running needs. make test, make lint, make docs: what CI runs.
+# make bench: the speed figures. These install what development needs.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 BROWSERS := chromium chromium-browser google-chrome
-STAMP := $(VENV)/installed
+RUN_STAMP := $(VENV)/installed-to-run
+DEV_STAMP := $(VENV)/installed-to-develop
 
-.PHONY: run test lint docs bench install browser clean
+.PHONY: run test lint docs bench install install-dev browser clean
 
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
 
-test: install browser
+test: install-dev browser
 	$(BIN)/python -m pytest -n 2
 
-lint: install
+lint: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 # The site, in docs/_build/html. A broken link, a page in no table of contents or an unknown component is an error.
-docs: install
+docs: install-dev
 	rm -rf docs/_build
 	$(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
 
-bench: install
+bench: install-dev
 	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 
-install: $(STAMP)
+install: $(RUN_STAMP)
+
+install-dev: $(DEV_STAMP)
 
 # torch goes first and by itself: left to the resolver it may come with gigabytes of CUDA.
-$(STAMP): pyproject.toml constraints.txt
+$(RUN_STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,docs,render]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e .
+	touch $@
+
+$(DEV_STAMP): $(RUN_STAMP)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	touch $@
 
 # The browser that the tests of the leaderboard's page drive: one on the PATH, else Debian's (as root), else Playwright's own.
 # Without any they are skipped, and say why.
-browser: install
+browser: install-dev
 	@for name in $(BROWSERS); do command -v $$name >/dev/null && exit 0; done; \
 	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium && exit 0; \

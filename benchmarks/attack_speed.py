@@ -22,8 +22,9 @@ from attacks.zo import ZOSignSGD
 from bench.driving import DrivingAttack, ObservationThreat, Policy
 from bench.driving.attacker import AttackModule
 from bench.run.process import settle
-from bench.scenarios import Cell, SeedBlock
+from bench.scenarios import SeedBlock
 from bench.victims.drivers.networks import QPolicy
+from envs.highway.axes import AXES
 from envs.highway.world import HighwayWorld
 
 SMOOTHING, STEP_SIZE, FASTER = 0.01, 0.01, 3
@@ -98,7 +99,7 @@ def main() -> None:
 
 def _observations(world: HighwayWorld, episodes: int) -> Tensor:
     """[episodes, V, F] the start of as many episodes."""
-    env = world.make([Cell(lanes=3, density=1.0)] * episodes)
+    env = world.make([AXES.cell(lanes=3, density=1.0)] * episodes)
     seeds = torch.arange(SeedBlock.TUNE, SeedBlock.TUNE + episodes)
     observation: Tensor = env.reset(TensorDict({"seed": seeds}, batch_size=env.batch_size))["observation"]
     return observation

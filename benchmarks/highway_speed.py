@@ -26,13 +26,14 @@ from rich.console import Console
 from rich.table import Table
 from tensordict import TensorDict
 
-from bench.scenarios import Cell, SeedBlock
+from bench.scenarios import SeedBlock
+from envs.highway.axes import AXES
 from envs.highway.batched import BatchedHighway
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.engine import HighwayEngine
 from envs.highway.reference import SensedHighwayEnv
 
-CELL = Cell(lanes=3, density=1.0)
+CELL = AXES.cell(lanes=3, density=1.0)
 IDLE = ACTIONS.index("IDLE")
 ENGINE_GOAL, ENVIRONMENT_GOAL = 700, 500
 

@@ -22,9 +22,10 @@ from bench.detection.approach import look
 from bench.errors import UserError
 from bench.run.process import settle
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
+from envs.camera.axes import APPROACH_V1
 from envs.camera.world import StopSignApproach
 
-GRID, THREAT, WORKERS = GRIDS["approach-v1"], PatchThreat(), 2
+GRID, THREAT, WORKERS = APPROACH_V1, PatchThreat(), 2
 CLOCKS = ("processor", "wall")
 
 
@@ -86,7 +87,7 @@ def score(detector: Detector, world: StopSignApproach, rounds: int) -> None:
             rounds=rounds,
         ) / len(every)
     height, width = scenes().size
-    frames = len(list(GRID.scenarios())) * len(every)
+    frames = len(GRID.cells()) * len(GRID.seeds()) * len(every)
     print(f"scoring a texture: yolov3_tiny, batch {len(every)}, pictures of {width} x {height}, one thread")
     for clock, name in enumerate(CLOCKS):
         rendered, seen = np.median((rendering[clock], looking[clock]), 1)

@@ -25,6 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bench.records.store import FOLDER, SCHEMA
+from envs.highway.axes import STANDARD_V1
 
 SEEDS, EPISODES, ATTACKS = 3, 100, 8
 POLICY = {f"parameter_{number}": 0.125 for number in range(15)}
@@ -90,7 +91,7 @@ def write(out: Path, episodes: int, units: int) -> int:
     folder.mkdir(parents=True)
     rng = np.random.default_rng(0)
     attacks = ["none", *(f"attack_{number}" for number in range(ATTACKS))]
-    every = itertools.product(range(episodes // EPISODES), attacks, range(SEEDS), GRIDS["standard-v1"].cells())
+    every = itertools.product(range(episodes // EPISODES), attacks, range(SEEDS), STANDARD_V1.cells())
     waiting, files = [], 0
     for number, (place, attack, seed, cell) in enumerate(itertools.islice(every, episodes // EPISODES)):
         waiting.append(unit(number, f"defense_{place}", attack, seed, cell, rng))

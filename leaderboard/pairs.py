@@ -70,14 +70,12 @@ class Pair:
         return summarise(self.clean) if self.clean else None
 
     @cached_property
-    def effect(self) -> Interval | None:
-        """Attacked - clean safe progress, paired scenario by scenario."""
-        return self._gap(self.clean)
-
-    @cached_property
     def lead(self) -> Interval | None:
         """Attacked - best blind safe progress, paired: below 0 the victim would do better with its eyes shut."""
-        return self._gap(self.references.get(BEST_BLIND))
+        control = self.references.get(BEST_BLIND)
+        if control is None or self.attacked is None:
+            return None
+        return difference(*shared(self.attacked, control), "safe_progress")
 
     @cached_property
     def reference_scores(self) -> dict[str, Interval]:
@@ -86,11 +84,6 @@ class Pair:
             name: unit_interval(drive.only(runs=drive.runs[:1]).column("safe_progress"))
             for name, drive in self.references.items()
         }
-
-    def _gap(self, control: Episodes | None) -> Interval | None:
-        if control is None or self.attacked is None:
-            return None
-        return difference(*shared(self.attacked, control), "safe_progress")
 
     @property
     def retained(self) -> float:

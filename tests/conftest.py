@@ -7,6 +7,9 @@ import pytest
 from bench.errors import UserError
 from bench.run.process import settle
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
+from envs.camera.world import StopSignApproach
+
+FACTS = StopSignApproach().facts
 
 # Tests run in as many processes as there are cores: threads that wait for each other would only be in the way.
 settle()
@@ -16,7 +19,7 @@ settle()
 def published() -> YOLOv3TinyNetwork:
     """YOLOv3-tiny with its published weights, which are fetched if need be; without a network the test is skipped."""
     try:
-        return YOLOv3Tiny().load(0)
+        return YOLOv3Tiny().load(0, FACTS)
     except UserError as error:
         if "cannot be downloaded" not in str(error):
             raise

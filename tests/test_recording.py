@@ -12,7 +12,7 @@ from rerun.chunk import Chunk, RrdReader
 from bench.driving import Features, ObservationThreat
 from bench.driving.rollout import Trace
 from bench.driving.threat import project
-from bench.recording import RerunLogger, save
+from bench.recording.driving import save
 from bench.recording.driving.episode import ACTIONS, Episode
 
 FEATURES = Features(
@@ -186,17 +186,3 @@ def test_observations_without_positions_are_recorded_without_a_road(path: Path) 
     entities = set(read(path))
     assert "/perturbation/position/a" in entities
     assert not [entity for entity in entities if entity.startswith(("/road", "/traffic"))]
-
-
-def test_training_curves_come_back_from_the_logger(tmp_path: Path) -> None:
-    logger = RerunLogger("dqn-0", tmp_path)
-    logger.log_hparams({"gamma": 0.97})
-    for step in range(5):
-        logger.log_scalar("loss", 1.0 / (1 + step), step=step)
-    logger.log_histogram("q", torch.randn(100), step=4)
-    logger.log_video("drive", torch.zeros(1, 2, 3, 4, 4, dtype=torch.uint8), step=4)
-    logger.shutdown()
-    chunks = read(tmp_path / "dqn-0.rrd")
-    assert np.asarray(values(chunks["/loss"], "scalars")).ravel() == pytest.approx([1, 1 / 2, 1 / 3, 1 / 4, 1 / 5])
-    assert {"/hparams", "/q", "/drive"} <= set(chunks)
-    assert "dqn-0" in repr(logger)

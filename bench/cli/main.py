@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from bench.cli.axes_help import AxesHelp
 from bench.errors import UserError
 
 if TYPE_CHECKING:
@@ -29,14 +30,14 @@ Words = Annotated[
     typer.Argument(
         metavar="KEY=VALUE...",
         help="Comma lists sweep: attack=zo,noise defense=advtrain victim=dqn attack.steps=50 threat.budget=0.1,0.2. "
-        "lanes, density, weather and seeds choose from the grid: lanes=3,4 density=1 weather=clear,rain episodes=20.",
+        "seeds and the axes of the world choose from its grid: seeds=0,1 lanes=3,4 weather=clear,rain episodes=20.",
     ),
 ]
 
 
 @app.callback()
 def bench() -> None:
-    """How much does this attack hurt this defence of an automated vehicle?
+    """A benchmark for the adversarial robustness of driving policies and object detectors.
 
     With --debug anywhere on the line, or BENCH_DEBUG=1, an error shows its traceback.
     """
@@ -87,28 +88,15 @@ def check(
     raise typer.Exit(cli_check.print_checks(name, words or [], Console()))
 
 
-@app.command()
+@app.command(cls=AxesHelp)
 def run(words: Words = None) -> None:
-    """Score attacks on defended victims over the standard grid; goes on where a run was broken off.
+    """Score attacks on defended victims over a grid of scenarios; the same command again continues a run that was ended.
 
     For instance: bench run attack=zo defense=advtrain
     """
-    from bench.cli.progress import RunProgress
-    from bench.plugins.track import track_of
-    from bench.records import reading
-    from bench.run import runner
-    from bench.run.config import run_config
+    from bench.cli import run as cli_run
 
-    config = run_config(words or [])
-    with RunProgress(Console(stderr=True)) as progress:
-        try:
-            units = runner.run(config, progress)
-        except KeyboardInterrupt:
-            kept = f"{progress.done} of {progress.total} episodes are kept"
-            raise UserError(f"interrupted; {kept}, and the same command goes on from there") from None
-    own = track_of(config.pairs[0])
-    _print_report(own, reading.read(config.out, units, track=own))
-    Console().print(Text(f"Records in {config.out}: `bench show {config.out}` says what made them."), soft_wrap=True)
+    cli_run.run(words or [], Console(), _print_report)
 
 
 @app.command()
@@ -157,20 +145,9 @@ def render(
 
     It needs the renderer: pip install 'cavbench[render]'. The frames of the standard grid ship with the project.
     """
-    from bench.cli.progress import TrainingProgress
-    from bench.detection import CameraWorld
-    from bench.run.config import component
+    from bench.cli import render as cli_render
 
-    found = component("world", world, {})
-    if not isinstance(found, CameraWorld):
-        raise UserError(f"world {world!r} has no camera to render for")
-    with TrainingProgress(Console(stderr=True), f"render {world}") as progress:
-        try:
-            files = found.render(out, progress)
-        except NotImplementedError as error:
-            raise UserError(str(error)) from error
-    size = sum(file.stat().st_size for file in files) / 1e6
-    Console().print(Text(f"{len(files)} files, {size:.1f} MB, in {files[0].parent}"), soft_wrap=True)
+    cli_render.render(world, out, Console())
 
 
 @app.command()

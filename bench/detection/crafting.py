@@ -63,7 +63,9 @@ def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
     """The file of the patch of a job's pair and training seed (`bench.detection.patch`)."""
     pair = job.pair
     attack, world, threat = pair.attack.component, pair.world.component, pair.threat
-    assert isinstance(attack, PatchAttack) and isinstance(world, CameraWorld) and isinstance(threat, PatchThreat)
+    assert isinstance(attack, PatchAttack)
+    assert isinstance(world, CameraWorld)
+    assert isinstance(threat, PatchThreat)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(job.attack_seed)
         detector = pair.load(job.training_seed)

@@ -20,7 +20,8 @@ def drive(job: Job, traced: Sequence[int]) -> Driven:
         traced: scenario seeds of the episodes that a recording is wanted of.
     """
     pair, world, attack = job.pair, job.pair.world.component, job.pair.attack.component
-    assert isinstance(world, DrivingWorld) and isinstance(pair.threat, ObservationThreat)
+    assert isinstance(world, DrivingWorld)
+    assert isinstance(pair.threat, ObservationThreat)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(job.attack_seed)
         policy = pair.load(job.training_seed)

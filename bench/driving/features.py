@@ -29,8 +29,8 @@ class Features:
         names: of the measured features.
         low, high: what -1 and 1 stand for, in `units`.
         units: for instance m and m/s.
-        floors: the resolution of the sensor, in `units`: the smallest deviation of the `relative` set at a budget of 0.1; empty for
-            none.
+        floors: the resolution of the sensor, in `units`: the smallest deviation of the `relative` set at a budget of 0.1;
+            empty for none.
     """
 
     names: tuple[str, ...]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from bench.driving.features import Features
 from bench.plugins.contracts import ThreatModel
+from bench.plugins.ranges import Natural
 
 Norm = Literal["relative", "linf"]
 
@@ -29,15 +31,8 @@ class ObservationThreat(ThreatModel):
     """
 
     norm: Norm = "relative"
-    budget: float = 0.1
-    queries: int = 1000
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.norm not in get_args(Norm):
-            raise ValueError(f"threat.norm must be one of {', '.join(get_args(Norm))}, got {self.norm!r}")
-        if not 0 <= self.budget <= 2:
-            raise ValueError(f"threat.budget must be between 0 and 2, got {self.budget}")
+    budget: Annotated[float, Interval(ge=0, le=2)] = 0.1
+    queries: Natural = 1000
 
     def radius(self, observation: Tensor, features: Features, scale: float = 1.0) -> Tensor:
         """[..., V, F] the largest deviation of each entry, on the normalised scale; 0 for presence and absent rows.

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, get_args
 
 from bench.errors import UserError
+from bench.plugins import ranges
 from bench.scenarios import Axes
 
 if TYPE_CHECKING:
@@ -37,6 +38,10 @@ class Component(ABC):
     """Name of the track, set by the base classes of a track, and by them only."""
     libraries: ClassVar[tuple[str, ...]] = ()
     """Distributions that compute for it: records name their versions, beside those of torch and the rest."""
+
+    def __post_init__(self) -> None:
+        """Check the fields against their annotations; a component that checks more calls this first."""
+        ranges.check(self)
 
     @classmethod
     def choices(cls) -> Mapping[str, str]:
@@ -200,18 +205,16 @@ class ThreatModel:
         queries: most evaluations of the victim.
     """
 
-    track: ClassVar[str]
-
     norm: str
     budget: float
     access: Access = "gradients"
-    queries: int
+    queries: ranges.Natural
 
     def __post_init__(self) -> None:
-        if self.access not in get_args(Access):
-            raise ValueError(f"threat.access must be one of {', '.join(get_args(Access))}, got {self.access!r}")
-        if self.queries < 0:
-            raise ValueError(f"threat.queries must be at least 0, got {self.queries}")
+        try:
+            ranges.check(self)
+        except ValueError as error:
+            raise ValueError(f"threat.{error}") from None
 
     @classmethod
     def of_nobody(cls) -> Self:

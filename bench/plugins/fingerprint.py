@@ -15,16 +15,28 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-LIBRARIES = ("torch", "torchrl", "tensordict", "highway-env", "numba", "numpy")
+LIBRARIES = ("torch", "torchrl", "tensordict", "numba", "numpy")
 
 BESIDE_THE_RESULT = frozenset(
-    ["cli", "conformance", "errors", "files", "plugins", "recording", "records", "run", "statistics", "tracks"]
+    [
+        "cli",
+        "conformance",
+        "errors",
+        "files",
+        "plugins",
+        "recording",
+        "records",
+        "run",
+        "shadow",
+        "statistics",
+        "tracks",
+    ]
 )
 """Rooms of `bench` that choose, store or show results: editing them outdates no record."""
 
 
 def canonical(value: Any) -> str:
-    """The one JSON text of a value: sorted keys, no spaces; dataclasses by their fields, mappings as objects, the rest by str()."""
+    """The one JSON text of a value: sorted keys, no spaces; dataclasses and mappings as objects, the rest by str()."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     return json.dumps(value, sort_keys=True, separators=(",", ":"), default=_plain)

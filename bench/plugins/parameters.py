@@ -10,6 +10,7 @@ from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any, Literal, Union, get_args, get_origin
 
 from bench.errors import UserError
+from bench.plugins import ranges
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +23,7 @@ class Parameter:
         default: None where `required`.
         required: whether it must be given.
         meaning: what the class docstring's Args say of it; empty if nothing.
+        allowed: its choices or its range in words; empty if its type says all.
     """
 
     name: str
@@ -29,17 +31,13 @@ class Parameter:
     default: Any
     required: bool
     meaning: str
+    allowed: str = ""
 
     @property
     def choices(self) -> tuple[Any, ...]:
         """What is allowed, where the type is a Literal; empty otherwise."""
         hints = (self.hint, *get_args(self.hint)) if get_origin(self.hint) in (Union, types.UnionType) else (self.hint,)
         return tuple(choice for hint in hints if get_origin(hint) is Literal for choice in get_args(hint))
-
-    @property
-    def allowed(self) -> str:
-        """The choices in words; empty where there are none."""
-        return f"one of {', '.join(map(str, self.choices))}" if self.choices else ""
 
     @property
     def default_text(self) -> str:
@@ -63,7 +61,7 @@ def parameters(component: type) -> dict[str, Parameter]:
         UserError: if a type annotation cannot be read at run time.
     """
     try:
-        hints = typing.get_type_hints(component)
+        hints, annotated = (typing.get_type_hints(component, include_extras=extras) for extras in (False, True))
     # An annotation is evaluated, and may be any expression.
     except Exception as error:
         raise UserError(f"the parameters of {component.__qualname__} cannot be read: {error}") from error
@@ -77,6 +75,7 @@ def parameters(component: type) -> dict[str, Parameter]:
             default=_default(field),
             required=field.default is MISSING and field.default_factory is MISSING,
             meaning=meanings.get(field.name, ""),
+            allowed=ranges.words(annotated[field.name]),
         )
         for field in fields(component)
         if field.init

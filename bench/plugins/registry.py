@@ -13,6 +13,7 @@ from functools import cache
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from bench import shadow
 from bench.errors import UserError, reason
 from bench.scenarios import Grid
 
@@ -127,7 +128,8 @@ def resolve(group: str, name: str, noun: str) -> Any:
         return point.load()
     # A plug-in may fail in any way while it is imported, end the program too, and must not take the others with it.
     except (Exception, SystemExit) as error:
-        raise UserError(f"{_where(group, name, noun)} cannot be imported: {reason(error)}") from error
+        why = shadow.explanation(point.module, entry.distribution) or reason(error)
+        raise UserError(f"{_where(group, name, noun)} cannot be imported: {why}") from error
 
 
 def declared(kind: Kind, name: str) -> type[Any]:

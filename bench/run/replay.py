@@ -41,7 +41,7 @@ class Replay:
 
 
 def find(records: pa.Table, where: Mapping[str, str]) -> dict[str, Any]:
-    """The first record with these values in its columns or on the axes of its cell, for instance {"lanes": "3", "seed": "1000017"}.
+    """The first record with these values in its columns or on the axes of its cell, as {"lanes": "3", "seed": "1000017"}.
 
     Raises:
         UserError: if a column is unknown or no record fits.

@@ -1,4 +1,4 @@
-"""Carries out one piece of work, wherever it is asked to: all that it made comes back in its outcome, so no shared disk is needed."""
+"""Carries out one piece of work. All that it made comes back in its outcome, so that no shared disk is needed."""
 
 from __future__ import annotations
 

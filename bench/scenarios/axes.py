@@ -72,7 +72,9 @@ class Axis:
         if self.choices:
             return f"one of {', '.join(map(written, self.choices))}"
         noun = {"int": "a whole number", "float": "a number", "str": "a name"}[self.kind]
-        low = f"at least {self.low:g}" if self.low > -math.inf else ""
+        if -math.inf < self.low and self.high < math.inf:
+            return f"{noun} between {self.low:g} and {self.high:g}"
+        low = f"of at least {self.low:g}" if self.low > -math.inf else ""
         low = f"above {self.above:g}" if self.above > -math.inf else low
         high = f"at most {self.high:g}" if self.high < math.inf else ""
         return " ".join([noun, " and ".join(filter(None, (low, high)))]).strip()

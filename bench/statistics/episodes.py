@@ -212,11 +212,8 @@ class Summary:
         offroad_rate: share of episodes that leave the road, all runs pooled.
         attack_success: share of steps in [0, 1] whose decision the attack changed.
         queries_mean: victim evaluations a step, mean over steps.
-        queries_median: victim evaluations a step, median over episodes of the episode's median.
-        queries_max: most victim evaluations in one step.
         attack_ms: the attack's wall time a step and episode, milliseconds.
         min_ttc_s: smallest time to collision of an episode in seconds, median over episodes; inf: never a car ahead.
-        mean_speed: metres a second.
         action_entropy: of discrete actions, in [0, 1] (1: all equally often, 0: always one); NaN for continuous ones.
         runs: training seeds.
         cells: cells of the grid.
@@ -229,11 +226,8 @@ class Summary:
     offroad_rate: Interval
     attack_success: float
     queries_mean: float
-    queries_median: float
-    queries_max: float
     attack_ms: float
     min_ttc_s: float
-    mean_speed: float
     action_entropy: float
     runs: int
     cells: int
@@ -250,11 +244,8 @@ def summarise(episodes: Episodes) -> Summary:
         offroad_rate=rate(episodes, "offroad"),
         attack_success=step_mean(episodes, "changed"),
         queries_mean=step_mean(episodes, "queries"),
-        queries_median=float(np.median(episodes.column("queries_median"))),
-        queries_max=float(episodes.column("queries_max").max()),
         attack_ms=step_mean(episodes, "attack_ms"),
         min_ttc_s=float(np.median(episodes.column("min_ttc_s"))),
-        mean_speed=step_mean(episodes, "mean_speed"),
         action_entropy=action_entropy(episodes.table),
         runs=runs,
         cells=cells,

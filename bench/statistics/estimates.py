@@ -3,7 +3,8 @@
 Pure functions on arrays; what the arrays mean is said in `bench.statistics.episodes`. The aggregate is rliable's interquartile
 mean and the resampling is that of its `StratifiedBootstrap` (Agarwal et al. 2021, "Deep RL at the edge of the
 statistical precipice"), drawn in one vectorised pass from a generator of our own: rliable 1.2 draws from numpy's
-global one, whatever seed it is given.
+global one, whatever seed it is given. `iqm` and `wilson` are scipy's `trim_mean` and `binomtest(...).proportion_ci` to the last
+digit that a table shows (a test compares them), without the 0.8 s that importing `scipy.stats` takes, and 6 and 100 times faster.
 """
 
 from __future__ import annotations

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from bench.driving.drive import drive
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
 from bench.driving import DrivingAttack, ObservationThreat, Policy
 from bench.driving.attacker import AttackModule
+from bench.driving.drive import drive
 from bench.driving.rollout import Columns, Trace
 from bench.plugins.pair import choose
 from bench.run.config import run_config

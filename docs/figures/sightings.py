@@ -18,9 +18,9 @@ from bench.detection.approach import Sight, look
 from bench.detection.boxes import confidence
 from bench.detection.stopping import THRESHOLD
 from bench.plugins.pair import choose
-from bench.scenarios import Cell
 from docs.figures import style
 from docs.figures.patches import SHARE
+from envs.camera.axes import APPROACH_V1, AXES
 from leaderboard.approaches import Patched, read_patched
 from leaderboard.published import published
 
@@ -35,7 +35,7 @@ MARGIN = 1.1
 def approaches(weather: str = "clear") -> list[Approach]:
     """One approach a place."""
     return choose("world", "camera").component.approaches(
-        Cell(lanes=LANES, density=DENSITY, weather=weather), GRIDS["approach-v1"].seeds()
+        AXES.cell(lanes=LANES, density=DENSITY, weather=weather), APPROACH_V1.seeds()
     )
 
 

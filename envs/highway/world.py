@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 from bench.driving import ActionType, Driver, DrivingWorld, Features
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
 Backend = Literal["batched", "reference"]
+REFERENCE = "highway-env"
+"""The distribution that the backend `reference` runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +41,8 @@ class HighwayWorld(DrivingWorld):
         simulation_frequency, policy_frequency: physics frames and decisions a second.
         max_steps: decisions until an episode is truncated.
         offroad_terminal: whether leaving the road ends the episode.
-        backend: `batched`, our engine, or `reference`, the real highway-env (equal, and several hundred times slower).
+        backend: `batched`, our engine, or `reference`, the real highway-env (equal, and several hundred times slower; needs
+            pip install 'cavbench[reference]').
 
     Raises:
         ValueError: with one line, for what neither environment can do.
@@ -71,6 +75,10 @@ class HighwayWorld(DrivingWorld):
         if self.preset == "thesis":
             # The class says the standard's ranges; this object's own are others.
             object.__setattr__(self, "features", THESIS_FEATURES)
+        if self.backend == "reference":
+            if find_spec("highway_env") is None:
+                raise ValueError(f"backend=reference needs {REFERENCE}: pip install 'cavbench[reference]'")
+            object.__setattr__(self, "libraries", (REFERENCE,))
         self.config((AXES.cell(lanes=3, density=1.0),))
 
     @property

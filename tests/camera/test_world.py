@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bench.errors import UserError
-from bench.scenarios import Cell
 from envs.camera import poses
+from envs.camera.axes import AXES
 from envs.camera.bank import SHIPPED
 from envs.camera.street.layout import LOCATIONS
 from envs.camera.world import StopSignApproach
@@ -21,7 +20,7 @@ def test_every_approach_is_there(weather: str) -> None:
     scored = {name for name, place in LOCATIONS.items() if not place.training}
     for lanes in poses.LANES:
         for density in poses.DENSITIES:
-            approaches = WORLD.approaches(Cell(lanes=lanes, density=density, weather=weather), range(3))
+            approaches = WORLD.approaches(AXES.cell(lanes=lanes, density=density, weather=weather), range(3))
             assert {approach.location for approach in approaches} == scored
             for approach in approaches:
                 distance = approach.scenes.distance
@@ -38,7 +37,5 @@ def test_all_of_it_is_under_80_mb() -> None:
 
 
 def test_a_road_that_was_not_rendered_is_one_line() -> None:
-    with pytest.raises(
-        UserError, match=r"the camera world has no 6 lanes, density 1, clear: lanes must be one of 3, 4, 5"
-    ):
-        WORLD.approaches(Cell(lanes=6, density=1.0, weather="clear"), range(1))
+    with pytest.raises(ValueError, match="lanes must be one of 3, 4, 5, got 6"):
+        AXES.cell(lanes=6, density=1.0, weather="clear")

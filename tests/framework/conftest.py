@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.cli.main import main as cli
+from bench.cli import main as cli
 from bench.plugins import registry
 from tests.framework.distributions import install_toy
 
@@ -49,6 +49,9 @@ class Said:
     code: int
     out: str
     err: str
+
+
+Bench = Callable[..., Said]
 
 
 @pytest.fixture

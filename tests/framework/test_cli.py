@@ -152,7 +152,7 @@ def test_without_a_display_view_says_how_to_open_a_recording(
 
 
 def test_a_traceback_is_shown_to_who_asks_for_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    from bench.cli.main import main as cli
+    from bench.cli import main as cli
     from bench.errors import UserError
 
     monkeypatch.setattr(sys, "argv", ["bench", "run", "attack=nugde", "--debug"])

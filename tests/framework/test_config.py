@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from bench.errors import UserError
 from bench.plugins.registry import load
 from bench.run.config import RunConfig, component, run_config, train_config
+from envs.highway.axes import STANDARD_V1
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
@@ -28,7 +29,7 @@ def test_the_defaults_are_the_clean_dqn_on_the_standard_grid() -> None:
         "dqn",
         "highway",
     )
-    assert config.grid == GRIDS["standard-v1"]
+    assert config.grid == STANDARD_V1
     assert (config.seeds, config.out, config.reference, config.record) == ((0, 1, 2), Path("results"), True, None)
 
 
@@ -40,7 +41,8 @@ def test_a_line_of_words_sets_everything() -> None:
     (pair,) = config.pairs
     assert (pair.attack.component.scale, pair.defense.component.skip, pair.world.component.vehicles) == (0.5, 0.25, 50)
     assert (pair.threat.norm, pair.threat.budget, pair.threat.access) == ("linf", 0.2, "gradients")
-    assert (config.grid.lanes, config.grid.density, config.grid.weather) == ((3, 4), (1.0,), ("clear", "rain"))
+    values = {name: tuple(values) for name, values in config.grid.values.items()}
+    assert values == {"lanes": (3, 4), "density": (1.0,), "weather": ("clear", "rain")}
     assert (len(config.grid.seeds()), config.grid.name) == (20, "custom")
     assert (config.seeds, config.workers, config.out, config.record) == ((0, 1), 2, Path("some/where"), 3)
 
@@ -92,16 +94,20 @@ BAD = {
     "attack=noise attack.distribution=normal": "'normal'; did you mean 'uniform'? known: uniform, gaussian",
     "attack=pgd attack.steps=many": "cannot read attack.steps=many: value 'many' of type 'str' could not be converted",
     "attack=pgd attack.steps=0": "attack 'pgd': ",
-    "attack=steer victim=toy": "attack 'steer' does not fit victim 'toy': it needs continuous actions",
+    "attack=steer victim=toy": "attack 'steer' does not fit victim 'toy', whose actions are discrete: it needs continuous ones",
     "attack=steer victim=toy victim.actions=continuous threat.access=scores": "needs access 'gradients'",
     "defense=guard": "defense 'guard' needs defense.digits=",
-    "lanes=9": "lanes must be between 2 and 8, got 9",
-    "density=-1": "density must be in (0, 4], got -1",
-    "weather=snow": "unknown weather 'snow'; known: clear, rain, fog, night",
-    "weather=night": "weather 'night' is for cameras",
+    "lanes=9": "lanes must be a whole number between 2 and 8, got 9",
+    "lanes=3.5": "lanes must be a whole number between 2 and 8, got 3.5",
+    "lanes=[[3]]": "lanes must be a whole number between 2 and 8, got [3]",
+    "density=-1": "density must be a number above 0 and at most 4, got -1",
+    "density=nan": "density must be a number above 0 and at most 4, got nan",
+    "weather=snow": "unknown weather 'snow'; known: clear, rain, fog",
+    "weather=night": "unknown weather 'night'; known: clear, rain, fog",
     "episodes=0": "episodes must be between 1 and 1000000, got 0",
     "episodes=1,2": "episodes takes one value, got 1,2",
-    "grid=standard": "unknown grid 'standard'; did you mean 'standard-v1'?",
+    "grid=standard": "unknown grid 'standard' of the world 'highway'; did you mean 'standard-v1'?",
+    "grid=approach-v1": "unknown grid 'approach-v1' of the world 'highway'",
     "world.vehicles=0": "world 'highway': vehicles must be between 1",
     "workers=0": "workers must be at least 1, got 0",
     "seeds=-1": "seeds must be different numbers of at least 0, got -1",

@@ -58,10 +58,9 @@ def test_other_weights_or_another_training_seed_are_another_unit() -> None:
 
 
 def test_other_library_versions_are_another_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    unit = first()
-    before = unit.fingerprint
+    before = first().fingerprint
     monkeypatch.setattr("bench.run.unit.libraries", lambda more: {"torch": "0.0"})
-    assert unit.fingerprint != before
+    assert first().fingerprint != before
 
 
 def test_the_source_of_a_component_and_of_what_it_imports_counts(
@@ -83,23 +82,47 @@ def test_the_source_of_a_component_and_of_what_it_imports_counts(
 
     def digest() -> str:
         fingerprint.code_digest.cache_clear()
+        fingerprint._code.cache_clear()
         return fingerprint.code_digest(("some_plugin.attack",))
 
     before = digest()
     assert digest() == before
     for name, text in files.items():
-        (package / f"{name}.py").write_text(text + "# changed\n")
+        (package / f"{name}.py").write_text(text + "changed = 1\n")
         assert (digest() == before) == (name == "unrelated"), name
         (package / f"{name}.py").write_text(text)
     assert digest() == before
+
+
+def test_comments_docstrings_and_layout_outdate_no_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    module = tmp_path / "lone_plugin.py"
+
+    def digest(text: str) -> str:
+        module.write_text(text)
+        fingerprint.code_digest.cache_clear()
+        fingerprint._code.cache_clear()
+        return fingerprint.code_digest(("lone_plugin",))
+
+    before = digest("def f(x):\n    return x + 1\n")
+    assert (
+        digest('"""A module."""\n\n\ndef f(x):\n    """One more."""\n    # why\n    return (x\n            + 1)\n')
+        == before
+    )
+    assert digest("def f(x):\n    return x + 2\n") != before
+
+
+def test_another_track_outdates_no_record() -> None:
+    clean = first("attack=none", "victim=dqn", "world=highway")
+    assert not [name for name in fingerprint.sources(clean.modules) if "detect" in name or "yolo" in name]
 
 
 def test_the_code_of_a_unit_is_what_computes_it_and_nothing_else() -> None:
     counted = set(fingerprint.sources(first("world=highway", "attack=pgd", "victim=ddpg").modules))
     assert counted >= {
         *(
-            f"bench.{name}"
-            for name in ("contracts", "drive", "driving", "pipeline", "rollout", "scenario", "threat", "unit")
+            f"bench.driving.{name}"
+            for name in ("contracts", "drive", "attacker", "meter", "metrics", "oracle", "policy", "rollout", "threat")
         ),
         *("attacks.pgd", "attacks.objectives", "defenses.none", "bench.victims.drivers.ddpg"),
         *("envs.highway.world", "envs.highway.batched", "envs.highway.engine", "envs.highway.sensor"),

@@ -54,7 +54,8 @@ BROKEN = {
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(DrivingAttack): ...\n"
     ),
     "is not a frozen dataclass": (
-        "from bench.driving.contracts import DrivingAttack\nclass Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
+        "from bench.driving.contracts import DrivingAttack\n"
+        "class Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
     ),
     "takes steps by position": (
         "from dataclasses import dataclass\nfrom bench.driving.contracts import DrivingAttack\n"
@@ -86,7 +87,7 @@ def test_a_name_that_two_packages_claim_is_refused_and_both_are_named(plugins: P
 
 def test_listing_names_imports_no_torch() -> None:
     code = (
-        "import sys; from bench import cli; sys.argv = ['bench', 'list']\n"
+        "import sys; from bench.cli import main as cli; sys.argv = ['bench', 'list']\n"
         "try: cli.main()\nexcept SystemExit: pass\n"
         "heavy = {'torch', 'hydra', 'numpy', 'duckdb', 'attacks.noise'} & set(sys.modules)\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)"

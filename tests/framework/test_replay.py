@@ -8,12 +8,18 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from bench.records import store as results
+from bench.plugins.track import track
+from bench.records import reading, store
+from bench.records.schema import schema
 from bench.run.replay import find, replay
 from tests.framework.conftest import Said
 from tests.framework.test_cli import TOY, assert_one_line
 
 Bench = Callable[..., Said]
+
+
+def records_of(folder: Path) -> pa.Table:
+    return reading.read(folder, track=track("driving"))
 
 
 @pytest.fixture
@@ -28,24 +34,24 @@ def folder(bench: Bench, tmp_path: Path) -> Path:
 def test_a_run_records_the_first_episode_of_each_pair_that_was_asked_for(folder: Path) -> None:
     (path,) = folder.glob("recordings/*/*.rrd")
     assert path.parent.name.startswith("nudge-none-toy-")
-    assert path.name == "3-lanes-density-1-clear-1000000.rrd"
+    assert path.name == "lanes-3-density-1-weather-clear-1000000.rrd"
 
 
 def test_a_replay_measures_what_the_record_says(folder: Path) -> None:
-    record = find(results.read(folder), {"attack": "nudge", "seed": "1000002"})
+    record = find(records_of(folder), {"attack": "nudge", "seed": "1000002"})
     again = replay(folder, record)
     assert (again.differences, again.changed) == ((), "")
-    assert again.path.name == "3-lanes-density-1-clear-1000002.rrd"
+    assert again.path.name == "lanes-3-density-1-weather-clear-1000002.rrd"
     assert again.path.stat().st_size > 0
 
 
 def test_a_replay_that_comes_out_otherwise_says_in_what_and_why(folder: Path) -> None:
-    records = results.read(folder)
+    records = records_of(folder)
     record = find(records, {"attack": "nudge"})
     rows = records.filter(pa.compute.field("unit") == record["unit"]).to_pylist()
     altered = [row | {"return": row["return"] + 1e-9, "code_digest": "another"} for row in rows]
-    results.write(folder, pa.Table.from_pylist(altered, results.SCHEMA))
-    again = replay(folder, find(results.read(folder), {"attack": "nudge"}))
+    store.write(folder, pa.Table.from_pylist(altered, schema(track("driving"))))
+    again = replay(folder, find(records_of(folder), {"attack": "nudge"}))
     assert (again.differences, again.changed) == (("return",), "code_digest")
 
 

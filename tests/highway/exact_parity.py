@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.scenarios import Cell
+from envs.highway.axes import AXES
 from envs.highway.config import THESIS_TARGET_SPEEDS, HighwayConfig
 from envs.highway.engine import HighwayEngine
 from envs.highway.reference import SensedHighwayEnv
@@ -27,7 +27,7 @@ IDLE = discrete(1)
 def case(
     lanes: int, density: float, choose: Chooser, *seeds: int, steps: int, weather: str = "clear", **options: Any
 ) -> Case:
-    cell = Cell(lanes=lanes, density=density, weather=weather)
+    cell = AXES.cell(lanes=lanes, density=density, weather=weather)
     return Case(cell=cell, seeds=seeds, choose=choose, steps=steps, options=options)
 
 
@@ -71,7 +71,7 @@ def test_short_drive_is_bit_equal(name: str) -> None:
 
 
 def test_reset_is_bit_equal_for_many_seeds() -> None:
-    config = HighwayConfig(cells=(Cell(lanes=3, density=1.0), Cell(lanes=5, density=2.0)))
+    config = HighwayConfig(cells=(AXES.cell(lanes=3, density=1.0), AXES.cell(lanes=5, density=2.0)))
     simulators, engine = [SensedHighwayEnv(config, cell) for cell in config.cells], HighwayEngine(config)
     for seed in [*range(15), 2**31, 2**40 + 1, 2**62]:
         engine.reset(np.arange(2), np.array([seed, seed]))
@@ -84,7 +84,7 @@ def test_reset_is_bit_equal_for_many_seeds() -> None:
 @st.composite
 def random_cases(draw: st.DrawFn) -> Case:
     """Any world that the configuration lets through, for a few steps."""
-    cell = Cell(
+    cell = AXES.cell(
         lanes=draw(st.integers(2, 8)),
         density=draw(st.floats(0.3, 4.0)),
         weather=draw(st.sampled_from(("clear", "clear", "rain", "fog"))),

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from bench.driving import DrivingWorld, Features
-from bench.scenarios import Cell
+from envs.highway.axes import AXES
 from envs.highway.config import STANDARD_FEATURES, THESIS_FEATURES, HighwayConfig
 from envs.highway.world import HighwayWorld
 
@@ -66,7 +66,7 @@ def test_presets_are_the_projects_and_the_thesis() -> None:
     assert isinstance(standard, DrivingWorld)
     assert standard.features == HighwayWorld.features == STANDARD_FEATURES
     assert thesis.features == THESIS_FEATURES
-    cells = (Cell(lanes=3, density=1.0),)
+    cells = (AXES.cell(lanes=3, density=1.0),)
     assert thesis.config(cells) == HighwayConfig.thesis(cells=cells)
     assert standard.config(cells) == HighwayConfig(cells=cells)
     assert standard.max_steps == 450
@@ -84,11 +84,16 @@ def test_the_engine_runs_where_no_compiled_code_can_be_kept() -> None:
         # As on a read-only installation without a home: numba finds nowhere to write.
         "for locator in caching.CacheImpl._locator_classes: locator.from_function = classmethod(lambda *a: None)\n"
         "from envs.highway.world import HighwayWorld\n"
-        "from bench.scenarios import Cell\n"
-        "env = HighwayWorld().make([Cell(lanes=3, density=1.0)])\n"
+        "from envs.highway.axes import AXES\n"
+        "env = HighwayWorld().make([AXES.cell(lanes=3, density=1.0)])\n"
         "print(env.rollout(3)['next', 'reward'].shape)\n"
     )
     command = [sys.executable, "-W", "ignore", "-c", program]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "[1, 3, 1]" in done.stdout
+
+
+def test_records_of_the_reference_backend_name_highway_envs_version() -> None:
+    assert HighwayWorld(backend="reference").libraries == ("highway-env",)
+    assert HighwayWorld().libraries == ()

@@ -16,10 +16,11 @@ from torchrl.envs.utils import check_env_specs
 
 from bench.driving import ActionType, Driver
 from bench.scenarios import Cell, SeedBlock
+from envs.highway.axes import AXES
 from envs.highway.world import Backend, HighwayWorld
 
-CLEAR = Cell(lanes=3, density=1.0)
-MIXED = (CLEAR, Cell(lanes=4, density=2.0, weather="rain"), Cell(lanes=5, density=1.0, weather="fog"))
+CLEAR = AXES.cell(lanes=3, density=1.0)
+MIXED = (CLEAR, AXES.cell(lanes=4, density=2.0, weather="rain"), AXES.cell(lanes=5, density=1.0, weather="fog"))
 IDLE, LANE_RIGHT, FASTER, SLOWER = 1, 2, 3, 4
 
 

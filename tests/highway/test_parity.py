@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from numpy._core._multiarray_umath import __cpu_dispatch__ as numpy_kernels  # type: ignore[attr-defined]
 
-from bench.scenarios import Cell
+from envs.highway.axes import AXES
 from tests.highway.side_by_side import Case, compare, differences, discrete
 
 ROOT = Path(__file__).parents[2]
@@ -42,5 +42,5 @@ def test_engine_equals_highway_env_bit_for_bit_in_long_drives() -> None:
 
 
 def test_engine_is_close_to_highway_env_whatever_numpy_was_built_for() -> None:
-    drive = Case(cell=Cell(lanes=4, density=1.0), seeds=(1,), choose=discrete(0, 1, 2, 4), steps=40)
+    drive = Case(cell=AXES.cell(lanes=4, density=1.0), seeds=(1,), choose=discrete(0, 1, 2, 4), steps=40)
     assert not differences(compare(drive, tolerance=1e-9))

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from bench.scenarios import Cell
+from envs.highway.axes import AXES
 from envs.highway.config import HighwayConfig
 from envs.highway.engine import HighwayEngine
 from envs.highway.sensor import add_noise, noise_sigma, sensor_range_m
@@ -46,7 +46,7 @@ def test_clear_air_is_highway_envs_own_observation() -> None:
 
 
 def test_weather_changes_what_is_seen_but_not_what_happens() -> None:
-    cells = tuple(Cell(lanes=3, density=2.0, weather=name) for name in ("clear", "rain", "fog"))
+    cells = tuple(AXES.cell(lanes=3, density=2.0, weather=name) for name in ("clear", "rain", "fog"))
     engine = HighwayEngine(HighwayConfig(cells=cells))
     engine.reset(np.arange(3), np.full(3, 8))
     for _ in range(10):
@@ -86,7 +86,7 @@ def test_noise_depends_on_scenario_step_and_vehicle_only() -> None:
 
 
 def test_noise_has_the_stated_size_in_metres() -> None:
-    cells = tuple(Cell(lanes=3, density=2.0, weather=name) for name in ("clear", "rain"))
+    cells = tuple(AXES.cell(lanes=3, density=2.0, weather=name) for name in ("clear", "rain"))
     engine = HighwayEngine(HighwayConfig(cells=cells * 40))
     seeds = np.repeat(np.arange(40), 2)
     engine.reset(np.arange(80), seeds)

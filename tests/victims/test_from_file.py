@@ -19,12 +19,15 @@ import torch
 from torch import Tensor, nn
 
 from bench.conformance import complaints
+from envs.highway.world import HighwayWorld
 from bench.driving.drive import drive
 from bench.driving.rollout import Columns
 from bench.errors import UserError
 from bench.plugins.pair import choose
 from bench.run.config import run_config
 from bench.run.plan import plan
+
+FACTS = HighwayWorld().facts
 
 ALGORITHMS = [
     ("dqn", False),
@@ -43,7 +46,7 @@ class Scores(nn.Module):
 
     def __init__(self, outputs: int = 5, *, flat: bool = False) -> None:
         super().__init__()
-        self.policy = choose("victim", "dqn").component.load(0)
+        self.policy = choose("victim", "dqn").component.load(0, FACTS)
         self.outputs, self.flat = outputs, flat
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -151,7 +154,7 @@ def test_a_policy_of_stable_baselines_acts_as_its_own_predict_does(tmp_path: Pat
     victim = choose("victim", "sb3", path=str(tmp_path / "model.zip"), algo=algo, actions=actions).component
     observation = 2 * torch.rand(200, 10, 5, generator=torch.Generator().manual_seed(0)) - 1
     wanted, _ = model.predict(observation.numpy(), deterministic=True)
-    decided = victim.load(0).decide(observation)
+    decided = victim.load(0, FACTS).decide(observation)
     assert len(np.unique(wanted, axis=0)) > 1
     torch.testing.assert_close(decided, torch.from_numpy(wanted), rtol=0, atol=1e-6)
 
@@ -160,7 +163,7 @@ def test_a_policy_of_stable_baselines_acts_as_its_own_predict_does(tmp_path: Pat
 def test_a_policy_of_stable_baselines_brings_its_critic(tmp_path: Path, algo: str) -> None:
     model = sb3_model(algo, spaces(continuous=True))
     model.save(tmp_path / "model.zip")
-    policy = choose("victim", "sb3", path=str(tmp_path / "model.zip"), algo=algo).component.load(0)
+    policy = choose("victim", "sb3", path=str(tmp_path / "model.zip"), algo=algo).component.load(0, FACTS)
     observation, action = torch.rand(7, 10, 5), torch.rand(7, 2)
     with torch.no_grad():
         wanted = model.policy.critic(observation, action)[0].squeeze(-1)
@@ -193,8 +196,8 @@ def test_victims_from_files_keep_the_rules(exported: str, onnx: str, tmp_path: P
 def test_a_network_of_flat_observations_is_given_them(tmp_path: Path) -> None:
     path = torch_file(tmp_path / "flat.pt2", Scores(flat=True), shape=(50,))
     observation = torch.rand(2, 3, 10, 5)
-    flat = choose("victim", "torch", path=path).component.load(0)
-    assert torch.equal(flat.scores(observation), choose("victim", "dqn").component.load(0).scores(observation))
+    flat = choose("victim", "torch", path=path).component.load(0, FACTS)
+    assert torch.equal(flat.scores(observation), choose("victim", "dqn").component.load(0, FACTS).scores(observation))
     assert flat.scores(observation[:0]).shape == (0, 3, 5)
 
 
@@ -261,7 +264,7 @@ def test_a_file_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, what: s
 
     name, make, part = BAD[what]
     with pytest.raises(UserError) as raised:
-        component("victim", name, make(tmp_path / "file.zip")).load(0)
+        component("victim", name, make(tmp_path / "file.zip")).load(0, FACTS)
     assert part in str(raised.value)
     assert "\n" not in str(raised.value)
 
@@ -289,7 +292,7 @@ def test_nothing_in_a_saved_model_is_unpickled_but_tensors(tmp_path: Path) -> No
         with zipfile.ZipFile(path, "w") as archive:
             for name, blob in {**entries, "data": json.dumps(data).encode(), **changed}.items():
                 archive.writestr(name, blob)
-        choose("victim", "sb3", path=str(path), algo="dqn").component.load(0)
+        choose("victim", "sb3", path=str(path), algo="dqn").component.load(0, FACTS)
 
     load()
     torch.save({"q_net.q_net.0.weight": Harm(harm)}, tmp_path / "policy.pth")
@@ -304,4 +307,4 @@ def test_without_onnx_runtime_the_command_that_installs_it_is_said(
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     (tmp_path / "policy.onnx").write_bytes(b"")
     with pytest.raises(UserError, match=r"needs ONNX Runtime: pip install 'cavbench\[onnx\]'"):
-        choose("victim", "onnx", path=str(tmp_path / "policy.onnx")).component.load(0)
+        choose("victim", "onnx", path=str(tmp_path / "policy.onnx")).component.load(0, FACTS)

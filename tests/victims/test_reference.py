@@ -1,45 +1,73 @@
-"""The drivers that learn nothing."""
+"""The baseline drivers, which ignore their input."""
 
 from __future__ import annotations
 
+import pytest
 import torch
+from torch import Tensor
 
-from bench.victims.drivers.reference import FASTER, LANE_RIGHT, RIGHT_STEPS, SLOWER, Blind, IDMDriver, RandomDriver
+from bench.driving import DrivingFacts, Policy
+from bench.errors import UserError
+from bench.victims.drivers.reference import Blind, IDMDriver, RandomDriver
+from envs.highway.world import HighwayWorld
+
+FACTS = HighwayWorld().facts
+LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
+RIGHT_STEPS = 60
+
+
+def driven(policy: Policy, episodes: Tensor, steps: int) -> Tensor:
+    """[steps, B] or [steps, B, 2] what it does, one step after the other."""
+    x, state, actions = torch.zeros(len(episodes), 10, 5), policy.initial(episodes), []
+    for _ in range(steps):
+        actions.append(policy.decide(x, state))
+        state = policy.advance(x, actions[-1], state)
+    return torch.stack(actions)
 
 
 def test_a_blind_driver_does_not_look() -> None:
-    policy = Blind(policy="faster").load(0)
+    policy = Blind(policy="faster").load(0, FACTS)
     assert policy.decide(torch.rand(6, 10, 5)).tolist() == [FASTER] * 6
-    assert Blind(policy="brake").load(0).decide(torch.rand(2, 10, 5)).tolist() == [[-1.0, 0.0]] * 2
+    assert Blind(policy="brake").load(0, FACTS).decide(torch.rand(2, 10, 5)).tolist() == [[-1.0, 0.0]] * 2
 
 
-def test_right_then_slower_changes_lanes_first_and_again_after_a_reset() -> None:
-    policy, x = Blind().load(0), torch.zeros(1, 10, 5)
+def test_right_then_slower_changes_lanes_first_and_again_in_the_next_episode() -> None:
+    policy = Blind().load(0, FACTS)
     for _ in range(2):
-        policy.reset(torch.zeros(1))
-        actions = [int(policy.decide(x)) for _ in range(RIGHT_STEPS + 5)]
-        assert actions == [LANE_RIGHT] * RIGHT_STEPS + [SLOWER] * 5
+        actions = driven(policy, torch.zeros(1, dtype=torch.int64), RIGHT_STEPS + 5)
+        assert actions.flatten().tolist() == [LANE_RIGHT] * RIGHT_STEPS + [SLOWER] * 5
 
 
-def test_random_actions_depend_on_the_scenario_seed_alone() -> None:
-    policy, x = RandomDriver().load(0), torch.zeros(3, 10, 5)
-    policy.reset(torch.tensor([7, 8, 9]))
-    together = torch.stack([policy.decide(x) for _ in range(50)])
-    policy.reset(torch.tensor([8]))
-    alone = torch.stack([policy.decide(x[:1]) for _ in range(50)])
+def test_right_then_slower_takes_four_seconds_at_any_decision_rate() -> None:
+    slow = HighwayWorld(policy_frequency=5).facts
+    actions = driven(Blind().load(0, slow), torch.zeros(1, dtype=torch.int64), 21)
+    assert actions.flatten().tolist() == [LANE_RIGHT] * 20 + [SLOWER]
+
+
+def test_the_blind_policies_are_those_of_the_worlds_own_actions() -> None:
+    three = DrivingFacts(
+        axes=FACTS.axes, decision_hz=5, max_steps=10, actions=("LEFT", "STAY", "RIGHT"), features=FACTS.features
+    )
+    assert three.blind_policies("discrete") == ["left", "stay", "right"]
+    assert driven(Blind(policy="right").load(0, three), torch.zeros(1, dtype=torch.int64), 1).tolist() == [[2]]
+    with pytest.raises(UserError, match="did you mean"):
+        Blind(policy="lane_right").load(0, three)
+
+
+def test_random_actions_depend_on_the_episode_alone() -> None:
+    policy = RandomDriver().load(0, FACTS)
+    together, alone = driven(policy, torch.tensor([7, 8, 9]), 50), driven(policy, torch.tensor([8]), 50)
     assert torch.equal(together[:, 1], alone[:, 0])
     assert set(together.flatten().tolist()) == set(range(5))
 
 
 def test_random_continuous_actions_fill_their_range() -> None:
-    policy = RandomDriver(actions="continuous").load(0)
-    policy.reset(torch.arange(50))
-    actions = torch.stack([policy.decide(torch.zeros(50, 10, 5)) for _ in range(50)])
+    actions = driven(RandomDriver(actions="continuous").load(0, FACTS), torch.arange(50), 50)
     assert actions.shape == (50, 50, 2)
     assert actions.min() < -0.9
     assert actions.max() > 0.9
 
 
 def test_idm_leaves_the_wheel_to_the_world() -> None:
-    assert IDMDriver().load(0).driver == "idm"
+    assert IDMDriver().load(0, FACTS).driver == "idm"
     assert not IDMDriver.sees

@@ -10,12 +10,14 @@ import torch
 from bench.detection import STOP_SIGN
 from bench.detection.boxes import confidence
 from bench.errors import UserError
-from bench.scenarios import Cell
 from bench.victims import zoo
 from bench.victims.detectors import yolov5_file
 from bench.victims.detectors.yolov5 import MULTIPLES, Size, YOLOv5, YOLOv5Network
+from envs.camera.axes import AXES
 from envs.camera.world import StopSignApproach
 from tests.vision.drawn_street import DrawnStreet
+
+FACTS = StopSignApproach().facts
 
 PUBLISHED = {"n": 1_872_157, "s": 7_235_389, "m": 21_190_557, "l": 46_563_709, "x": 86_749_405}
 
@@ -38,7 +40,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[YOLOv5Network, Path
 
 def test_what_is_saved_is_what_is_loaded(saved: tuple[YOLOv5Network, Path]) -> None:
     network, path = saved
-    loaded = YOLOv5(path=str(path)).load(0)
+    loaded = YOLOv5(path=str(path)).load(0, FACTS)
     pictures = torch.rand(1, 3, 64, 64)
     torch.testing.assert_close(loaded(pictures).scores, network(pictures).scores, rtol=0, atol=1e-5)
     assert loaded.names == ("stop sign", "car")
@@ -49,13 +51,13 @@ def test_what_is_saved_is_what_is_loaded(saved: tuple[YOLOv5Network, Path]) -> N
 
 def test_another_size_than_the_files_is_refused_in_one_line(saved: tuple[YOLOv5Network, Path]) -> None:
     with pytest.raises(UserError, match=r"does not hold a YOLOv5s \(victim.size\): size mismatch for model") as error:
-        YOLOv5(size="s", path=str(saved[1])).load(0)
+        YOLOv5(size="s", path=str(saved[1])).load(0, FACTS)
     assert "\n" not in str(error.value)
 
 
 def test_without_a_file_it_says_how_to_name_one() -> None:
     with pytest.raises(UserError, match=r"victim\.path=yolov5m\.pt names a file of yours"):
-        YOLOv5(size="m").load(0)
+        YOLOv5(size="m").load(0, FACTS)
 
 
 def test_what_is_trained_is_found_in_the_zoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,7 +69,7 @@ def test_what_is_trained_is_found_in_the_zoo(tmp_path: Path, monkeypatch: pytest
     assert made.card["frames"] == len(DrawnStreet().training_scenes())
     assert told[0].startswith("loss ")
     zoo.save(made.network, made.card, name=victim.zoo_name(), seed=4)
-    loaded = YOLOv5(updates=3, batch=2, window=64, trained=4).load(0)
+    loaded = YOLOv5(updates=3, batch=2, window=64, trained=4).load(0, FACTS)
     rounded = {
         name: value.half().float() if value.ndim > 1 else value for name, value in made.network.state_dict().items()
     }
@@ -75,7 +77,7 @@ def test_what_is_trained_is_found_in_the_zoo(tmp_path: Path, monkeypatch: pytest
     pictures = torch.rand(1, 3, 64, 64)
     torch.testing.assert_close(loaded(pictures).scores, made.network(pictures).scores, rtol=1e-3, atol=1e-4)
     with pytest.raises(UserError, match=r"was made with victim\.updates=3, not 4"):
-        YOLOv5(updates=4, batch=2, window=64, trained=4).load(0)
+        YOLOv5(updates=4, batch=2, window=64, trained=4).load(0, FACTS)
     with pytest.raises(UserError, match="is trained already"):
         YOLOv5(path="own.pt").train(DrawnStreet(), seed=0, progress=lambda share, text: None)
 
@@ -88,8 +90,8 @@ def test_a_recipe_out_of_range_is_named(bad: dict[str, float]) -> None:
 
 @pytest.mark.slow
 def test_the_one_that_ships_finds_signs_it_was_not_trained_on() -> None:
-    detector, world = YOLOv5().load(0), StopSignApproach()
-    for approach in world.approaches(Cell(lanes=3, density=1.0), range(3)):
+    detector, world = YOLOv5().load(0, FACTS), StopSignApproach()
+    for approach in world.approaches(AXES.cell(lanes=3, density=1.0), range(3)):
         frames = torch.arange(len(approach.scenes))
         predictions = detector(approach.scenes.render(frames, None, 0.5))
         seen = confidence(predictions, detector.index(STOP_SIGN), approach.scenes.boxes)

@@ -1,7 +1,7 @@
 """YOLOv5 in its sizes n to x (architecture of release 6.0 and later) as a plain graph, written from its published layer table.
 
-The weights that were published are AGPL-3.0 and not ours to hand on: a user's own file is read (`bench.victims.detectors.yolov5_file`), and
-one that is trained here is in the zoo.
+The weights that were published are AGPL-3.0 and not ours to hand on: a user's own file is read
+(`bench.victims.detectors.yolov5_file`), and one that is trained here is in the zoo.
 """
 
 from __future__ import annotations

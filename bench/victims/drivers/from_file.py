@@ -73,9 +73,8 @@ class FileDriver(DrivingVictim):
 
     Args:
         path: the file.
-        actions: `discrete`: it gives values or logits of the world's actions (on the highway LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER),
-            and the largest is done;
-            `continuous`: it gives [acceleration, steering] in [-1, 1].
+        actions: `discrete`: it gives values or logits of the world's actions (on the highway LANE_LEFT, IDLE, LANE_RIGHT,
+            FASTER, SLOWER), and the largest is done; `continuous`: it gives [acceleration, steering] in [-1, 1].
         rows: of the observation it was trained on, the ego's own among them; the world must show as many.
         features: numbers in a row: presence and the measured ones.
     """
