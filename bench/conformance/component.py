@@ -44,7 +44,7 @@ class ComponentSuite(Suite):
             value, wanted = getattr(made, name), getattr(self.component, name)
             require(
                 type(value) is type(wanted) and value == wanted,
-                f"{self.subject.kind}.{name}={text} comes back as {value!r}: its type annotation does not fit its value {wanted!r}",
+                f"{self.subject.kind}.{name}={text} is read as {value!r}: its type annotation does not fit its value {wanted!r}",
             )
         return f"{len(written)} of {len(owned)} parameters" if len(written) < len(owned) else ""
 

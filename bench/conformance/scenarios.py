@@ -69,7 +69,9 @@ class ScenarioSuite(Suite):
         """Records hold the facts as JSON, and reports read the axes from there."""
         facts = self.component.facts
         require(isinstance(facts, Facts), f"facts is a {type(facts).__name__}, not a bench.plugins.contracts.Facts")
-        require(facts.axes == self.component.axes, "facts.axes are not the world's axes: write Facts(axes=self.axes, …)")
+        require(
+            facts.axes == self.component.axes, "facts.axes are not the world's axes: write Facts(axes=self.axes, …)"
+        )
         require(facts.decision_hz >= 0 and facts.max_steps >= 0, "facts.decision_hz and max_steps must not be negative")
         require(len(set(facts.actions)) == len(facts.actions), "two of facts.actions have the same name: rename one")
         try:
@@ -81,7 +83,9 @@ class ScenarioSuite(Suite):
         except (KeyError, ValueError):
             raise BrokenRuleError("facts.written() must hold the axes: begin with super().written()") from None
         require(read == facts.axes, "the axes in facts.written() are not the world's: leave the entry `axes` as it is")
-        require(pickle.loads(pickle.dumps(facts)) == facts, "a pickled copy of its facts is not equal: use plain values")
+        require(
+            pickle.loads(pickle.dumps(facts)) == facts, "a pickled copy of its facts is not equal: use plain values"
+        )
 
 
 def _check_axis(axis: Axis) -> None:

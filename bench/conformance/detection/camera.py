@@ -118,7 +118,9 @@ class CameraSuite(Suite):
         """An approach is fixed by its seed."""
         frames = torch.tensor([0])
         first, second = (
-            self.component.approaches(first_cell(self.component), range(SeedBlock.REPORT, SeedBlock.REPORT + 1))[0].scenes.render(frames, None, SHARE)
+            self.component.approaches(first_cell(self.component), range(SeedBlock.REPORT, SeedBlock.REPORT + 1))[
+                0
+            ].scenes.render(frames, None, SHARE)
             for _ in range(2)
         )
         require(torch.equal(first, second), "the same seed gives two different pictures")

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from bench.conformance.check import Check, Suite, require
-from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.conformance.detection.street import Street
+from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.detection import STOP_SIGN, Detector
 
 PICTURES = 3
@@ -74,13 +74,22 @@ class DetectorSuite(Suite):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(1)
             second, again = detector(pictures).scores, self.subject.load()(pictures).scores
-        require(torch.equal(first, second), "asked twice about a picture, it gives two answers: predict must have no side effect and draw nothing")
-        require(torch.equal(first, again), "two loads with the same seed predict differently: make weights from the seed only")
+        require(
+            torch.equal(first, second),
+            "asked twice about a picture, it gives two answers: predict must have no side effect and draw nothing",
+        )
+        require(
+            torch.equal(first, again),
+            "two loads with the same seed predict differently: make weights from the seed only",
+        )
 
     def looks(self) -> None:
         """What it says depends on the picture."""
         scores = self.subject.load()(self._pictures()).scores
-        require(not torch.equal(scores[0], scores[1]), "its predictions are the same for two different pictures: does predict use its input?")
+        require(
+            not torch.equal(scores[0], scores[1]),
+            "its predictions are the same for two different pictures: does predict use its input?",
+        )
 
     def differentiable(self) -> None:
         """White-box attacks find a way back to the pixels."""

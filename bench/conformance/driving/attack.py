@@ -143,9 +143,12 @@ class AttackSuite(Suite):
             policy, observation = self._victim(action_type), self._observations()
             before, truth = (state_digest(policy), _marks(policy)), observation.clone()
             self._answer(policy, observation)
-            require(state_digest(policy) == before[0], "the victim's weights changed: the attack may only ask the oracle")
             require(
-                _marks(policy) == before[1], "the victim's mode or gradients changed: the attack may only ask the oracle"
+                state_digest(policy) == before[0], "the victim's weights changed: the attack may only ask the oracle"
+            )
+            require(
+                _marks(policy) == before[1],
+                "the victim's mode or gradients changed: the attack may only ask the oracle",
             )
             require(torch.equal(observation, truth), "the true observation was changed in place: work on a clone")
 
@@ -167,7 +170,9 @@ class AttackSuite(Suite):
         self, policy: Policy, observation: Tensor, threat: ObservationThreat | None = None
     ) -> tuple[Tensor, Oracle]:
         threat = threat or self._threat()
-        oracle = Oracle(policy, threat, self.component.access, self.subject.world.features, torch.Generator().manual_seed(0))
+        oracle = Oracle(
+            policy, threat, self.component.access, self.subject.world.features, torch.Generator().manual_seed(0)
+        )
         oracle.begin_step(observation)
         try:
             with torch.no_grad():

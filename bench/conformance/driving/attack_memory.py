@@ -105,7 +105,8 @@ class AttackMemorySuite(Suite):
 def _check_step(before: TensorDictBase | None, after: TensorDictBase | None) -> None:
     """Raise BrokenRuleError unless a step keeps the form of the state."""
     require(
-        before is not None or after is None, "step returns a state, but initial gave none: write initial, which begins it"
+        before is not None or after is None,
+        "step returns a state, but initial gave none: write initial, which begins it",
     )
     require(before is None or after is not None, "step returns None as the state: return it even where it is unchanged")
     check_state(after, "step", EPISODES)

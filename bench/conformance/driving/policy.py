@@ -39,9 +39,7 @@ class PolicySuite(Suite):
     def frozen(self) -> None:
         """Eval mode, no gradients on weights, of the action type it says."""
         policy = self.subject.load()
-        require(
-            isinstance(policy, Policy), f"load returned a {type(policy).__name__}, not a bench.driving.Policy"
-        )
+        require(isinstance(policy, Policy), f"load returned a {type(policy).__name__}, not a bench.driving.Policy")
         check_frozen(policy, "policy")
         require(
             policy.action_type == self.victim.action_type,
@@ -51,8 +49,10 @@ class PolicySuite(Suite):
     def shapes(self) -> None:
         """Scores for a batch of episodes and, without a memory, for any leading dimensions: attacks ask about many points."""
         policy, state, observation = *self._ready(), self._observations()
-        continuous = policy.action_type == "continuous"
-        width = 2 if continuous else len(self.world.facts.actions)
+        width, why = 2, "continuous actions are 2"
+        if policy.action_type == "discrete":
+            width = len(self.world.facts.actions)
+            why = f"the world has {width} actions: look at facts.actions"
         asked = [observation] if state is not None else [observation, observation.expand(3, *observation.shape)]
         for one in asked:
             scores = policy.scores(one, state)
@@ -60,10 +60,7 @@ class PolicySuite(Suite):
                 scores.ndim == one.ndim - 1 and scores.shape[:-1] == one.shape[:-2],
                 f"scores has shape {list(scores.shape)} for {list(one.shape)}: keep all dimensions but the last two",
             )
-            require(
-                scores.shape[-1] == width,
-                f"scores has {scores.shape[-1]} numbers, {'continuous actions are 2' if continuous else f'the world has {width} actions: look at facts.actions'}",
-            )
+            require(scores.shape[-1] == width, f"scores has {scores.shape[-1]} numbers, {why}")
             require(scores.dtype == one.dtype, f"scores is {scores.dtype} for {one.dtype}")
             require(bool(scores.isfinite().all()), "some scores are NaN or infinite")
 

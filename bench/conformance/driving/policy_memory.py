@@ -66,7 +66,9 @@ class PolicyMemorySuite(Suite):
             observation = self._observations(step)
             first = policy.scores(observation, state)
             policy.scores(self._observations(100), state)
-            require(same(before, state), "scores changed the state it was given: work on a copy, and change it in advance")
+            require(
+                same(before, state), "scores changed the state it was given: work on a copy, and change it in advance"
+            )
             after = self._advanced(policy, state, step)
             require(same(before, state), "advance changed the state it was given: return a new TensorDict")
             require(

@@ -43,9 +43,7 @@ class WorldSuite(Suite):
     def describes_its_observation(self) -> None:
         """Every feature has a range and a unit."""
         facts = self.component.facts
-        require(
-            isinstance(facts, DrivingFacts), f"facts is a {type(facts).__name__}, not a bench.driving.DrivingFacts"
-        )
+        require(isinstance(facts, DrivingFacts), f"facts is a {type(facts).__name__}, not a bench.driving.DrivingFacts")
         features = facts.features
         require(features == self.component.features, "facts.features are not the world's features: give both the same")
         sizes = {len(part) for part in (features.names, features.low, features.high, features.units)}
@@ -58,7 +56,9 @@ class WorldSuite(Suite):
     def describes_its_decisions(self) -> str:
         """How often is decided, for how long, and among what: defences and baselines rely on it."""
         facts = self.component.facts
-        require(facts.decision_hz > 0, f"decision_hz must be above 0, got {facts.decision_hz}: say how often is decided")
+        require(
+            facts.decision_hz > 0, f"decision_hz must be above 0, got {facts.decision_hz}: say how often is decided"
+        )
         require(facts.max_steps >= 1, f"max_steps must be at least 1, got {facts.max_steps}")
         require(
             all(isinstance(name, str) and name for name in facts.actions), "actions must name every discrete action"
@@ -85,7 +85,9 @@ class WorldSuite(Suite):
         finally:
             env.close(raise_if_closed=False)
         count = td["observation"].shape[0]
-        require(count == len(cells), f"make({len(cells)} cells) gives {count} episodes: one for each cell, in their order")
+        require(
+            count == len(cells), f"make({len(cells)} cells) gives {count} episodes: one for each cell, in their order"
+        )
         require(not bool(td["done"].any()), "an episode is done before its first step")
         return f"{len(cells)} of {len(grid.cells())} cells" if len(cells) < len(grid.cells()) else f"{len(cells)} cells"
 
