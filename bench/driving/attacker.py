@@ -87,7 +87,9 @@ class Attacker:
         self.oracle.begin_step(observation, policy_state)
         self.state, self.begun = self.attack.initial(observation, self.oracle), True
         if self.oracle.spent.any():
-            raise UserError(f"{type(self.attack).__name__}.initial asked the victim: ask in step, where queries are counted")
+            raise UserError(
+                f"{type(self.attack).__name__}.initial asked the victim: ask in step, where queries are counted"
+            )
 
     def _answer(self, observation: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and how far outside the set it was."""

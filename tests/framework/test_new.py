@@ -125,3 +125,16 @@ def test_an_installed_package_is_listed_checked_and_scored_in_workers(installed:
     assert all('"strength":2.0' in row["attack_params"] for row in rows)
     assert {row["attack_shipped_by"] for row in rows} == {"cavbench-my-attack-driving 0.1.0"}
     assert all(row["queries"] > 1 and row["linf_max"] > 0 for row in rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "on"), EVERY)
+def test_the_first_run_of_a_package_is_as_it_says(installed: Path, tmp_path: Path, kind: str, on: str) -> None:
+    name = name_of(kind, on)
+    _, command, *words = scaffold.first_run(kind, name, on).split()
+    quicker = ["seeds=0", "reference=false", "record=0", "workers=1"]
+    quicker += ["world.max_steps=30"] if on == "driving" else ["episodes=1"]
+    said = ran(installed, command, *words, *quicker, f"out={tmp_path}")
+    assert said.code == 0, said.err
+    rows = reading.read(tmp_path, track=track(on)).to_pylist()
+    assert name in {row[kind] for row in rows}

@@ -77,7 +77,7 @@ class AttackMemorySuite(Suite):
 
     def _shown(self, action_type: ActionType, batch: Tensor, beside: Tensor | None = None) -> list[Tensor]:
         """What the victim is shown at every step of a batch [STEPS, B, V, F], while another run takes turns with it."""
-        runs = [self._attacker(action_type)] + ([] if beside is None else [self._attacker(action_type)])
+        runs = [self._attacker(action_type)] + ([] if beside is None else [self._attacker(action_type, seed=1)])
         running = torch.ones(EPISODES, dtype=torch.bool)
         shown = []
         for step in range(STEPS):
@@ -90,10 +90,10 @@ class AttackMemorySuite(Suite):
                     shown.append(answer.observation)
         return shown
 
-    def _attacker(self, action_type: ActionType) -> Attacker:
+    def _attacker(self, action_type: ActionType, seed: int = 0) -> Attacker:
         facts = self.subject.world.facts
         policy = victim(action_type, facts).double()
-        return Attacker(self.component, policy, ObservationThreat(), facts.features, seed=0)
+        return Attacker(self.component, policy, ObservationThreat(), facts.features, seed=seed)
 
     def _observations(self, seed: int = 0) -> Tensor:
         """[STEPS, B, V, F] in double precision, so that rounding decides no sign."""
