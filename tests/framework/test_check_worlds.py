@@ -13,12 +13,20 @@ from tests.framework.distributions import install
 from tests.framework.test_third_track import POINTS as LISTENING
 
 BAD = (
-    *("nameless", "taken", "silent", "defaulted", "gridless", "borrowing", "otheraxes", "lying", "general", "unwritten"),
+    *(
+        "nameless",
+        "taken",
+        "silent",
+        "defaulted",
+        "gridless",
+        "borrowing",
+        "otheraxes",
+        "lying",
+        "general",
+        "unwritten",
+    ),
     *("timeless", "miscounted", "driverless", "choosy", "refusing"),
 )
-POINTS as LISTENING
-
-BAD = ["nameless", "taken", "silent", "defaulted", "gridless", "borrowing", "otheraxes", "lying", "general", "unwritten", "timeless", "miscounted", "driverless", "choosy", "refusing"]
 POINTS = {
     "cavbench.worlds": {name: f"bad_worlds_plugin:{name.capitalize()}" for name in BAD},
     "cavbench.grids": {
