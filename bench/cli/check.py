@@ -1,4 +1,4 @@
-"""`bench check`: the rules of the benchmark, one line each, and what to fix."""
+"""`bench check`: carries out the checks of a component, and prints a line each."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from bench.plugins import registry
 if TYPE_CHECKING:
     from bench.conformance.check import Outcome
 
+TRIED_WITH = ("victim", "world")
+"""Keys that choose what a component is tried together with."""
 MARKS = {"pass": ("✓", "green"), "fail": ("✗ fix", "bold red"), "skip": ("– skipped", "dim")}
 
 
@@ -32,15 +34,16 @@ def print_checks(name: str, words: Sequence[str], console: Console) -> int:
     settle()
     given = dict(_read(word) for word in words)
     kinds = registry.kinds_of(name)
-    if strange := [key for key in given if key != "victim" and key.partition(".")[0] not in kinds]:
-        known = [*(f"{kind}.…" for kind in kinds), "victim"]
+    if strange := [key for key in given if key not in TRIED_WITH and key.partition(".")[0] not in kinds]:
+        known = [*(f"{kind}.…" for kind in kinds), *TRIED_WITH]
         raise UserError(registry.unknown(f"key {strange[0]!r}", strange[0], known))
     failed = False
     for kind in kinds:
         console.print(heading(kind, name))
         own = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{kind}.")}
         with console.status("checking"):
-            outcomes = list(examine(kind, name, own, given.get("victim", "")))
+            tried_with = {key: given.get(key, "") for key in TRIED_WITH}
+            outcomes = list(examine(kind, name, own, **tried_with))
         console.print(_table(outcomes))
         counts = Counter(outcome.status for outcome in outcomes)
         told = f"{counts['pass']} passed, {counts['fail']} to fix, {counts['skip']} skipped\n"
@@ -63,8 +66,9 @@ def _table(outcomes: Sequence[Outcome]) -> Table:
 
 def _read(word: str) -> tuple[str, str]:
     key, equals, value = word.partition("=")
-    if not (equals and value and (key == "victim" or "." in key)):
+    if not (equals and value and (key in TRIED_WITH or "." in key)):
         raise UserError(
-            f"cannot read {word!r}: write attack.steps=50 for a parameter, or victim=NAME to try a defence on"
+            f"cannot read {word!r}: write attack.steps=50 for a parameter, victim=NAME for the victim that a defence is tried "
+            "on, or world=NAME for the world that it is tried in"
         )
     return key, value

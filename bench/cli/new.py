@@ -1,4 +1,4 @@
-"""`bench new`: a plug-in package to begin with, and what to type next."""
+"""`bench new`: writes a plug-in package that works, and says what to type next."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def print_new(kind: str, name: str, words: Sequence[str], console: Console) -> N
         if key not in KEYS or not (equals and value):
             raise UserError(registry.unknown(f"word {word!r}", key, [f"{known}=…" for known in KEYS]))
         given[key] = value
-    track, out = given.get("track", "driving"), given.get("out")
+    track, out = given.get("track") or scaffold.default_track(), given.get("out")
     folder = scaffold.write(kind, name, track=track, folder=Path(out).expanduser() if out else None)
     console.print(Text(f"{folder} is written. Next, in the environment that cavbench is in:"), soft_wrap=True)
     lines = {

@@ -1,6 +1,5 @@
 """The rules that every component keeps, as checks: `bench check NAME`, and `complaints` for a plug-in's own tests."""
 
 from bench.conformance.suites import complaints, examine
-from bench.conformance.traffic import observations
 
-__all__ = ["complaints", "examine", "observations"]
+__all__ = ["complaints", "examine"]

@@ -6,13 +6,17 @@ import inspect
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from bench.errors import UserError
+from bench.plugins.registry import Kind
+
 Status = Literal["pass", "fail", "skip"]
 Check = Callable[[], str | None]
-"""Returns what is worth knowing beside that it passed, or nothing."""
+"""Returns a remark beside that it passed, or nothing."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +24,7 @@ class Outcome:
     """How a check ended.
 
     Args:
-        check: what was looked at.
+        check: its name.
         status: pass, fail, or skip where it does not apply.
         text: one line: what to fix, why it does not apply, or a remark.
     """
@@ -31,27 +35,61 @@ class Outcome:
 
 
 class BrokenRuleError(Exception):
-    """A rule is broken; the message says in one line which and what to do."""
+    """A rule is broken; the message says in one line which rule and what to do."""
 
 
 class NotApplicableError(Exception):
     """A check does not apply; the message says why."""
 
 
-class Suite(ABC):
-    """The checks of a kind of component.
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """A component that is checked, with what it is tried together with.
 
     Args:
-        name: the component is registered by.
+        kind: attack, defense, victim or world.
+        name: it is registered by.
         component: as it would be used in a run.
+        world: that attacks, victims and defences are tried in; None for a world, and for checks that need none.
+        victim: that a defence is tried on; of a victim, the victim itself; None for the others.
     """
 
-    def __init__(self, name: str, component: Any) -> None:
-        self.name, self.component = name, component
+    kind: Kind
+    name: str
+    component: Any
+    world: Any = None
+    victim: Any = None
+
+    def load(self) -> Any:
+        """The network of training seed 0 that a victim or a defence loads, made anew.
+
+        Raises:
+            UserError: if it is not there.
+        """
+        if self.kind == "victim":
+            return self.component.load(0, self.world.facts)
+        return self.component.load(self.victim, 0, self.world.facts)
+
+    def load_victim(self) -> Any:
+        """The network of the victim without the defence, made anew."""
+        return self.victim.load(0, self.world.facts)
+
+
+class Suite(ABC):
+    """Some checks of a component.
+
+    Args:
+        subject: what is checked.
+    """
+
+    component: Any
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject, self.component = subject, subject.component
 
     @abstractmethod
     def checks(self) -> Mapping[str, Check]:
-        """What is looked at, in order."""
+        """The checks by name, in order."""
 
     def outcomes(self) -> Iterator[Outcome]:
         """Carry out every check."""
@@ -67,7 +105,7 @@ class Suite(ABC):
                 yield Outcome(name, "fail", f"{type(error).__name__}: {one_line(error)}{self._place(error)}")
 
     def _place(self, error: Exception) -> str:
-        """Where in the component's own file it happened; empty if not in it."""
+        """The line of the component's own file at which it happened; empty if it happened elsewhere."""
         own = inspect.getsourcefile(type(self.component))
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
         return f" ({Path(own).name}, line {lines[-1]})" if own and lines else ""
@@ -80,5 +118,14 @@ def require(held: object, complaint: str) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """The first line of what an exception says."""
+    """The first line of an exception's message."""
     return next(iter(str(error).splitlines()), "")
+
+
+@contextmanager
+def refusals_are_broken_rules() -> Iterator[None]:
+    """Turn a UserError, by which the framework refuses what a component did, into a broken rule with the same message."""
+    try:
+        yield
+    except UserError as error:
+        raise BrokenRuleError(one_line(error)) from None

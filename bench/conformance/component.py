@@ -1,10 +1,9 @@
-"""What holds for every component: it is documented, can be set on the command line, and travels to worker processes."""
+"""The rules for every component: it is documented, can be set on the command line, and survives pickling."""
 
 from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping
-from typing import Any
 
 from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
 from bench.errors import UserError
@@ -12,15 +11,10 @@ from bench.plugins import registry
 from bench.plugins.fingerprint import canonical
 from bench.plugins.options import configured
 from bench.plugins.parameters import description, parameters
-from bench.plugins.registry import Kind
 
 
 class ComponentSuite(Suite):
     """Of any kind and track."""
-
-    def __init__(self, name: str, component: Any, kind: Kind) -> None:
-        super().__init__(name, component)
-        self.kind = kind
 
     def checks(self) -> Mapping[str, Check]:
         return {
@@ -31,7 +25,7 @@ class ComponentSuite(Suite):
         }
 
     def documented(self) -> None:
-        """`bench list NAME` has something to say."""
+        """`bench list NAME` shows its docstrings."""
         kind = type(self.component)
         require(description(kind), f"{kind.__name__} has no docstring: say what it does in a sentence")
         silent = [parameter.name for parameter in parameters(kind).values() if not parameter.meaning]
@@ -42,7 +36,7 @@ class ComponentSuite(Suite):
         owned = parameters(type(self.component))
         written = {name: text for name in owned if (text := _text(getattr(self.component, name))) is not None}
         try:
-            made = configured(self.kind, self.name, written).component
+            made = configured(self.subject.kind, self.subject.name, written).component
         except UserError as error:
             hint = "types may be bool, int, float, str, Literal, None and tuples of them"
             raise BrokenRuleError(f"{one_line(error)} ({hint})") from None
@@ -50,12 +44,12 @@ class ComponentSuite(Suite):
             value, wanted = getattr(made, name), getattr(self.component, name)
             require(
                 type(value) is type(wanted) and value == wanted,
-                f"{self.kind}.{name}={text} comes back as {value!r}: its type annotation does not fit its value {wanted!r}",
+                f"{self.subject.kind}.{name}={text} is read as {value!r}: its type annotation does not fit its value {wanted!r}",
             )
         return f"{len(written)} of {len(owned)} parameters" if len(written) < len(owned) else ""
 
     def picklable(self) -> None:
-        """What a worker process is sent is what it gets."""
+        """Worker processes get it pickled."""
         try:
             copy = pickle.loads(pickle.dumps(self.component))
         except (pickle.PicklingError, TypeError, AttributeError) as error:
@@ -68,7 +62,7 @@ class ComponentSuite(Suite):
 
     def versioned(self) -> str:
         """Records name the package and its version."""
-        shipped_by = registry.find(registry.GROUPS[self.kind], self.name, self.kind).shipped_by
+        shipped_by = registry.find(registry.GROUPS[self.subject.kind], self.subject.name, self.subject.kind).shipped_by
         require("unknown" not in shipped_by, "its package has no version: install it with pip")
         return f"records say {shipped_by}"
 

@@ -7,64 +7,47 @@ import re
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
+from bench.conformance import kits
+from bench.conformance.kits import Kit
 from bench.errors import UserError
-from bench.plugins import registry
-from bench.plugins.contracts import TRACKS
+from bench.plugins import registry, sources
+from bench.plugins.options import DEFAULTS
+from bench.plugins.registry import Kind
 
 NewKind = Literal["attack", "defense", "victim"]
 NOUNS = {"attack": "an attack", "defense": "a defence", "victim": "a victim"}
-LINES = {
-    ("attack", "driving"): (
-        "bench run attack={name} attack.strength=2 lanes=3 density=1 weather=clear episodes=20",
-        "attack.strength=2",
-    ),
-    ("defense", "driving"): (
-        "bench run attack=noise,pgd defense={name} lanes=3 density=1 weather=clear episodes=20",
-        "defense.copies=16",
-    ),
-    ("victim", "driving"): (
-        "bench run attack=noise,pgd victim={name} lanes=3 density=1 weather=clear episodes=20",
-        "victim.gap_m=60",
-    ),
-    ("attack", "detection"): (
-        "bench run attack={name} attack.strength=2 victim=yolov5 lanes=3 density=1 weather=clear",
-        "attack.strength=2",
-    ),
-    ("defense", "detection"): (
-        "bench run attack=noise_patch defense={name} victim=yolov5 lanes=3 density=1 weather=clear",
-        "defense.size=5",
-    ),
-    ("victim", "detection"): (
-        "bench run attack=noise_patch victim={name} lanes=3 density=1 weather=clear",
-        "victim.sharpness=20",
-    ),
-}
-"""A first run of a new component of a kind and track, and one of its parameters."""
+
+
+def default_track() -> str:
+    """The track of the victim that a run attacks when it is not told otherwise."""
+    entry = registry.find(registry.GROUPS["victim"], DEFAULTS["victim"], "victim")
+    return sources.tracks_of(entry.target)[0]
 
 
 def first_run(kind: str, name: str, track: str) -> str:
-    """The command that scores a new component on a small part of the grid."""
-    return LINES[kind, track][0].format(name=name)
+    """The command that scores a new component on a small part of the grid.
+
+    Raises:
+        UserError: if the kind or the track is unknown, or the track has no template of the kind.
+    """
+    return _kit(kind, track).starts[cast(Kind, kind)].run.format(name=name)
 
 
-def write(kind: str, name: str, *, track: str = "driving", folder: Path | None = None) -> Path:
+def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Path:
     """Write the package of a new component and return its folder.
 
     Args:
         kind: attack, defense or victim.
         name: what the command line shall call it.
-        track: driving or detection.
+        track: one that has templates.
         folder: must be empty or not there yet; by default `cavbench-NAME` in the current one.
 
     Raises:
-        UserError: if the name cannot be used, the kind or track is unknown, or the folder is not empty.
+        UserError: if the name cannot be used, there is no template, or the folder is not empty.
     """
-    if kind not in get_args(NewKind):
-        raise UserError(registry.unknown(f"kind {kind!r}", kind, get_args(NewKind)))
-    if track not in TRACKS:
-        raise UserError(registry.unknown(f"track {track!r}", track, TRACKS))
+    kit = _kit(kind, track)
     _check_name(kind, name)
     distribution = f"cavbench-{name.replace('_', '-')}"
     module = f"cavbench_{name}"
@@ -72,7 +55,6 @@ def write(kind: str, name: str, *, track: str = "driving", folder: Path | None =
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} is there already and not empty; nothing was written: say out=another-folder")
     article, noun = NOUNS[kind].split()
-    run, setting = LINES[kind, track]
     values = {
         "kind": kind,
         "name": name,
@@ -81,24 +63,39 @@ def write(kind: str, name: str, *, track: str = "driving", folder: Path | None =
         "Class": "".join(part.capitalize() for part in name.split("_")),
         "article": article.capitalize(),
         "noun": noun,
-        "run": run.format(name=name),
-        "setting": setting,
+        "run": first_run(kind, name, track),
+        "setting": kit.starts[cast(Kind, kind)].setting,
     }
+    common, special = (resources.files(package) / "templates" for package in ("bench.conformance", kit.package))
     files = {
-        "pyproject.toml": "pyproject.toml",
-        "README.md": "README.md",
-        f"{module}.py": f"{kind}_{track}.py",
-        f"tests/test_{name}.py": f"test_{kind}_{track}.py",
+        "pyproject.toml": common / "pyproject.toml.tmpl",
+        "README.md": common / "README.md.tmpl",
+        f"{module}.py": special / f"{kind}.py.tmpl",
+        f"tests/test_{name}.py": special / f"test_{kind}.py.tmpl",
     }
-    templates = resources.files("bench.conformance") / "templates"
     try:
         (folder / "tests").mkdir(parents=True)
         for path, template in files.items():
-            text = Template((templates / f"{template}.tmpl").read_text(encoding="utf-8"))
-            (folder / path).write_text(text.substitute(values), encoding="utf-8")
+            text = Template(template.read_text(encoding="utf-8")).substitute(values)
+            (folder / path).write_text(text, encoding="utf-8")
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror}; say out=another-folder") from error
     return folder
+
+
+def _kit(kind: str, track: str) -> Kit:
+    """The kit of a track, with a template of the kind; UserError if there is none."""
+    if kind not in get_args(NewKind):
+        raise UserError(registry.unknown(f"kind {kind!r}", kind, get_args(NewKind)))
+    known = registry.entries(registry.TRACKS)
+    if track not in known:
+        raise UserError(registry.unknown(f"track {track!r}", track, known))
+    kit = kits.kit(track)
+    if kit is None or kind not in kit.starts:
+        raise UserError(
+            f"the track {track!r} has no template for {NOUNS[kind]}; tracks with templates: {', '.join(kits.kits())}"
+        )
+    return kit
 
 
 def _check_name(kind: str, name: str) -> None:

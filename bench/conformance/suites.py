@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
-from bench.conformance.check import NotApplicableError, Outcome, Suite, one_line
+from bench.conformance import kits
+from bench.conformance.check import NotApplicableError, Outcome, Subject, Suite, one_line
 from bench.conformance.component import ComponentSuite
+from bench.conformance.scenarios import ScenarioSuite
 from bench.errors import UserError
-from bench.plugins import sources as tracks
-from bench.plugins.contracts import Track
-from bench.plugins.options import WORLDS, configured
+from bench.plugins import sources
+from bench.plugins.contracts import ANY_TRACK
+from bench.plugins.options import configured
 from bench.plugins.pair import choose
 from bench.plugins.registry import Kind
+from bench.plugins.track import track
 
 
-def examine(kind: Kind, name: str, values: Mapping[str, str] | None = None, victim: str = "") -> Iterator[Outcome]:
+def examine(
+    kind: Kind, name: str, values: Mapping[str, str] | None = None, *, victim: str = "", world: str = ""
+) -> Iterator[Outcome]:
     """The outcome of every check of a component, in order, as they come.
 
     Args:
@@ -24,26 +29,21 @@ def examine(kind: Kind, name: str, values: Mapping[str, str] | None = None, vict
         name: it is registered by.
         values: its parameters, as on the command line.
         victim: that a defence is tried on; empty for the first that it can be loaded for.
+        world: that attacks, victims and defences are tried in; empty for the default world of the track.
 
     Raises:
-        UserError: if the plug-in is broken, a parameter is not allowed, or the victim does not fit.
+        UserError: if the plug-in is broken, or a parameter is not allowed.
     """
-    component = configured(kind, name, values or {}).component
-    served = component.tracks()
-    yield from ComponentSuite(name, component, kind).outcomes()
-    for track in served:
-        prefix = f"{track}: " if len(served) > 1 else ""
-        try:
-            suite = SUITES[kind, track](name, component, victim)
-        except NotApplicableError as reason:
-            yield Outcome(f"{prefix}behaviour", "skip", one_line(reason))
-            continue
-        # Third-party code may fail in any way, while it is loaded too.
-        except Exception as error:
-            yield Outcome(f"{prefix}behaviour", "fail", f"{type(error).__name__}: {one_line(error)}")
-            continue
-        for outcome in suite.outcomes():
-            yield Outcome(f"{prefix}{outcome.check}", outcome.status, outcome.text)
+    subject = Subject(kind=kind, name=name, component=configured(kind, name, values or {}).component)
+    yield from ComponentSuite(subject).outcomes()
+    if kind == "world":
+        yield from ScenarioSuite(subject).outcomes()
+    served = subject.component.tracks()
+    served = tuple(kits.kits()) if served == (ANY_TRACK,) else served
+    for track_name in served:
+        prefix = f"{track_name}: " if len(served) > 1 else ""
+        for outcome in _behaviour(subject, track_name, victim, world):
+            yield replace(outcome, check=f"{prefix}{outcome.check}")
 
 
 def complaints(kind: Kind, name: str, **values: str) -> list[str]:
@@ -61,102 +61,68 @@ def complaints(kind: Kind, name: str, **values: str) -> list[str]:
     return [f"{outcome.check}: {outcome.text}" for outcome in found if outcome.status == "fail"]
 
 
-def _attack(name: str, component: Any, victim: str) -> Suite:
-    from bench.conformance.attack import AttackSuite
-
-    return AttackSuite(name, component, _world("driving").features)
-
-
-def _patch(name: str, component: Any, victim: str) -> Suite:
-    from bench.conformance.patch import PatchSuite
-
-    return PatchSuite(name, component)
-
-
-def _driver(name: str, component: Any, victim: str) -> Suite:
-    from bench.conformance.policy import PolicySuite
-
-    _loaded(component.load)
-    return PolicySuite(name, component, component, partial(component.load, 0), _world("driving"))
+def _behaviour(subject: Subject, track_name: str, victim: str, world: str) -> Iterator[Outcome]:
+    """The outcomes of the suites of a track."""
+    try:
+        suites = list(_suites(subject, track_name, victim, world))
+    except NotApplicableError as reason:
+        yield Outcome("behaviour", "skip", one_line(reason))
+        return
+    # Third-party code may fail in any way, while it is loaded too.
+    except Exception as error:
+        yield Outcome("behaviour", "fail", f"{type(error).__name__}: {one_line(error)}")
+        return
+    for suite in suites:
+        yield from suite.outcomes()
 
 
-def _detector(name: str, component: Any, victim: str) -> Suite:
-    from bench.conformance.detector import DetectorSuite
-
-    _loaded(component.load)
-    return DetectorSuite(name, component, component, partial(component.load, 0))
-
-
-def _defended_driver(name: str, component: Any, victim: str) -> Suite:
-    from bench.conformance.policy import PolicySuite
-
-    target = _victim_for(component, victim, "driving")
-    return PolicySuite(name, component, target, partial(component.load, target, 0), _world("driving"))
-
-
-def _defended_detector(name: str, component: Any, victim: str) -> Suite:
-    from bench.conformance.detector import DetectorSuite
-
-    target = _victim_for(component, victim, "detection")
-    return DetectorSuite(name, component, target, partial(component.load, target, 0))
+def _suites(subject: Subject, track_name: str, victim: str, world: str) -> Iterator[Suite]:
+    """The suites that the kit of a track has for a component, which is loaded first if it has to be."""
+    kit = kits.kit(track_name)
+    if kit is None or subject.kind not in kit.suites:
+        raise NotApplicableError(f"the track {track_name!r} has no checks of its own for it (entry point {kits.KITS})")
+    if subject.kind != "world":
+        tried_in = choose("world", world or track(track_name).world).component
+        if not tried_in.serves(track_name):
+            raise NotApplicableError(f"world {world!r} is of another track")
+        subject = replace(subject, world=tried_in)
+    if subject.kind == "victim":
+        subject = replace(subject, victim=subject.component)
+        _require_loadable(subject)
+    if subject.kind == "defense":
+        subject = _with_victim(subject, victim, track_name)
+    yield from kit.suites[subject.kind](subject)
 
 
-def _driving_world(name: str, component: Any, victim: str) -> Suite:
-    from bench.conformance.world import WorldSuite
-
-    return WorldSuite(name, component)
-
-
-def _camera_world(name: str, component: Any, victim: str) -> Suite:
-    from bench.conformance.camera import CameraSuite
-
-    return CameraSuite(name, component)
-
-
-SUITES: dict[tuple[Kind, Track], Callable[[str, Any, str], Suite]] = {
-    ("attack", "driving"): _attack,
-    ("attack", "detection"): _patch,
-    ("defense", "driving"): _defended_driver,
-    ("defense", "detection"): _defended_detector,
-    ("victim", "driving"): _driver,
-    ("victim", "detection"): _detector,
-    ("world", "driving"): _driving_world,
-    ("world", "detection"): _camera_world,
-}
-
-
-def _world(track: Track) -> Any:
-    return choose("world", WORLDS[track]).component
-
-
-def _loaded(load: Callable[[int], object]) -> None:
+def _require_loadable(subject: Subject) -> None:
     """Raise NotApplicableError where there is nothing to load yet: a victim that nobody has trained."""
     try:
-        load(0)
+        subject.load()
     except UserError as error:
         raise NotApplicableError(f"it cannot be loaded: {one_line(error)}") from None
 
 
-def _victim_for(defense: Any, name: str, track: Track) -> Any:
-    """The victim that a defence is tried on: the one that is named, or the first that it can be loaded for."""
+def _with_victim(subject: Subject, name: str, track_name: str) -> Subject:
+    """The defence with the victim it is tried on: the one that is named, or the first that it can be loaded for."""
     reasons = []
-    for target in [choose("victim", name).component] if name else _victims(track):
-        if track not in target.tracks():
+    for victim in [choose("victim", name).component] if name else _victims(track_name):
+        if not victim.serves(track_name):
             raise NotApplicableError(f"victim {name!r} is of another track")
+        tried = replace(subject, victim=victim)
         try:
-            defense.load(target, 0)
-            return target
+            tried.load()
+            return tried
         except UserError as error:
             reasons.append(one_line(error))
     raise NotApplicableError(f"it can be loaded for no victim: {reasons[0] if reasons else 'none is installed'}")
 
 
-def _victims(track: Track) -> Iterator[Any]:
-    """Those of a track that look at something and need no words."""
-    for name in tracks.names("victim", track):
+def _victims(track_name: str) -> Iterator[Any]:
+    """The victims of a track that use their input and have a default for every parameter."""
+    for name in sources.names("victim", track_name):
         try:
-            target = choose("victim", name).component
+            victim = choose("victim", name).component
         except UserError:
             continue
-        if getattr(target, "sees", True):
-            yield target
+        if victim.sees:
+            yield victim

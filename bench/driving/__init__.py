@@ -3,7 +3,7 @@
 from bench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, DrivingWorld, TrainingHooks
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features
 from bench.driving.oracle import Oracle
-from bench.driving.policy import Policy, State
+from bench.driving.policy import Policy, PolicyWrapper, State
 from bench.driving.threat import ObservationThreat
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "ObservationThreat",
     "Oracle",
     "Policy",
+    "PolicyWrapper",
     "State",
     "TrainingHooks",
 ]

@@ -65,12 +65,11 @@ class Attacker:
             policy_state: what the victim remembers of the B episodes.
         """
         counts = torch.zeros(3, observation.shape[0], dtype=torch.int64)
-        excess = torch.zeros(observation.shape[0])
+        excess = observation.new_zeros(observation.shape[0])
         if self.attack is None:
             return Shown(observation, counts[0], counts[1], counts[2], excess)
         if not self.begun:
-            self.oracle.begin_step(observation, policy_state)
-            self.state, self.begun = self.attack.initial(observation, self.oracle), True
+            self._begin(observation, policy_state)
         rows = running.nonzero().squeeze(-1)
         perturbed = observation.clone()
         start = time.perf_counter()
@@ -82,6 +81,16 @@ class Attacker:
         milliseconds = (time.perf_counter() - start) * 1000
         return Shown(perturbed, counts[0], counts[1], counts[2], excess, milliseconds)
 
+    def _begin(self, observation: Tensor, policy_state: State) -> None:
+        """Let the attack begin its memory, for which it may ask nothing: those queries would be in no record."""
+        assert self.attack is not None
+        self.oracle.begin_step(observation, policy_state)
+        self.state, self.begun = self.attack.initial(observation, self.oracle), True
+        if self.oracle.spent.any():
+            raise UserError(
+                f"{type(self.attack).__name__}.initial asked the victim: ask in step, where queries are counted"
+            )
+
     def _answer(self, observation: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and how far outside the set it was."""
         assert self.attack is not None
@@ -90,6 +99,8 @@ class Attacker:
         if not isinstance(answer, Tensor) or answer.shape != observation.shape:
             found = f"shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else f"a {type(answer).__name__}"
             raise UserError(f"{name}.perturb returned {found}, not {tuple(observation.shape)}")
+        if (self.state is None) != (state is None):
+            raise UserError(f"{name}.step and {name}.initial must both return a state, or both None")
         if self.state is not None and state is not None:
             self.state[rows] = state.detach()
         answer = answer.detach()

@@ -162,6 +162,11 @@ class DrivingAttack(Attack):
     track: ClassVar[str] = "driving"
     action_types: ClassVar[tuple[ActionType, ...]] = ("discrete", "continuous")
 
+    @classmethod
+    def missing(cls) -> list[str]:
+        neither = cls.perturb is DrivingAttack.perturb and cls.step is DrivingAttack.step
+        return super().missing() + (["perturb or step"] if neither else [])
+
     def misfit(self, victim: DrivingVictim) -> str:
         if victim.action_type in self.action_types:
             return ""

@@ -82,6 +82,34 @@ class Policy(nn.Module, ABC):
         raise NotImplementedError(f"{type(self).__name__} has no critic")
 
 
+class PolicyWrapper(Policy):
+    """A policy in front of another one, as defences are: everything passes through but what is overridden.
+
+    Args:
+        policy: the other one, `self.policy`. What it remembers is the state, unless `initial` and `advance` are overridden.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        self.policy = policy
+        self.action_type, self.driver, self.weights_sha256 = policy.action_type, policy.driver, policy.weights_sha256
+
+    def initial(self, episodes: Tensor) -> State:
+        return self.policy.initial(episodes)
+
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        return self.policy.scores(observation, state)
+
+    def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
+        return self.policy.advance(observation, action, state)
+
+    def choose(self, scores: Tensor) -> Tensor:
+        return self.policy.choose(scores)
+
+    def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
+        return self.policy.value(observation, action, state)
+
+
 def rows_of(state: State, rows: Tensor) -> State:
     """The state of some episodes, int64 [R] or bool [B]."""
     return None if state is None else state[rows]

@@ -64,6 +64,11 @@ class Component(ABC):
         return tuple(sorted(own, reverse=True))
 
     @classmethod
+    def missing(cls) -> list[str]:
+        """The methods that it must have and does not implement."""
+        return sorted(getattr(cls, "__abstractmethods__", ()))
+
+    @classmethod
     def serves(cls, track: str) -> bool:
         """Whether it can be used on a track."""
         return bool({track, ANY_TRACK} & set(cls.tracks()))

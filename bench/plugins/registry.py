@@ -5,6 +5,7 @@ Reading names imports no component, so `bench list` is quick; a component's modu
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import inspect
 from collections.abc import Iterable
@@ -167,8 +168,12 @@ def grid(name: str) -> Grid:
 
 
 def all_grids() -> list[Grid]:
-    """The grids of all worlds, by name; this imports no torch."""
-    return [grid(name) for name in entries(GRIDS)]
+    """The grids of all worlds, by name, without those that cannot be imported: they are named when they are asked for."""
+    found = []
+    for name in entries(GRIDS):
+        with contextlib.suppress(UserError):
+            found.append(grid(name))
+    return found
 
 
 def grids(world: str) -> list[Grid]:
@@ -192,7 +197,7 @@ def load(kind: Kind, name: str) -> type[Any]:
 
     component = _chosen(kind, name)
     where = _where(GROUPS[kind], name, kind)
-    if missing := sorted(getattr(component, "__abstractmethods__", ())):
+    if missing := component.missing():
         raise UserError(f"{where} does not implement {', '.join(missing)}")
     if not (is_dataclass(component) and component.__dataclass_params__.frozen):  # type: ignore[attr-defined]
         raise UserError(f"{where} is not a frozen dataclass: write @dataclass(frozen=True, kw_only=True) above it")

@@ -148,6 +148,8 @@ def _grid(given: Options, name: str | None) -> Grid:
     known = [grid.name for grid in registry.grids(own)]
     wanted = name or world.grid
     if wanted not in known:
+        if wanted in registry.entries(registry.GRIDS):
+            registry.grid(wanted)  # says why, if it is broken
         raise UserError(registry.unknown(f"grid {wanted!r} of the world {own!r}", wanted, known))
     return registry.grid(wanted)
 

@@ -1,4 +1,4 @@
-"""Three defences that are none: one does not look, one has no gradient, one throws dice."""
+"""Defences that do not defend: one ignores its input, two have no gradient, one is random."""
 
 from __future__ import annotations
 
@@ -7,33 +7,27 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.driving import DrivingDefense, DrivingVictim, Policy
+from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, PolicyWrapper, State
 
 
-class _Wrapped(Policy):
-    def __init__(self, policy: Policy) -> None:
-        super().__init__()
-        self.policy, self.action_type = policy, policy.action_type
+class _Deaf(PolicyWrapper):
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        return self.policy.scores(torch.zeros_like(observation), state)
 
 
-class _Deaf(_Wrapped):
-    def scores(self, observation: Tensor) -> Tensor:
-        return self.policy.scores(torch.zeros_like(observation))
+class _Stepped(PolicyWrapper):
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        return self.policy.scores((20 * observation).round() / 20, state)
 
 
-class _Stepped(_Wrapped):
-    def scores(self, observation: Tensor) -> Tensor:
-        return self.policy.scores((20 * observation).round() / 20)
+class _Detached(PolicyWrapper):
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        return self.policy.scores(observation.detach(), state)
 
 
-class _Detached(_Wrapped):
-    def scores(self, observation: Tensor) -> Tensor:
-        return self.policy.scores(observation.detach())
-
-
-class _Dicing(_Wrapped):
-    def scores(self, observation: Tensor) -> Tensor:
-        scores = self.policy.scores(observation)
+class _Dicing(PolicyWrapper):
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        scores = self.policy.scores(observation, state)
         return scores + 0.5 * torch.randn_like(scores)
 
 
@@ -41,29 +35,29 @@ class _Dicing(_Wrapped):
 class Deaf(DrivingDefense):
     """Shows the victim an empty road."""
 
-    def load(self, victim: DrivingVictim, seed: int) -> Policy:
-        return _Deaf(victim.load(seed))
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
+        return _Deaf(victim.load(seed, facts))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stepped(DrivingDefense):
     """Rounds what the victim sees: its gradient is zero."""
 
-    def load(self, victim: DrivingVictim, seed: int) -> Policy:
-        return _Stepped(victim.load(seed))
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
+        return _Stepped(victim.load(seed, facts))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Detached(DrivingDefense):
     """Cuts the gradient off."""
 
-    def load(self, victim: DrivingVictim, seed: int) -> Policy:
-        return _Detached(victim.load(seed))
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
+        return _Detached(victim.load(seed, facts))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dicing(DrivingDefense):
     """Adds noise to the scores."""
 
-    def load(self, victim: DrivingVictim, seed: int) -> Policy:
-        return _Dicing(victim.load(seed))
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
+        return _Dicing(victim.load(seed, facts))

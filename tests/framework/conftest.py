@@ -70,9 +70,14 @@ def bench(toy_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     return call
 
 
+def import_path(*folders: Path) -> str:
+    """PYTHONPATH of a process: these folders, then what this process was given."""
+    return os.pathsep.join(filter(None, [*map(str, folders), os.environ.get("PYTHONPATH", "")]))
+
+
 def started(folder: Path, *words: str) -> subprocess.Popen[str]:
     """The command line as a process of its own, with the plug-ins of `folder`."""
-    environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1", "COLUMNS": "160"}
+    environment = os.environ | {"PYTHONPATH": import_path(folder), "OMP_NUM_THREADS": "1", "COLUMNS": "160"}
 
     def hear() -> None:
         """A shell's background job, which these tests may be, is deaf to Ctrl-C and so are its children."""

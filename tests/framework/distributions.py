@@ -18,7 +18,16 @@ TOY_POINTS = {
     },
     "cavbench.defenses": {"guard": "toy_plugin:Guard", "harden": "toy_camera_plugin:Harden"},
     "cavbench.victims": {"toy": "toy_plugin:ToyVictim", "red": "toy_camera_plugin:RedVictim"},
-    "cavbench.worlds": {"toy": "toy_plugin:ToyWorld", "red_street": "toy_camera_plugin:RedStreet"},
+    "cavbench.worlds": {
+        "toy": "toy_plugin:ToyWorld",
+        "bend": "toy_plugin:BendWorld",
+        "red_street": "toy_camera_plugin:RedStreet",
+    },
+    "cavbench.grids": {
+        "toy-v1": "toy_plugin:TOY_V1",
+        "bend-v1": "toy_plugin:BEND_V1",
+        "red-v1": "toy_camera_plugin:RED_V1",
+    },
 }
 
 

@@ -1,4 +1,4 @@
-"""From bad defences to their flags, through real runs: what is no defence is found out and ranks last."""
+"""Defences that do not defend are flagged after a real run, and rank below the others."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from bench.plugins import registry
-from bench.records import store as results
-from leaderboard.entries import MEASUREMENTS
-from leaderboard.ranking import Row, read_boards
+from bench.plugins.track import track
+from bench.records import reading
+from leaderboard.comparisons.reading import measurements
+from leaderboard.ranking.boards import Row, read_boards
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 
@@ -29,8 +30,7 @@ def rows(plugins: Path, bench: Callable[..., Said], tmp_path: Path) -> dict[str,
     out = tmp_path / "results"
     said = bench("run", "attack=pgd,zo,noise", f"defense=none,{','.join(BAD)}", *WORDS, f"out={out}")
     assert said.code == 0, said.err
-    measurements = {name for names in MEASUREMENTS.values() for name in names}
-    (board,) = read_boards(results.read_compact(out, measurements))[0]
+    (board,) = read_boards(reading.read_compact(out, measurements(track("driving"))))[0]
     return {str(row.identity["defense"]): row for row in board.rows}
 
 
@@ -38,7 +38,7 @@ def fired(row: Row) -> set[str]:
     return {flag.name for flag in row.flags if flag.fired}
 
 
-def test_bad_defences_are_found_out_and_a_sound_victim_is_not(rows: dict[str, Row]) -> None:
+def test_bad_defences_are_flagged_and_a_sound_victim_is_not(rows: dict[str, Row]) -> None:
     found_out = {"ignores_input", "zero_gradients", "one_draw"}
     assert not fired(rows["none"]) & (found_out | {"unattacked"})
     assert fired(rows["deaf"]) & found_out >= {"ignores_input"}

@@ -42,7 +42,7 @@ CANNOT_BE_LOADED = {
         "is not a subclass of bench.plugins.contracts.Attack",
     ),
     "no track": (f"{HEAD}{GOOD}".replace("(DrivingAttack)", "(Attack)"), "is of no track"),
-    "an abstract method": (f"{HEAD}{GOOD}".replace("def perturb", "def disturb"), "does not implement perturb"),
+    "an abstract method": (f"{HEAD}{GOOD}".replace("def perturb", "def disturb"), "does not implement perturb or step"),
     "no dataclass": (
         f"{HEAD}{GOOD}".replace("@dataclass(frozen=True, kw_only=True)", ""),
         "is not a frozen dataclass",

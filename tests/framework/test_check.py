@@ -157,7 +157,7 @@ class Bad(Policy):
             self.requires_grad_(False)
         self.train(rule == "mode")
 
-    def scores(self, observation):
+    def forward(self, observation):
         scores = self.layer(observation.mean(-2))
         match self.rule:
             case "shape":
@@ -179,8 +179,8 @@ class Bad(Policy):
                     self.layer.weight.add_(1e-3)
         return scores
 
-    def decide(self, observation):
-        action = super().decide(observation)
+    def decide(self, observation, state=None):
+        action = super().decide(observation, state)
         return action.float() if self.rule == "float" else action
 
 
@@ -198,7 +198,7 @@ class BadVictim(DrivingVictim):
     def action_type(self):
         return "continuous" if self.rule == "action type" else "discrete"
 
-    def load(self, seed):
+    def load(self, seed, facts):
         if self.rule == "raise":
             raise ZeroDivisionError("at a loss")
         return None if self.rule == "nothing" else Bad(self.rule)
@@ -257,8 +257,8 @@ RULES: list[tuple[Kind, str, str, str, str]] = [
     ("attack", "crooked", "batch", "batching", "an episode's answer changes with the other episodes of the batch"),
     ("attack", "crooked", "global", "determinism", "draw with generator=oracle.generator"),
     ("attack", "crooked", "numpy", "determinism", "draw with generator=oracle.generator"),
-    ("attack", "crooked", "memory", "determinism", "keep no state between steps"),
-    ("attack", "crooked", "widen", "threat model", "perturb must not change oracle.radius or its set"),
+    ("attack", "crooked", "memory", "determinism", "keep nothing on the object"),
+    ("attack", "crooked", "widen", "threat model", "the attack must not change oracle.radius or its set"),
     (
         "attack",
         "crooked",
@@ -285,7 +285,7 @@ RULES: list[tuple[Kind, str, str, str, str]] = [
     ("attack", "bad_patch", "progress", "progress", "outside [0, 1]"),
     ("attack", "bad_patch", "weights", "victim left alone", "the detector's weights changed"),
     ("attack", "bad_patch", "scenes", "victim left alone", "the scenes were changed in place"),
-    ("victim", "bad", "nothing", "ready to drive", "load returned a NoneType, not a bench.driving.contracts.Policy"),
+    ("victim", "bad", "nothing", "ready to drive", "load returned a NoneType, not a bench.driving.Policy"),
     ("victim", "bad", "raise", "behaviour", "ZeroDivisionError: at a loss"),
     ("victim", "bad", "mode", "ready to drive", "load must return policy.eval()"),
     ("victim", "bad", "weights", "ready to drive", "load must return policy.requires_grad_(False)"),

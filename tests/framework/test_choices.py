@@ -10,7 +10,8 @@ import pytest
 
 from bench.conformance import complaints
 from bench.errors import UserError
-from bench.records import store as results
+from bench.plugins.track import track
+from bench.records import reading
 from bench.run.config import run_config
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
@@ -82,7 +83,7 @@ def test_a_choice_is_a_component_with_parameters_of_its_own(bench: Callable[...,
     )
     assert said.code == 0, said.err
     assert "shelf:up" in said.out
-    rows = [row for row in results.read(tmp_path).to_pylist() if row["attack"] != "none"]
+    rows = [row for row in reading.read(tmp_path, track=track("driving")).to_pylist() if row["attack"] != "none"]
     made = {(row["attack"], row["attack_params"]) for row in rows}
     assert made == {
         ("shelf:up", '{"strength":0.5}'),

@@ -12,27 +12,27 @@ from pathlib import Path
 import pytest
 
 from bench.conformance import scaffold
-from bench.records import store as results
-from tests.framework.conftest import Said, ran
-from tests.framework.distributions import pip_install
+from bench.plugins.track import track
+from bench.records import reading
+from tests.framework.conftest import Said, import_path, ran
+from tests.framework.distributions import install, pip_install
 from tests.framework.test_cli import assert_one_line
+from tests.framework.test_third_track import POINTS as LISTENING
 
 Bench = Callable[..., Said]
+TOY_TRACK = Path(__file__).with_name("toy_track.py")
 EVERY = list(itertools.product(("attack", "defense", "victim"), ("driving", "detection")))
 
 
-def name_of(kind: str, track: str) -> str:
-    return f"my_{kind}_{track}"
+def name_of(kind: str, on: str) -> str:
+    return f"my_{kind}_{on}"
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """A package of each kind and track, as `bench new` writes it."""
     folder = tmp_path_factory.mktemp("packages")
-    return [
-        scaffold.write(kind, name_of(kind, track), track=track, folder=folder / name_of(kind, track))
-        for kind, track in EVERY
-    ]
+    return [scaffold.write(kind, name_of(kind, on), track=on, folder=folder / name_of(kind, on)) for kind, on in EVERY]
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_what_is_there_is_not_overwritten(bench: Bench, tmp_path: Path) -> None:
         (("victim", "a" * 41), "at most 40 characters"),
         (("atack", "my_attack"), "unknown kind 'atack'; did you mean 'attack'?"),
         (("world", "my_world"), "unknown kind 'world'; known: attack, defense, victim"),
-        (("attack", "my_attack", "track=street"), "unknown track 'street'; known: driving, detection"),
+        (("attack", "my_attack", "track=street"), "unknown track 'street'; known: detection, driving"),
         (("attack", "my_attack", "trak=driving"), "unknown word 'trak=driving'"),
         (("attack", "my_attack", "out=/proc/none/here"), "cannot be written"),
     ],
@@ -90,9 +90,16 @@ def test_bad_words_are_refused_in_one_line_and_nothing_is_written(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_track_without_templates_is_refused_in_one_line(bench: Bench, plugins: Path, tmp_path: Path) -> None:
+    install(plugins, "cavbench-listening", LISTENING, {"toy_track_plugin": TOY_TRACK.read_text()})
+    said = bench("new", "attack", "my_attack", "track=listening", f"out={tmp_path / 'package'}")
+    assert_one_line(said, "the track 'listening' has no template for an attack", "templates: detection, driving")
+    assert not (tmp_path / "package").exists()
+
+
 @pytest.mark.slow
 def test_every_package_passes_its_own_tests(written: list[Path], installed: Path) -> None:
-    environment = os.environ | {"PYTHONPATH": str(installed), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": import_path(installed), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", "--import-mode=importlib", *written]
     ended = subprocess.run(command, cwd=installed, env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stdout
@@ -109,8 +116,25 @@ def test_an_installed_package_is_listed_checked_and_scored_in_workers(installed:
     words = ("attack=my_attack_driving", "attack.strength=2", "lanes=3,4", "density=1", "weather=clear", "episodes=2")
     said = ran(installed, "run", *words, "seeds=0", "workers=2", "reference=false", "record=0", f"out={tmp_path}")
     assert said.code == 0, said.err
-    rows = [row for row in results.read(tmp_path).to_pylist() if row["attack"] == "my_attack_driving"]
+    rows = [
+        row
+        for row in reading.read(tmp_path, track=track("driving")).to_pylist()
+        if row["attack"] == "my_attack_driving"
+    ]
     assert len(rows) == 4
     assert all('"strength":2.0' in row["attack_params"] for row in rows)
     assert {row["attack_shipped_by"] for row in rows} == {"cavbench-my-attack-driving 0.1.0"}
     assert all(row["queries"] > 1 and row["linf_max"] > 0 for row in rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "on"), EVERY)
+def test_the_first_run_of_a_package_is_as_it_says(installed: Path, tmp_path: Path, kind: str, on: str) -> None:
+    name = name_of(kind, on)
+    _, command, *words = scaffold.first_run(kind, name, on).split()
+    quicker = ["seeds=0", "reference=false", "record=0", "workers=1"]
+    quicker += ["world.max_steps=30"] if on == "driving" else ["episodes=1"]
+    said = ran(installed, command, *words, *quicker, f"out={tmp_path}")
+    assert said.code == 0, said.err
+    rows = reading.read(tmp_path, track=track(on)).to_pylist()
+    assert name in {row[kind] for row in rows}

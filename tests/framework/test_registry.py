@@ -13,6 +13,7 @@ from bench.errors import UserError
 from bench.plugins import registry
 from bench.plugins.contracts import Attack, Defense, Victim, World
 from bench.plugins.registry import GROUPS, KINDS
+from bench.run.config import run_config
 from tests.framework.conftest import BENCH
 from tests.framework.distributions import TOY_POINTS, install, install_toy
 
@@ -45,11 +46,11 @@ BROKEN = {
     "cannot be imported: ZeroDivisionError": "1 / 0\n",
     "is not a subclass of bench.plugins.contracts.Attack": "class Plugin: ...\n",
     "cannot be imported: AttributeError": "class Other: ...\n",
-    "is of no track: derive it from a base class of bench.driving.contracts or bench.detection.contracts": (
+    "is of no track: derive it from a base class of one": (
         "from dataclasses import dataclass\nfrom bench.plugins.contracts import Attack\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(Attack): ...\n"
     ),
-    "does not implement perturb": (
+    "does not implement perturb or step": (
         "from dataclasses import dataclass\nfrom bench.driving.contracts import DrivingAttack\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(DrivingAttack): ...\n"
     ),
@@ -76,6 +77,17 @@ def test_a_broken_plugin_is_named_in_one_line_and_breaks_no_other(complaint: str
     assert "\n" not in message
     assert "wrong" in registry.names("attack")
     registry.load("attack", "noise")
+
+
+def test_a_grid_that_cannot_be_imported_is_named_when_it_is_asked_for_and_breaks_no_other(plugins: Path) -> None:
+    points = {
+        "cavbench.grids": {"rough-v1": "rough:GRID"},
+        "cavbench.worlds": {"rough": "envs.highway.world:HighwayWorld"},
+    }
+    install(plugins, "rough-pack", points, {"rough": "1 / 0\n"})
+    assert run_config(["victim=blind"]).grid.name == "standard-v1"
+    with pytest.raises(UserError, match=r"grid 'rough-v1' .* cannot be imported: ZeroDivisionError"):
+        run_config(["victim=blind", "world=rough", "grid=rough-v1"])
 
 
 def test_a_name_that_two_packages_claim_is_refused_and_both_are_named(plugins: Path) -> None:

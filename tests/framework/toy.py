@@ -20,27 +20,67 @@ from bench.driving import (
     Driver,
     DrivingAttack,
     DrivingDefense,
+    DrivingFacts,
     DrivingVictim,
     DrivingWorld,
     Features,
     Oracle,
     Policy,
+    PolicyWrapper,
+    State,
 )
 from bench.plugins.contracts import Access, Progress, Trained
-from bench.scenarios import Cell
+from bench.scenarios import Axes, Axis, Cell, Grid
 
 FLAGS = ("crashed", "offroad")
 MEASURES = ("progress", "speed", "x", "ttc")
 
+TOY_AXES = Axes(
+    (
+        Axis(name="lanes", kind="int", meaning="number of lanes", low=2, high=8),
+        Axis(name="density", kind="float", meaning="traffic density", above=0.0, high=4.0),
+        Axis(
+            name="weather",
+            kind="str",
+            meaning="what the air is like",
+            choices=("clear", "rain", "fog"),
+            default="clear",
+            perceptual=True,
+        ),
+    )
+)
+TOY_V1 = Grid(
+    name="toy-v1",
+    world="toy",
+    axes=TOY_AXES,
+    values={"lanes": (3, 4, 5), "density": (1.0, 2.0), "weather": ("clear", "rain", "fog")},
+    episodes=100,
+)
+BEND_AXES = Axes(
+    (
+        Axis(name="curvature", kind="float", meaning="of the road", unit="1/m", low=0.0, high=1.0),
+        Axis(name="gap", kind="int", meaning="to the car ahead when an episode begins", unit="m", low=1),
+    )
+)
+BEND_V1 = Grid(
+    name="bend-v1", world="bend", axes=BEND_AXES, values={"curvature": (0.0, 0.1, 0.2), "gap": (20, 40)}, episodes=4
+)
+
 
 class ToyEnv(EnvBase):
-    """Each episode counts down; its observation and rewards depend on its seed, its lanes and the actions taken."""
+    """Each episode counts down; its observation and rewards depend on its seed, its cell and the actions taken.
 
-    def __init__(self, cells: Sequence[Cell], action_type: ActionType, steps: int) -> None:
+    Args:
+        cells: of the episodes; the numbers on their axes count.
+        actions: discrete ones; 0 for continuous ones.
+        steps: of an episode.
+    """
+
+    def __init__(self, cells: Sequence[Cell], actions: int, steps: int) -> None:
         size = len(cells)
         super().__init__(batch_size=[size])
-        self.lanes = torch.tensor([float(cell.lanes) for cell in cells])
-        self.discrete, self.steps = action_type == "discrete", steps
+        numbers = [sum(float(value) for value in cell.values() if not isinstance(value, str)) for cell in cells]
+        self.offset, self.actions, self.steps = torch.tensor(numbers), actions, steps
         info = {name: Unbounded((size, 1)) for name in MEASURES} | {
             name: Binary(1, (size, 1), dtype=torch.bool) for name in FLAGS
         }
@@ -52,17 +92,17 @@ class ToyEnv(EnvBase):
             {name: Binary(1, (size, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")},
             shape=(size,),
         )
-        self.action_spec = Categorical(5, (size,)) if self.discrete else Bounded(-1.0, 1.0, (size, 2))
+        self.action_spec = Categorical(actions, (size,)) if actions else Bounded(-1.0, 1.0, (size, 2))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         seeds = tensordict["seed"] if tensordict is not None else torch.zeros(self.batch_size, dtype=torch.int64)
-        self.place = (seeds % 97).float() / 97 + self.lanes
+        self.place = (seeds % 97).float() / 97 + self.offset
         self.time = 0
         return self._state(torch.zeros(self.batch_size))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].float()
-        push = action / 4 if self.discrete else action[..., 0]
+        push = action / (self.actions - 1) if self.actions else action[..., 0]
         self.place, self.time = self.place + push, self.time + 1
         return self._state(push).set("reward", push[:, None])
 
@@ -88,14 +128,21 @@ class ToyEnv(EnvBase):
 
 @dataclass(frozen=True, kw_only=True)
 class ToyWorld(DrivingWorld):
-    """Ten steps of nothing much.
+    """Ten steps of nothing much, on the axes of a highway.
 
     Args:
         max_steps: of an episode.
     """
 
+    axes: ClassVar[Axes] = TOY_AXES
+    grid: ClassVar[str] = TOY_V1.name
     features: ClassVar[Features] = Features(names=("x", "vx"), low=(-10.0, -5.0), high=(10.0, 5.0), units=("m", "m/s"))
+    actions: ClassVar[tuple[str, ...]] = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
     max_steps: int = 10
+
+    @property
+    def decision_hz(self) -> float:
+        return 10.0
 
     def make(
         self,
@@ -105,19 +152,38 @@ class ToyWorld(DrivingWorld):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        return ToyEnv(cells, action_type, self.max_steps)
+        return ToyEnv(cells, len(self.actions) if action_type == "discrete" else 0, self.max_steps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BendWorld(ToyWorld):
+    """Ten steps on a bend, five a second, with axes of its own and three actions."""
+
+    axes: ClassVar[Axes] = BEND_AXES
+    grid: ClassVar[str] = BEND_V1.name
+    actions: ClassVar[tuple[str, ...]] = ("LEFT", "STRAIGHT", "RIGHT")
+
+    @property
+    def decision_hz(self) -> float:
+        return 5.0
 
 
 class ToyPolicy(Policy):
-    """A linear policy with weights drawn from its seed."""
+    """A linear policy with weights drawn from its seed.
 
-    def __init__(self, action_type: ActionType, seed: int) -> None:
+    Args:
+        action_type: what it decides.
+        seed: of its weights.
+        actions: discrete ones.
+    """
+
+    def __init__(self, action_type: ActionType, seed: int, actions: int = 5) -> None:
         super().__init__()
-        self.action_type, self.shape = action_type, {"action_type": action_type, "seed": seed}
-        weights = torch.randn(6, 5 if action_type == "discrete" else 2, generator=torch.Generator().manual_seed(seed))
-        self.register_buffer("weights", weights)
+        self.action_type, self.shape = action_type, {"action_type": action_type, "seed": seed, "actions": actions}
+        width = actions if action_type == "discrete" else 2
+        self.register_buffer("weights", torch.randn(6, width, generator=torch.Generator().manual_seed(seed)))
 
-    def scores(self, observation: Tensor) -> Tensor:
+    def forward(self, observation: Tensor) -> Tensor:
         return (observation.flatten(-2) @ self.weights).tanh()
 
 
@@ -141,13 +207,13 @@ class ToyVictim(DrivingVictim):
     def zoo_name(self) -> str:
         return f"toy-{self.actions}"
 
-    def load(self, seed: int) -> Policy:
-        return ToyPolicy(self.actions, seed)
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        return ToyPolicy(self.actions, seed, len(facts.actions)).eval()
 
     def train(self, world: DrivingWorld, *, seed: int, hooks: object = None, progress: Progress) -> Trained[Policy]:
         progress(0.5, "half way")
         progress(1.0, "there")
-        return Trained(ToyPolicy(self.actions, seed), {"world": type(world).__name__})
+        return Trained(ToyPolicy(self.actions, seed, len(world.actions)), {"world": type(world).__name__})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,14 +267,14 @@ class Guard(DrivingDefense):
 
     digits: int
 
-    def load(self, victim: DrivingVictim, seed: int) -> Policy:
-        return _Guarded(victim.load(seed), self.digits)
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
+        return _Guarded(victim.load(seed, facts), self.digits)
 
 
-class _Guarded(Policy):
+class _Guarded(PolicyWrapper):
     def __init__(self, policy: Policy, digits: int) -> None:
-        super().__init__()
-        self.policy, self.digits, self.action_type = policy, digits, policy.action_type
+        super().__init__(policy)
+        self.digits = digits
 
-    def scores(self, observation: Tensor) -> Tensor:
-        return self.policy.scores(observation.round(decimals=self.digits))
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        return self.policy.scores(observation.round(decimals=self.digits), state)

@@ -1,4 +1,4 @@
-"""A third party's plug-ins of the detection track: red squares, a detector of red, patches of every temper."""
+"""A third party's plug-ins of the detection track: red squares, a detector of red, and patches that misbehave on demand."""
 
 from __future__ import annotations
 
@@ -22,13 +22,35 @@ from bench.detection import (
     Predictions,
     Scenes,
 )
-from bench.plugins.contracts import Access, Progress, Trained
-from bench.scenarios import Cell
+from bench.plugins.contracts import Access, Facts, Progress, Trained
+from bench.scenarios import Axes, Axis, Cell, Grid
 from bench.victims import zoo
 from envs.weather import WEATHERS
 
 SIDE, SIGN = 32, slice(8, 24)
 """Of the pictures, and where the sign is in them, in both directions."""
+
+RED_AXES = Axes(
+    (
+        Axis(name="lanes", kind="int", meaning="number of lanes", choices=(3, 4, 5)),
+        Axis(name="density", kind="float", meaning="density of the cars", choices=(1.0, 2.0)),
+        Axis(
+            name="weather",
+            kind="str",
+            meaning="the air and the light",
+            choices=("clear", "rain", "fog", "night"),
+            default="clear",
+            perceptual=True,
+        ),
+    )
+)
+RED_V1 = Grid(
+    name="red-v1",
+    world="red_street",
+    axes=RED_AXES,
+    values={"lanes": (3, 4, 5), "density": (1.0, 2.0), "weather": ("clear", "rain", "fog")},
+    episodes=3,
+)
 
 
 class RedScenes(Scenes):
@@ -63,6 +85,8 @@ class RedStreet(CameraWorld):
         frames: of an approach.
     """
 
+    axes: ClassVar[Axes] = RED_AXES
+    grid: ClassVar[str] = RED_V1.name
     locations: ClassVar[tuple[str, ...]] = ("front", "side", "back")
     frames: int = 10
 
@@ -106,7 +130,7 @@ class RedVictim(DetectorVictim):
     def zoo_name(self) -> str:
         return "red"
 
-    def load(self, seed: int) -> Detector:
+    def load(self, seed: int, facts: Facts) -> Detector:
         return RedDetector().requires_grad_(False).eval()
 
 
@@ -176,5 +200,5 @@ class Harden(DetectorDefense):
     def train(self, victim: Any, world: Any, *, seed: int, progress: Progress) -> Trained[Detector]:
         return Trained(RedDetector(bias=-1.0 - seed / 10), {"scenes": len(world.training_scenes())})
 
-    def load(self, victim: DetectorVictim, seed: int) -> Detector:
+    def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
         return zoo.load(zoo.Recipe.of(victim, self), seed, RedDetector)

@@ -1,35 +1,22 @@
-"""The rules for detectors, as victims are loaded and as defences make them."""
+"""The rules for detectors, of victims and of defences."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
-from typing import Any
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from bench.conformance.check import Check, Suite, require
+from bench.conformance.detection.street import Street
 from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
-from bench.conformance.street import Street
-from bench.detection import STOP_SIGN, Detector, DetectorVictim
+from bench.detection import STOP_SIGN, Detector
 
 PICTURES = 3
 
 
 class DetectorSuite(Suite):
-    """Of what a `DetectorVictim` or a `DetectorDefense` loads.
-
-    Args:
-        name: of the component.
-        component: the victim or the defence.
-        victim: the victim itself, or the one that the defence is tried on.
-        load: gives the detector anew.
-    """
-
-    def __init__(self, name: str, component: Any, victim: DetectorVictim, load: Callable[[], Detector]) -> None:
-        super().__init__(name, component)
-        self.victim, self.load = victim, load
+    """Of what a `DetectorVictim` or a `DetectorDefense` loads."""
 
     def checks(self) -> Mapping[str, Check]:
         return {
@@ -44,10 +31,10 @@ class DetectorSuite(Suite):
 
     def frozen(self) -> None:
         """Eval mode, no gradients on weights, and a stop sign among its classes."""
-        detector = self.load()
+        detector = self.subject.load()
         require(
             isinstance(detector, Detector),
-            f"load returned a {type(detector).__name__}, not a bench.detection.contracts.Detector",
+            f"load returned a {type(detector).__name__}, not a bench.detection.Detector",
         )
         check_frozen(detector, "detector")
         require(STOP_SIGN in detector.names, f"none of its classes is {STOP_SIGN!r}, which is what attacks hide")
@@ -55,7 +42,7 @@ class DetectorSuite(Suite):
 
     def predicts(self) -> None:
         """Boxes and probabilities of the shapes and ranges that `Predictions` says."""
-        detector, pictures = self.load(), self._pictures()
+        detector, pictures = self.subject.load(), self._pictures()
         found = detector(pictures)
         boxes, objectness, classes = found.boxes, found.objectness, found.classes
         count = boxes.shape[1]
@@ -71,34 +58,43 @@ class DetectorSuite(Suite):
 
     def neighbours_do_not_matter(self) -> None:
         """Every picture of a batch is looked at by itself."""
-        detector, among = self.load(), self._pictures()
+        detector, among = self.subject.load(), self._pictures()
         others = among.flip(0).clone()
         others[0] = among[0]
         first, second = detector(among).scores[0], detector(others).scores[0]
         require(
             torch.allclose(first, second, rtol=1e-3, atol=1e-5),
-            "what it finds in a picture changes with the others of the batch: is a batch normalisation in training mode?",
+            "its predictions for a picture change with the others of the batch: is a batch normalisation in training mode?",
         )
 
     def same_picture_same_answer(self) -> None:
         """Loaded twice and asked twice, it says the same."""
-        pictures, detector = self._pictures(), self.load()
+        pictures, detector = self._pictures(), self.subject.load()
         first = detector(pictures).scores
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(1)
-            second, again = detector(pictures).scores, self.load()(pictures).scores
-        require(torch.equal(first, second), "asked twice about a picture, it says two things")
-        require(torch.equal(first, again), "two loads with the same seed say two things")
+            second, again = detector(pictures).scores, self.subject.load()(pictures).scores
+        require(
+            torch.equal(first, second),
+            "asked twice about a picture, it gives two answers: predict must have no side effect and draw nothing",
+        )
+        require(
+            torch.equal(first, again),
+            "two loads with the same seed predict differently: make weights from the seed only",
+        )
 
     def looks(self) -> None:
         """What it says depends on the picture."""
-        scores = self.load()(self._pictures()).scores
-        require(not torch.equal(scores[0], scores[1]), "it says the same of two pictures")
+        scores = self.subject.load()(self._pictures()).scores
+        require(
+            not torch.equal(scores[0], scores[1]),
+            "its predictions are the same for two different pictures: does predict use its input?",
+        )
 
     def differentiable(self) -> None:
         """White-box attacks find a way back to the pixels."""
-        check_white_box(self.victim)
-        leaf, detector = self._pictures().requires_grad_(True), self.load()
+        check_white_box(self.subject.victim)
+        leaf, detector = self._pictures().requires_grad_(True), self.subject.load()
         scores = detector(leaf).scores_of(detector.index(STOP_SIGN))
         require(scores.requires_grad, "its scores have no graph: no torch.no_grad in predict, no .detach, no NumPy")
         (gradient,) = torch.autograd.grad(scores.sum(), leaf)
@@ -106,16 +102,16 @@ class DetectorSuite(Suite):
 
     def keeps_weights(self) -> None:
         """Loading and asking change nothing."""
-        detector, pictures = self.load(), self._pictures()
+        detector, pictures = self.subject.load(), self._pictures()
         shown = pictures.clone()
-        with unchanged(detector, partial(self.victim.load, 0)):
+        with unchanged(detector, self.subject.load_victim):
             detector(pictures)
-            self.load()
+            self.subject.load()
         require(torch.equal(pictures, shown), "the pictures were changed in place")
 
     def _pictures(self) -> Tensor:
         """Three of the street with a random veil, padded to what the stride needs."""
-        scenes, stride = Street(), self.load().stride
+        scenes, stride = Street(), self.subject.load().stride
         pictures = scenes.render(torch.arange(PICTURES), None, 1.0)
         side = -(-max(scenes.size) // stride) * stride
         veil = torch.rand(PICTURES, 3, side, side, generator=torch.Generator().manual_seed(0))

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from bench.conformance.check import BrokenRuleError, Check, NotApplicableError, Suite, one_line, require
+from bench.conformance.detection.street import SignDetector, Street
 from bench.conformance.randomness import stir_others
-from bench.conformance.street import SignDetector, Street
 from bench.detection import PatchAttack, PatchOracle, PatchThreat
 from bench.errors import UserError
 from bench.plugins.contracts import QueryBudgetError

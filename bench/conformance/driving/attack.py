@@ -1,4 +1,4 @@
-"""The rules for attacks on drivers."""
+"""The rules for attacks on drivers, in one step."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
+from bench.conformance.driving.traffic import observations, victim
 from bench.conformance.randomness import stir_others
-from bench.conformance.traffic import observations, victim
-from bench.driving import ActionType, DrivingAttack, Features, ObservationThreat, Oracle, Policy
+from bench.driving import ActionType, DrivingAttack, ObservationThreat, Oracle, Policy
 from bench.errors import UserError
 from bench.plugins.contracts import QueryBudgetError
 from bench.plugins.fingerprint import state_digest
@@ -25,19 +25,9 @@ WITHIN = 1e-5
 
 
 class AttackSuite(Suite):
-    """Of a `DrivingAttack`, on networks with random weights.
-
-    Args:
-        name: of the component.
-        component: the attack.
-        features: of the observations.
-    """
+    """Of a `DrivingAttack`, on networks with random weights. An attack with a memory is in its first step."""
 
     component: DrivingAttack
-
-    def __init__(self, name: str, component: Any, features: Features) -> None:
-        super().__init__(name, component)
-        self.features = features
 
     def checks(self) -> Mapping[str, Check]:
         return {
@@ -57,14 +47,14 @@ class AttackSuite(Suite):
             for dtype in (torch.float32, torch.float64):
                 policy, observation = self._victim(action_type).to(dtype), self._observations().to(dtype)
                 answer, _ = self._answer(policy, observation)
-                require(isinstance(answer, Tensor), f"perturb returned a {type(answer).__name__}, not a tensor")
+                require(isinstance(answer, Tensor), f"{self._method} returned a {type(answer).__name__}, not a tensor")
                 require(
                     answer.shape == observation.shape,
-                    f"perturb returned shape {list(answer.shape)} for {list(observation.shape)}: return [B, V, F]",
+                    f"{self._method} returned shape {list(answer.shape)} for {list(observation.shape)}: return [B, V, F]",
                 )
                 require(
                     (answer.dtype, answer.device) == (dtype, observation.device),
-                    f"perturb returned {answer.dtype} on {answer.device} for {dtype} on {observation.device}: "
+                    f"{self._method} returned {answer.dtype} on {answer.device} for {dtype} on {observation.device}: "
                     "make new tensors with observation.new_zeros or torch.zeros_like",
                 )
                 require(not answer.requires_grad, "the answer carries a graph: return answer.detach()")
@@ -82,7 +72,7 @@ class AttackSuite(Suite):
             answer, _ = self._answer(self._victim(action_type), self._observations()[:0])
             require(
                 answer.shape[0] == 0,
-                f"perturb returned {answer.shape[0]} observations for none: if not len(observation): return observation",
+                f"{self._method} returned {answer.shape[0]} observations for none: if not len(observation): return observation",
             )
 
     def neighbours_do_not_matter(self) -> None:
@@ -100,7 +90,7 @@ class AttackSuite(Suite):
                 )
 
     def same_seed_same_answer(self) -> None:
-        """Only the run's generator decides what is drawn, and nothing is kept from step to step."""
+        """Only the run's generator decides what is drawn."""
         for action_type in self.component.action_types:
             policy, observation = self._victim(action_type), self._observations()
             answers = []
@@ -111,21 +101,21 @@ class AttackSuite(Suite):
                     answers.append(self._answer(policy, observation)[0])
             require(
                 torch.equal(*answers),
-                "the same seed gave two answers: draw with generator=oracle.generator, keep no state between steps",
+                "the same seed gave two answers: draw with generator=oracle.generator, and keep nothing on the object",
             )
 
     def within_the_set(self) -> str:
-        """What is outside is projected by the oracle, and recorded."""
+        """An answer outside the set is projected by the oracle, and the record says how far it was outside."""
         outside = 0.0
         for action_type in self.component.action_types:
             for threat in (self._threat(), self._threat(norm="linf", budget=0.2), self._threat(budget=0.0)):
                 policy, observation = self._victim(action_type), self._observations()
                 answer, oracle = self._answer(policy, observation, threat)
                 shown = oracle.project(answer)
-                radius = threat.radius(observation, self.features)
+                radius = threat.radius(observation, self.subject.world.features)
                 require(
                     bool(((shown - observation).abs() <= radius + WITHIN).all()),
-                    "what the oracle projected is outside the set: perturb must not change oracle.radius or its set",
+                    "what the oracle projected is outside the set: the attack must not change oracle.radius or its set",
                 )
                 outside = max(outside, float((answer - shown).abs().max()))
         if outside > WITHIN:
@@ -133,7 +123,7 @@ class AttackSuite(Suite):
         return ""
 
     def within_the_budget(self) -> str:
-        """However few queries there are, it does with them, and its own count is the oracle's."""
+        """It works with any query budget, and stays within it."""
         most = 0
         for action_type in self.component.action_types:
             policy, observation = self._victim(action_type), self._observations()
@@ -148,22 +138,30 @@ class AttackSuite(Suite):
         return f"{most} of 1000 queries a step"
 
     def leaves_the_victim(self) -> None:
-        """Weights, mode and gradients of the victim, and the true observation, are as they were."""
+        """It changes neither weights, mode or gradients of the victim, nor the true observation."""
         for action_type in self.component.action_types:
             policy, observation = self._victim(action_type), self._observations()
             before, truth = (state_digest(policy), _marks(policy)), observation.clone()
             self._answer(policy, observation)
-            require(state_digest(policy) == before[0], "the victim's weights changed: perturb may only ask the oracle")
             require(
-                _marks(policy) == before[1], "the victim's mode or gradients changed: perturb may only ask the oracle"
+                state_digest(policy) == before[0], "the victim's weights changed: the attack may only ask the oracle"
+            )
+            require(
+                _marks(policy) == before[1],
+                "the victim's mode or gradients changed: the attack may only ask the oracle",
             )
             require(torch.equal(observation, truth), "the true observation was changed in place: work on a clone")
 
+    @property
+    def _method(self) -> str:
+        """The method that its author wrote."""
+        return "perturb" if type(self.component).step is DrivingAttack.step else "step"
+
     def _victim(self, action_type: ActionType) -> Policy:
-        return victim(action_type, self.features)
+        return victim(action_type, self.subject.world.facts)
 
     def _observations(self, seed: int = 0) -> Tensor:
-        return observations(EPISODES, features=self.features, seed=seed)
+        return observations(EPISODES, features=self.subject.world.features, seed=seed)
 
     def _threat(self, **values: Any) -> ObservationThreat:
         return ObservationThreat(**values)
@@ -172,11 +170,14 @@ class AttackSuite(Suite):
         self, policy: Policy, observation: Tensor, threat: ObservationThreat | None = None
     ) -> tuple[Tensor, Oracle]:
         threat = threat or self._threat()
-        oracle = Oracle(policy, threat, self.component.access, self.features, torch.Generator().manual_seed(0))
+        oracle = Oracle(
+            policy, threat, self.component.access, self.subject.world.features, torch.Generator().manual_seed(0)
+        )
         oracle.begin_step(observation)
         try:
             with torch.no_grad():
-                return self.component.perturb(observation, oracle), oracle
+                state = self.component.initial(observation, oracle)
+                return self.component.step(observation, oracle, state)[0], oracle
         except QueryBudgetError:
             raise
         except UserError as error:

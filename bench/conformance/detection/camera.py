@@ -1,4 +1,4 @@
-"""The rules for worlds that are looked at."""
+"""The rules for camera worlds."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from bench.conformance.check import Check, Suite, require
+from bench.conformance.scenarios import first_cell
 from bench.detection import STOP_SIGN, CameraWorld, Scenes
-from bench.scenarios import Cell
+from bench.plugins import registry
+from bench.scenarios import SeedBlock
 
-CELL = Cell(lanes=3, density=1.0)
 FRAMES = 3
 SHARE = 0.5
 TEXELS = 8
@@ -32,6 +33,7 @@ class CameraSuite(Suite):
             "patches": self.patches,
             "windows": self.windows,
             "reach": self.reach,
+            "cells": self.every_cell,
             "approaches": self.approaches,
             "determinism": self.same_seed_same_approach,
         }
@@ -91,24 +93,34 @@ class CameraSuite(Suite):
             outside[top:bottom, left:right] = 0
             require(float(outside.max()) < 1e-4, "a patch changes pixels outside of reach: make the boxes larger")
 
+    def every_cell(self) -> str:
+        """There is an approach in every cell of the default grid."""
+        grid = registry.grid(self.component.grid)
+        for cell in grid.cells():
+            found = self.component.approaches(cell, range(SeedBlock.REPORT, SeedBlock.REPORT + 1))
+            require(len(found) == 1, f"approaches gives {len(found)} for one seed in the cell {cell}: give one a seed")
+        return f"{len(grid.cells())} cells"
+
     def approaches(self) -> None:
         """One a seed, at the place of the seed, farthest first, all of the same length."""
         places = self.component.locations
-        seeds = range(1_000_000, 1_000_000 + len(places))
-        found = self.component.approaches(CELL, seeds)
+        seeds = range(SeedBlock.REPORT, SeedBlock.REPORT + len(places))
+        found = self.component.approaches(first_cell(self.component), seeds)
         require([one.seed for one in found] == list(seeds), "approaches must give one for each seed, in order")
         wanted = [places[seed % len(places)] for seed in seeds]
         require([one.location for one in found] == wanted, "a seed's place must be locations[seed % len(locations)]")
         require(len({len(one.scenes) for one in found}) == 1, "approaches differ in their number of frames")
         for one in found:
             self._check_scenes(one.scenes)
-            require(bool((one.scenes.distance.diff() <= 0).all()), "frames must come farthest first")
+            require(bool((one.scenes.distance.diff() < 0).all()), "frames must come farthest first")
 
     def same_seed_same_approach(self) -> None:
         """An approach is fixed by its seed."""
         frames = torch.tensor([0])
         first, second = (
-            self.component.approaches(CELL, range(1_000_000, 1_000_001))[0].scenes.render(frames, None, SHARE)
+            self.component.approaches(first_cell(self.component), range(SeedBlock.REPORT, SeedBlock.REPORT + 1))[
+                0
+            ].scenes.render(frames, None, SHARE)
             for _ in range(2)
         )
         require(torch.equal(first, second), "the same seed gives two different pictures")

@@ -1,4 +1,4 @@
-"""What the checks of the detection track stand on: a red sign on grey, and a small detector with random weights."""
+"""The scenes and the detector that the checks of the detection track use: a red sign on grey, and random weights."""
 
 from __future__ import annotations
 

@@ -1,0 +1,45 @@
+"""What `bench check` and `bench new` know of the detection track."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from bench.conformance.check import NotApplicableError, Subject, Suite
+from bench.conformance.kits import Kit, Start
+
+
+def _attack(subject: Subject) -> Iterator[Suite]:
+    from bench.conformance.detection.patch import PatchSuite
+    from bench.detection import PatchAttack
+
+    if not isinstance(subject.component, PatchAttack):
+        raise NotApplicableError("it is no PatchAttack: signs stay as they are")
+    yield PatchSuite(subject)
+
+
+def _detector(subject: Subject) -> Iterator[Suite]:
+    from bench.conformance.detection.detector import DetectorSuite
+
+    yield DetectorSuite(subject)
+
+
+def _world(subject: Subject) -> Iterator[Suite]:
+    from bench.conformance.detection.camera import CameraSuite
+
+    yield CameraSuite(subject)
+
+
+PLACE = "lanes=3 density=1 weather=clear"
+KIT = Kit(
+    suites={"attack": _attack, "defense": _detector, "victim": _detector, "world": _world},
+    starts={
+        "attack": Start(
+            run=f"bench run attack={{name}} attack.strength=2 victim=yolov5 {PLACE}", setting="attack.strength=2"
+        ),
+        "defense": Start(
+            run=f"bench run attack=noise_patch defense={{name}} victim=yolov5 {PLACE}", setting="defense.size=5"
+        ),
+        "victim": Start(run=f"bench run attack=noise_patch victim={{name}} {PLACE}", setting="victim.sharpness=20"),
+    },
+    package="bench.conformance.detection",
+)

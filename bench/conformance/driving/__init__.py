@@ -1,0 +1,45 @@
+"""What `bench check` and `bench new` know of the driving track."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from bench.conformance.check import NotApplicableError, Subject, Suite
+from bench.conformance.kits import Kit, Start
+
+
+def _attack(subject: Subject) -> Iterator[Suite]:
+    from bench.conformance.driving.attack import AttackSuite
+    from bench.conformance.driving.attack_memory import AttackMemorySuite
+    from bench.driving import DrivingAttack
+
+    if not isinstance(subject.component, DrivingAttack):
+        raise NotApplicableError("it is no DrivingAttack: observations stay as they are")
+    yield AttackSuite(subject)
+    yield AttackMemorySuite(subject)
+
+
+def _policy(subject: Subject) -> Iterator[Suite]:
+    from bench.conformance.driving.policy import PolicySuite
+    from bench.conformance.driving.policy_memory import PolicyMemorySuite
+
+    yield PolicySuite(subject)
+    yield PolicyMemorySuite(subject)
+
+
+def _world(subject: Subject) -> Iterator[Suite]:
+    from bench.conformance.driving.world import WorldSuite
+
+    yield WorldSuite(subject)
+
+
+ROAD = "lanes=3 density=1 weather=clear episodes=20"
+KIT = Kit(
+    suites={"attack": _attack, "defense": _policy, "victim": _policy, "world": _world},
+    starts={
+        "attack": Start(run=f"bench run attack={{name}} attack.strength=2 {ROAD}", setting="attack.strength=2"),
+        "defense": Start(run=f"bench run attack=noise,pgd defense={{name}} {ROAD}", setting="defense.copies=16"),
+        "victim": Start(run=f"bench run attack=noise,pgd victim={{name}} {ROAD}", setting="victim.gap_m=60"),
+    },
+    package="bench.conformance.driving",
+)

@@ -1,0 +1,116 @@
+"""The rules for attacks on drivers, over several steps: where an attack keeps what it remembers of an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from bench.conformance.check import Check, Suite, refusals_are_broken_rules, require
+from bench.conformance.driving.state import check_state, named
+from bench.conformance.driving.traffic import observations, victim
+from bench.driving import ActionType, DrivingAttack, ObservationThreat
+from bench.driving.attacker import Attacker
+
+EPISODES, STEPS = 6, 4
+ENDING, ENDED_AT = (1, 4), 2
+"""Episodes that end early, and the step at which they have ended."""
+
+
+class AttackMemorySuite(Suite):
+    """Of a `DrivingAttack`, with a memory or without, as a run drives it."""
+
+    component: DrivingAttack
+
+    def checks(self) -> Mapping[str, Check]:
+        return {
+            "memory": self.state_of_the_episodes,
+            "memory, episodes": self.ended_episodes_do_not_matter,
+            "memory, object": self.keeps_nothing,
+        }
+
+    def state_of_the_episodes(self) -> str:
+        """The state is a TensorDict with a row an episode, from the first step on, and costs no query."""
+        for action_type in self.component.action_types:
+            observation = self._observations()[0]
+            oracle = self._attacker(action_type).oracle
+            oracle.begin_step(observation)
+            with torch.no_grad(), refusals_are_broken_rules():
+                first = self.component.initial(observation, oracle)
+                require(not oracle.spent.any(), "initial asked the victim: ask in step, where queries are counted")
+                check_state(first, "initial", EPISODES)
+                answer = self.component.step(observation, oracle, first)
+            require(
+                isinstance(answer, tuple) and len(answer) == 2,
+                "step must return two things: what the victim is shown, and the state",
+            )
+            _check_step(first, answer[1])
+        return named(first)
+
+    def ended_episodes_do_not_matter(self) -> None:
+        """The state of an episode stays with it while others end."""
+        changed = self._observations()
+        changed[:ENDED_AT, list(ENDING)] = self._observations(seed=100)[:ENDED_AT, list(ENDING)]
+        kept = [episode for episode in range(EPISODES) if episode not in ENDING]
+        for action_type in self.component.action_types:
+            first, second = (
+                torch.stack(self._shown(action_type, batch))[:, kept] for batch in (self._observations(), changed)
+            )
+            require(
+                torch.allclose(first, second, atol=1e-9),
+                "what an episode is shown changes with episodes that have ended: keep what you remember in the state that "
+                "initial and step return, one row an episode",
+            )
+
+    def keeps_nothing(self) -> None:
+        """The attack object itself remembers nothing: many runs use it at once."""
+        for action_type in self.component.action_types:
+            alone = self._shown(action_type, self._observations())
+            beside = self._shown(action_type, self._observations(), beside=self._observations(seed=100))
+            require(
+                all(torch.equal(one, other) for one, other in zip(alone, beside, strict=True)),
+                "another run with the same attack object changes what is shown: keep what you remember in the state that "
+                "initial and step return, not on the object",
+            )
+
+    def _shown(self, action_type: ActionType, batch: Tensor, beside: Tensor | None = None) -> list[Tensor]:
+        """What the victim is shown at every step of a batch [STEPS, B, V, F], while another run takes turns with it."""
+        runs = [self._attacker(action_type)] + ([] if beside is None else [self._attacker(action_type, seed=1)])
+        running = torch.ones(EPISODES, dtype=torch.bool)
+        shown = []
+        for step in range(STEPS):
+            running[list(ENDING)] = step < ENDED_AT
+            for run, seen in zip(runs, (batch, beside), strict=False):
+                assert seen is not None
+                with torch.no_grad(), refusals_are_broken_rules():
+                    answer = run.show(seen[step], running, None)
+                if run is runs[0]:
+                    shown.append(answer.observation)
+        return shown
+
+    def _attacker(self, action_type: ActionType, seed: int = 0) -> Attacker:
+        facts = self.subject.world.facts
+        policy = victim(action_type, facts).double()
+        return Attacker(self.component, policy, ObservationThreat(), facts.features, seed=seed)
+
+    def _observations(self, seed: int = 0) -> Tensor:
+        """[STEPS, B, V, F] in double precision, so that rounding decides no sign."""
+        features = self.subject.world.features
+        steps = [observations(EPISODES, features=features, seed=seed + step) for step in range(STEPS)]
+        return torch.stack(steps).double()
+
+
+def _check_step(before: TensorDictBase | None, after: TensorDictBase | None) -> None:
+    """Raise BrokenRuleError unless a step keeps the form of the state."""
+    require(
+        before is not None or after is None,
+        "step returns a state, but initial gave none: write initial, which begins it",
+    )
+    require(before is None or after is not None, "step returns None as the state: return it even where it is unchanged")
+    check_state(after, "step", EPISODES)
+    if before is None or after is None:
+        return
+    forms = [{name: (value.dtype, value.shape) for name, value in state.items(True, True)} for state in (before, after)]
+    require(forms[0] == forms[1], "step changed names, types or shapes in the state: give them in initial as they stay")

@@ -1,0 +1,189 @@
+"""The rules for policies over several steps: what a policy remembers is in its state, and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from bench.conformance.check import Check, NotApplicableError, Subject, Suite, one_line, require
+from bench.conformance.driving.remembering import Remembering
+from bench.conformance.driving.state import ATOL, RTOL, check_state, close, named, same
+from bench.conformance.driving.traffic import observations, rows_of_observation
+from bench.driving import ObservationThreat, Oracle, Policy, State
+from bench.driving.oracle import CHUNK
+from bench.driving.policy import rows_of
+from bench.errors import UserError
+from bench.scenarios import SeedBlock
+
+EPISODES, STEPS = 6, 3
+SUBSETS = ((4,), (5, 0, 3), (2, 1))
+"""Episodes asked about, in orders of their own."""
+POINTS = CHUNK // EPISODES + 2
+"""Points asked about in each episode: more than the oracle answers at once, so that it splits an episode's."""
+ON_THE_OBJECT = "keep what it remembers in the state that initial and advance return, not on the object"
+
+
+class PolicyMemorySuite(Suite):
+    """Of what a `DrivingVictim` or a `DrivingDefense` loads, with a memory or without."""
+
+    def __init__(self, subject: Subject) -> None:
+        super().__init__(subject)
+        self.features, self.rows = subject.world.features, rows_of_observation(subject.world)
+
+    def checks(self) -> Mapping[str, Check]:
+        return {
+            "memory": self.state_of_the_episodes,
+            "memory, scores": self.scores_are_pure,
+            "memory, subsets": self.any_subset_in_any_chunk,
+            "memory, episodes": self.neighbours_do_not_matter,
+            "memory, object": self.keeps_nothing,
+            **({"memory of the victim": self.passes_on} if self.subject.kind == "defense" else {}),
+        }
+
+    def state_of_the_episodes(self) -> str:
+        """The state is a TensorDict with a row an episode; a policy without a memory has None."""
+        policy = self.subject.load()
+        first = policy.initial(_episodes())
+        check_state(first, "initial", EPISODES)
+        after = self._advanced(policy, first, 0)
+        require(
+            first is not None or after is None, "advance returns a state, but initial gave None: begin it in initial"
+        )
+        require(first is None or after is not None, "advance returns None: return the state of the next step")
+        check_state(after, "advance", EPISODES)
+        again = policy.initial(_episodes())
+        require(same(first, again), "initial gives two states for the same episodes: draw from a seeded generator only")
+        return named(first)
+
+    def scores_are_pure(self) -> None:
+        """Asking changes no state, and the same question has the same answer, also after the step."""
+        policy = self.subject.load()
+        state = policy.initial(_episodes())
+        for step in range(STEPS):
+            before = None if state is None else state.clone()
+            observation = self._observations(step)
+            first = policy.scores(observation, state)
+            policy.scores(self._observations(100), state)
+            require(
+                same(before, state), "scores changed the state it was given: work on a copy, and change it in advance"
+            )
+            after = self._advanced(policy, state, step)
+            require(same(before, state), "advance changed the state it was given: return a new TensorDict")
+            require(
+                torch.equal(policy.scores(observation, state), first),
+                f"asked again about an earlier step, it scores differently: {ON_THE_OBJECT}",
+            )
+            state = after
+
+    def any_subset_in_any_chunk(self) -> None:
+        """An attack may ask about some of the episodes, in any order, and about many points at once."""
+        policy, state = self._after_some_steps()
+        observation = self._observations(STEPS)
+        together = policy.scores(observation, state)
+        for subset in SUBSETS:
+            rows = torch.tensor(subset)
+            alone = policy.scores(observation[rows], rows_of(state, rows))
+            require(
+                torch.allclose(alone, together[rows], rtol=RTOL, atol=ATOL),
+                f"asked about episodes {list(subset)} only, it scores differently: use the rows of the state that is given",
+            )
+            self._check_oracle(policy, state, rows)
+
+    def _check_oracle(self, policy: Policy, state: State, rows: Tensor) -> None:
+        """Points asked through the oracle get the scores that the policy gives when it is asked itself."""
+        observation = self._observations(STEPS)
+        generator = torch.Generator().manual_seed(0)
+        threat = ObservationThreat(queries=POINTS)
+        oracle = Oracle(policy, threat, "scores", self.features, generator)
+        oracle.begin_step(observation, state)
+        share = 2 * torch.rand(POINTS, *observation[rows].shape, generator=generator) - 1
+        points = oracle.project(observation[rows] + share * oracle.radius[rows], rows)
+        answered = oracle.scores(points, rows)
+        for place in (0, POINTS - 1):
+            asked = policy.scores(points[place], rows_of(state, rows))
+            require(
+                torch.allclose(answered[place], asked, rtol=RTOL, atol=ATOL),
+                "asked about many points at once, it scores differently: a row of the state belongs to the same row of the "
+                "observation",
+            )
+
+    def neighbours_do_not_matter(self) -> None:
+        """An episode's state is the same alone and among others."""
+        _, state = self._after_some_steps()
+        if state is None:
+            raise NotApplicableError("it remembers nothing")
+        for subset in SUBSETS:
+            rows = torch.tensor(subset)
+            alone = self._after_some_steps(rows)[1]
+            require(
+                close(alone, state[rows]),
+                "what is remembered of an episode changes with the others of the batch: begin and advance it row by row",
+            )
+
+    def keeps_nothing(self) -> None:
+        """Another batch on the same object, and questions in between, change nothing: the state is all there is."""
+        policy, state = self._after_some_steps()
+        expected = policy.scores(self._observations(STEPS), state)
+        asked = self.subject.load()
+        state, other = asked.initial(_episodes()), asked.initial(_episodes() + EPISODES)
+        for step in range(STEPS):
+            for question in range(3):
+                asked.scores(self._observations(200 + question), state)
+            other = self._advanced(asked, other, 100 + step)
+            state = self._advanced(asked, state, step)
+        require(
+            torch.equal(asked.scores(self._observations(STEPS), state), expected),
+            f"questions and other batches in between change its scores: {ON_THE_OBJECT}",
+        )
+
+    def passes_on(self) -> None:
+        """A defence of a victim with a memory passes on what the victim remembers."""
+        facts = self.subject.world.facts
+        victim = Remembering(actions=self.subject.victim.action_type)
+        try:
+            policy = self.subject.component.load(victim, 0, facts)
+        except (UserError, NotImplementedError) as error:
+            raise NotApplicableError(f"it cannot be loaded for a victim with a memory: {one_line(error)}") from None
+        before = state = policy.initial(_episodes())
+        require(
+            state is not None,
+            "initial gives None where the victim remembers something: derive from PolicyWrapper, or call the policy's own",
+        )
+        for step in range(STEPS):
+            state = self._advanced(policy, state, step)
+        first, last = (policy.scores(self._observations(STEPS), one) for one in (before, state))
+        require(
+            not torch.equal(first, last),
+            "what the victim remembers makes no difference: call policy.scores with the state, and policy.advance",
+        )
+
+    def _after_some_steps(self, rows: Tensor | None = None) -> tuple[Policy, State]:
+        """The policy, loaded anew, and what it remembers of all episodes, or of some that were driven alone."""
+        policy = self.subject.load()
+        state = policy.initial(_episodes() if rows is None else _episodes()[rows])
+        for step in range(STEPS):
+            state = self._advanced(policy, state, step, rows)
+        return policy, state
+
+    def _advanced(self, policy: Policy, state: State, step: int, rows: Tensor | None = None) -> State:
+        """The state after a step with the same actions for every policy."""
+        observation, action = self._observations(step), self._actions(policy, step)
+        if rows is not None:
+            observation, action = observation[rows], action[rows]
+        return policy.advance(observation, action, state)
+
+    def _actions(self, policy: Policy, step: int) -> Tensor:
+        """[B] or [B, 2], different for every episode."""
+        number = torch.arange(EPISODES) + step
+        if policy.action_type == "discrete":
+            return number % len(self.subject.world.facts.actions)
+        return torch.stack((number.sin(), number.cos()), -1)
+
+    def _observations(self, step: int) -> Tensor:
+        return observations(EPISODES, features=self.features, rows=self.rows, seed=step)
+
+
+def _episodes() -> Tensor:
+    return torch.arange(SeedBlock.REPORT, SeedBlock.REPORT + EPISODES)

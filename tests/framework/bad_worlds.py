@@ -1,0 +1,199 @@
+"""Worlds that each break one rule about their cells, facts or actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+from torchrl.envs import EnvBase
+from toy_plugin import ToyEnv, ToyWorld  # type: ignore[import-not-found]
+
+from bench.driving import ActionType, Driver, DrivingFacts
+from bench.errors import UserError
+from bench.plugins.contracts import Facts
+from bench.scenarios import Axes, Axis, Cell, Grid
+
+
+def axes(**changes: Any) -> Axes:
+    """One axis, `gap`, with some values of it changed."""
+    return Axes((Axis(**{"name": "gap", "kind": "int", "meaning": "to the car ahead", "unit": "m"} | changes),))
+
+
+def grid(world: str, of: Axes, value: int = 20) -> Grid:
+    """A grid of a single cell."""
+    return Grid(name=f"{world}-v1", world=world, axes=of, values={next(iter(of)): (value,)}, episodes=2)
+
+
+PLAIN = axes()
+NAMELESS, TAKEN, DEFAULTED = axes(name="the gap"), axes(name="seeds"), axes(low=10, default=5)
+SILENT = axes(meaning="")
+GRIDS = {
+    "nameless": grid("nameless", NAMELESS),
+    "taken": grid("taken", TAKEN),
+    "silent": grid("silent", SILENT),
+    "defaulted": grid("defaulted", DEFAULTED),
+    "otheraxes": grid("otheraxes", axes(unit="km")),
+    **{name: grid(name, PLAIN) for name in ("lying", "general", "unwritten", "timeless", "miscounted", "driverless")},
+    "choosy": replace(grid("choosy", PLAIN), values={"gap": (20, 30)}),
+    "refusing": grid("refusing", PLAIN),
+}
+(NAMELESS_V1, TAKEN_V1, SILENT_V1, DEFAULTED_V1, OTHERAXES_V1, LYING_V1, GENERAL_V1, UNWRITTEN_V1, TIMELESS_V1,
+ MISCOUNTED_V1, DRIVERLESS_V1, CHOOSY_V1, REFUSING_V1) = GRIDS.values()  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bad(ToyWorld):
+    """One axis, and a rule that is broken."""
+
+    axes: ClassVar[Axes] = PLAIN
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nameless(Bad):
+    """The name of its axis has a space."""
+
+    axes: ClassVar[Axes] = NAMELESS
+    grid: ClassVar[str] = "nameless-v1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taken(Bad):
+    """Its axis is called as an option of a run."""
+
+    axes: ClassVar[Axes] = TAKEN
+    grid: ClassVar[str] = "taken-v1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Silent(Bad):
+    """Its axis has no meaning."""
+
+    axes: ClassVar[Axes] = SILENT
+    grid: ClassVar[str] = "silent-v1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Defaulted(Bad):
+    """The default of its axis is out of the bounds."""
+
+    axes: ClassVar[Axes] = DEFAULTED
+    grid: ClassVar[str] = "defaulted-v1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gridless(Bad):
+    """Its grid is not there."""
+
+    grid: ClassVar[str] = "gridless-v1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Borrowing(Bad):
+    """Its grid is of another world."""
+
+    grid: ClassVar[str] = "standard-v1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Otheraxes(Bad):
+    """Its grid has other axes."""
+
+    grid: ClassVar[str] = "otheraxes-v1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lying(Bad):
+    """Its facts tell of other axes."""
+
+    grid: ClassVar[str] = "lying-v1"
+
+    @property
+    def facts(self) -> DrivingFacts:
+        return replace(super().facts, axes=NAMELESS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class General(Bad):
+    """Its facts are not those of its track."""
+
+    grid: ClassVar[str] = "general-v1"
+
+    @property
+    def facts(self) -> Any:
+        return Facts(axes=self.axes)
+
+
+class _Unwritten(DrivingFacts):
+    def written(self) -> dict[str, Any]:
+        return {"cells": {1, 2}}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unwritten(Bad):
+    """Its facts cannot be written as JSON."""
+
+    grid: ClassVar[str] = "unwritten-v1"
+
+    @property
+    def facts(self) -> DrivingFacts:
+        return _Unwritten(**vars(super().facts))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timeless(Bad):
+    """It never decides."""
+
+    grid: ClassVar[str] = "timeless-v1"
+
+    @property
+    def decision_hz(self) -> float:
+        return 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Miscounted(Bad):
+    """It names three actions and takes five."""
+
+    grid: ClassVar[str] = "miscounted-v1"
+    actions: ClassVar[tuple[str, ...]] = ("LEFT", "STRAIGHT", "RIGHT")
+
+    def make(self, cells: Sequence[Cell], *, action_type: ActionType = "discrete", **kwargs: Any) -> EnvBase:
+        return ToyEnv(cells, 5 if action_type == "discrete" else 0, self.max_steps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Driverless(Bad):
+    """It names a driver that it cannot make."""
+
+    grid: ClassVar[str] = "driverless-v1"
+    drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm")
+
+    def make(self, cells: Sequence[Cell], *, driver: Driver = "agent", **kwargs: Any) -> EnvBase:
+        if driver == "idm":
+            raise KeyError("idm")
+        return super().make(cells, driver=driver, **kwargs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choosy(Bad):
+    """It cannot start one of the cells of its own grid."""
+
+    grid: ClassVar[str] = "choosy-v1"
+
+    def make(self, cells: Sequence[Cell], **kwargs: Any) -> EnvBase:
+        if any(cell.gap > 20 for cell in cells):
+            raise ValueError("the gap is too large")
+        return super().make(cells, **kwargs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refusing(Bad):
+    """It takes no continuous actions, which it may."""
+
+    grid: ClassVar[str] = "refusing-v1"
+
+    def make(self, cells: Sequence[Cell], *, action_type: ActionType = "discrete", **kwargs: Any) -> EnvBase:
+        if action_type == "continuous":
+            raise UserError("nobody steers here")
+        return super().make(cells, action_type=action_type, **kwargs)

@@ -1,0 +1,103 @@
+"""`bench check` of worlds: any axes and any number of actions pass, and what a run could not use is found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bench.conformance import examine
+from bench.plugins.track import track
+from tests.framework.conftest import Bench
+from tests.framework.distributions import install
+from tests.framework.test_third_track import POINTS as LISTENING
+
+BAD = (
+    *(
+        "nameless",
+        "taken",
+        "silent",
+        "defaulted",
+        "gridless",
+        "borrowing",
+        "otheraxes",
+        "lying",
+        "general",
+        "unwritten",
+    ),
+    *("timeless", "miscounted", "driverless", "choosy", "refusing"),
+)
+POINTS = {
+    "cavbench.worlds": {name: f"bad_worlds_plugin:{name.capitalize()}" for name in BAD},
+    "cavbench.grids": {
+        f"{name}-v1": f"bad_worlds_plugin:{name.upper()}_V1" for name in BAD if name not in ("gridless", "borrowing")
+    },
+}
+RULES = {
+    "nameless": ("axes", "the axis 'the gap' cannot be typed as NAME=VALUE"),
+    "taken": ("axes", "the axis 'seeds' has the name of an option of `bench run`: rename it"),
+    "silent": ("axes", "the axis 'gap' has no meaning: say in a few words what it is"),
+    "defaulted": ("axes", "the axis 'gap' does not allow its own value"),
+    "gridless": ("grids", "give its grid an entry point in cavbench.grids"),
+    "borrowing": ("grids", "the grid 'standard-v1' is of the world 'highway'"),
+    "otheraxes": ("grids", "give both the same Axes object"),
+    "lying": ("facts", "facts.axes are not the world's axes"),
+    "general": ("features", "facts is a Facts, not a bench.driving.DrivingFacts"),
+    "unwritten": ("facts", "facts.written() must hold plain JSON values"),
+    "timeless": ("decisions", "decision_hz must be above 0, got 0.0"),
+    "miscounted": ("decisions", "the action_spec of the environment has 5 actions, facts.actions names 3"),
+    "driverless": ("drivers", "KeyError: 'idm'"),
+    "choosy": ("cells", "ValueError: the gap is too large"),
+}
+
+
+@pytest.fixture
+def bad_worlds(plugins: Path, toy_folder: Path) -> None:
+    source = Path(__file__).with_name("bad_worlds.py").read_text()
+    install(plugins, "bad-worlds", POINTS, {"bad_worlds_plugin": source})
+
+
+@pytest.mark.usefixtures("bad_worlds")
+@pytest.mark.parametrize("world", RULES)
+def test_a_broken_rule_is_found_and_what_to_do_is_said(world: str) -> None:
+    check, part = RULES[world]
+    failed = {outcome.check: outcome.text for outcome in examine("world", world) if outcome.status == "fail"}
+    assert part in failed[check]
+    assert "\n" not in failed[check]
+
+
+@pytest.mark.usefixtures("bad_worlds")
+def test_a_world_may_refuse_continuous_actions() -> None:
+    outcomes = {outcome.check: outcome for outcome in examine("world", "refusing")}
+    assert {outcome.status for outcome in outcomes.values()} == {"pass"}
+    assert outcomes["actions"].text == "continuous actions are refused: nobody steers here"
+
+
+@pytest.mark.usefixtures("toy_folder")
+@pytest.mark.parametrize("world", ["toy", "bend", "red_street"])
+def test_a_world_with_axes_and_actions_of_its_own_passes(world: str) -> None:
+    assert {outcome.check: outcome.text for outcome in examine("world", world) if outcome.status != "pass"} == {}
+
+
+@pytest.mark.usefixtures("toy_folder")
+def test_a_victim_is_tried_in_the_world_that_is_named(bench: Bench) -> None:
+    assert bench("check", "toy", "world=bend").code == 0
+    blind = {outcome.check: outcome for outcome in examine("victim", "blind", {"policy": "straight"}, world="bend")}
+    assert blind["shape and type"].status == "pass"
+    assert (
+        "unknown victim.policy 'straight'"
+        in {o.check: o.text for o in examine("victim", "blind", {"policy": "straight"})}["behaviour"]
+    )
+
+
+def test_a_track_without_checks_of_its_own_has_those_of_every_component(plugins: Path) -> None:
+    source = Path(__file__).with_name("toy_track.py").read_text()
+    install(plugins, "cavbench-listening", LISTENING, {"toy_track_plugin": source})
+    track.cache_clear()
+    for kind, name in (("attack", "down"), ("victim", "ear"), ("world", "booth")):
+        outcomes = {outcome.check: outcome for outcome in examine(kind, name)}  # type: ignore[arg-type]
+        assert outcomes["docs"].status == "pass"
+        assert outcomes["behaviour"].status == "skip"
+        assert "the track 'listening' has no checks of its own" in outcomes["behaviour"].text
+    assert outcomes["grids"].text == "melodies-v1; melodies-v1 has 2 cells"
+    track.cache_clear()
