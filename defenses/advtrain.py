@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -25,6 +26,7 @@ from bench.driving.threat import Norm
 from bench.errors import UserError
 from bench.plugins.contracts import Progress, Trained
 from bench.plugins.options import configured, parameter_words
+from bench.plugins.ranges import Count, NotNegative, Share
 from bench.victims import zoo
 from bench.victims.drivers.networks import ActorPolicy
 
@@ -62,36 +64,24 @@ class AdversarialTraining(DrivingDefense):
             `bench train` sets it.
     """
 
-    training: ClassVar[int] = 1
-    """Version of the training; raised when a change of the code changes the weights that it makes."""
-
-    skip: float = 0.3
+    skip: Share = 0.3
     attack: str = "pgd"
     attack_params: str = "steps=1 step_size=1 temperature=1"
     norm: Norm = "relative"
-    budget: float = 0.1
+    budget: Annotated[float, Interval(ge=0, le=2)] = 0.1
     start: Literal["trained", "scratch"] = "trained"
-    decisions: int = 8_000
-    consistency: float = 0.4
-    margin: float = 0.02
+    decisions: Count = 8_000
+    consistency: NotNegative = 0.4
+    margin: NotNegative = 0.02
     where: Literal["acting", "replay", "both"] = "both"
-    ramp_from: float = 0.0
-    ramp_to: float = 0.3
+    ramp_from: Share = 0.0
+    ramp_to: Share = 0.3
     trained_in: str = ""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.skip <= 1:
-            raise ValueError(f"skip must be between 0 and 1, got {self.skip}")
-        if self.decisions < 1:
-            raise ValueError(f"decisions must be at least 1, got {self.decisions}")
-        for name in ("consistency", "margin"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
-        if not 0 <= self.ramp_from <= self.ramp_to <= 1:
-            raise ValueError(
-                f"ramp_from and ramp_to must be in order between 0 and 1, got {self.ramp_from} and {self.ramp_to}"
-            )
-        ObservationThreat(norm=self.norm, budget=self.budget)
+        super().__post_init__()
+        if self.ramp_from > self.ramp_to:
+            raise ValueError(f"ramp_from must be at most ramp_to, got {self.ramp_from} and {self.ramp_to}")
 
     def zoo_name(self, victim: DrivingVictim) -> str:
         return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"

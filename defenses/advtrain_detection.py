@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 from dataclasses import asdict, dataclass
-from typing import ClassVar
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from bench.detection import (
@@ -23,6 +24,7 @@ from bench.detection import (
 from bench.errors import UserError
 from bench.plugins.contracts import Facts, Progress, Trained
 from bench.plugins.options import configured, parameter_words
+from bench.plugins.ranges import Count, Natural, NotNegative, Positive, Share
 from bench.victims import zoo
 from bench.victims.detectors.loss import missed, unlike
 from bench.victims.detectors.training import descend
@@ -59,35 +61,19 @@ class DetectorAdversarialTraining(DetectorDefense):
         trained_in: parameters of the world it was trained in where they are not the default; `bench train` sets it.
     """
 
-    training: ClassVar[int] = 1
-    """Version of the training; raised when a change of the code changes the weights that it makes."""
-
-    skip: float = 0.3
+    skip: Share = 0.3
     attack: str = "eot"
     attack_params: str = "steps=40 batch=6 window=224 learning_rate=0.08"
-    budget: float = 0.5
-    rounds: int = 12
-    updates: int = 30
-    shown: int = 8
-    batch: int = 8
-    window: int = 224
-    learning_rate: float = 3e-4
-    fidelity: float = 0.3
-    trained: int = 0
+    budget: Annotated[float, Interval(gt=0, le=1)] = 0.5
+    rounds: Count = 12
+    updates: Count = 30
+    shown: Count = 8
+    batch: Count = 8
+    window: Count = 224
+    learning_rate: Positive = 3e-4
+    fidelity: NotNegative = 0.3
+    trained: Natural = 0
     trained_in: str = ""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.skip <= 1:
-            raise ValueError(f"skip must be between 0 and 1, got {self.skip}")
-        for name in ("rounds", "updates", "shown", "batch", "window"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate must be above 0, got {self.learning_rate}")
-        for name in ("fidelity", "trained"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
-        PatchThreat(budget=self.budget)
 
     @property
     def trains(self) -> bool:

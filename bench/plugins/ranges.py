@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import types
 import typing
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -33,7 +33,8 @@ def check(instance: Any) -> None:
     Raises:
         ValueError: in one line: which field, what is allowed, what it is.
     """
-    for name, hint in _hints(type(instance)).items():
+    kind: Any = type(instance)
+    for name, hint in _hints(kind).items():
         value = getattr(instance, name)
         if value is not None and not _allows(hint, value):
             raise ValueError(f"{name} must be {words(hint)}, got {value!r}")

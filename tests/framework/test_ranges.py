@@ -70,7 +70,16 @@ def test_a_share_is_a_number_from_0_to_1(value: float) -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"count": 0}, {"positive": 0.0}, {"low": -1e-9}, {"half": 0.0}, {"half": 2.1}, {"name": "c"}, {"maybe": 0}, {"count": True}],
+    [
+        {"count": 0},
+        {"positive": 0.0},
+        {"low": -1e-9},
+        {"half": 0.0},
+        {"half": 2.1},
+        {"name": "c"},
+        {"maybe": 0},
+        {"count": True},
+    ],
 )
 def test_what_is_out_of_range_is_refused(wrong: dict[str, object]) -> None:
     ((name, value),) = wrong.items()

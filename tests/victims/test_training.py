@@ -52,7 +52,7 @@ def test_the_card_says_how_the_checkpoint_was_chosen(world: DrivingWorld) -> Non
 def test_returns_end_where_the_episode_ends(world: DrivingWorld) -> None:
     victim = DQN(**SHORT | {"copies": 4, "crash_penalty": 1000.0})
     phase = victim.phases(TrainingHooks())[0]
-    env = world.make(roads(4), action_type="discrete", action_repeat=phase.repeat)
+    env = world.make(roads(world, 4), action_type="discrete", action_repeat=phase.repeat)
     env.set_seed(0)
     learner = victim.learner(env, TrainingHooks())
     learner.enter(phase)
@@ -131,7 +131,7 @@ class Lesson:
         torch.manual_seed(0)
         discrete = victim.action_type == "discrete"
         shape = {"features": 5, "hidden": 8}
-        self.victim, self.env = victim, world.make(roads(1), action_type=victim.action_type)
+        self.victim, self.env = victim, world.make(roads(world, 1), action_type=victim.action_type)
         self.teacher = QPolicy(actions=5, **shape) if discrete else ActorPolicy(steering_limit=0.1, **shape)
         self.truth = torch.rand(64, 10, 5)
         self.shown = (self.truth + 0.3 * torch.randn(self.truth.shape)).clamp(-1, 1)

@@ -19,6 +19,7 @@ from torch.optim.swa_utils import update_bn
 from bench.detection import CameraWorld, Detector, DetectorVictim, Predictions
 from bench.errors import UserError
 from bench.plugins.contracts import Facts, Progress, Trained
+from bench.plugins.ranges import Count, Natural, Positive
 from bench.victims import zoo
 from bench.victims.detectors import coco, yolo, yolov5_file
 from bench.victims.detectors.loss import supervised
@@ -210,28 +211,20 @@ class YOLOv5(DetectorVictim):
     """
 
     learns: ClassVar[bool] = True
-    training: ClassVar[int] = 1
-    """Version of the training; raised when a change of the code changes the weights that it makes."""
 
     size: Size = "n"
     path: str = ""
-    trained: int = 0
-    updates: int = 1200
-    batch: int = 12
+    trained: Natural = 0
+    updates: Count = 1200
+    batch: Count = 12
     window: int = 320
-    learning_rate: float = 2e-3
+    learning_rate: Positive = 2e-3
     trained_in: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("updates", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"yolov5.{name} must be at least 1, got {getattr(self, name)}")
+        super().__post_init__()
         if self.window < STRIDES[-1] or self.window % STRIDES[-1]:
-            raise ValueError(f"yolov5.window must be a multiple of {STRIDES[-1]}, got {self.window}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"yolov5.learning_rate must be above 0, got {self.learning_rate}")
-        if self.trained < 0:
-            raise ValueError(f"yolov5.trained must be at least 0, got {self.trained}")
+            raise ValueError(f"window must be a multiple of {STRIDES[-1]}, got {self.window}")
 
     def zoo_name(self) -> str:
         return f"yolov5{self.size}"

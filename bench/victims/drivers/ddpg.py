@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
@@ -15,6 +17,7 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
 from bench.driving import ActionType, Policy, TrainingHooks
+from bench.plugins.ranges import Count, NotNegative
 from bench.victims.drivers.learner import CHUNK, Learner, Phase, copy_weights
 from bench.victims.drivers.networks import Actor, ActorPolicy, Critic
 from bench.victims.drivers.training import LearningDriver
@@ -37,20 +40,11 @@ class DDPG(LearningDriver):
     policy_type = ActorPolicy
 
     # Smaller and shorter than the DQN's: actor and critic learn in turns, and it is the clock that ends it.
-    decisions: int = 24_000
-    hidden: int = 64
-    steering_limit: float = 0.1
-    noise: float = 0.15
-    actor_delay: int = 2
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.steering_limit <= 1:
-            raise ValueError(f"steering_limit must be in (0, 1], got {self.steering_limit}")
-        if self.noise < 0:
-            raise ValueError(f"noise must be at least 0, got {self.noise}")
-        if self.actor_delay < 1:
-            raise ValueError(f"actor_delay must be at least 1, got {self.actor_delay}")
+    decisions: Count = 24_000
+    hidden: Count = 64
+    steering_limit: Annotated[float, Interval(gt=0, le=1)] = 0.1
+    noise: NotNegative = 0.15
+    actor_delay: Count = 2
 
     @property
     def action_type(self) -> ActionType:

@@ -15,11 +15,10 @@ from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
 from bench.driving import ActionType, Policy, TrainingHooks
+from bench.plugins.ranges import Share
 from bench.victims.drivers.learner import CHUNK, Learner, Phase, copy_weights
-from bench.victims.drivers.networks import QNetwork, QPolicy
+from bench.victims.drivers.networks import QPolicy
 from bench.victims.drivers.training import LearningDriver
-
-ACTIONS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,12 +34,7 @@ class DQN(LearningDriver):
 
     policy_type = QPolicy
 
-    final_epsilon: float = 0.02
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 <= self.final_epsilon <= 1:
-            raise ValueError(f"final_epsilon must be between 0 and 1, got {self.final_epsilon}")
+    final_epsilon: Share = 0.02
 
     @property
     def action_type(self) -> ActionType:
@@ -58,13 +52,14 @@ class _QLearner(Learner):
         super().__init__(hooks)
         self.recipe, self.gap = recipe, 0.0
         batch, _, features = env.observation_spec["observation"].shape
-        self.policy: QPolicy = QPolicy(features, ACTIONS, recipe.hidden)
-        self.mean = QPolicy(features, ACTIONS, recipe.hidden)
+        actions = int(env.action_spec.space.n)
+        self.policy: QPolicy = QPolicy(features, actions, recipe.hidden)
+        self.mean = QPolicy(features, actions, recipe.hidden)
         if hooks.start is not None:
             self.policy.load_state_dict(hooks.start.state_dict())
-        actor = _actor(self.policy.network)
+        actor = _actor(self.policy)
         self.greedy = EGreedyModule(
-            Categorical(ACTIONS, shape=(batch,)),
+            Categorical(actions, shape=(batch,)),
             eps_init=1.0 if hooks.start is None else recipe.final_epsilon,
             eps_end=recipe.final_epsilon,
             annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
@@ -104,9 +99,10 @@ class _QLearner(Learner):
         self.greedy.step()
 
     def averaged(self) -> Policy:
-        copy_weights(self.loss.target_value_network_params, _actor(self.mean.network))
+        copy_weights(self.loss.target_value_network_params, _actor(self.mean))
         return self.mean
 
 
-def _actor(network: QNetwork) -> QValueActor:
-    return QValueActor(network, in_keys=["observation"], spec=Categorical(ACTIONS), action_space="categorical")
+def _actor(policy: QPolicy) -> QValueActor:
+    actions = Categorical(policy.shape["actions"])
+    return QValueActor(policy.network, in_keys=["observation"], spec=actions, action_space="categorical")

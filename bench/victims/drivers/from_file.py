@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from bench.errors import UserError, reason
+from bench.plugins.ranges import Count
 
 CONTROLS = 2
 """Numbers of a continuous action: acceleration and steering."""
@@ -81,13 +82,8 @@ class FileDriver(DrivingVictim):
 
     path: str
     actions: Literal["discrete", "continuous"] = "discrete"
-    rows: int = 10
-    features: int = 5
-
-    def __post_init__(self) -> None:
-        for name in ("rows", "features"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"victim.{name} must be at least 1, got {getattr(self, name)}")
+    rows: Count = 10
+    features: Count = 5
 
     @property
     def action_type(self) -> ActionType:

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import itertools
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, ExplorationType, MultiStepTransform, set_exploration_type
 
+from bench.driving import DrivingWorld
 from bench.plugins import registry
 from bench.scenarios import Cell
 from bench.victims.drivers.learner import Learner, Phase
 
 
-def roads(copies: int) -> list[Cell]:
-    """The roads of the standard grid in clear weather, `copies` of each: one batch practises on all of them."""
-    grid = registry.grid("standard-v1")
-    pairs = itertools.product(grid.values["lanes"], grid.values["density"])
-    return [Cell(lanes=lanes, density=density, weather="clear") for lanes, density in pairs for _ in range(copies)]
+def roads(world: DrivingWorld, copies: int) -> list[Cell]:
+    """The roads of a world's own grid, `copies` of each: one batch practises on all of them.
+
+    Perceptual axes are at their first value: it practises in clear weather.
+    """
+    cells = dict.fromkeys(world.axes.unperceived(cell) for cell in registry.grid(world.grid).cells())
+    return [cell for cell in cells for _ in range(copies)]
 
 
 class Practice:

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from bench.driving import DrivingWorld, Policy, TrainingHooks
+from bench.driving.metrics import safe_progress
 from bench.scenarios import SeedBlock
 from bench.victims.drivers.practice import roads
 
@@ -27,7 +28,7 @@ def selection_score(
         episodes: a road.
         show: what the policy is shown for an observation [B, V, F]; None is the truth.
     """
-    cells = roads(episodes)
+    cells = roads(world, episodes)
     env = world.make(cells, action_type=policy.action_type)
     seeds = torch.arange(SeedBlock.SELECT, SeedBlock.SELECT + episodes).repeat(len(cells) // episodes)
     td = env.reset(TensorDict({"seed": seeds}, batch_size=env.batch_size))
@@ -44,8 +45,8 @@ def selection_score(
         failed |= (td["info", "crashed"] | td["info", "offroad"]).squeeze(-1) & running
         if bool(td["done"].all()):
             break
-    score = torch.where(failed, 0.0, progress / world.max_steps).view(-1, episodes).mean(1)
-    names = [f"{cell.lanes} lanes, density {cell.density:g}" for cell in cells[::episodes]]
+    score = safe_progress(progress, failed, world.max_steps).view(-1, episodes).mean(1)
+    names = [str(cell) for cell in cells[::episodes]]
     return {"mean": float(score.mean()), **dict(zip(names, score.tolist(), strict=True))}
 
 

@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from bench.driving import DrivingFacts, DrivingVictim, DrivingWorld, Policy, TrainingHooks
 from bench.plugins.contracts import Progress, Trained
+from bench.plugins.ranges import Count, Share
 from bench.scenarios import SeedBlock
 from bench.victims import zoo
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
@@ -50,33 +51,23 @@ class LearningDriver(DrivingVictim):
     """
 
     learns: ClassVar[bool] = True
-    training: ClassVar[int] = 1
-    """Version of the training; raised when a change of the code changes the weights that it makes."""
     policy_type: ClassVar[type[Policy]]
 
-    decisions: int = 36_000
-    fine: float = 0.45
-    repeat: int = 5
-    hidden: int = 128
-    gamma: float = 0.97
-    n_step: int = 3
+    decisions: Count = 36_000
+    fine: Share = 0.45
+    repeat: Count = 5
+    hidden: Count = 128
+    gamma: Share = 0.97
+    n_step: Count = 3
     crash_penalty: float = 40.0
     learning_rate: float = 5e-4
-    batch: int = 512
-    updates: int = 1
-    copies: int = 24
-    memory: int = 600_000
-    tau: float = 0.005
-    checkpoints: int = 8
+    batch: Count = 512
+    updates: Count = 1
+    copies: Count = 24
+    memory: Count = 600_000
+    tau: Share = 0.005
+    checkpoints: Count = 8
     trained_in: str = ""
-
-    def __post_init__(self) -> None:
-        for name in ("decisions", "hidden", "n_step", "repeat", "batch", "updates", "copies", "memory", "checkpoints"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("gamma", "tau", "fine"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         return zoo.load(zoo.Recipe.of(self), seed, self.policy_type)
@@ -116,7 +107,7 @@ class LearningDriver(DrivingVictim):
         phases = self.phases(hooks)
         total = sum(phase.decisions for phase in phases)
         for number, phase in enumerate(phases):
-            env = world.make(roads(self.copies), action_type=self.action_type, action_repeat=phase.repeat)
+            env = world.make(roads(world, self.copies), action_type=self.action_type, action_repeat=phase.repeat)
             env.set_seed(SeedBlock.TRAIN * (seed + 1) + number * SeedBlock.REPORT)
             learner = learner or self.learner(env, hooks)
             learner.enter(phase)

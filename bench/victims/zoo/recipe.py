@@ -64,7 +64,7 @@ class Part:
             source=f"{own.__module__.partition('.')[0]}.{own.__qualname__}",
             module=own.__module__,
             libraries=own.libraries,
-            training=getattr(own, "training", 1),
+            training=own.training,
             parameters=values,
             changed={name: value for name, value in values.items() if _differs(value, owned[name])},
         )
