@@ -37,7 +37,7 @@ class Component(ABC):
     track: ClassVar[str]
     """Name of the track, set by the base classes of a track, and by them only."""
     training: ClassVar[int] = 1
-    """Of a victim or a defence that trains: version of its training, raised when a change of the code changes the weights that it makes."""
+    """Version of what it trains, if it does; raised when a change of the code changes the weights that it makes."""
     libraries: ClassVar[tuple[str, ...]] = ()
     """Distributions that compute for it: records name their versions, beside those of torch and the rest."""
 
