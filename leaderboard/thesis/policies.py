@@ -12,11 +12,12 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.scenarios import Cell
-from leaderboard.pairs import IDM
-from leaderboard.text import ATTACKED, CLEAN, estimate, share
-from leaderboard.thesis_numbers import PUBLISHED, THESIS, Beside, as_printed
-from leaderboard.thesis_records import BUDGET, Attack, Found, Source, Victim, Wanted
-from leaderboard.trend import ENOUGH_SEEDS, trend
+from bench.tracks.driving import BEST_BLIND, IDM
+from leaderboard.comparisons.comparison import ENOUGH_SEEDS
+from leaderboard.terminal.text import ATTACKED, CLEAN, estimate, share
+from leaderboard.thesis.numbers import PUBLISHED, THESIS, Beside, as_printed
+from leaderboard.thesis.policy_records import BUDGET, CLEAR, Attack, Found, Source, Victim, Wanted
+from leaderboard.thesis.trend import trend
 
 SKIPS = (0.0, 0.3, 0.5, 1.0)
 """The thesis', and the control: the same training without an attack."""
@@ -137,10 +138,10 @@ def policy_table(section: Mapping[str, Any], source: Source) -> tuple[Table, lis
             cells += [as_printed(section["rows"].get(key, {}).get(victim)), _ours(ours), _progress(ours)]
         made.add_row(Text(label, style=CLEAN if attack == "none" else ATTACKED), *cells)
     made.add_section()
-    for label, name in (("best blind policy", "best blind"), ("IDM and MOBIL", IDM)):
+    for label, name in (("best blind policy", BEST_BLIND), ("IDM and MOBIL", IDM)):
         cells = []
         for victim in VICTIMS:
-            cells += [Text(""), estimate(source.reference(found["initial_training", victim], name), digits=0), Text("")]
+            cells += [Text(""), estimate(source.baseline(found["initial_training", victim], name), digits=0), Text("")]
         made.add_row(Text(label, style="dim"), *cells)
     made.add_section()
     for label, ratio in RATIOS.items():
@@ -182,7 +183,7 @@ def road_table(section: Mapping[str, Any], source: Source) -> tuple[Table, list[
         "\nours",
         "best\nblind",
     )
-    cells = tuple(Cell(lanes=row["lanes"], density=float(row["density"])) for row in section["rows"])
+    cells = tuple(Cell(lanes=row["lanes"], density=float(row["density"]), weather=CLEAR) for row in section["rows"])
     for row, cell in zip(section["rows"], cells, strict=True):
         clean, attacked = (source.find(Wanted("ddpg", attack), [cell]) for attack in ("none", "zo"))
         lost = float("nan")
@@ -196,7 +197,7 @@ def road_table(section: Mapping[str, Any], source: Source) -> tuple[Table, list[
             _ours(attacked),
             Text(share(1 - row["attacked"] / row["clean"]), style=THESIS),
             share(lost),
-            estimate(source.reference(clean or attacked), digits=0),
+            estimate(source.baseline(clean or attacked), digits=0),
         )
     # One command makes every road at once.
     source.missing = [(wanted, cells) for wanted, _ in source.missing]

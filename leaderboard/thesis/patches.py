@@ -10,12 +10,13 @@ import pyarrow as pa
 from rich.console import Console
 from rich.text import Text
 
-from leaderboard.approaches import NO_PATCH
-from leaderboard.layout import Column, Section, fitted
-from leaderboard.text import ATTACKED, BLIND, CLEAN, MISSING, bounds, change, estimate, share, signed
-from leaderboard.thesis_claims import configuration_claims, location_claims
-from leaderboard.thesis_numbers import PUBLISHED, THESIS, Beside, as_printed
-from leaderboard.thesis_patch_records import (
+from bench.plugins import registry
+from leaderboard.comparisons.comparison import NO_ATTACK
+from leaderboard.terminal.layout import Column, Section, fitted
+from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MISSING, bounds, change, estimate, share, signed
+from leaderboard.thesis.claims import configuration_claims, location_claims
+from leaderboard.thesis.numbers import PUBLISHED, THESIS, Beside, as_printed
+from leaderboard.thesis.patch_records import (
     CONFIGURATIONS,
     CONTROLS,
     LOCATIONS,
@@ -25,7 +26,9 @@ from leaderboard.thesis_patch_records import (
     Source,
 )
 
-CONTROL_LABELS = {"noise_patch": "random noise", "grey_patch": "grey", NO_PATCH: "no patch"}
+GRID = "approach-v1"
+"""Whose roads are the standard ones."""
+CONTROL_LABELS = {"noise_patch": "random noise", "grey_patch": "grey", NO_ATTACK: "no patch"}
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,7 @@ def location_table(section: Mapping[str, Any], source: Source) -> Made:
     sections = []
     for printed in section["rows"]:
         for theirs, ours in WEATHERS.items():
-            confidences = {row: printed[row][theirs] for row in (STANDARD, "noise_patch", NO_PATCH)}
+            confidences = {row: printed[row][theirs] for row in (STANDARD, "noise_patch", NO_ATTACK)}
             rows = _found(source, (STANDARD, *CONTROLS), ours, LOCATIONS[printed["location"]])
             lines = [Line(row, found, _derived(confidences, row)) for row, found in rows.items()]
             sections.append(Section(lines, Text(f"location {printed['location']}, {theirs}", style="bold")))
@@ -138,10 +141,10 @@ def _found(
 
 def _roads(source: Source, sections: Sequence[Section[Line]]) -> Iterator[Text]:
     """On which roads the numbers of a detector are, where those are not the standard ones."""
-    standard = frozenset((cell.lanes, cell.density) for cell in GRIDS["approach-v1"].cells())
+    standard = frozenset((cell.lanes, cell.density) for cell in registry.grid(GRID).cells())
     for place, detector in enumerate(source.detectors):
         found = [line.found[place] for section in sections for line in section.subjects]
-        roads = {frozenset((cell.lanes, cell.density) for cell in each.pair.own.cells) for each in found if each}
+        roads = {frozenset((cell.lanes, cell.density) for cell in each.of.cells) for each in found if each}
         if roads - {standard}:
             which = [", ".join(f"{lanes} × {density:g}" for lanes, density in sorted(some)) for some in roads]
             yield Text(
@@ -152,11 +155,11 @@ def _roads(source: Source, sections: Sequence[Section[Line]]) -> Iterator[Text]:
 def _derived(printed: Mapping[str, float], row: str) -> dict[str, Text | str]:
     """A confidence of the thesis, the share of the unpatched one that is lost, and what is left beyond random noise."""
     value = printed.get(row)
-    if value is None or row == NO_PATCH:
+    if value is None or row == NO_ATTACK:
         return {"confidence": as_printed(value, 3)}
     found: dict[str, Text | str] = {
         "confidence": as_printed(value, 3),
-        "lost": Text(share(1 - value / printed[NO_PATCH]), style=THESIS),
+        "lost": Text(share(1 - value / printed[NO_ATTACK]), style=THESIS),
     }
     if row not in CONTROLS:
         found["beyond"] = Text(signed(value - printed["noise_patch"], 2), style=THESIS)
@@ -175,7 +178,7 @@ def _label() -> Column[Line]:
     def value(line: Line) -> Text:
         if line.row in CONFIGURATIONS:
             return Text(CONFIGURATIONS[line.row].label, style=ATTACKED)
-        return Text(CONTROL_LABELS[line.row], style=CLEAN if line.row == NO_PATCH else BLIND)
+        return Text(CONTROL_LABELS[line.row], style=CLEAN if line.row == NO_ATTACK else BASELINE)
 
     return Column("", value, "left")
 
@@ -199,7 +202,9 @@ def _ours(source: Source) -> list[Column[Line]]:
             Column(f"{detector.victim}\nours [95 %]", _of(place, _confidence), "left"),
             Column("\nlost", _of(place, _lost), spare=1),
             Column("beyond\ncontrol", _of(place, _beyond)),
-            Column("\n[95 %]", _of(place, lambda found: bounds(found.beyond) if found.beyond else Text("")), "left", 3),
+            Column(
+                "\n[95 %]", _of(place, lambda found: bounds(found.of.lead) if found.of.lead else Text("")), "left", 3
+            ),
         ]
     return columns
 
@@ -215,13 +220,13 @@ def _of(place: int, written: Callable[[Found], Text]) -> Callable[[Line], Text]:
 
 
 def _confidence(found: Found) -> Text:
-    written = estimate(found.pair.measured.confidence)
+    written = estimate(found.of.score)
     return written.append(PUBLISHED, style="dim") if found.shipped else written
 
 
 def _lost(found: Found) -> Text:
-    return Text(share(found.pair.lost) if found.pair.attacked else "")
+    return Text(share(1 - found.of.retained) if found.of.is_attacked else "")
 
 
 def _beyond(found: Found) -> Text:
-    return change(found.beyond) if found.pair.attacked and not found.pair.is_reference else Text("")
+    return change(found.of.lead) if found.of.is_attacked and not found.of.is_baseline else Text("")

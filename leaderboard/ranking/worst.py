@@ -1,4 +1,4 @@
-"""What the strongest attack of each cell leaves of a defended victim."""
+"""The score of a defended victim where the strongest attack of each cell counts."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ import numpy as np
 from bench.scenarios import Cell
 from bench.statistics.episodes import unit_interval
 from bench.statistics.estimates import Array, Interval, interval
-from envs.weather import WEATHERS
-from leaderboard.entries import Aligned, Entry, align
+from leaderboard.comparisons.alignment import Aligned, align
+from leaderboard.comparisons.comparison import Comparison
 
 
 @dataclass(frozen=True, eq=False)
 class Worst:
-    """What is left of a defended victim where in every cell the strongest attack counts.
+    """The robust score of a defended victim.
 
     Args:
-        scores: [R, C, E] of the ranking metric.
+        scores: [R, C, E] of the metric, under the strongest attack of each cell.
         runs: training or patch seeds.
         cells: [C].
         attacks: the strongest attack of each cell.
-        blind: [C, E] of the best blind policy on the same scenarios; NaN where it was not driven.
+        rival: [C, E] of the baseline that the victim is compared with, on the same scenarios; NaN where it was not driven.
     """
 
     scores: Array
     runs: tuple[int, ...]
     cells: tuple[Cell, ...]
-    attacks: tuple[Entry, ...]
-    blind: Array
+    attacks: tuple[Comparison, ...]
+    rival: Array
 
     @cached_property
     def score(self) -> Interval:
@@ -47,64 +47,61 @@ class Worst:
     def clean(self) -> Interval | None:
         """The same cells without an attack, as far as they were driven."""
         parts = []
-        for entry, cell in zip(self.attacks, self.cells, strict=True):
-            control = entry.control
+        for attack, cell in zip(self.attacks, self.cells, strict=True):
+            control = attack.clean
             if control and cell in control.cells:
-                # The sign without a patch is one run, whatever the patches' seeds are.
-                runs = control.runs if entry.track == "driving" else (0,)
-                parts.append((runs, control.column(entry.metric)[:, control.cells.index(cell)]))
+                # A control that stands for all runs is one run, whatever their seeds are.
+                runs = control.runs if control.runs == attack.own.runs else (0,)
+                parts.append((runs, control.column(attack.track.metric)[:, control.cells.index(cell)]))
         scores = _joined(parts)
         return None if scores is None else unit_interval(scores)
 
     @cached_property
     def lead(self) -> Interval | None:
-        """Minus the best blind policy of the cell, paired scenario by scenario, in the cells where that was driven."""
-        known = np.isfinite(self.blind).all(1)
-        return interval((self.scores - self.blind)[:, known]) if known.any() else None
+        """Minus the baseline of the cell, paired scenario by scenario, in the cells where that was driven."""
+        known = np.isfinite(self.rival).all(1)
+        return interval((self.scores - self.rival)[:, known]) if known.any() else None
 
 
-def worst(entries: Sequence[Entry]) -> Worst:
-    """Of each cell the attack that leaves least, on the runs that all attacks share.
+def worst(attacks: Sequence[Comparison]) -> Worst:
+    """Of each cell the attack with the lowest score, on the runs that all attacks share.
 
     An attack that shares no run with those that were driven more is left out.
     """
-    kept: list[Entry] = []
+    kept: list[Comparison] = []
     shared: set[int] = set()
-    for entry in sorted(entries, key=lambda entry: (entry.stands_for_all, -entry.own.table.num_rows)):
-        own = shared if kept and entry.stands_for_all else set(entry.own.runs)
+    for attack in sorted(attacks, key=lambda one: (one.stands_for_all, -one.own.table.num_rows)):
+        own = shared if kept and attack.stands_for_all else set(attack.own.runs)
         if not kept or shared & own:
             shared = shared & own if kept else own
-            kept.append(entry)
+            kept.append(attack)
     runs = tuple(sorted(shared))
-    order = list(WEATHERS)
-    cells = sorted(
-        {cell for entry in kept for cell in entry.own.cells},
-        key=lambda cell: (order.index(cell.weather), cell.lanes, cell.density),
-    )
+    cells = sorted({cell for attack in kept for cell in attack.cells}, key=kept[0].axes.place)
     chosen = [_strongest(kept, cell, runs) for cell in cells]
     fewest = min(scores.shape[1] for _, scores, _ in chosen)
     return Worst(
         scores=np.stack([scores[:, :fewest] for _, scores, _ in chosen], 1),
         runs=runs,
         cells=tuple(cells),
-        attacks=tuple(entry for entry, _, _ in chosen),
-        blind=np.stack([blind[:fewest] for _, _, blind in chosen]),
+        attacks=tuple(attack for attack, _, _ in chosen),
+        rival=np.stack([rival[:fewest] for _, _, rival in chosen]),
     )
 
 
-def _strongest(entries: Iterable[Entry], cell: Cell, runs: Sequence[int]) -> tuple[Entry, Array, Array]:
-    """The attack that leaves least in a cell, what it leaves [R, E], and what the best blind policy gets there [E]."""
+def _strongest(attacks: Iterable[Comparison], cell: Cell, runs: Sequence[int]) -> tuple[Comparison, Array, Array]:
+    """The attack with the lowest score in a cell, its scores [R, E], and those of the victim's baseline there [E]."""
     found = []
-    for entry in entries:
-        if cell in entry.own.cells:
-            place = entry.own.cells.index(cell)
-            rows = [0] * len(runs) if entry.stands_for_all else [entry.own.runs.index(run) for run in runs]
-            found.append((entry, entry.scores[rows, place]))
-    entry, scores = min(found, key=lambda pair: float(pair[1].mean()))
-    blind = entry.blind
-    if blind is None or cell not in blind.cells or blind.seeds != entry.own.seeds:
-        return entry, scores, np.full(scores.shape[1], np.nan)
-    return entry, scores, blind.column(entry.metric)[0, blind.cells.index(cell)]
+    for attack in attacks:
+        if cell in attack.cells:
+            place = attack.cells.index(cell)
+            rows = [0] * len(runs) if attack.stands_for_all else [attack.own.runs.index(run) for run in runs]
+            found.append((attack, attack.scores[rows, place]))
+    attack, scores = min(found, key=lambda pair: float(pair[1].mean()))
+    contrast = attack.track.contrast
+    rival = attack.baselines.get(attack.rival) if contrast and contrast.side == "victim" else None
+    if rival is None or cell not in rival.cells or rival.seeds != attack.own.seeds:
+        return attack, scores, np.full(scores.shape[1], np.nan)
+    return attack, scores, rival.column(attack.track.metric)[0, rival.cells.index(cell)]
 
 
 def margin(first: Worst, second: Worst) -> Interval | None:

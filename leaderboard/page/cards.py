@@ -11,21 +11,21 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from leaderboard.entries import Entry
-from leaderboard.pairs import codes_of, parameters
+from leaderboard.comparisons.comparison import THREAT, Comparison, parameters
+from leaderboard.comparisons.reading import codes_of
 
 KINDS = ("attack", "defense", "victim", "world")
 
 
-def card(entry: Entry, folder: Path | None) -> dict[str, object]:
-    """The provenance of an entry.
+def card(one: Comparison, folder: Path | None) -> dict[str, object]:
+    """The provenance of a comparison.
 
     Args:
-        entry: of any track.
+        one: of any track.
         folder: the results folder, where its recordings may be; None where its records are published.
     """
-    records, identity = entry.own.table, entry.identity
-    seeds = entry.own.seeds
+    records, identity = one.own.table, one.identity
+    seeds = one.own.seeds
     _, units = np.unique(codes_of(records, ["unit"]), return_index=True)
     pair = str(records["pair"][0].as_py())
     return {
@@ -35,48 +35,44 @@ def card(entry: Entry, folder: Path | None) -> dict[str, object]:
         },
         "shipped_by": {kind: _values(records, f"{kind}_shipped_by") for kind in KINDS},
         "grid": _values(records, "grid"),
-        "training_seeds": list(entry.own.runs),
+        "training_seeds": list(one.own.runs),
         "scenario_seeds": [seeds[0], seeds[-1]],
         "episodes": records.num_rows,
-        "left_out": entry.own.left_out,
-        "weights_sha256": [value for value in _values(records, "weights_sha256") if value],
-        "patch_sha256": [value for value in _values(records, "patch_sha256") if value]
-        if entry.track == "detection"
-        else [],
+        "left_out": one.own.left_out,
+        "weights_sha256": _hashes(records, "weights_sha256"),
+        "artefact_sha256": _hashes(records, f"{one.track.artefact[0]}_sha256") if one.track.artefact else [],
         "code_digest": _values(records, "code_digest"),
         "libraries": [json.loads(text) for text in _values(records, "libraries") if text],
         "machine": _values(records, "machine"),
         "finished": pc.max(records["created_at"]).as_py().isoformat(timespec="seconds"),
         "wall_s": round(pc.sum(records["wall_s"].take(pa.array(units))).as_py(), 1),
-        "run": run_command(entry),
-        "replay": replay_command(entry, pair, folder),
+        "run": run_command(one),
+        "replay": replay_command(one, pair, folder),
         "recording": _recording(pair, folder),
     }
 
 
-def run_command(entry: Entry) -> str:
-    """What makes the records of an entry again."""
-    identity = entry.identity
+def run_command(one: Comparison) -> str:
+    """What makes the records of a comparison again."""
+    identity = one.identity
     words = []
     for kind in KINDS:
         words.append(f"{kind}={identity[kind]}")
         words += [f"{kind}.{name}={_word(value)}" for name, value in parameters(identity[f"{kind}_params"]).items()]
-    if entry.attacked:
-        words += [
-            f"threat.{name}={_word(identity[f'threat_{name}'])}" for name in ("norm", "budget", "access", "queries")
-        ]
-    for axis in ("lanes", "density", "weather"):
-        values = dict.fromkeys(getattr(cell, axis) for cell in entry.own.cells)
+    if one.is_attacked:
+        words += [f"threat.{name.removeprefix('threat_')}={_word(identity[name])}" for name in THREAT]
+    for axis in one.axes:
+        values = dict.fromkeys(cell[axis] for cell in one.cells)
         words.append(f"{axis}={','.join(_word(value) for value in values)}")
-    words += [f"episodes={len(entry.own.seeds)}", f"seeds={','.join(map(str, entry.own.runs))}"]
+    words += [f"episodes={len(one.own.seeds)}", f"seeds={','.join(map(str, one.own.runs))}"]
     return shlex.join(["bench", "run", *words])
 
 
-def replay_command(entry: Entry, pair: str, folder: Path | None) -> str:
+def replay_command(one: Comparison, pair: str, folder: Path | None) -> str:
     """What drives its first episode again and opens the recording."""
-    cell, seed = entry.own.cells[0], entry.own.seeds[0]
-    where = f"lanes={cell.lanes} density={cell.density:g} weather={cell.weather} seed={seed}"
-    return f"bench view {pair} {where} --out {shlex.quote(str(folder or 'results'))}"
+    where = [f"{name}={_word(value)}" for name, value in one.cells[0].items()]
+    words = ["bench", "view", pair, *where, f"seed={one.own.seeds[0]}", "--out", str(folder or "results")]
+    return shlex.join(words)
 
 
 def _word(value: object) -> str:
@@ -86,7 +82,13 @@ def _word(value: object) -> str:
         return str(value).lower()
     if isinstance(value, list):
         return "[" + ",".join(_word(each) for each in value) + "]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:g}"
+    return str(value) or "''"
+
+
+def _hashes(records: pa.Table, name: str) -> list[str]:
+    return [value for value in _values(records, name) if value] if name in records.column_names else []
 
 
 def _values(records: pa.Table, name: str) -> list[str]:

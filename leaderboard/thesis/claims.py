@@ -9,13 +9,14 @@ from typing import Literal
 import numpy as np
 from rich.text import Text
 
-from bench.plugins.contracts import REFERENCE_PATCHES
 from bench.statistics.episodes import shared
 from bench.statistics.estimates import Array, interval
-from leaderboard.approaches import NO_PATCH
-from leaderboard.text import bounds, change
-from leaderboard.thesis_patch_records import ABLATION, LOCATIONS, STANDARD, WEATHERS, Detector, Source
-from leaderboard.trend import ENOUGH_SEEDS, LEVEL, trend
+from bench.tracks.detection import REFERENCE_PATCHES
+from leaderboard.comparisons.comparison import ENOUGH_SEEDS
+from leaderboard.comparisons.pairing import beside
+from leaderboard.terminal.text import bounds, change
+from leaderboard.thesis.patch_records import ABLATION, LOCATIONS, STANDARD, WEATHERS, Detector, Source
+from leaderboard.thesis.trend import LEVEL, trend
 
 Place = tuple[str, str | None]
 """A weather and a location of ours; no location is all of them."""
@@ -111,7 +112,7 @@ def _unknown(needed: str, seeds: int) -> Text:
 
 def _left(source: Source, detector: Detector, rows: Sequence[str], place: Place) -> Array:
     """[R, S] confidence left, patch seeds x settings, on the approaches that all settings have; no seed where one is missing."""
-    found = [each.pair.own for row in rows if (each := source.find(detector, row, *place))]
+    found = [each.of.own for row in rows if (each := source.find(detector, row, *place))]
     if len(found) < len(rows):
         return np.empty((0, len(rows)))
     common = found[0]
@@ -129,20 +130,21 @@ def _lost(source: Source, detector: Detector, weather: str) -> dict[int, list[fl
     by_location = []
     for location in LOCATIONS.values():
         found = source.find(detector, STANDARD, weather, location)
-        clean = found.pair.controls.get(NO_PATCH) if found else None
+        clean = found.of.clean if found else None
         if found is None or clean is None or not clean.column("confidence_mean").any():
             return {}
-        left, whole = (each.column("confidence_mean").mean((1, 2)) for each in (found.pair.own, clean))
-        by_location.append(dict(zip(found.pair.own.runs, 1 - left / whole, strict=True)))
+        own, control = beside(found.of.own, clean)
+        left, whole = (each.column("confidence_mean").mean((1, 2)) for each in (own, control))
+        by_location.append(dict(zip(own.runs, 1 - left / whole, strict=True)))
     seeds = set.intersection(*(set(each) for each in by_location))
     return {seed: [each[seed] for each in by_location] for seed in sorted(seeds)}
 
 
 def _below(source: Source, detector: Detector, weather: str) -> Text:
     found = [source.find(detector, STANDARD, weather, location) for location in LOCATIONS.values()]
-    whole = [each for each in found if each and set(REFERENCE_PATCHES) <= set(each.pair.controls)]
-    seeds = min((len(each.pair.own.runs) for each in whole), default=0)
-    beyond = [each.beyond for each in whole if each.beyond]
+    whole = [each for each in found if each and set(REFERENCE_PATCHES) <= set(each.of.baselines)]
+    seeds = min((len(each.of.own.runs) for each in whole), default=0)
+    beyond = [each.of.lead for each in whole if each.of.lead]
     if len(beyond) < len(LOCATIONS) or seeds < ENOUGH_SEEDS:
         return _unknown(f"all {len(LOCATIONS)} locations and both controls", seeds)
     below, above = sum(one.high < 0 for one in beyond), sum(one.low > 0 for one in beyond)

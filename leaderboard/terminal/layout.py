@@ -1,4 +1,4 @@
-"""The look of every table: columns of headings and how to fill them; what a terminal has no room for is left out."""
+"""The layout of every table: columns with headings; columns that a terminal has no room for are left out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from bench.scenarios import Cell
+from bench.scenarios import Axes, Cell
+from bench.scenarios.axes import written
 
 Subject = TypeVar("Subject")
 STRIP = 25
@@ -48,18 +49,27 @@ class Section(Generic[Subject]):
 
 
 def fitted(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], console: Console) -> Table:
-    """The table with as many of the columns as the console has room for, and air between them where there is room."""
+    """The table with as many of the columns as the console has room for, and a space between them where there is room."""
     room = console.width - 2
+    rows = [
+        [[_text(column.value(subject)) for column in columns] for subject in section.subjects] for section in sections
+    ]
+    titles = [section.title for section in sections]
     limits = range(max(column.spare for column in columns), -1, -1)
     for names, limit, gap in product((None, console.width // 3), limits, (1, 0)):
-        made = _table([column for column in columns if column.spare <= limit], sections, gap, names)
+        kept = [place for place, column in enumerate(columns) if column.spare <= limit]
+        texts = [[[row[place] for place in kept] for row in section] for section in rows]
+        made = _table([columns[place] for place in kept], list(zip(titles, texts, strict=True)), gap, names)
         if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= room:
             break
     return made
 
 
 def _table(
-    columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], gap: int, names: int | None
+    columns: Sequence[Column[Subject]],
+    sections: Sequence[tuple[Text | None, Sequence[Sequence[Text]]]],
+    gap: int,
+    names: int | None,
 ) -> Table:
     """With `gap` characters between the columns; names that fold are at most `names` wide."""
     made = Table(box=box.SIMPLE_HEAD, header_style="dim", padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
@@ -72,16 +82,16 @@ def _table(
             max_width=None if whole else names,
             vertical="bottom",
         )
-    for section in sections:
-        if section.title is not None:
-            made.add_row(section.title)
-        for subject in section.subjects:
-            made.add_row(*(_text(column.value(subject)) for column in columns))
+    for title, rows in sections:
+        if title is not None:
+            made.add_row(title)
+        for row in rows:
+            made.add_row(*row)
         made.add_section()
     return made
 
 
-def axis(measure: str = "safe progress") -> str:
+def axis(measure: str) -> str:
     """The heading of a strip chart: 0 at its left end, 1 at its right."""
     return f"{measure}\n0" + "0.5".center(STRIP - 2) + "1"
 
@@ -91,12 +101,26 @@ def _text(value: Text | str) -> Text:
     return value if isinstance(value, Text) else Text(value)
 
 
-def rows_by_weather(cells: Iterable[Cell]) -> list[list[tuple[Text, list[Cell]]]]:
-    """The rows of each weather: one of its own where it has several cells, then a row a cell; with the cells each is of."""
+def cell_heading(axes: Axes) -> str:
+    """The heading of a column of cells: the names of the axes that change more than what is observed."""
+    names = [axis.name for axis in axes.values() if not axis.perceptual] or list(axes)
+    return f"{names[0]}\n× {' × '.join(names[1:])}" if len(names) > 1 else f"\n{names[0]}"
+
+
+def cell_rows(cells: Iterable[Cell], axes: Axes) -> list[list[tuple[Text, list[Cell]]]]:
+    """The rows of a table of cells, grouped by the perceptual axes.
+
+    A group has a row of its own where it has several cells, then a row a cell; each with the cells that it is of. Without
+    perceptual axes all cells are one group, which has no row of its own.
+    """
+    perceptual = [axis.name for axis in axes.values() if axis.perceptual and len(axes) > 1]
+    others = [name for name in axes if name not in perceptual]
     found = []
-    for weather, group in groupby(cells, key=lambda cell: cell.weather):
+    for values, group in groupby(cells, key=lambda cell: [cell[name] for name in perceptual]):
         own = list(group)
-        whole = [(Text(weather, style="bold"), own)] if len(own) > 1 else []
-        indent = "  " if whole else f"{weather} "
-        found.append([*whole, *((Text(f"{indent}{cell.lanes} × {cell.density:g}"), [cell]) for cell in own)])
+        title = ", ".join(map(written, values))
+        whole = [(Text(title, style="bold"), own)] if title and len(own) > 1 else []
+        indent = "  " if whole else f"{title} " if title else ""
+        names = [" × ".join(written(cell[name]) for name in others) for cell in own]
+        found.append([*whole, *((Text(f"{indent}{name}"), [cell]) for name, cell in zip(names, own, strict=True))])
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shlex
 from collections import Counter
@@ -12,17 +13,16 @@ from functools import cache
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.plugins.contracts import REFERENCE_PATCHES
 from bench.plugins.fingerprint import canonical
 from bench.plugins.registry import Kind
-from bench.statistics.estimates import Interval
-from leaderboard.approaches import NO_PATCH, Patched, read_patched
-from leaderboard.entries import MEASUREMENTS
-from leaderboard.pairs import ATTACKER, DEFENDED, SCENARIO, groups, parameters
+from bench.plugins.track import track
+from bench.tracks.detection import REFERENCE_PATCHES, DetectionTrack
+from leaderboard.comparisons.comparison import IDENTITY, NO_ATTACK, Comparison, parameters
+from leaderboard.comparisons.reading import SCENARIO, groups, read_comparisons
 from leaderboard.published import published
 
 ATTACK, WORLD, DETECTOR = "eot", "camera", "yolov3_tiny"
-CONTROLS = (*REFERENCE_PATCHES, NO_PATCH)
+CONTROLS = (*REFERENCE_PATCHES, NO_ATTACK)
 WEATHERS = {"sun": "clear", "rain": "rain"}
 """The thesis' and ours."""
 LOCATIONS = {1: "sun-behind-ego", 2: "sun-beside", 3: "sun-behind-sign"}
@@ -38,7 +38,7 @@ SWITCHED_OFF = (
     "brightness", "contrast", "saturation", "hue", "noise", "perspective", "rotation", "scale", "translation",
 )  # fmt: skip
 """The transformations in the order in which the thesis leaves them out; the first four are its colour jitter."""
-COLUMNS = (*DEFENDED, *ATTACKER, *SCENARIO, "created_at", *MEASUREMENTS["detection"])
+COLUMNS = (*IDENTITY, *SCENARIO, "world_facts", "weights_sha256", "created_at", "location", "confidence_mean")
 """Of a record that are read here."""
 
 
@@ -112,17 +112,12 @@ class Found:
     """What stands beside a number of the thesis.
 
     Args:
-        pair: a patch, or none at all.
+        of: a patch, or none at all.
         shipped: whether it is published with the package, not the user's own.
     """
 
-    pair: Patched
+    of: Comparison
     shipped: bool
-
-    @property
-    def beyond(self) -> Interval | None:
-        """Confidence left minus that of the control that leaves least, paired; None for what is no attack."""
-        return self.pair.beyond[1] if self.pair.beyond else None
 
 
 class Source:
@@ -135,11 +130,12 @@ class Source:
 
     def __init__(self, records: pa.Table, shipped: pa.Table | None = None) -> None:
         ours = (pc.field("world") == WORLD) & (pc.field("defense") == "none")
-        tables = (records, published("detection") if shipped is None else shipped)
+        self.track = track(DetectionTrack.name)
+        tables = (records, published(self.track) if shipped is None else shipped)
         self.tables = [table.select(COLUMNS).filter(ours) for table in tables]
         self.detectors = _detectors(self.tables)
         self.missing: dict[Detector, set[str]] = {}
-        self._pairs = cache(self._read)
+        self._read = cache(self._comparisons)
 
     def find(self, detector: Detector, row: str, weather: str, location: str | None = None) -> Found | None:
         """What was measured of a row; None, and noted as missing, where nothing was.
@@ -151,14 +147,12 @@ class Source:
             location: ours; None is all of them.
         """
         for shipped in (False, True):
-            candidates = [pair for pair in self._pairs(detector, weather, shipped) if is_of(row, pair.identity)]
+            candidates = [one for one in self._read(detector, weather, shipped) if is_of(row, one.identity)]
             if location is not None:
-                candidates = [
-                    pair.only(seeds=pair.locations[location]) for pair in candidates if location in pair.locations
-                ]
+                candidates = [one.only(seeds=one.places[location]) for one in candidates if location in one.places]
             if candidates:
-                found = Found(max(candidates, key=lambda pair: pair.own.table.num_rows), shipped)
-                if found.beyond is None and row in CONFIGURATIONS:
+                found = Found(max(candidates, key=lambda one: one.own.table.num_rows), shipped)
+                if found.of.lead is None and row in CONFIGURATIONS:
                     self._note(detector, row)
                 return found
         self._note(detector, row)
@@ -169,28 +163,34 @@ class Source:
     ) -> dict[str, Found | None]:
         """`find` for the rows of a table: those that are there on the approaches that all of them have, where there are any."""
         found = {row: self.find(detector, row, weather, location) for row in rows}
-        there = [each.pair.own for each in found.values() if each]
+        there = [each.of.own for each in found.values() if each]
         cells = set.intersection(*(set(own.cells) for own in there)) if there else set()
         seeds = set.intersection(*(set(own.seeds) for own in there)) if there else set()
         if not (cells and seeds):
             return found
-        return {
-            row: each and replace(each, pair=each.pair.only(cells=cells, seeds=seeds)) for row, each in found.items()
-        }
+        return {row: each and replace(each, of=each.of.only(cells=cells, seeds=seeds)) for row, each in found.items()}
 
     def _note(self, detector: Detector, row: str) -> None:
         """Note that a row, or a control of it, is missing; controls are part of every run."""
         self.missing.setdefault(detector, set()).add(row if row in CONFIGURATIONS else STANDARD)
 
-    def _read(self, detector: Detector, weather: str, shipped: bool) -> list[Patched]:
-        same = pc.field("weather") == weather
+    def _comparisons(self, detector: Detector, weather: str, shipped: bool) -> list[Comparison]:
+        cells = [
+            text
+            for text in self.tables[shipped]["cell"].unique().to_pylist()
+            if json.loads(text).get("weather") == weather
+        ]
+        same = pc.field("cell").isin(pa.array(cells, pa.string()))
         for name in ("victim", "victim_params", "world_params"):
             same &= pc.field(name) == getattr(detector, name)
         records = self.tables[shipped].filter(same)
         crafted = {text for text in records["attack_params"].to_pylist() if _crafting(text) == detector.crafting}
         same_crafting = pc.field("attack_params").isin(pa.array(sorted(crafted), pa.string()))
         records = records.filter((pc.field("attack") != ATTACK) | same_crafting)
-        return read_patched(records) + read_patched(records.filter(pc.field("attack") == NO_PATCH))
+        return [
+            *read_comparisons(records, self.track),
+            *read_comparisons(records.filter(pc.field("attack") == NO_ATTACK), self.track),
+        ]
 
     def commands(self) -> list[str]:
         """What to type for everything that was asked for and not found."""
@@ -207,8 +207,8 @@ class Source:
 
 def is_of(row: str, identity: Mapping[str, object]) -> bool:
     """Whether a pair's identity columns are those of a row, a key of `CONFIGURATIONS` or one of `CONTROLS`."""
-    if row == NO_PATCH:
-        return identity["attack"] == NO_PATCH
+    if row == NO_ATTACK:
+        return identity["attack"] == NO_ATTACK
     configuration = CONFIGURATIONS.get(row, CONFIGURATIONS[STANDARD])
     if not math.isclose(float(str(identity["threat_budget"])), configuration.budget):
         return False
@@ -251,7 +251,7 @@ def _crafting(attack_params: str) -> str:
 
 def usual_crafting() -> str | None:
     """The attack's default parameters as in the published records, most of which were run with them; None without any."""
-    records = published("detection")
+    records = published(track(DetectionTrack.name))
     counts = records.filter(pc.field("attack") == ATTACK)["attack_params"].value_counts()
     most = max(counts.to_pylist(), key=lambda one: one["counts"], default=None)
     return _crafting(most["values"]) if most else None

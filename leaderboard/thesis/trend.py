@@ -7,7 +7,6 @@ from typing import Literal
 
 from bench.statistics.estimates import Array
 
-ENOUGH_SEEDS = 3
 LEVEL = 0.05
 
 

@@ -6,12 +6,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.plugins.contracts import Track
-from leaderboard.thesis_numbers import THESIS, printed
+from bench.plugins.track import track
+from bench.records.schema import schema
+from bench.tracks.detection import DetectionTrack
+from bench.tracks.driving import DrivingTrack
+from leaderboard.thesis.numbers import THESIS, printed
+from leaderboard.thesis.policy_records import clear
 
 Chapter = dict[str, Any]
 """`name`, `heading` and `tables`, each with its `title`, `headings`, `rows` and `notes`."""
@@ -21,21 +26,24 @@ def prepare() -> None:
     """Import what the tables need."""
     from scipy import stats  # noqa: F401
 
-    from leaderboard import thesis_driving, thesis_patches  # noqa: F401
+    from leaderboard.thesis import patches, policies  # noqa: F401
 
 
-def chapters(own: Mapping[Track, pa.Table]) -> list[Chapter]:
+def chapters(own: Mapping[str, pa.Table]) -> list[Chapter]:
     """The tables of the thesis beside ours.
 
     Args:
         own: the user's records, by track; where they have none, those published with the package are read.
     """
-    from leaderboard import thesis_driving, thesis_patches
+    from leaderboard.thesis import patches, policies
 
     numbers = printed()
+    detection, driving = (
+        own.get(name, schema(track(name)).empty_table()) for name in (DetectionTrack.name, DrivingTrack.name)
+    )
     found = (
-        ("Chapter 3", thesis_patches.heading(), thesis_patches.tables(numbers, own["detection"], Console(width=400))),
-        ("Chapter 4", thesis_driving.heading(numbers["max_reward"]), thesis_driving.tables(numbers, own["driving"])),
+        ("Chapter 3", patches.heading(), patches.tables(numbers, detection, Console(width=400))),
+        ("Chapter 4", policies.heading(numbers["max_reward"]), policies.tables(numbers, driving)),
     )
     return [
         {
@@ -56,6 +64,28 @@ def chapters(own: Mapping[Track, pa.Table]) -> list[Chapter]:
         }
         for name, heading, tables in found
     ]
+
+
+def needed(records: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
+    """The records that the thesis has a number for; those of patches with their text as text.
+
+    Args:
+        records: by track; text may be dictionaries.
+    """
+    found = {}
+    if DrivingTrack.name in records:
+        table = clear(records[DrivingTrack.name])
+        attacks = pc.is_in(table["attack"].cast(pa.string()), pa.array(["none", "zo", "noise"]))
+        budget = pc.or_(pc.equal(table["attack"], "none"), pc.equal(table["threat_norm"], "linf"))
+        found[DrivingTrack.name] = table.filter(pc.and_(attacks, budget))
+    if DetectionTrack.name in records:
+        table = records[DetectionTrack.name]
+        plain = [
+            field.with_type(field.type.value_type) if pa.types.is_dictionary(field.type) else field
+            for field in table.schema
+        ]
+        found[DetectionTrack.name] = table.cast(pa.schema(plain))
+    return found
 
 
 def _cells(made: Table) -> dict[str, Any]:

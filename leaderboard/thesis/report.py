@@ -9,13 +9,15 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from bench.plugins.contracts import TRACKS, Track
-from bench.records.store import SCHEMAS
-from leaderboard import thesis_driving, thesis_patches
-from leaderboard.thesis_numbers import PUBLISHED, THESIS, Beside, printed
+from bench.plugins.track import track
+from bench.records.schema import schema
+from bench.tracks.detection import DetectionTrack
+from bench.tracks.driving import DrivingTrack
+from leaderboard.thesis import patches, policies
+from leaderboard.thesis.numbers import PUBLISHED, THESIS, Beside, printed
 
 
-def thesis_report(records: Mapping[Track, pa.Table], console: Console) -> None:
+def thesis_report(records: Mapping[str, pa.Table], console: Console) -> None:
     """Print the thesis' tables beside ours.
 
     Args:
@@ -23,15 +25,17 @@ def thesis_report(records: Mapping[Track, pa.Table], console: Console) -> None:
         console: where to print; readable from 100 columns on.
     """
     numbers = printed()
-    own = {track: records.get(track, SCHEMAS[track].empty_table()) for track in TRACKS}
+    driven = {
+        name: records.get(name, schema(track(name)).empty_table()) for name in (DetectionTrack.name, DrivingTrack.name)
+    }
     source = Text.assemble(
         (numbers["source"], f"bold {THESIS}"), f"\nBeside it ours.{PUBLISHED} published with the package, not run here."
     )
     console.print(Padding(source, (1, 1)))
-    patches = thesis_patches.tables(numbers, own["detection"], console)
-    _print_chapter("Chapter 3", thesis_patches.heading(), patches, console)
-    driving = thesis_driving.tables(numbers, own["driving"])
-    _print_chapter("Chapter 4", thesis_driving.heading(numbers["max_reward"]), driving, console)
+    chapter = patches.tables(numbers, driven[DetectionTrack.name], console)
+    _print_chapter("Chapter 3", patches.heading(), chapter, console)
+    chapter = policies.tables(numbers, driven[DrivingTrack.name])
+    _print_chapter("Chapter 4", policies.heading(numbers["max_reward"]), chapter, console)
 
 
 def _print_chapter(name: str, heading: Text, tables: Iterable[Beside], console: Console) -> None:

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Literal
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from bench.plugins.track import track
 from bench.scenarios import Cell
 from bench.statistics.episodes import Episodes, unit_interval
 from bench.statistics.estimates import Interval, interval
-from leaderboard.entries import MEASUREMENTS
-from leaderboard.pairs import ATTACKER, BEST_BLIND, DEFENDED, SCENARIO, groups, newest, parameters, references
+from bench.tracks.driving import BEST_BLIND, DrivingTrack
+from leaderboard.comparisons.baselines import Baselines
+from leaderboard.comparisons.comparison import ATTACKER, DEFENDED, IDENTITY, parameters
+from leaderboard.comparisons.reading import SCENARIO, groups, newest
 from leaderboard.published import published
 
 Victim = Literal["dqn", "ddpg"]
 Attack = Literal["none", "zo", "noise"]
 
-TRAINED_ON = Cell(lanes=3, density=1.0)
+CLEAR = "clear"
+TRAINED_ON = Cell(lanes=3, density=1.0, weather=CLEAR)
 """The road of tables 4.1 and 4.2."""
 BUDGET = 0.2
 """Of every attack of chapter 4, L-inf on the [-1, 1] scale (4.4.3)."""
@@ -30,7 +34,7 @@ TARGETS: dict[str, dict[str, float]] = {
     "ddpg": {"target_acceleration": 1.0, "target_steering": 0.5},
 }
 """What the thesis' attack drives a victim to (4.4.3): FASTER; full throttle and a turn to the right."""
-COLUMNS = (*DEFENDED, *ATTACKER, *SCENARIO, "action_type", "sees", "grid", "created_at", *MEASUREMENTS["driving"])
+COLUMNS = (*IDENTITY, *SCENARIO, "world_facts", "created_at", "return", "safe_progress")
 """Of a record that are read here."""
 
 
@@ -96,8 +100,9 @@ class Source:
     """
 
     def __init__(self, records: pa.Table, shipped: pa.Table | None = None) -> None:
-        tables = (records, published("driving") if shipped is None else shipped)
-        self.tables = [table.select(COLUMNS).filter(pc.equal(table["weather"], "clear")) for table in tables]
+        self.track = track(DrivingTrack.name)
+        tables = (records, published(self.track) if shipped is None else shipped)
+        self.tables = [clear(table).select(COLUMNS) for table in tables]
         self.missing: list[tuple[Wanted, tuple[Cell, ...]]] = []
         self._driven = cache(self._groups)
 
@@ -113,25 +118,25 @@ class Source:
 
     def _groups(self, shipped: bool, cells: tuple[Cell, ...]) -> list[tuple[dict[str, object], pa.Table]]:
         """What was driven in these cells, by attack and defended victim."""
-        return list(groups(_in(self.tables[shipped], cells), (*DEFENDED, *ATTACKER)))
+        return list(groups(_in(self.tables[shipped], set(cells).__contains__), (*DEFENDED, *ATTACKER)))
 
-    def reference(self, found: Found | None, name: str = BEST_BLIND) -> Interval | None:
-        """The return of a reference driver on the scenarios of `found`."""
+    def baseline(self, found: Found | None, name: str = BEST_BLIND) -> Interval | None:
+        """The return of a baseline on the scenarios of `found`."""
         if found is None:
             return None
-        for drives in self._reference_drivers:
-            reference = references(found.episodes, drives).get(name)
-            if reference:
-                return interval(reference.only(runs=reference.runs[:1]).column("return"))
+        for drivers in self._baselines:
+            if baseline := drivers.beside(found.episodes).get(name):
+                return interval(baseline.only(runs=baseline.runs[:1]).column("return"))
         return None
 
     @cached_property
-    def _reference_drivers(self) -> list[list[Episodes]]:
+    def _baselines(self) -> list[Baselines]:
         """Of the user's records, and of the published ones."""
         made = []
         for table in self.tables:
             blind = table.filter(pc.and_(pc.invert(table["sees"]), pc.equal(table["attack"], "none")))
-            made.append([Episodes.arrange(newest(rows, DEFENDED)) for _, rows in groups(blind, DEFENDED)])
+            drives = [Episodes.arrange(newest(rows, DEFENDED)) for _, rows in groups(blind, DEFENDED)]
+            made.append(Baselines(self.track, drives))
         return made
 
     def commands(self) -> list[str]:
@@ -148,12 +153,15 @@ class Source:
         return lines
 
 
-def _in(table: pa.Table, cells: Iterable[Cell]) -> pa.Table:
-    mask = np.zeros(table.num_rows, bool)
-    for cell in cells:
-        here = pc.and_(pc.equal(table["lanes"], cell.lanes), pc.equal(table["density"], cell.density))
-        mask |= here.to_numpy()
-    return table.filter(pa.array(mask))
+def clear(table: pa.Table) -> pa.Table:
+    """The records in clear weather, which chapter 4 is about."""
+    return _in(table, lambda cell: cell.get("weather") == CLEAR)
+
+
+def _in(table: pa.Table, wanted: Callable[[Cell], bool]) -> pa.Table:
+    """The records in some cells."""
+    texts = [text for text in pc.unique(table["cell"]).to_pylist() if wanted(Cell(**json.loads(text)))]
+    return table.filter(pc.is_in(table["cell"].cast(pa.string()), pa.array(texts, pa.string())))
 
 
 def _command(victim: Victim, cells: Sequence[Cell], wanted: Sequence[Wanted]) -> str:
@@ -162,7 +170,7 @@ def _command(victim: Victim, cells: Sequence[Cell], wanted: Sequence[Wanted]) ->
     skips = sorted({each.skip for each in wanted if each.skip is not None})
     words = [f"victim={victim}", f"attack={','.join(attacks)}"]
     words += ["attack.objective=target"] if "zo" in attacks else []
-    words += [f"threat.norm=linf threat.budget={BUDGET:g}", "weather=clear"]
+    words += [f"threat.norm=linf threat.budget={BUDGET:g}", f"weather={CLEAR}"]
     if skips:
         words.append(f"defense=advtrain defense.skip={','.join(f'{skip:g}' for skip in skips)}")
     if len(cells) == 1:
