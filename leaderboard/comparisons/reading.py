@@ -64,8 +64,9 @@ def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:
 
 
 def read_tracks(records: Mapping[str, pa.Table]) -> list[Comparison]:
-    """The comparisons of several tracks, by name; without baselines that nobody attacked."""
-    found = [one for name, table in records.items() for one in read_comparisons(table, track(name))]
+    """The comparisons of several tracks, the one with the most records first; without baselines that nobody attacked."""
+    ordered = sorted(records.items(), key=lambda item: -item[1].num_rows)
+    found = [one for name, table in ordered for one in read_comparisons(table, track(name))]
     return [one for one in found if one.is_attacked or not one.is_baseline]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,6 +16,7 @@ from leaderboard.comparisons.comparison import THREAT, Comparison, parameters
 from leaderboard.comparisons.reading import codes_of
 
 KINDS = ("attack", "defense", "victim", "world")
+PLAIN = re.compile(r"[\w./+-]+")
 
 
 def card(one: Comparison, folder: Path | None) -> dict[str, object]:
@@ -76,6 +78,7 @@ def replay_command(one: Comparison, pair: str, folder: Path | None) -> str:
 
 
 def _word(value: object) -> str:
+    """A value as the command line reads it back."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -84,7 +87,9 @@ def _word(value: object) -> str:
         return "[" + ",".join(_word(each) for each in value) + "]"
     if isinstance(value, float):
         return f"{value:g}"
-    return str(value) or "''"
+    text = str(value)
+    # Other text means something in the grammar of the command line (commas sweep), or nothing at all.
+    return text if PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=False)
 
 
 def _hashes(records: pa.Table, name: str) -> list[str]:

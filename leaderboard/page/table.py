@@ -28,7 +28,7 @@ def table(made: Mapping[str, Any]) -> str:
             line = {
                 "track": board["track"],
                 "world": board["world"]["name"],
-                **{f"threat_{name}": value for name, value in board["threat"].items()},
+                **{f"threat_{name}": board["threat"][name] for name in ("norm", "budget", "access", "queries")},
                 "group": row["group"],
                 "flagged": str(row["flagged"]).lower(),
                 "flags": " ".join(flag["name"] for flag in row["flags"] if flag["fired"]),

@@ -69,7 +69,7 @@ def _columns(one: Comparison) -> list[Column[Part]]:
     if one.is_attacked:
         columns += [
             Column("\nattacked", lambda part: estimate(part.attacked, style=ATTACKED), "left"),
-            Column("re-\ntained", lambda part: share(part.of.retained)),
+            Column("\nkept", lambda part: share(part.of.retained)),
         ]
         if track.contrast and track.contrast.side == "victim" and one.baselines:
             columns.append(Column(" \n ", lambda part: verdict(part.of.lead)))
@@ -97,9 +97,7 @@ def _measure(measure: Measure) -> Callable[[Part], Text | str]:
             return written(measure, one.measured(measure))
         both = (one.clean, one.attacked)
         texts = [str(written(measure, measured(episodes, measure))) if episodes else "" for episodes in both]
-        if measure.unit == "share" and all(texts):
-            texts[0] = texts[0].removesuffix(" %")
-        return arrow(*texts)
+        return arrow(*(text.removesuffix(" %") for text in texts))
 
     return value
 

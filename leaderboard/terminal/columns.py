@@ -32,7 +32,7 @@ def measure_columns(
     attacked = any(one.is_attacked for one in comparisons)
     return [
         Column(
-            measure.heading.format_map(first.facts),
+            _heading(measure, table).format_map(first.facts),
             value(measure),
             "left" if measure.with_interval and table == "overview" else "right",
             spare=measure.spare,
@@ -40,6 +40,13 @@ def measure_columns(
         for measure in first.track.measures
         if measure.tables in (table, "both") and (attacked or not measure.of_attack)
     ]
+
+
+def _heading(measure: Measure, table: str) -> str:
+    """In a table of cells with the unit of a share, which the overview has behind every number."""
+    if table == "overview" or measure.unit != "share" or measure.of_attack:
+        return measure.heading
+    return f"{measure.heading[1:]}\n%" if measure.heading.startswith("\n") else f"{measure.heading} %"
 
 
 def written(measure: Measure, found: Interval, *, with_interval: bool = False) -> Text | str:

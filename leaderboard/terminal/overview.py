@@ -63,7 +63,7 @@ def _columns(comparisons: Sequence[Comparison]) -> list[Column[Line]]:
         Column(f"{track.metric_title}\n[95 %]", _score, "left"),
     ]
     if any(one.is_attacked for one in comparisons):
-        columns.append(Column("re-\ntained", lambda line: share(line.attack.retained) if line.attack else ""))
+        columns.append(Column("kept", lambda line: share(line.attack.retained) if line.attack else ""))
         if any(one.baselines for one in comparisons) and track.contrast:
             spare = 0 if track.contrast.side == "victim" else 2
             columns += [

@@ -93,7 +93,7 @@ def legend(track: Track) -> Text:
     text = Text(style="dim")
     contrast = track.contrast
     marks = [(CLEAN, "no attack"), (ATTACKED, "attacked")]
-    marks += [(BASELINE, f"{contrast.title}, a baseline")] if contrast else []
+    marks += [(BASELINE, contrast.title)] if contrast else []
     for colour, meaning in marks:
         text.append(f"{MARKS[colour]} ", style=f"not dim {colour}").append(f"{meaning}   ")
     if contrast and contrast.side == "victim":
@@ -104,6 +104,6 @@ def legend(track: Track) -> Text:
             ("✗", "bold red", "not better: its input is worth nothing"),
         ):
             text.append(f"{mark} ", style=f"not dim {style}").append(f"{meaning}   ")
-    said = (track.legend, "retained: attacked / clean score.", f"Scores: interquartile mean over {track.run}s and cells, with a "
+    said = (track.legend, "kept: retention, attacked / clean score.", f"Scores: interquartile mean over {track.run}s and cells, with a "
             f"95 % bootstrap interval. Attacked, clean and baselines have the same {track.episode[1]}.")  # fmt: skip
     return text.append("\n" + " ".join(filter(None, said)))

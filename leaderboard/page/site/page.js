@@ -2,8 +2,7 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const at = (id) => document.getElementById(id);
 const pairs = new Map(data.pairs.map((pair) => [pair.key, pair]));
-const AXES = ["weather", "lanes", "density"];
-const state = { track: null, board: 0, sort: {}, shown: null };
+const state = { track: null, board: 0, sort: {}, shown: null, axes: {} };
 
 /* ---- elements: text goes in as text, never as markup ---- */
 function el(tag, attributes = {}, ...children) {
@@ -24,7 +23,7 @@ function estimate(found) {
   return found == null ? ["—"] : [el("b", {}, fixed(found.estimate)), " ", el("small", {}, bounds(found))];
 }
 
-/* ---- statistics: those of bench/statistics.py, for the cells that are left ---- */
+/* ---- statistics: those of bench/statistics/estimates.py, for the cells that are left ---- */
 function iqm(values) {
   const ordered = Float64Array.from(values).sort();
   const cut = Math.floor(ordered.length / 4);
@@ -61,7 +60,7 @@ function interval(cells, scenarios) {
   return { estimate: found, low: Math.min(draws[12], found), high: Math.max(draws[487], found) };
 }
 function kept(cells) {
-  return cells.filter((cell) => AXES.every((axis) => state[axis].has(cell[axis])));
+  return cells.filter(({ cell }) => Object.entries(state.axes).every(([axis, values]) => values.has(cell[axis])));
 }
 function over(cells, whole, scenarios) {
   const left = kept(cells);
@@ -83,7 +82,7 @@ function ranked(rows) {
 }
 
 /* ---- tables: columns say what a row shows, sorts by and copies ---- */
-function strip(score, blind) {
+function strip(score, baseline) {
   if (!score) return "";
   const place = (value) => `${(100 * Math.max(0, Math.min(1, value))).toFixed(1)}%`;
   const made = el("span", { class: "strip", "aria-hidden": "true" });
@@ -92,7 +91,7 @@ function strip(score, blind) {
   bar.style.right = `calc(100% - ${place(score.high ?? score.estimate)})`;
   dot.style.left = place(score.estimate);
   made.append(bar, dot);
-  if (blind != null) { const line = el("u"); line.style.left = place(blind); made.append(line); }
+  if (baseline != null) { const line = el("u"); line.style.left = place(baseline); made.append(line); }
   return made;
 }
 function cardLink(pair, text) {
@@ -169,10 +168,13 @@ for (const place of document.querySelectorAll(".copy")) {
 /* ---- what is shown of a board ---- */
 const boards = () => data.boards.filter((board) => board.track === state.track);
 const current = () => boards()[state.board];
-const norms = { relative: (b) => `each value off by ${+(100 * b).toFixed(4)} % of itself`, linf: (b) => `each value off by ${b} of half its range`, patch: (b) => `a patch ${+(100 * b).toFixed(4)} % as wide as the sign` };
-const threatText = (t) => `${t.norm} ${t.budget}: ${norms[t.norm]?.(t.budget) ?? ""}; access ${t.access}, ${t.queries} queries`;
+const said = () => data.tracks[state.track];
+const threatText = (t) => `${t.norm} ${t.budget}${t.allowed ? `: ${t.allowed};` : ","} access ${t.access}, ${t.queries} queries`;
+const threatName = (t) => threatText({ ...t, allowed: "" });
 const threatShort = (t) => (t.budget ? `${t.norm} ${t.budget}, ${t.access}` : "none");
-const order = (values) => [...new Set(values)].sort((a, b) => (typeof a === "number" ? a - b : ["clear", "rain", "fog"].indexOf(a) - ["clear", "rain", "fog"].indexOf(b)));
+const capital = (text) => text[0].toUpperCase() + text.slice(1);
+const place = (cell) => JSON.stringify(Object.entries(cell).sort());
+const joined = (values) => values.join(" × ");
 
 function options(select, values, chosen) {
   select.replaceChildren(...values.map(([value, text]) => el("option", { value, selected: String(value) === String(chosen) }, text)));
@@ -188,18 +190,15 @@ function setTrack(track) {
 function setBoard(place) {
   state.board = place; state.shown = null;
   const board = current();
-  options(at("threat"), boards().map((one, i) => [i, `${one.world.name}: ${threatText(one.threat)}`]), place);
-  const cells = board.rows.flatMap((row) => row.cells);
-  for (const axis of AXES) {
-    const values = order(cells.map((cell) => cell[axis]));
-    state[axis] = new Set(values);
-    const field = at(axis);
-    field.replaceChildren(field.firstElementChild, ...values.map((value) => el("label", {}, el("input", {
-      type: "checkbox", checked: true, name: axis, value, onchange: (event) => {
-        if (event.target.checked) state[axis].add(value); else state[axis].delete(value);
+  options(at("threat"), boards().map((one, i) => [i, `${one.world.name}: ${threatName(one.threat)}`]), place);
+  state.axes = Object.fromEntries(board.axes.map((axis) => [axis.name, new Set(axis.values)]));
+  const ordered = [...board.axes].sort((a, b) => b.perceptual - a.perceptual);
+  at("axes").replaceChildren(...ordered.map((axis) => el("fieldset", {}, el("legend", { title: axis.meaning }, capital(axis.name) + (axis.unit ? ` (${axis.unit})` : "")),
+    ...axis.values.map((value) => el("label", {}, el("input", {
+      type: "checkbox", checked: true, name: axis.name, value, onchange: (event) => {
+        if (event.target.checked) state.axes[axis.name].add(value); else state.axes[axis.name].delete(value);
         render();
-      } }), String(value))));
-  }
+      } }), String(value))))));
   for (const kind of ["defense", "victim"]) {
     state[kind] = "";
     options(at(kind), [["", "all"], ...[...new Set(board.rows.map((row) => row[kind].name))].sort().map((name) => [name, name])], "");
@@ -220,27 +219,27 @@ function render() {
   const board = current();
   if (!board) return;
   const rows = ranked(board.rows.filter(chosen).map((row) => ({ row, score: over(row.cells, row.score, row.scenarios) })).filter((one) => one.score));
-  const references = board.references.map((reference) => ({ reference, score: over(reference.cells, reference.score, 100) })).filter((one) => one.score);
-  const metric = board.track === "driving" ? "safe progress" : "confidence";
-  const total = order(board.rows.flatMap((row) => row.cells.map((cell) => AXES.map((axis) => cell[axis]).join()))).length;
-  const left = new Set(board.rows.flatMap((row) => kept(row.cells).map((cell) => AXES.map((axis) => cell[axis]).join()))).size;
+  const baselines = board.baselines.map((baseline) => ({ baseline, score: over(baseline.cells, baseline.score, 100) })).filter((one) => one.score);
+  const metric = said().title;
+  const total = new Set(board.rows.flatMap((row) => row.cells.map(({ cell }) => place(cell)))).size;
+  const left = new Set(board.rows.flatMap((row) => kept(row.cells).map(({ cell }) => place(cell)))).size;
   at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, interquartile mean with its 95 % interval.` +
     (rows.length ? "" : " Nothing was driven in the cells that are left.");
 
   const whole = left === total;
   const columns = [
     { name: "Rank", show: (one) => (one.row ? String(one.group) : ""), value: (one) => one.group ?? null },
-    { name: "Defence", class: "name", show: (one) => (one.row ? el("a", { href: "#grid", onclick: () => { state.shown = `r${board.rows.indexOf(one.row)}`; render(); } }, one.row.defense.label) : one.reference.name), value: (one) => one.row?.defense.label ?? one.reference.name },
+    { name: "Defence", class: "name", show: (one) => (one.row ? el("a", { href: "#grid", onclick: () => { state.shown = `r${board.rows.indexOf(one.row)}`; render(); } }, one.row.defense.label) : one.baseline.name), value: (one) => one.row?.defense.label ?? one.baseline.name },
     { name: "Victim", show: (one) => one.row?.victim.label ?? "", value: (one) => one.row?.victim.label ?? "" },
     { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, number: true },
-    { name: "0 – 1", show: (one) => strip(one.score, blindOf(one)) },
+    { name: "0 – 1", show: (one) => strip(one.score, baselineOf(one)) },
     { name: "Clean", show: (one) => (whole ? fixed(one.row?.clean?.estimate) : fixed(cleanOf(one)?.estimate)), value: (one) => (whole ? one.row?.clean?.estimate : cleanOf(one)?.estimate) ?? null, number: true },
-    ...(board.references.length ? [{ name: "Against blind", show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, number: true }] : []),
+    ...(said().baseline ? [{ name: `Against ${said().baseline.replace(/^the /, "")}`, show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, number: true }] : []),
     { name: "Strongest attack", class: "name", show: (one) => (one.row ? cardLink(pairs.get(one.row.strongest), pairs.get(one.row.strongest).attack.label) : ""), value: (one) => (one.row ? pairs.get(one.row.strongest).attack.label : "") },
     { name: "Flags", class: "doubts", show: (one) => (one.row ? doubts(one.row) : ""), value: (one) => (one.row ? one.row.flags.filter((flag) => flag.fired).map((flag) => flag.name).join(" ") : "") },
   ];
-  draw("ranks", columns, [...rows, ...references], (one, before, unsorted) =>
-    [one.reference ? "reference" : "", one.row?.flagged ? "flagged" : "", unsorted && before && one.group !== before.group ? "group" : ""].filter(Boolean).join(" "));
+  draw("ranks", columns, [...rows, ...baselines], (one, before, unsorted) =>
+    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", unsorted && before && one.group !== before.group ? "group" : ""].filter(Boolean).join(" "));
 
   drawPairs(board, metric);
   drawMatrix(board);
@@ -257,17 +256,17 @@ function cleanOf(one) {
     sameDefended(pair, strongest));
   return control ? over(control.cells, control.score, 100) : null;
 }
-function besideBlind(row) {
-  return kept(row.cells).filter((cell) => cell.blind != null);
+function besideBaseline(row) {
+  return kept(row.cells).filter((cell) => cell.baseline != null);
 }
-function blindOf(one) {
-  const cells = one.row ? besideBlind(one.row) : [];
-  return cells.length ? iqm(cells.map((cell) => cell.blind)) : null;
+function baselineOf(one) {
+  const cells = one.row ? besideBaseline(one.row) : [];
+  return cells.length ? iqm(cells.map((cell) => cell.baseline)) : null;
 }
 function leadOf(one, whole) {
   if (!one.row) return null;
   if (whole) return one.row.lead;
-  const cells = besideBlind(one.row).map((cell) => ({ ...cell, runs: cell.runs.map((run) => run - cell.blind) }));
+  const cells = besideBaseline(one.row).map((cell) => ({ ...cell, runs: cell.runs.map((run) => run - cell.baseline) }));
   return cells.length ? interval(cells, one.row.scenarios) : null;
 }
 function lead(one, whole) {
@@ -285,17 +284,16 @@ function drawPairs(board, metric) {
   const rows = within(board).filter(chosen).filter((pair) => !state.attack || pair.attack.name === state.attack)
     .map((pair) => ({ pair, score: over(pair.cells, pair.score, 100) })).filter((one) => one.score);
   const rowOf = (pair) => board.rows.find((row) => sameDefended(row, pair));
-  const [other, title] = board.track === "driving" ? ["crashed", "Crashed"] : ["ran", "Runs the sign"];
-  const share = ({ pair }) => mean(pair, other, pair.measures[other]?.estimate ?? null);
+  const failed = ({ pair }) => mean(pair, "failed", pair.measures[said().failure]?.estimate ?? null);
   const queries = ({ pair }) => mean(pair, "queries", pair.queries);
   draw("pairs", [
     { name: "Attack", class: "name", show: ({ pair }) => cardLink(pair, pair.attack.label), value: ({ pair }) => pair.attack.label },
     { name: "Defence", class: "name", show: ({ pair }) => pair.defense.label, value: ({ pair }) => pair.defense.label },
     { name: "Victim", show: ({ pair }) => pair.victim.label, value: ({ pair }) => pair.victim.label },
     { name: "Threat model", show: ({ pair }) => threatShort(pair.threat), value: ({ pair }) => threatShort(pair.threat) },
-    { name: metric[0].toUpperCase() + metric.slice(1), show: (one) => [estimate(one.score), el("small", {}, " ", part(one.pair, rowOf(one.pair)))].flat(), value: (one) => one.score.estimate, number: true },
+    { name: capital(metric), show: (one) => [estimate(one.score), el("small", {}, " ", part(one.pair, rowOf(one.pair)))].flat(), value: (one) => one.score.estimate, number: true },
     { name: "0 – 1", show: (one) => strip(one.score) },
-    { name: title, show: (one) => percent(share(one)), value: share, number: true },
+    ...(said().failure ? [{ name: capital(said().failure_title), show: (one) => percent(failed(one)), value: failed, number: true }] : []),
     { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
     { name: "Queries", show: (one) => fixed(queries(one), 0), value: queries, number: true },
     { name: "Recording", show: ({ pair }) => (pair.card.recording ? el("a", { href: data.recordings + pair.card.recording }, "rrd") : "") },
@@ -317,18 +315,26 @@ function drawHeat(board) {
   const known = choices.some(([value]) => value === state.shown) ? state.shown : choices[0][0];
   options(at("shown"), choices, known);
   const shown = known[0] === "r" ? board.rows[+known.slice(1)] : pairs.get(+known.slice(1));
-  const cells = kept(shown.cells), weathers = order(cells.map((cell) => cell.weather));
-  const roads = [...new Map(cells.map((cell) => [`${cell.lanes} × ${cell.density}`, cell])).entries()].sort(([, a], [, b]) => a.lanes - b.lanes || a.density - b.density);
-  const head = el("tr", {}, el("th", { scope: "col" }, "Lanes × density"), ...weathers.map((weather) => el("th", { scope: "col" }, weather)));
+  const cells = kept(shown.cells), [down, across] = split(board.axes);
+  const of = (axes) => [...new Map(cells.map(({ cell }) => [joined(axes.map((axis) => cell[axis.name])), cell])).entries()]
+    .sort(([, a], [, b]) => axes.reduce((found, axis) => found || axis.values.indexOf(a[axis.name]) - axis.values.indexOf(b[axis.name]), 0));
+  const columns = of(across);
+  const head = el("tr", {}, el("th", { scope: "col" }, capital(joined(down.map((axis) => axis.name)))), ...columns.map(([name]) => el("th", { scope: "col" }, name || said().title)));
   at("heat").className = "heat";
-  at("heat").replaceChildren(el("thead", {}, head), el("tbody", {}, ...roads.map(([name, road]) => el("tr", {}, el("th", { scope: "row" }, name),
-    ...weathers.map((weather) => {
-      const cell = cells.find((one) => one.weather === weather && one.lanes === road.lanes && one.density === road.density);
-      if (!cell) return el("td", {}, "—");
-      const by = cell.pair == null ? "" : pairs.get(cell.pair).attack.name;
-      return el("td", { style: tint(cell.estimate), title: `${name}, ${weather}: ${fixed(cell.estimate)} ${bounds(cell)} ${by}` },
-        fixed(cell.estimate), el("small", {}, [bounds(cell), by].filter(Boolean).join(" ")));
+  at("heat").replaceChildren(el("thead", {}, head), el("tbody", {}, ...of(down).map(([name, row]) => el("tr", {}, el("th", { scope: "row" }, name),
+    ...columns.map(([column, values]) => {
+      const one = cells.find(({ cell }) => down.every((axis) => cell[axis.name] === row[axis.name]) && across.every((axis) => cell[axis.name] === values[axis.name]));
+      if (!one) return el("td", {}, "—");
+      const by = one.pair == null ? "" : pairs.get(one.pair).attack.name;
+      return el("td", { style: tint(one.estimate), title: `${[name, column].filter(Boolean).join(", ")}: ${fixed(one.estimate)} ${bounds(one)} ${by}` },
+        fixed(one.estimate), el("small", {}, [bounds(one), by].filter(Boolean).join(" ")));
     })))));
+}
+/* The axes that go down the grid, and those that go across: the perceptual ones, or else the last. */
+function split(axes) {
+  const across = axes.filter((axis) => axis.perceptual), down = axes.filter((axis) => !axis.perceptual);
+  if (!down.length) return [across, []];
+  return across.length || down.length < 2 ? [down, across] : [down.slice(0, -1), down.slice(-1)];
 }
 /* Of a pair that was driven in fewer cells than its row. */
 function part(pair, row) {
@@ -371,7 +377,7 @@ function figure(curve, board) {
   svg.append(make("path", { class: "band", d: "M" + points.map((p) => `${X(p.x)} ${Y(p.high ?? p.estimate)}`).join("L") + "L" + [...points].reverse().map((p) => `${X(p.x)} ${Y(p.low ?? p.estimate)}`).join("L") + "Z" }));
   svg.append(make("path", { class: "line", d: "M" + points.map((p) => `${X(p.x)} ${Y(p.estimate)}`).join("L") }));
   for (const p of points) svg.append(make("circle", { cx: X(p.x), cy: Y(p.estimate), r: 3 }), make("text", { x: X(p.x), y: H - B + 15, "text-anchor": "middle" }, p.x >= 100 ? Math.round(p.x) : +p.x.toFixed(3)));
-  const unit = curve.kind === "budget" ? `budget (${board.threat.norm})` : board.track === "driving" ? "queries a step" : "pictures asked about";
+  const unit = curve.kind === "budget" ? `budget (${board.threat.norm})` : said().queries_title;
   svg.append(make("text", { x: (L + W - R) / 2, y: H - 4, "text-anchor": "middle" }, unit + (log ? ", log scale" : "")));
   return el("figure", {}, svg, el("figcaption", {}, `${curve.first.attack.label} on ${curve.first.defense.label} · ${curve.first.victim.label}, ${curve.cells} cell${curve.cells > 1 ? "s" : ""}`));
 }
@@ -390,11 +396,11 @@ function showCard() {
     el("dl", {},
       ...fact("score", ...estimate(pair.score)),
       ...["attack", "defense", "victim", "world"].flatMap((kind) => fact(kind === "defense" ? "defence" : kind, params(card.components[kind]), el("br"), el("small", { class: "quiet" }, words(card.shipped_by[kind])))),
-      ...fact("threat model", pair.threat.budget ? threatText(pair.threat) : "nothing is attacked"),
+      ...fact("threat model", pair.threat.budget ? threatName(pair.threat) : "nothing is attacked"),
       ...fact("training seeds", words(card.training_seeds)),
       ...fact("scenario seeds", `${card.scenario_seeds[0]} to ${card.scenario_seeds[1]} (${words(card.grid)}), ${pair.cells.length} cells, ${card.episodes} episodes` + (card.left_out ? `; ${card.left_out} left out` : "")),
       ...fact("weights", words(card.weights_sha256)),
-      ...(card.patch_sha256.length ? fact("patch", words(card.patch_sha256)) : []),
+      ...(card.artefact_sha256.length ? fact(data.tracks[pair.track].artefact, words(card.artefact_sha256)) : []),
       ...fact("code", words(card.code_digest)),
       ...fact("libraries", ...card.libraries.map((one) => el("div", {}, Object.entries(one).map(([k, v]) => `${k} ${v}`).join(", ")))),
       ...fact("machine", words(card.machine)),
