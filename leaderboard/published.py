@@ -17,18 +17,18 @@ from rich.console import Console
 
 from bench.errors import UserError
 from bench.files import whole
-from bench.plugins.contracts import Track
-from bench.records import store as results
-from bench.records.store import SCHEMAS, track_of
+from bench.plugins.track import Track
+from bench.records import reading
+from bench.records.generations import check
+from bench.records.schema import schema
 
 
 def published(track: Track) -> pa.Table:
     """Every record of a track in `leaderboard/data/*.parquet`, an empty table if none is shipped."""
-    schema = SCHEMAS[track]
     with as_file(files("leaderboard") / "data") as folder:
-        paths = [path for path in sorted(folder.glob("*.parquet")) if track_of(pq.read_schema(path).names) == track]
-        tables = [results.upgraded(pq.read_table(path), track) for path in paths]
-    return pa.concat_tables([schema.empty_table(), *tables])
+        paths = [path for path in sorted(folder.glob("*.parquet")) if check(path)[0] is track]
+        tables = [pq.read_table(path) for path in paths]
+    return pa.concat_tables([schema(track).empty_table(), *tables])
 
 
 def publish(folder: Path, file: Path) -> int:
@@ -44,7 +44,7 @@ def publish(folder: Path, file: Path) -> int:
     Raises:
         UserError: if the folder has records of no track, or of several.
     """
-    found = results.read_all(folder)
+    found = reading.read_all(folder)
     if len(found) > 1:
         raise UserError(f"{folder} has records of the tracks {' and '.join(found)}; what is published has one")
     (records,) = found.values()

@@ -7,7 +7,7 @@ records and reports ask the object. Importing a track's module must be quick (no
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -67,24 +67,62 @@ class Measure:
 
     Args:
         column: of the records.
-        heading: at most two lines.
-        how: `mean`; `rate`: the share of episodes for which a flag is set, with a Wilson interval; `step mean`: mean over all
-            steps of a column that holds a mean a step; `median`.
+        heading: at most two lines; `{max_steps}` and other facts of the world are filled in.
+        how: `iqm`: interquartile mean over runs and cells with a bootstrap interval; `mean`; `median`; `rate`: share of the
+            episodes for which a flag is set, with a Wilson interval; `step mean`: mean over all steps, of a column that holds the
+            mean of each episode.
         unit: `share` is written as a percentage.
         digits: behind the point.
-        of_attack: whether it says something of the attack, and nothing where there is none.
+        of_attack: whether it describes the attack, and nothing where there is none.
+        with_interval: whether the overview shows its interval.
+        tables: which tables have it: `overview` (a row an attack), `cells` (a row a cell), or `both`.
         spare: columns are left out of a narrow terminal from the highest number down; 0 stays.
-        meaning: a sentence for the legend; empty where the heading says it.
     """
 
     column: str
     heading: str
-    how: Literal["mean", "rate", "step mean", "median"] = "mean"
-    unit: Literal["", "share", "m", "s", "ms"] = ""
+    how: Literal["iqm", "mean", "rate", "step mean", "median"] = "mean"
+    unit: Literal["", "share"] = ""
     digits: int = 0
     of_attack: bool = False
+    with_interval: bool = False
+    tables: Literal["overview", "cells", "both"] = "both"
     spare: int = 0
-    meaning: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Baseline:
+    """What reports call a baseline (`Track.baseline_of`).
+
+    Args:
+        title: in a row or a sentence.
+        heading: of its column, at most two lines.
+        spare: as in `Measure`.
+    """
+
+    title: str
+    heading: str
+    spare: int = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contrast:
+    """The baseline that scores under attack are compared with, scenario by scenario, and who has to do better than it.
+
+    Args:
+        side: `victim`: the victim under attack must score above a baseline that ignores its input. `attack`: the score must fall
+            below that under a baseline attack, which knows nothing of the victim.
+        baseline: its name; empty for the one with the lowest score of those that were driven.
+        title: of the baseline in a sentence, with its article.
+        heading: of the column of differences, at most two lines.
+        short: of a column of marks, at most two lines.
+    """
+
+    side: Literal["victim", "attack"]
+    baseline: str = ""
+    title: str
+    heading: str
+    short: str = ""
 
 
 class Track(ABC):
@@ -124,10 +162,28 @@ class Track(ABC):
     """The columns of its reports, beside the metric."""
     legend: ClassVar[str] = ""
     """What a reader of its tables has to know."""
-    baseline_titles: ClassVar[Mapping[str, str]] = {}
+    baseline_kinds: ClassVar[Mapping[str, Baseline]] = {}
     """What reports call its baselines (`baseline_of`), in their order."""
-    best_baseline: ClassVar[str] = ""
-    """The baseline that a pair under attack is compared with; empty for none."""
+    contrast: ClassVar[Contrast | None] = None
+    """The baseline that a pair under attack is compared with; None where there is none."""
+    place: ClassVar[str] = ""
+    """The measurement that names where an episode takes place; tables of a pair have a row for each. Empty for none."""
+    queries: ClassVar[str] = "queries"
+    """The measurement that counts what an attack asked the victim."""
+    queries_title: ClassVar[str] = "queries"
+    """What reports call it, for instance queries a step."""
+    gradients: ClassVar[str] = "gradient_queries"
+    """The measurement, or probe, that counts the gradients among them."""
+    excess: ClassVar[str] = ""
+    """The measurement of how far an attack's answers were outside its perturbation set; empty for none."""
+    step_ms: ClassVar[str] = ""
+    """The measurement of an attack's wall time a decision, in milliseconds; empty for none."""
+    enough_episodes: ClassVar[int] = 20
+    """Scenarios a cell below which a leaderboard flags a score."""
+    other_input: ClassVar[str] = "another input"
+    """What the probe `same_answer` shows the victim instead of its input."""
+    many_draws: ClassVar[str] = ""
+    """Why every attack sees many draws of a random victim, as a sentence; empty where it has to ask again to see them."""
 
     work: ClassVar[str]
     """The module that computes its records: its source, with all it imports, is what they outdate with."""
@@ -139,13 +195,31 @@ class Track(ABC):
         yield from ()
 
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
-        """The name under which records are a baseline for others; empty if they are none.
+        """The name under which records are a baseline for others; empty if they are none. A baseline is one for itself too.
 
         Args:
             other: the identity columns of a record of what may be a baseline.
             own: those of what is compared.
         """
         return ""
+
+    def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
+        """What a perturbation budget allows, in words.
+
+        Args:
+            norm: of the threat model.
+            budget: of the threat model.
+            facts: of the world, as records have them (`world_facts`).
+        """
+        return f"a perturbation of at most {budget:g}"
+
+    def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
+        """What an attack did or cost, each as a word and a sentence.
+
+        Args:
+            column: gives the values of a measurement in all its episodes.
+        """
+        yield from ()
 
     def identity(self, pair: Pair) -> Mapping[str, object]:
         """The columns of a record's identity that only this track fills: `action_type`."""

@@ -1,7 +1,7 @@
-"""What a set of episode records says: driving metrics and attack metrics, a cell or a grid at a time, with intervals.
+"""The episodes of a pair in order, and what they say with intervals, a cell or a grid at a time.
 
-Records come as a `pyarrow.Table`, one row an episode (columns: `bench.records.store.SCHEMA`). `Episodes.arrange` puts the
-rows of one pair in order, training seeds x cells x scenario seeds; `summarise` measures them; `difference` compares
+Records come as a `pyarrow.Table`, one row an episode (columns: `bench.records.schema`). `Episodes.arrange` puts the
+rows of one pair in order, training seeds x cells x scenario seeds; `measured` makes them one number; `difference` compares
 two sets scenario by scenario. The statistics are those of `bench.statistics.estimates`.
 """
 
@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from bench.plugins.track import Measure
 from bench.scenarios import Axes, Cell
 from bench.statistics.estimates import Array, Interval, interval, wilson
 
@@ -201,56 +202,20 @@ def difference(treated: Episodes, control: Episodes, name: str) -> Interval:
     return interval(treated.column(name) - control.column(name))
 
 
-@dataclass(frozen=True)
-class Summary:
-    """The measurements of a set of episodes.
-
-    Args:
-        safe_progress: in [0, 1], the ranking metric: 0 where the episode crashes or leaves the road.
-        episode_return: in [0, 450], highway-env's normalised reward summed over the episode.
-        crash_rate: share of episodes that end in a crash, all runs pooled.
-        offroad_rate: share of episodes that leave the road, all runs pooled.
-        attack_success: share of steps in [0, 1] whose decision the attack changed.
-        queries_mean: victim evaluations a step, mean over steps.
-        attack_ms: the attack's wall time a step and episode, milliseconds.
-        min_ttc_s: smallest time to collision of an episode in seconds, median over episodes; inf: never a car ahead.
-        action_entropy: of discrete actions, in [0, 1] (1: all equally often, 0: always one); NaN for continuous ones.
-        runs: training seeds.
-        cells: cells of the grid.
-        episodes: a run and cell.
-    """
-
-    safe_progress: Interval
-    episode_return: Interval
-    crash_rate: Interval
-    offroad_rate: Interval
-    attack_success: float
-    queries_mean: float
-    attack_ms: float
-    min_ttc_s: float
-    action_entropy: float
-    runs: int
-    cells: int
-    episodes: int
-
-
-def summarise(episodes: Episodes) -> Summary:
-    """Measure a set of episodes: a whole grid, or one cell of it (`episodes.only(cells=[cell])`)."""
-    runs, cells, count = episodes.shape
-    return Summary(
-        safe_progress=unit_interval(episodes.column("safe_progress")),
-        episode_return=interval(episodes.column("return")),
-        crash_rate=rate(episodes, "crashed"),
-        offroad_rate=rate(episodes, "offroad"),
-        attack_success=step_mean(episodes, "changed"),
-        queries_mean=step_mean(episodes, "queries"),
-        attack_ms=step_mean(episodes, "attack_ms"),
-        min_ttc_s=float(np.median(episodes.column("min_ttc_s"))),
-        action_entropy=action_entropy(episodes.table),
-        runs=runs,
-        cells=cells,
-        episodes=count,
-    )
+def measured(episodes: Episodes, measure: Measure) -> Interval:
+    """The number that a measure is of some episodes; its bounds are NaN where it has no interval."""
+    if measure.how == "rate":
+        return rate(episodes, measure.column)
+    if measure.how == "step mean":
+        found = step_mean(episodes, measure.column)
+    elif measure.how == "median":
+        found = float(np.median(episodes.column(measure.column)))
+    elif measure.how == "mean":
+        found = float(episodes.column(measure.column).mean())
+    else:
+        scores = episodes.column(measure.column)
+        return unit_interval(scores) if measure.unit == "share" else interval(scores)
+    return Interval(found, np.nan, np.nan)
 
 
 def unit_interval(scores: Array) -> Interval:
@@ -275,15 +240,3 @@ def step_mean(episodes: Episodes, name: str) -> float:
     """Mean over all driven steps of a column that holds a mean a step."""
     steps = episodes.column("steps")
     return float((episodes.column(name) * steps).sum() / max(float(steps.sum()), 1.0))
-
-
-def action_entropy(records: pa.Table) -> float:
-    """Shannon entropy of the actions taken, over its largest value log(A); NaN where no action is discrete."""
-    counts = [row for row in records["action_counts"].to_pylist() if row]
-    if not counts:
-        return float("nan")
-    totals = np.zeros(max(map(len, counts)))
-    for row in counts:
-        totals[: len(row)] += row
-    share = totals[totals > 0] / totals.sum()
-    return float(-(share * np.log(share)).sum() / np.log(len(totals)))

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from bench.plugins import registry
 from bench.plugins.contracts import Progress
 from bench.plugins.pair import Pair, choose
-from bench.plugins.track import Driven, Job, Measure, Track
+from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
 from bench.records.schema import FLOAT, PROBES, TEXT, field
 
 REFERENCE_PATCHES = ("noise_patch", "grey_patch")
@@ -63,20 +65,34 @@ class DetectionTrack(Track):
     metric_title: ClassVar[str] = "confidence"
     failure: ClassVar[str] = "ran"
     measures: ClassVar[tuple[Measure, ...]] = (
-        Measure(column="detection_rate", heading="frames\nseen", unit="share"),
-        Measure(column="first_seen_m", heading="first\nseen m", spare=2),
-        Measure(column="ran", heading="runs the\nsign", how="rate", unit="share"),
-        Measure(column="overrun_m", heading="overrun\nm", digits=1, spare=3),
-        Measure(column="visible_share", heading="visible", unit="share", spare=5),
-        Measure(column="false_alarms", heading="false alarms\na frame", digits=2, spare=7),
-        Measure(column="queries", heading="pictures\na patch", of_attack=True, spare=4),
-        Measure(column="crafting_s", heading="crafting\ns", of_attack=True, spare=6),
+        Measure(column="detection_rate", heading="frames\nseen", how="iqm", unit="share"),
+        Measure(column="first_seen_m", heading="first\nseen m", how="iqm", digits=1, spare=2),
+        Measure(column="ran", heading="runs the\nsign", how="rate", unit="share", with_interval=True),
+        Measure(column="overrun_m", heading="over-\nrun m", digits=1, spare=3),
+        Measure(column="visible_share", heading="\nvisible", unit="share", tables="cells", spare=5),
+        Measure(column="false_alarms", heading="false\nalarms", digits=2, spare=7),
+        Measure(column="queries", heading="\nimages", of_attack=True, tables="overview", spare=4),
+        Measure(column="crafting_s", heading="craft\ns", of_attack=True, tables="overview", spare=4),
     )
     legend: ClassVar[str] = (
         "confidence: in the stop sign at its true place, mean over an approach, 0 in a frame that misses it. frames seen: "
-        "confidence above 0.25. runs the sign: the car, at 10 m/s, never brakes or stops more than 1 m beyond the line."
+        "confidence above 0.25. runs the sign: the car, at 10 m/s, never brakes or stops more than 1 m beyond the line. false "
+        "alarms: a frame."
     )
-    baseline_titles: ClassVar[Mapping[str, str]] = {"noise_patch": "noise patch", "grey_patch": "grey patch"}
+    baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
+        "noise_patch": Baseline(title="noise patch", heading="\nnoise", spare=1),
+        "grey_patch": Baseline(title="grey patch", heading="\ngrey", spare=1),
+    }
+    contrast: ClassVar[Contrast | None] = Contrast(
+        side="attack", title="the best baseline patch", heading="beyond best\nbaseline"
+    )
+    place: ClassVar[str] = "location"
+    queries_title: ClassVar[str] = "images a patch"
+    gradients: ClassVar[str] = "gradients"
+    excess: ClassVar[str] = "excess"
+    enough_episodes: ClassVar[int] = 3
+    other_input: ClassVar[str] = "a grey image"
+    many_draws: ClassVar[str] = "It draws, and a patch is crafted on many images, each a draw of its own."
     facts_of_v1: ClassVar[Mapping[str, object]] = {
         "decision_hz": 0,
         "max_steps": 0,
@@ -109,6 +125,13 @@ class DetectionTrack(Track):
         same = ("defense", "defense_params", "victim", "victim_params", "world", "world_params", "threat_budget")
         is_one = other["attack"] in REFERENCE_PATCHES and all(other[name] == own[name] for name in same)
         return str(other["attack"]) if is_one else ""
+
+    def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
+        return f"a patch {100 * budget:g} % as wide as the sign"
+
+    def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
+        images, seconds = (float(column(name).mean()) for name in ("queries", "crafting_s"))
+        yield "crafted", f"from {images:.0f} images in {seconds:.0f} s, a patch, on average"
 
     def prepare(self, job: Job, made_by: str, progress: Progress) -> bytes:
         from bench.detection.crafting import prepare

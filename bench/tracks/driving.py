@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from bench.plugins.pair import Pair, choose
-from bench.plugins.track import Driven, Job, Measure, Track
+from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
 from bench.records.schema import FLOAT, PROBES, field
 
 if TYPE_CHECKING:
@@ -61,10 +63,10 @@ class DrivingTrack(Track):
     metric_title: ClassVar[str] = "safe progress"
     failure: ClassVar[str] = "crashed"
     measures: ClassVar[tuple[Measure, ...]] = (
-        Measure(column="return", heading="return"),
-        Measure(column="crashed", heading="crashed", how="rate", unit="share"),
-        Measure(column="offroad", heading="off\nroad", how="rate", unit="share", spare=4),
-        Measure(column="min_ttc_s", heading="min\nTTC s", how="median", digits=1, spare=6),
+        Measure(column="return", heading="return\nof {max_steps}", how="iqm"),
+        Measure(column="crashed", heading="\ncrashed", how="rate", unit="share"),
+        Measure(column="offroad", heading="off\nroad", how="rate", unit="share", tables="overview", spare=4),
+        Measure(column="min_ttc_s", heading="min\nTTC s", how="median", digits=1, tables="overview", spare=6),
         Measure(column="changed", heading="success\n/ step", how="step mean", unit="share", of_attack=True, spare=2),
         Measure(column="queries", heading="queries\n/ step", how="step mean", of_attack=True),
         Measure(column="attack_ms", heading="ms\n/ step", how="step mean", digits=1, of_attack=True, spare=3),
@@ -73,12 +75,22 @@ class DrivingTrack(Track):
         "safe progress: 0 if the episode crashes or leaves the road, else its mean progress. success: share of steps whose "
         "decision the attack changed. TTC: time to collision with the car ahead."
     )
-    baseline_titles: ClassVar[Mapping[str, str]] = {
-        BEST_BLIND: "best blind policy",
-        RANDOM: "random",
-        IDM: "IDM and MOBIL",
+    baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
+        BEST_BLIND: Baseline(title="best blind policy", heading="best\nblind", spare=0),
+        RANDOM: Baseline(title="random", heading="ran-\ndom"),
+        IDM: Baseline(title="IDM and MOBIL", heading="\nIDM"),
     }
-    best_baseline: ClassVar[str] = BEST_BLIND
+    contrast: ClassVar[Contrast | None] = Contrast(
+        side="victim",
+        baseline=BEST_BLIND,
+        title="the best blind policy",
+        heading="against\nbest blind",
+        short="beats\nblind",
+    )
+    queries_title: ClassVar[str] = "queries a step"
+    excess: ClassVar[str] = "excess_max"
+    step_ms: ClassVar[str] = "attack_ms"
+    other_input: ClassVar[str] = "another episode's observation"
     facts_of_v1: ClassVar[Mapping[str, object]] = {
         "decision_hz": 15,
         "max_steps": 450,
@@ -126,6 +138,24 @@ class DrivingTrack(Track):
         ):
             return ""
         return BEST_BLIND if other["victim"] == "blind" else str(other["victim"])
+
+    def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
+        off = f"{100 * budget:g} % of itself" if norm == "relative" else f"{budget:g} on the [-1, 1] scale"
+        features = facts.get("features", {})
+        floors = features.get("floors", ()) if norm == "relative" else ()
+        least = [
+            f"{name} {floor * budget / 0.1:g} {unit}"
+            for name, floor, unit in zip(features.get("names", ()), floors, features.get("units", ()), strict=False)
+        ]
+        by_floor = f", or by its floor ({', '.join(least)})" if least else ""
+        return f"each measured value may be off by {off}{by_floor}; presence cannot be forged"
+
+    def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
+        steps = column("steps")
+        metres, speed = (
+            f"{(column(name) * steps).sum() / max(float(steps.sum()), 1.0):.2f}" for name in ("linf_m", "linf_mps")
+        )
+        yield "moved", f"{metres} m and {speed} m/s, the largest deviation of a step, on average"
 
     def identity(self, pair: Pair) -> Mapping[str, object]:
         return {"action_type": _parts(pair)[0].action_type}

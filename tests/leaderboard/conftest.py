@@ -10,7 +10,7 @@ import pytest
 from full_house import write as write_records
 from rich.console import Console
 
-from leaderboard import page
+from leaderboard.page.write import write as write_page
 
 
 @pytest.fixture(scope="session")
@@ -19,7 +19,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     out = write_records(folder / "results")
     with (folder / "terminal.txt").open("w") as file:
-        page.write(out, folder, Console(file=file, width=120))
+        write_page(out, folder, Console(file=file, width=120))
     return folder
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from synthetic import CLEAR, approach, drive, probed, reference_drivers
+from synthetic import CLEAR, approach, baseline_drivers, drive, probed
 
 from bench.records.store import FOLDER
 
@@ -22,7 +22,7 @@ def driving() -> pa.Table:
         ("ddpg", "none"): (0.6, 0.3),
         ("dqn", "masked"): (0.7, 0.6),
     }
-    tables = [reference_drivers(episodes=20)]
+    tables = [baseline_drivers(episodes=20)]
     for (victim, defense), (clean, left) in skills.items():
         own = {
             "defense": defense,

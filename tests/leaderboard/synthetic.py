@@ -10,11 +10,17 @@ from datetime import UTC, datetime
 import numpy as np
 import pyarrow as pa
 
+from bench.plugins.contracts import Facts
 from bench.plugins.pair import choose
-from bench.records.store import SCHEMA, SCHEMAS
-from bench.scenarios import Cell
+from bench.plugins.track import track
+from bench.records.schema import schema
+from bench.scenarios import Cell, Grid
+from bench.statistics.episodes import as_text
+from envs.camera.axes import APPROACH_V1
+from envs.highway.axes import STANDARD_V1
 
-CLEAR = tuple(cell for cell in GRIDS["standard-v1"].cells() if cell.weather == "clear")
+FEATURES = {"names": ["x", "vx"], "units": ["m", "m/s"], "floors": [0.5, 0.3]}
+CLEAR = tuple(cell for cell in STANDARD_V1.cells() if cell.weather == "clear")
 
 
 def drive(
@@ -26,7 +32,7 @@ def drive(
     defense_params: dict[str, object] | None = None,
     victim_params: dict[str, object] | None = None,
     threat: tuple[str, float] = ("relative", 0.1),
-    cells: Iterable[Cell] = GRIDS["standard-v1"].cells(),
+    cells: Iterable[Cell] = STANDARD_V1.cells(),
     runs: Iterable[int] = (0, 1, 2),
     episodes: int = 20,
     skill: float = 0.6,
@@ -41,7 +47,7 @@ def drive(
     run, place, seed = (
         axis.ravel() for axis in np.meshgrid(tuple(runs), range(len(cells)), range(episodes), indexing="ij")
     )
-    lanes, density = (np.array([getattr(cell, name) for cell in cells])[place] for name in ("lanes", "density"))
+    density = np.array([cell.density for cell in cells])[place]
     weather = np.array([cell.weather for cell in cells])[place]
     attacked = attack != "none"
     generator = np.random.default_rng([ord(letter) for letter in victim + attack + defense])
@@ -52,7 +58,7 @@ def drive(
     steps = np.where(crashed, generator.integers(30, 450, count), 450)
     speed = 20 + 10 * at_cell
     columns: dict[str, object] = {
-        "unit": _units(
+        "unit": units(
             attack, attack_params, defense, defense_params, victim, victim_params, threat, run=run, place=place
         ),
         "pair": f"{attack}-{defense}-{victim}",
@@ -72,9 +78,8 @@ def drive(
         "threat_access": "scores",
         "threat_queries": 1000,
         "grid": grid,
-        "lanes": lanes,
-        "density": density,
-        "weather": weather,
+        "cell": [as_text(cells[i]) for i in place],
+        "world_facts": facts(STANDARD_V1, features=FEATURES, decision_hz=15, max_steps=450),
         "seed": 1_000_000 + seed,
         "steps": steps,
         "return": steps * (0.67 + 0.3 * at_cell),
@@ -100,7 +105,7 @@ def drive(
         "created_at": datetime(2026, 1, 1, tzinfo=UTC),
         "wall_s": 1.0,
     }
-    return _table(SCHEMA, columns, count)
+    return table(schema(track("driving")), columns, count)
 
 
 def probed(records: pa.Table, **columns: float | str) -> pa.Table:
@@ -112,12 +117,18 @@ def probed(records: pa.Table, **columns: float | str) -> pa.Table:
     return records
 
 
-def _units(*identity: object, run: np.ndarray, place: np.ndarray) -> list[str]:
+def units(*identity: object, run: np.ndarray, place: np.ndarray) -> list[str]:
     """A fingerprint a unit: a pair, a training seed and a cell."""
     return [hashlib.sha256(repr((identity, *key)).encode()).hexdigest() for key in zip(run, place, strict=True)]
 
 
-def _table(schema: pa.Schema, columns: Mapping[str, object], count: int) -> pa.Table:
+def facts(grid: Grid, **more: object) -> str:
+    """What records say of the world of a grid."""
+    return json.dumps({**Facts(axes=grid.axes).written(), **more})
+
+
+def table(schema: pa.Schema, columns: Mapping[str, object], count: int) -> pa.Table:
+    """Records of a schema; a column that is not given is empty, one value is that of every record."""
     arrays = []
     columns = {"libraries": "{}", **columns}
     for field in schema:
@@ -139,7 +150,7 @@ def approach(
     victim_params: Mapping[str, object] | None = None,
     world_params: Mapping[str, object] | None = None,
     budget: float = 0.5,
-    cells: Iterable[Cell] = GRIDS["approach-v1"].cells(),
+    cells: Iterable[Cell] = APPROACH_V1.cells(),
     runs: Iterable[int] = (0, 1, 2),
 ) -> pa.Table:
     """Records of one patch, an approach a location and cell; `left` is the confidence it leaves, by weather and location."""
@@ -153,7 +164,7 @@ def approach(
     frames = [[float(value)] * 10 for value in confidence]
     attacked = attack != "none"
     columns: dict[str, object] = {
-        "unit": _units(attack, changes, defense, victim, victim_params, budget, run=run, place=place),
+        "unit": units(attack, changes, defense, victim, victim_params, budget, run=run, place=place),
         "pair": f"{attack}-{defense}-{victim}",
         "attack": attack,
         "attack_params": choose("attack", attack, **(changes or {})).params,
@@ -170,9 +181,8 @@ def approach(
         "threat_access": "gradients" if attacked else "oblivious",
         "threat_queries": 20_000 if attacked else 0,
         "grid": "approach-v1",
-        "lanes": np.array([cells[i].lanes for i in place]),
-        "density": np.array([cells[i].density for i in place]),
-        "weather": weather,
+        "cell": [as_text(cells[i]) for i in place],
+        "world_facts": facts(APPROACH_V1),
         "seed": 1_000_000 + seed,
         "location": location,
         "confidence_mean": confidence,
@@ -194,11 +204,11 @@ def approach(
         "created_at": datetime(2026, 1, 1, tzinfo=UTC),
         "wall_s": 1.0,
     }
-    return _table(SCHEMAS["detection"], columns, len(run))
+    return table(schema(track("detection")), columns, len(run))
 
 
-def reference_drivers(cells: Iterable[Cell] = CLEAR, episodes: int = 20) -> pa.Table:
-    """The reference rows that every run leaves: blind policies, random and IDM, in clear weather."""
+def baseline_drivers(cells: Iterable[Cell] = CLEAR, episodes: int = 20) -> pa.Table:
+    """The baselines that every run drives: blind policies, random and IDM, in clear weather."""
     common = {"cells": tuple(cells), "runs": (0,), "episodes": episodes, "sees": False}
     blind = {"slower": 0.2, "idle": 0.05, "right_then_slower": 0.35, "faster": 0.0}
     return pa.concat_tables(

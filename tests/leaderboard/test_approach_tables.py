@@ -10,16 +10,17 @@ import pytest
 from rich.console import Console
 
 from bench.plugins.pair import choose
-from leaderboard.pairs import parameters
+from bench.plugins.track import track
+from leaderboard.comparisons.comparison import parameters
 from leaderboard.published import published
-from leaderboard.tables import run_report
-from leaderboard.thesis_patch_records import usual_crafting
+from leaderboard.terminal.run import run_report
+from leaderboard.thesis.patch_records import usual_crafting
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 160])
 def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut_off(width: int) -> None:
     out = io.StringIO()
-    records = published("detection").filter(pc.field("defense") == "none")
+    records = published(track("detection")).filter(pc.field("defense") == "none")
     run_report({"detection": records}, Console(file=out, width=width))
     text = out.getvalue()
     assert max(map(len, text.splitlines())) <= width

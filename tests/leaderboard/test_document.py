@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import shlex
+from importlib.resources import files
 from pathlib import Path
 
 import jsonschema
@@ -12,17 +14,21 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from full_house import driving
-from synthetic import drive
+from synthetic import CLEAR, drive
 
 from bench.errors import UserError
-from bench.records import store as results
-from leaderboard.cards import run_command
-from leaderboard.document import CSV, document, schema
-from leaderboard.entries import MEASUREMENTS, read_entries
-from leaderboard.flags import FLAGS
-from leaderboard.page import NAME, write
-from leaderboard.published import published
-from leaderboard.ranking import read_boards
+from bench.plugins.track import tracks
+from bench.records import reading
+from bench.run.config import run_config
+from bench.scenarios import Cell
+from bench.statistics.episodes import as_text
+from leaderboard.comparisons.reading import measurements, read_tracks
+from leaderboard.page.cards import run_command
+from leaderboard.page.document import document, schema
+from leaderboard.page.table import CSV
+from leaderboard.page.write import NAME, write
+from leaderboard.ranking.boards import read_boards
+from leaderboard.ranking.flags import FLAGS
 
 
 def test_the_document_keeps_to_its_schema(site: Path) -> None:
@@ -40,8 +46,8 @@ def test_the_document_keeps_to_its_schema(site: Path) -> None:
 def test_what_a_pair_did_is_the_mean_of_what_it_did_in_its_cells(site: Path) -> None:
     made = json.loads((site / "leaderboard.json").read_text())
     for pair in made["pairs"]:
-        rate = "crashed" if pair["track"] == "driving" else "ran"
-        whole = {rate: pair["measures"][rate]["estimate"], "queries": pair["queries"]}
+        failure = made["tracks"][pair["track"]]["failure"]
+        whole = {"failed": pair["measures"][failure]["estimate"], "queries": pair["queries"]}
         for name, value in whole.items():
             assert value == pytest.approx(np.mean([cell[name] for cell in pair["cells"]]), abs=1e-4)
 
@@ -69,29 +75,35 @@ def test_the_terminal_says_the_ranking(site: Path) -> None:
 
 
 def test_compact_records_give_the_same_as_those_in_memory(site: Path) -> None:
-    measurements = {name for names in MEASUREMENTS.values() for name in names}
-    compact = read_entries(results.read_compact(site / "results", measurements))
-    whole = read_entries({track: results.read(site / "results", track=track) for track in ("driving", "detection")})
-    scores = [
-        {(entry.track, *map(str, entry.identity.values())): entry.score for entry in each} for each in (compact, whole)
-    ]
+    needed = {name for each in tracks() for name in measurements(each)}
+    compact = read_tracks(reading.read_compact(site / "results", needed))
+    whole = read_tracks(reading.read_all(site / "results"))
+    scores = [{(one.track, *map(str, one.identity.values())): one.score for one in each} for each in (compact, whole)]
     assert scores[0] == scores[1]
 
 
 def test_a_card_says_what_to_type() -> None:
-    entry = next(one for one in read_entries({"driving": driving()}) if one.identity["attack"] == "pgd")
-    words = run_command(entry).split()
+    attacked = next(one for one in read_tracks({"driving": driving()}) if one.identity["attack"] == "pgd")
+    words = run_command(attacked).split()
     assert words[:3] == ["bench", "run", "attack=pgd"]
     assert {"attack.steps=10", "threat.budget=0.1", "lanes=3,4,5", "density=1,2", "episodes=20", "seeds=0,1,2"} <= set(
         words
     )
 
 
-def test_older_records_are_read_and_say_that_nothing_was_probed() -> None:
-    records = published("driving")
-    assert records.schema.equals(results.SCHEMAS["driving"])
-    older = records.drop_columns([field.name for field in results.PROBES])
-    assert results.upgraded(older, "driving")["same_answer"].null_count == records.num_rows
+def test_every_published_run_command_makes_the_same_pair_on_the_same_scenarios() -> None:
+    made = json.loads((files("leaderboard") / "index.json").read_text())
+    assert len(made["pairs"]) > 100
+    for pair in made["pairs"]:
+        card = pair["card"]
+        config = run_config(shlex.split(card["run"])[2:])
+        (found,) = config.pairs
+        for kind, component in card["components"].items():
+            chosen = getattr(found, kind)
+            assert (chosen.name, json.loads(chosen.params)) == (component["name"], component["params"]), card["run"]
+        assert {name: getattr(found.threat, name) for name in pair["threat"]} == pair["threat"]
+        assert list(config.seeds) == card["training_seeds"]
+        assert {cell for one in pair["cells"] for cell in [Cell(**one["cell"])]} <= set(config.grid.cells())
 
 
 def test_a_folder_without_records_is_refused_and_so_is_a_place_that_cannot_be_written(
@@ -106,7 +118,7 @@ def test_a_folder_without_records_is_refused_and_so_is_a_place_that_cannot_be_wr
         write(site / "results", tmp_path / "file" / NAME, Console())
 
 
-def test_reference_drivers_of_both_types_of_action_stand_apart() -> None:
+def test_baselines_of_both_types_of_action_stand_apart() -> None:
     own = {"discrete": ("dqn", 0.4), "continuous": ("ddpg", 0.1)}
     records = [
         table
@@ -119,8 +131,8 @@ def test_reference_drivers_of_both_types_of_action_stand_apart() -> None:
     ]
     (board,), _ = read_boards({"driving": pa.concat_tables(records)})
     names = ["best blind policy, discrete", "best blind policy, continuous"]
-    assert list(board.references) == names
-    better, worse = (board.references[name].column("safe_progress").mean() for name in names)
+    assert list(board.baselines) == names
+    better, worse = (board.baselines[name].column("safe_progress").mean() for name in names)
     assert better > worse
 
 
@@ -129,11 +141,12 @@ def test_a_curve_is_about_the_cells_that_all_its_points_have() -> None:
         drive(attack=attack, skill=skill, threat=("relative", budget), queries=44.0)
         for attack, skill, budget in (("none", 0.8, 0.1), ("zo", 0.5, 0.05), ("zo", 0.3, 0.1))
     )
-    part = (pc.field("lanes") == 3) & (pc.field("weather") == "clear")
-    boards, entries = read_boards({"driving": pa.concat_tables([clean, few.filter(part), many])})
-    (curve,) = document(boards, entries, None)["curves"]
-    only = read_entries({"driving": pa.concat_tables([clean, few, many]).filter(part)})
-    wanted = {entry.identity["threat_budget"]: entry.score.estimate for entry in only if entry.attacked}
+    cells = [as_text(cell) for cell in CLEAR if cell.lanes == 3]
+    part = pc.field("cell").isin(cells)
+    boards, comparisons = read_boards({"driving": pa.concat_tables([clean, few.filter(part), many])})
+    (curve,) = document(boards, comparisons, None)["curves"]
+    only = read_tracks({"driving": pa.concat_tables([clean, few, many]).filter(part)})
+    wanted = {one.identity["threat_budget"]: one.score.estimate for one in only if one.is_attacked}
     assert curve["cells"] == 2
     assert {point["x"]: point["estimate"] for point in curve["points"]} == pytest.approx(wanted, abs=1e-4)
     assert curve["clean"]["estimate"] == pytest.approx(only[0].clean_score.estimate, abs=1e-4)

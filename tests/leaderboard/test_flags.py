@@ -5,17 +5,18 @@ from __future__ import annotations
 import pyarrow as pa
 import pytest
 from full_house import PGD, SEEN
-from synthetic import CLEAR, approach, drive, probed, reference_drivers
+from synthetic import CLEAR, approach, baseline_drivers, drive, probed
 
-from leaderboard.entries import read_entries
-from leaderboard.flags import FLAGS, Flag
-from leaderboard.ranking import Board, boards
+from envs.highway.axes import STANDARD_V1
+from leaderboard.comparisons.reading import read_tracks
+from leaderboard.ranking.boards import Board, boards
+from leaderboard.ranking.flags import FLAGS, Flag
 
 HALF = CLEAR[:3]
 
 
 def board(*tables: pa.Table, track: str = "driving") -> Board:
-    return boards(read_entries({track: pa.concat_tables(tables)}))[0]  # type: ignore[dict-item]
+    return boards(read_tracks({track: pa.concat_tables(tables)}))[0]
 
 
 def flag(name: str, *tables: pa.Table, track: str = "driving") -> Flag:
@@ -41,7 +42,7 @@ def noise(skill: float = 0.7) -> pa.Table:
     return probed(drive(attack="noise", skill=skill, weights="ab"), gradient_queries=0.0, **SEEN)
 
 
-BLIND = reference_drivers()
+BLIND = baseline_drivers()
 FIRES: dict[str, tuple[pa.Table, ...]] = {
     "unattacked": (clean(), noise()),
     "blind": (clean(), zo(0.1), BLIND),
@@ -108,7 +109,7 @@ def test_a_reason_is_one_sentence(name: str) -> None:
         assert ". " not in reason
 
 
-def test_a_detector_that_sees_signs_in_grey_pictures_is_flagged() -> None:
+def test_a_detector_that_sees_signs_in_grey_images_is_flagged() -> None:
     def seen(share: float) -> Flag:
         tables = [approach(0.9), approach(0.8, attack="eot")]
         return flag("ignores_input", *(probed(one, same_answer=share) for one in tables), track="detection")
@@ -117,7 +118,7 @@ def test_a_detector_that_sees_signs_in_grey_pictures_is_flagged() -> None:
     assert seen(0.0).fired is False
 
 
-def test_a_patch_that_takes_no_more_than_noise_is_flagged() -> None:
+def test_a_patch_that_lowers_the_score_no_more_than_noise_is_flagged() -> None:
     def beside(left: float) -> Flag:
         tables = approach(0.9), approach(left, attack="eot"), approach(0.6, attack="noise_patch")
         return flag("noise", *tables, track="detection")
@@ -140,21 +141,19 @@ def test_a_flagged_row_ranks_below_those_without_whatever_its_score() -> None:
 
 
 def test_the_worst_attack_of_each_cell_counts() -> None:
-    dense = [cell for cell in GRIDS["standard-v1"].cells() if cell.density == 2]
+    dense = [cell for cell in STANDARD_V1.cells() if cell.density == 2]
     (row,) = board(clean(), zo(0.4), probed(drive(attack="pgd", skill=0.1, cells=dense, queries=9.0), **PGD)).rows
-    attacks = {cell: entry.identity["attack"] for cell, entry in zip(row.worst.cells, row.worst.attacks, strict=True)}
+    attacks = {cell: one.identity["attack"] for cell, one in zip(row.worst.cells, row.worst.attacks, strict=True)}
     assert {cell.density for cell, attack in attacks.items() if attack == "pgd"} == {2.0}
     assert {cell.density for cell, attack in attacks.items() if attack == "zo"} == {1.0}
-    assert row.worst.score.estimate < min(
-        entry.score.estimate for entry in row.entries if entry.identity["attack"] == "zo"
-    )
+    assert row.worst.score.estimate < min(one.score.estimate for one in row.attacks if one.identity["attack"] == "zo")
 
 
 def test_an_attack_with_less_counts_in_a_larger_threat_model_but_not_the_other_way_round() -> None:
     small = zo(0.2, threat=("relative", 0.05))
     large = zo(0.5, threat=("relative", 0.1))
-    found = boards(read_entries({"driving": pa.concat_tables([clean(), small, large])}))
-    budgets = {one.threat[1]: [entry.identity["threat_budget"] for entry in one.rows[0].entries] for one in found}
+    found = boards(read_tracks({"driving": pa.concat_tables([clean(), small, large])}))
+    budgets = {one.threat[1]: [attack.identity["threat_budget"] for attack in one.rows[0].attacks] for one in found}
     assert budgets == {0.1: [0.05, 0.1], 0.05: [0.05]}
 
 
@@ -177,13 +176,13 @@ def test_an_attack_on_a_few_cells_changes_nothing_but_their_score() -> None:
     (also,) = board(clean(), BLIND, pgd(0.3), zo(0.5), longer).rows
     assert also.worst.score.estimate < row.worst.score.estimate
     assert also.clean == row.clean
-    assert also.entries[0].identity["attack_params"] == row.entries[0].identity["attack_params"]
+    assert also.attacks[0].identity["attack_params"] == row.attacks[0].identity["attack_params"]
     fired = [[flag.name for flag in each.flags if flag.fired] for each in (row, also)]
     assert fired[1] == fired[0]
 
 
 def test_masked_gradients_are_judged_cell_by_cell() -> None:
-    """The best white-box attack of each cell is held against the black box, not the one whose own cells are hardest."""
+    """The best white-box attack of each cell is compared with the black box, not the one whose own cells are hardest."""
     strong = probed(
         drive(attack="pgd", attack_params={"objective": "target"}, skill=0.05, queries=45.0, weights="ab"),
         **(PGD | SEEN),

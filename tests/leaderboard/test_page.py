@@ -58,7 +58,7 @@ def test_the_page_is_one_file_of_at_most_three_megabytes(site: Path) -> None:
     assert "src=" not in text
 
 
-def test_rows_are_in_rank_groups_with_their_flags_and_the_references_below(opened: Open) -> None:
+def test_rows_are_in_rank_groups_with_their_flags_and_the_baselines_below(opened: Open) -> None:
     page = opened()
     assert column(page, "ranks", 2)[-3:] == ["best blind policy", "random", "IDM and MOBIL"]
     ranks = [int(text) for text in column(page, "ranks", 1) if text]
@@ -86,7 +86,12 @@ def test_filters_choose_rows_and_compute_scores_again_from_the_cells_that_are_le
     page = opened()
     made = json.loads((site / "leaderboard.json").read_text())
     row = next(row for row in made["boards"][0]["rows"] if row["defense"]["name"] == "advtrain")
-    runs = [run for cell in row["cells"] if cell["weather"] == "clear" and cell["density"] == 1 for run in cell["runs"]]
+    runs = [
+        run
+        for cell in row["cells"]
+        if cell["cell"]["weather"] == "clear" and cell["cell"]["density"] == 1
+        for run in cell["runs"]
+    ]
     middle = sorted(runs)[len(runs) // 4 : len(runs) - len(runs) // 4]
     for name, value in (("weather", "rain"), ("weather", "fog"), ("density", "2")):
         page.locator(f"input[name={name}][value='{value}']").uncheck()
@@ -114,8 +119,8 @@ def test_crashes_and_queries_are_those_of_the_cells_that_are_left(opened: Open, 
     for weathers in (("clear", "rain", "fog"), ("clear", "rain"), ("clear",)):
         if len(weathers) < 3:
             page.locator(f"input[name=weather][value={('fog', 'rain')[2 - len(weathers)]}]").uncheck()
-        cells = [cell for cell in pair["cells"] if cell["weather"] in weathers]
-        crashed, queries = (sum(cell[name] for cell in cells) / len(cells) for name in ("crashed", "queries"))
+        cells = [cell for cell in pair["cells"] if cell["cell"]["weather"] in weathers]
+        crashed, queries = (sum(cell[name] for cell in cells) / len(cells) for name in ("failed", "queries"))
         shown += column(page, "pairs", 7)
         assert shown[-1] == f"{100 * crashed:.0f} %"
         assert column(page, "pairs", 9) == [f"{queries:.0f}"]

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 import leaderboard
-from leaderboard.page import write
+from leaderboard.page.write import write
 
 MADE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d\+00:00)?")
 NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")

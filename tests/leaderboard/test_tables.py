@@ -10,15 +10,21 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from rich.console import Console
-from synthetic import CLEAR, drive, reference_drivers
+from synthetic import CLEAR, baseline_drivers, drive
 
-from bench.records.store import SCHEMA
+from bench.plugins.track import track
+from bench.records.schema import schema
 from bench.scenarios import Cell
+from bench.statistics.episodes import as_text
 from bench.statistics.estimates import Interval
-from leaderboard.pairs import BEST_BLIND, read_pairs
-from leaderboard.tables import remarks, run_report
-from leaderboard.text import CLEAN, estimate, strip, threat
+from bench.tracks.driving import BEST_BLIND
+from envs.highway.axes import STANDARD_V1
+from leaderboard.comparisons.comparison import Comparison
+from leaderboard.comparisons.reading import read_comparisons
+from leaderboard.terminal.run import remarks, run_report
+from leaderboard.terminal.text import CLEAN, estimate, strip, threat
 
+SCHEMA = schema(track("driving"))
 ZO = {"objective": "expected", "steps": 50}
 
 
@@ -28,9 +34,13 @@ def printed(records: pa.Table, width: int = 120) -> str:
     return out.getvalue()
 
 
+def read(records: pa.Table) -> list[Comparison]:
+    return read_comparisons(records, track("driving"))
+
+
 def one_pair(**changes: object) -> pa.Table:
     attacked = {"attack": "zo", "attack_params": ZO, "skill": 0.25, "queries": 1050.0, **changes}
-    return pa.concat_tables([drive(), drive(**attacked), reference_drivers()])  # type: ignore[arg-type]
+    return pa.concat_tables([drive(), drive(**attacked), baseline_drivers()])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 140])
@@ -62,7 +72,7 @@ def test_the_threat_model_and_the_attacks_parameters_are_stated() -> None:
 
 
 def test_a_linf_threat_model_is_stated_on_the_normalised_scale() -> None:
-    (pair,) = read_pairs(one_pair(threat=("linf", 0.2)))
+    (pair,) = read(one_pair(threat=("linf", 0.2)))
     assert threat(pair).startswith("linf 0.2: each measured value may be off by 0.2 on the [-1, 1] scale")
 
 
@@ -73,26 +83,26 @@ def test_a_victim_no_better_than_a_blind_policy_is_marked() -> None:
 
 
 def test_the_blind_policy_is_the_best_of_each_cell_and_stands_for_every_weather() -> None:
-    (pair,) = read_pairs(one_pair())
-    blind = pair.references[BEST_BLIND]
+    (pair,) = read(one_pair())
+    blind = pair.baselines[BEST_BLIND]
     assert blind.cells == pair.cells
-    records = reference_drivers()
+    records = baseline_drivers()
     for cell in (Cell(lanes=3, density=1.0, weather="fog"), Cell(lanes=5, density=2.0, weather="clear")):
         best = 0.0
         for policy in set(records["victim_params"].to_pylist()) - {"{}"}:
             mask = [
-                (row["lanes"], row["density"], row["victim_params"]) == (cell.lanes, cell.density, policy)
+                (row["cell"], row["victim_params"]) == (as_text(cell.replaced(weather="clear")), policy)
                 for row in records.to_pylist()
             ]
             best = max(best, float(np.mean(records.filter(pa.array(mask))["safe_progress"].to_numpy())))
         assert blind.only(cells=[cell]).column("safe_progress").mean() == pytest.approx(best)
 
 
-def test_reference_drivers_of_other_actions_are_no_reference() -> None:
+def test_drivers_of_other_actions_are_no_baseline() -> None:
     continuous = drive("blind", victim_params={"policy": "brake"}, cells=CLEAR, runs=(0,), sees=False, skill=0.9,
                        action_type="continuous")  # fmt: skip
-    with_it, without = (read_pairs(table)[0] for table in (pa.concat_tables([one_pair(), continuous]), one_pair()))
-    assert with_it.reference_scores == without.reference_scores
+    with_it, without = (read(table)[0] for table in (pa.concat_tables([one_pair(), continuous]), one_pair()))
+    assert with_it.baseline_scores == without.baseline_scores
 
 
 def test_a_sweep_has_one_row_a_pair_the_strongest_attack_first() -> None:
@@ -105,7 +115,7 @@ def test_a_sweep_has_one_row_a_pair_the_strongest_attack_first() -> None:
             drive(attack="zo", attack_params=ZO, defense="advtrain", skill=0.45),
         ]
     )
-    pairs = read_pairs(records)
+    pairs = read(records)
     assert [(pair.identity["defense"], pair.identity["attack"]) for pair in pairs] == [
         ("none", "zo"), ("none", "zo"), ("none", "noise"), ("advtrain", "zo"),
     ]  # fmt: skip
@@ -117,7 +127,7 @@ def test_a_sweep_has_one_row_a_pair_the_strongest_attack_first() -> None:
 
 def test_attacked_and_clean_are_measured_on_the_same_scenarios() -> None:
     records = pa.concat_tables([drive(episodes=20), drive(attack="zo", skill=0.2, cells=CLEAR[:2], episodes=10)])
-    (pair,) = read_pairs(records)
+    (pair,) = read(records)
     assert pair.clean is not None
     assert pair.attacked is not None
     assert (pair.clean.cells, pair.clean.seeds) == (pair.attacked.cells, pair.attacked.seeds)
@@ -126,9 +136,9 @@ def test_attacked_and_clean_are_measured_on_the_same_scenarios() -> None:
 
 def test_a_run_that_broke_off_says_what_is_left_out() -> None:
     whole = drive(attack="zo", skill=0.2)
-    late = pa.array([run == 2 and weather == "fog" for run, weather in
-                     zip(whole["training_seed"].to_pylist(), whole["weather"].to_pylist(), strict=True)])  # fmt: skip
-    (pair,) = read_pairs(pa.concat_tables([drive(), whole.filter(pc.invert(late))]))
+    late = pa.array([run == 2 and "fog" in cell for run, cell in
+                     zip(whole["training_seed"].to_pylist(), whole["cell"].to_pylist(), strict=True)])  # fmt: skip
+    (pair,) = read(pa.concat_tables([drive(), whole.filter(pc.invert(late))]))
     assert {cell.weather for cell in pair.cells} == {"clear", "rain"}
     assert any("left out" in remark for remark in remarks(pair))
 
@@ -140,17 +150,17 @@ def test_the_newest_record_of_a_scenario_counts() -> None:
     )
     new = new.set_column(SCHEMA.get_field_index("created_at"), SCHEMA.field("created_at"), later)
     for records in (pa.concat_tables([old, new]), pa.concat_tables([new, old])):
-        (pair,) = read_pairs(records)
-        assert pair.driven.column("safe_progress").mean() == pytest.approx(np.mean(new["safe_progress"].to_numpy()))
+        (pair,) = read(records)
+        assert pair.own.column("safe_progress").mean() == pytest.approx(np.mean(new["safe_progress"].to_numpy()))
 
 
-def test_clean_runs_and_reference_drivers_alone_can_be_reported() -> None:
-    assert "queries" not in printed(pa.concat_tables([drive(), reference_drivers()])).split("safe progress: 0")[0]
+def test_clean_runs_and_baseline_drivers_alone_can_be_reported() -> None:
+    assert "queries" not in printed(pa.concat_tables([drive(), baseline_drivers()])).split("safe progress: 0")[0]
     assert "idm" in printed(drive("idm", runs=(0,), cells=CLEAR, sees=False))
 
 
 def test_one_cell_one_episode_has_no_interval_but_a_number() -> None:
-    cells = GRIDS["standard-v1"].cells()[:1]
+    cells = STANDARD_V1.cells()[:1]
     one = {"cells": cells, "runs": (0,), "episodes": 1}
     assert "nan" not in printed(pa.concat_tables([drive(**one), drive(attack="zo", **one)]))  # type: ignore[arg-type]
 

@@ -13,15 +13,14 @@ from synthetic import approach
 
 from bench.detection import PatchThreat
 from bench.plugins.pair import choose
-from bench.records.store import SCHEMAS
+from bench.plugins.track import track
+from bench.records.schema import schema
 from bench.run.config import run_config
-from leaderboard import thesis_patch_records, thesis_records
-from leaderboard.approaches import NO_PATCH
-from leaderboard.pairs import parameters
-from leaderboard.thesis import thesis_report
-from leaderboard.thesis_claims import configuration_claims, location_claims
-from leaderboard.thesis_numbers import printed
-from leaderboard.thesis_patch_records import (
+from leaderboard.comparisons.comparison import NO_ATTACK, parameters
+from leaderboard.thesis import patch_records, policy_records
+from leaderboard.thesis.claims import configuration_claims, location_claims
+from leaderboard.thesis.numbers import printed
+from leaderboard.thesis.patch_records import (
     ABLATION,
     CONFIGURATIONS,
     CONTROLS,
@@ -31,17 +30,18 @@ from leaderboard.thesis_patch_records import (
     WEATHERS,
     Source,
 )
+from leaderboard.thesis.report import thesis_report
 
 Left = float | Callable[[str, str], float]
-NONE = SCHEMAS["detection"].empty_table()
+NONE = schema(track("detection")).empty_table()
 SIZES, WEIGHTS = ("patch_32", "patch_64", STANDARD), (STANDARD, "tv_3", "tv_5")
 SUN_AND_RAIN = {theirs: (ours, LOCATIONS[1]) for theirs, ours in WEATHERS.items()}
 
 
 @pytest.fixture(autouse=True)
 def nothing_published(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (thesis_patch_records, thesis_records):
-        monkeypatch.setattr(module, "published", lambda track: SCHEMAS[track].empty_table())
+    for module in (patch_records, policy_records):
+        monkeypatch.setattr(module, "published", lambda track: schema(track).empty_table())
 
 
 def patch(row: str = STANDARD, left: Left = 0.1, victim: str = "yolov3_tiny", **more: object) -> pa.Table:
@@ -125,7 +125,7 @@ def test_what_is_missing_is_a_dash_and_a_command_that_makes_it() -> None:
     made = set()
     for command in commands:
         config = run_config(command.removeprefix("bench run ").split())
-        assert config.grid.weather == ("clear", "rain")
+        assert config.grid.values["weather"] == ("clear", "rain")
         assert config.seeds == (0, 1, 2)
         assert config.reference
         for pair in config.pairs:
@@ -134,7 +134,7 @@ def test_what_is_missing_is_a_dash_and_a_command_that_makes_it() -> None:
                 "attack_params": pair.attack.params,
                 "threat_budget": pair.threat.budget,
             }
-            made |= {row for row in CONFIGURATIONS if thesis_patch_records.is_of(row, identity)}
+            made |= {row for row in CONFIGURATIONS if patch_records.is_of(row, identity)}
     assert made == set(CONFIGURATIONS)
     assert len(commands) == len(set(commands)) < len(CONFIGURATIONS)
     assert "missing" not in report(everything())
@@ -149,11 +149,11 @@ def test_what_one_row_lacks_is_all_that_is_asked_for() -> None:
     assert source.commands() == ["bench run attack=eot victim=yolov3_tiny weather=clear,rain seeds=0,1,2 attack.tv=0.3"]
 
 
-def test_a_patch_that_was_held_against_nothing_is_asked_for_again() -> None:
+def test_a_patch_without_a_baseline_is_asked_for_again() -> None:
     source = Source(pa.concat_tables([approach(0.9), patch("patch_32")]), NONE)
     found = source.find(source.detectors[0], "patch_32", "clear")
     assert found is not None
-    assert found.beyond is None
+    assert found.of.lead is None
     assert source.commands() == [
         "bench run attack=eot victim=yolov3_tiny weather=clear,rain seeds=0,1,2 attack.texels=32 threat.budget=0.16"
     ]
@@ -193,8 +193,8 @@ def test_a_location_has_its_own_approaches_and_all_have_all() -> None:
     for location, expected in [*left.items(), (None, 0.3)]:
         found = source.find(detector, STANDARD, "rain", location)
         assert found is not None
-        assert found.pair.measured.confidence.estimate == pytest.approx(expected, abs=0.02)
-        assert {cell.weather for cell in found.pair.own.cells} == {"rain"}
+        assert found.of.score.estimate == pytest.approx(expected, abs=0.02)
+        assert {cell.weather for cell in found.of.own.cells} == {"rain"}
 
 
 def test_the_rows_of_a_table_are_on_the_same_approaches() -> None:
@@ -202,27 +202,27 @@ def test_the_rows_of_a_table_are_on_the_same_approaches() -> None:
     part = [cell for cell in run_config(["victim=yolov3_tiny"]).grid.cells() if (cell.lanes, cell.density) == (4, 1)]
     records = pa.concat_tables([*whole, patch("tv_3", cells=part)])
     source = Source(records, NONE)
-    found = source.find_all(source.detectors[0], (STANDARD, "tv_3", "tv_5", NO_PATCH), "rain")
+    found = source.find_all(source.detectors[0], (STANDARD, "tv_3", "tv_5", NO_ATTACK), "rain")
     assert found["tv_5"] is None
-    assert {each.pair.own.cells for each in found.values() if each} == {(part[1],)}
+    assert {each.of.cells for each in found.values() if each} == {(part[1],)}
     assert part[1].weather == "rain"
     first, second, third = report(records).split("Table 3.")[1:]
     assert all("yolov3_tiny: on the roads 4 × 1 only" in table for table in (first, second))
     assert "on the roads" not in third
 
 
-def test_a_smaller_patch_is_held_against_controls_of_its_own_size() -> None:
+def test_a_smaller_patch_is_compared_with_baselines_of_its_own_size() -> None:
     noise = [approach(value, attack="noise_patch", budget=budget) for budget, value in ((0.5, 0.4), (0.16, 0.8))]
     source = Source(pa.concat_tables([approach(0.9), *noise, patch(left=0.3), patch("patch_32", 0.7)]), NONE)
     for row in (STANDARD, "patch_32"):
         found = source.find(source.detectors[0], row, "clear")
         assert found is not None
-        assert found.beyond is not None
-        assert found.beyond.estimate == pytest.approx(-0.1, abs=0.03)
+        assert found.of.lead is not None
+        assert found.of.lead.estimate == pytest.approx(-0.1, abs=0.03)
 
 
 def test_published_records_fill_in_where_they_are_of_the_same_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thesis_patch_records, "published", lambda track: everything())
+    monkeypatch.setattr(patch_records, "published", lambda track: everything())
     assert report().count("†") > 20
     tables = pa.concat_tables([controls(), patch()])
     same, other = Source(tables), Source(pa.concat_tables([controls(), patch(changes={"steps": 10})]))
@@ -240,7 +240,7 @@ def test_rows_that_do_not_share_their_settings_are_not_mixed() -> None:
     (detector,) = source.detectors
     found = source.find(detector, STANDARD, "clear")
     assert found is not None
-    assert parameters(found.pair.identity["attack_params"])["steps"] == 300
+    assert parameters(found.of.identity["attack_params"])["steps"] == 300
 
 
 def test_every_detector_has_its_columns_and_its_commands() -> None:
@@ -313,7 +313,7 @@ def test_the_claims_of_table_3_3() -> None:
 @pytest.mark.parametrize(("width", "detectors"), [(80, 1), (80, 2), (100, 2)])
 def test_no_number_is_cut_off(width: int, detectors: int, monkeypatch: pytest.MonkeyPatch) -> None:
     records = pa.concat_tables([everything(victim) for victim in ("yolov3_tiny", "yolov5")[:detectors]])
-    monkeypatch.setattr(thesis_patch_records, "published", lambda track: records)
+    monkeypatch.setattr(patch_records, "published", lambda track: records)
     lines = report(width=width).splitlines()
     assert max(map(len, lines)) <= width
     assert "…" not in re.sub(r"[−+]\S*…[−+]\S*", "", "\n".join(lines))
@@ -321,7 +321,7 @@ def test_no_number_is_cut_off(width: int, detectors: int, monkeypatch: pytest.Mo
 
 def test_no_patch_is_seen_once_and_stands_for_every_patch_seed() -> None:
     source = Source(pa.concat_tables([controls(), patch()]), NONE)
-    found = source.find(source.detectors[0], NO_PATCH, "clear")
+    found = source.find(source.detectors[0], NO_ATTACK, "clear")
     assert found is not None
-    assert found.pair.own.shape == (1, 6, 3)
-    assert found.pair.own.column("confidence_mean").mean() == pytest.approx(0.9, abs=0.02)
+    assert found.of.own.shape == (1, 6, 3)
+    assert found.of.own.column("confidence_mean").mean() == pytest.approx(0.9, abs=0.02)

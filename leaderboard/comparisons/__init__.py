@@ -1,0 +1,1 @@
+"""One model of an attack on a defended victim, of every track: read from records, compared with its controls."""

@@ -1,0 +1,56 @@
+"""Several comparisons on the scenarios that all of them have, and the difference of two."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.scenarios import Cell
+from bench.statistics.estimates import Array, Interval, interval
+from leaderboard.comparisons.comparison import Comparison
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """The scores of several comparisons on the same scenarios.
+
+    Args:
+        scores: [R, C, E] each, of the metric.
+        runs: training or patch seeds [R].
+        cells: [C].
+        seeds: scenario seeds [E].
+    """
+
+    scores: list[Array]
+    runs: tuple[int, ...]
+    cells: tuple[Cell, ...]
+    seeds: tuple[int, ...]
+
+
+def align(comparisons: Sequence[Comparison]) -> Aligned | None:
+    """The scores on the runs, cells and scenario seeds that all comparisons have; None where there are none."""
+    own = [one.own for one in comparisons]
+    seeded = [one.own.runs for one in comparisons if not one.stands_for_all] or [own[0].runs]
+    runs = sorted(set.intersection(*map(set, seeded)))
+    cells = [cell for cell in own[0].cells if all(cell in one.cells for one in own)]
+    seeds = sorted(set.intersection(*(set(one.seeds) for one in own)))
+    if not (runs and cells and seeds):
+        return None
+    scores = []
+    for one in comparisons:
+        kept_runs = one.own.runs * len(runs) if one.stands_for_all else runs
+        places = (
+            [one.own.runs.index(run) for run in kept_runs],
+            [one.own.cells.index(cell) for cell in cells],
+            [one.own.seeds.index(seed) for seed in seeds],
+        )
+        scores.append(one.scores[np.ix_(*places)])
+    return Aligned(scores, tuple(runs), tuple(cells), tuple(seeds))
+
+
+def gap(first: Comparison, second: Comparison) -> Interval | None:
+    """`first` minus `second`, paired on the runs, cells and scenarios that both have; None where they have none."""
+    aligned = align([first, second])
+    return interval(aligned.scores[0] - aligned.scores[1]) if aligned else None

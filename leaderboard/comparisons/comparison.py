@@ -1,0 +1,213 @@
+"""An attack on a defended victim, with what it is compared with on the same scenarios: one model for every track."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from bench.plugins.track import Measure, Track
+from bench.scenarios import Axes, Cell
+from bench.statistics.episodes import Episodes, difference, measured, unit_interval
+from bench.statistics.estimates import Array, Interval
+from leaderboard.comparisons.pairing import beside
+
+DEFENDED = ("defense", "defense_params", "victim", "victim_params", "world", "world_params")
+"""The columns that name what is attacked; a clean control shares them with the attacked episodes."""
+THREAT = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
+ATTACKER = ("attack", "attack_params", *THREAT)
+IDENTITY = (*DEFENDED, *ATTACKER, "grid", "action_type", "sees")
+"""The columns that all episodes of a comparison share."""
+NO_ATTACK = "none"
+ENOUGH_SEEDS = 3
+"""Training or patch seeds below which nothing is claimed."""
+Knowledge = Literal["nothing", "answers", "gradients", "unknown"]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """One attack on one defended victim, and what it is compared with.
+
+    Args:
+        identity: the values of `IDENTITY`; the attack is `none` where nothing was attacked.
+        track: of the victim.
+        own: the episodes, under attack if there is an attack.
+        clean: the same scenarios without an attack; None where they were not driven. A single run stands for every run of `own`
+            whose training seed changes nothing in the victim.
+        baselines: the same scenarios by name of a baseline (`Track.baseline_of`), in the cells that it has.
+    """
+
+    identity: Mapping[str, Any]
+    track: Track
+    own: Episodes
+    clean: Episodes | None
+    baselines: Mapping[str, Episodes]
+
+    @property
+    def is_attacked(self) -> bool:
+        """Whether there is an attack at all."""
+        return bool(self.identity["attack"] != NO_ATTACK)
+
+    @cached_property
+    def is_baseline(self) -> bool:
+        """Whether others are compared with it."""
+        return bool(self.track.baseline_of(self.identity, self.identity))
+
+    @property
+    def attacked(self) -> Episodes | None:
+        """The episodes under attack."""
+        return self.own if self.is_attacked else None
+
+    @property
+    def defended(self) -> tuple[object, ...]:
+        """What is attacked: the values of `DEFENDED`."""
+        return tuple(self.identity[name] for name in DEFENDED)
+
+    @cached_property
+    def settings(self) -> dict[str, object]:
+        """All it was run with, by name: defended victim, attack, threat model, and the attack's parameters as `attack.NAME`."""
+        params = parameters(self.identity["attack_params"])
+        plain = {name: self.identity[name] for name in (*DEFENDED, *ATTACKER) if name != "attack_params"}
+        return plain | {f"attack.{name}": value for name, value in params.items()}
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """The cells that were driven."""
+        return self.own.cells
+
+    @property
+    def axes(self) -> Axes:
+        """What the cells differ in."""
+        return self.own.axes
+
+    @cached_property
+    def facts(self) -> dict[str, Any]:
+        """Of the world: axes, decision rate, episode length, actions."""
+        return dict(json.loads(self.own.table["world_facts"][0].as_py()))
+
+    def only(self, *, cells: Collection[Cell] | None = None, seeds: Collection[int] | None = None) -> Comparison:
+        """The same in some of its cells, or on some scenario seeds."""
+
+        def part(episodes: Episodes) -> Episodes | None:
+            apart = (cells is not None and not set(cells) & set(episodes.cells)) or (
+                seeds is not None and not set(seeds) & set(episodes.seeds)
+            )
+            return None if apart else episodes.only(cells=cells, seeds=seeds)
+
+        baselines = {name: kept for name, one in self.baselines.items() if (kept := part(one))}
+        own = self.own.only(cells=cells, seeds=seeds)
+        return replace(self, own=own, clean=self.clean and part(self.clean), baselines=baselines)
+
+    @cached_property
+    def places(self) -> dict[str, list[int]]:
+        """The scenario seeds of each place (`Track.place`); empty where the track has none."""
+        found: dict[str, list[int]] = {}
+        if self.track.place:
+            columns = (self.own.table[name].to_pylist() for name in ("seed", self.track.place))
+            for seed, place in sorted(set(zip(*columns, strict=True))):
+                found.setdefault(place, []).append(seed)
+        return found
+
+    @cached_property
+    def scores(self) -> Array:
+        """[R, C, E] of the metric."""
+        return self.own.column(self.track.metric)
+
+    @cached_property
+    def score(self) -> Interval:
+        """The metric over all runs and cells."""
+        return unit_interval(self.scores)
+
+    @cached_property
+    def clean_score(self) -> Interval | None:
+        """The same without an attack."""
+        return self.score_of(self.clean) if self.clean else None
+
+    @cached_property
+    def baseline_scores(self) -> dict[str, Interval]:
+        """The same of each baseline."""
+        return {name: self.score_of(one) for name, one in self.baselines.items()}
+
+    def score_of(self, episodes: Episodes) -> Interval:
+        """The metric of other episodes, over all runs and cells."""
+        return unit_interval(episodes.column(self.track.metric))
+
+    @property
+    def retained(self) -> float:
+        """Attacked over clean score; NaN where there is no attack, or the clean score is unknown or 0."""
+        if not self.is_attacked or self.clean_score is None or self.clean_score.estimate <= 0:
+            return float("nan")
+        return self.score.estimate / self.clean_score.estimate
+
+    @cached_property
+    def effect(self) -> Interval | None:
+        """Attacked - clean score, paired scenario by scenario."""
+        return self._minus(self.clean)
+
+    @cached_property
+    def rival(self) -> str:
+        """The baseline that scores under attack are compared with (`Track.contrast`); empty where there is none."""
+        contrast = self.track.contrast
+        if contrast is None or self.is_baseline or not self.baselines:
+            return ""
+        if contrast.baseline:
+            return contrast.baseline if contrast.baseline in self.baselines else ""
+        return min(self.baselines, key=lambda name: self.baseline_scores[name].estimate)
+
+    @cached_property
+    def lead(self) -> Interval | None:
+        """Attacked - rival's score, paired scenario by scenario."""
+        return self._minus(self.baselines.get(self.rival))
+
+    def _minus(self, control: Episodes | None) -> Interval | None:
+        if control is None or not self.is_attacked:
+            return None
+        return difference(*beside(self.own, control), self.track.metric)
+
+    def measured(self, measure: Measure) -> Interval:
+        """A column of the track's reports."""
+        return measured(self.own, measure)
+
+    @cached_property
+    def queries(self) -> float:
+        """Mean number of questions to the victim, in the unit of the track; NaN where they are not counted."""
+        return self.mean(self.track.queries)
+
+    @cached_property
+    def knowledge(self) -> Knowledge:
+        """What the attack asked of the victim, as measured; `unknown` where records do not say."""
+        gradients = self.mean(self.track.gradients)
+        if gradients > 0:
+            return "gradients"
+        if self.queries == 0:
+            return "nothing"
+        return "unknown" if np.isnan(gradients) else "answers"
+
+    @property
+    def stands_for_all(self) -> bool:
+        """Whether its one run counts for every run of others: a baseline attack that depends on no seed."""
+        return self.is_baseline and len(self.own.runs) == 1
+
+    def mean(self, name: str) -> float:
+        """Mean of a column over all episodes; NaN where nothing was measured."""
+        return mean(self.own.table, name)
+
+
+def mean(records: pa.Table, name: str) -> float:
+    """Mean of a column, without nulls; NaN where there is nothing else, or no such column."""
+    if name not in records.column_names:
+        return float("nan")
+    found = pc.mean(records[name].cast(pa.float64())).as_py()
+    return float("nan") if found is None else float(found)
+
+
+def parameters(canonical: object) -> dict[str, object]:
+    """The parameters of a component from the canonical JSON of a record."""
+    found = json.loads(str(canonical) or "{}")
+    return dict(found) if isinstance(found, dict) else {}

@@ -1,0 +1,130 @@
+"""From records to comparisons: of every attack on every defended victim, with its controls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from bench.plugins.track import Track, track
+from bench.statistics.episodes import Episodes
+from bench.statistics.estimates import iqm
+from leaderboard.comparisons.baselines import Baselines, identity_of
+from leaderboard.comparisons.comparison import ATTACKER, DEFENDED, NO_ATTACK, Comparison
+from leaderboard.comparisons.pairing import with_control
+
+SCENARIO = ("training_seed", "cell", "seed")
+
+
+def measurements(of: Track) -> set[str]:
+    """The columns of a track's records that comparisons read, beside what was driven and what produced it."""
+    needed = {of.metric, of.failure, of.place, of.queries, of.gradients, "steps", *_artefact(of)}
+    needed |= {measure.column for measure in of.measures}
+    return needed & {field.name for field in of.measurements if not pa.types.is_list(field.type)}
+
+
+def _artefact(of: Track) -> tuple[str, ...]:
+    return (f"{of.artefact[0]}_sha256",) if of.artefact else ()
+
+
+def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:
+    """Every attack on every defended victim: by world, victim and defence, the strongest attack first, baselines last.
+
+    Records with attack `none` are the controls. A victim that was never attacked is a comparison of its own, unless it is a
+    baseline and there are others. Of a scenario driven twice, the newest record counts.
+
+    Args:
+        records: of one track (`bench.records.schema`); list columns may be missing.
+        of: that track.
+    """
+    records = newest(records)
+    attack = (*DEFENDED, *ATTACKER, "grid")
+    attacked = [
+        Episodes.arrange(rows) for _, rows in groups(records, attack, pc.not_equal(records["attack"], NO_ATTACK))
+    ]
+    clean = groups(records, DEFENDED, pc.equal(records["attack"], NO_ATTACK))
+    controls = {tuple(identity.values()): Episodes.arrange(newest(rows, DEFENDED)) for identity, rows in clean}
+    baselines = Baselines(of, [*controls.values(), *attacked])
+    found = []
+    for own in attacked:
+        identity = identity_of(own)
+        own, control = with_control(own, controls.get(tuple(identity[name] for name in DEFENDED)))
+        found.append(Comparison(identity, of, own, control, baselines.beside(own)))
+    defended = {one.defended for one in found}
+    alone = [
+        Comparison(identity_of(own), of, own, own, baselines.beside(own))
+        for drives, own in controls.items()
+        if drives not in defended
+    ]
+    found += [one for one in alone if not one.is_baseline] or ([] if found else alone)
+    return sorted(found, key=_rank)
+
+
+def read_tracks(records: Mapping[str, pa.Table]) -> list[Comparison]:
+    """The comparisons of several tracks, the one with the most records first; without baselines that nobody attacked."""
+    ordered = sorted(records.items(), key=lambda item: -item[1].num_rows)
+    found = [one for name, table in ordered for one in read_comparisons(table, track(name))]
+    return [one for one in found if one.is_attacked or not one.is_baseline]
+
+
+def _rank(one: Comparison) -> tuple[object, ...]:
+    """By world, victim and defence (`none` first); then the strongest attack first, baselines last."""
+    text = {name: str(value) for name, value in one.identity.items()}
+    score = round(float(iqm(one.scores.mean(2))), 9) if one.is_attacked else -1.0
+    return (
+        *(text[name] for name in ("world", "world_params", "victim", "victim_params")),
+        text["defense"] != "none",
+        text["defense"],
+        text["defense_params"],
+        one.is_baseline,
+        score,
+    )
+
+
+def newest(records: pa.Table, identity: Sequence[str] = (*DEFENDED, *ATTACKER, "grid")) -> pa.Table:
+    """The last record of each scenario, in the order given."""
+    codes = codes_of(records, (*identity, *SCENARIO))
+    rising = np.sort(codes)
+    if (rising[1:] > rising[:-1]).all():
+        return records
+    created = records["created_at"].cast(pa.int64()).to_numpy()
+    order = np.lexsort((np.arange(len(codes)), created, codes))
+    last = np.append(codes[order][1:] != codes[order][:-1], True)
+    return records.take(pa.array(np.sort(order[last])))
+
+
+def groups(
+    records: pa.Table, columns: Sequence[str], keep: pa.ChunkedArray | None = None
+) -> Iterator[tuple[dict[str, object], pa.Table]]:
+    """The records that share the values of `columns`, in the order of their first appearance."""
+    kept = records if keep is None else records.filter(keep)
+    if not kept.num_rows:
+        return
+    codes = codes_of(kept, columns)
+    starts = np.flatnonzero(np.append(True, codes[1:] != codes[:-1]))
+    together: dict[int, list[NDArray[np.int64]]] = {}
+    for start, end in zip(starts, [*starts[1:], len(codes)], strict=True):
+        together.setdefault(int(codes[start]), []).append(np.arange(start, end))
+    for stretches in together.values():
+        first = stretches[0]
+        alone = len(stretches) == 1
+        part = kept.slice(first[0], len(first)) if alone else kept.take(pa.array(np.concatenate(stretches)))
+        yield part.select(list(columns)).slice(0, 1).to_pylist()[0], part
+
+
+def codes_of(records: pa.Table, columns: Sequence[str]) -> NDArray[np.int64]:
+    """A number for each record, the same for those that share the values of `columns`."""
+    codes = np.zeros(records.num_rows, np.int64)
+    kinds = 1
+    for name in columns:
+        column = records[name].combine_chunks()
+        column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+        more = len(column.dictionary)
+        if kinds * more > 2**62:
+            distinct, codes = np.unique(codes, return_inverse=True)
+            kinds = len(distinct)
+        codes, kinds = codes * more + column.indices.to_numpy(), kinds * more
+    return codes

@@ -1,0 +1,1 @@
+"""The leaderboards as one HTML file, as JSON and as CSV."""

@@ -1,0 +1,48 @@
+"""`leaderboard.csv`: a line a ranked row."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from typing import Any
+
+CSV = (
+    "track", "world", "threat_norm", "threat_budget", "threat_access", "threat_queries", "group", "flagged", "flags",
+    "defense", "defense_params", "victim", "victim_params", "score", "low", "high", "clean", "clean_low", "clean_high",
+    "lead", "lead_low", "lead_high", "strongest_attack", "strongest_attack_params", "training_seeds", "cells", "scenarios",
+)  # fmt: skip
+"""The columns of `leaderboard.csv`, a line a ranked row."""
+
+
+def table(made: Mapping[str, Any]) -> str:
+    """The ranked rows of a document as CSV."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, CSV, lineterminator="\n")
+    writer.writeheader()
+    pairs = {pair["key"]: pair for pair in made["pairs"]}
+    for board in made["boards"]:
+        for row in board["rows"]:
+            strongest = pairs[row["strongest"]]["attack"]
+            line = {
+                "track": board["track"],
+                "world": board["world"]["name"],
+                **{f"threat_{name}": board["threat"][name] for name in ("norm", "budget", "access", "queries")},
+                "group": row["group"],
+                "flagged": str(row["flagged"]).lower(),
+                "flags": " ".join(flag["name"] for flag in row["flags"] if flag["fired"]),
+                "strongest_attack": strongest["name"],
+                "strongest_attack_params": json.dumps(strongest["params"], sort_keys=True),
+                "training_seeds": " ".join(map(str, row["training_seeds"])),
+                "cells": len(row["cells"]),
+                "scenarios": row["scenarios"],
+            }
+            for kind in ("defense", "victim"):
+                line |= {kind: row[kind]["name"], f"{kind}_params": json.dumps(row[kind]["params"], sort_keys=True)}
+            for name in ("score", "clean", "lead"):
+                found = row[name] or dict.fromkeys(("estimate", "low", "high"))
+                prefix = "" if name == "score" else f"{name}_"
+                line |= {name: found["estimate"], f"{prefix}low": found["low"], f"{prefix}high": found["high"]}
+            writer.writerow(line)
+    return out.getvalue()

@@ -1,0 +1,114 @@
+"""`bench report html=PAGE`: the leaderboards as one HTML file that opens from disk, and as JSON and CSV beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from importlib.resources import files
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import jinja2
+import pyarrow as pa
+from rich.console import Console
+from rich.text import Text
+
+from bench.errors import UserError
+from bench.files import whole
+from bench.plugins.track import tracks
+from bench.records import reading
+from leaderboard.comparisons.reading import measurements
+from leaderboard.page.document import document
+from leaderboard.page.table import table
+from leaderboard.published import published
+from leaderboard.ranking.boards import read_boards
+from leaderboard.ranking.flags import FLAGS
+from leaderboard.terminal.ranking import print_boards
+from leaderboard.thesis import chapters
+
+NAME = "leaderboard.html"
+
+
+def write(out: Path | None, page: Path, console: Console) -> None:
+    """Write the page, the JSON and the CSV of a results folder, and print the ranking.
+
+    Args:
+        out: results folder; None takes the records that are published with the package.
+        page: where to write; in a folder it is called `leaderboard.html`.
+        console: where to print.
+
+    Raises:
+        UserError: if there are no records, or nothing can be written.
+    """
+    page = page / NAME if page.is_dir() else page
+    # The thesis' tables are made of other records, and so in a process of their own meanwhile.
+    with ProcessPoolExecutor(1, get_context("spawn")) as beside:
+        beside.submit(chapters.prepare)
+        records = _read(out)
+        thesis = beside.submit(chapters.chapters, chapters.needed(records))
+        boards, comparisons = read_boards(records)
+        made = document(boards, comparisons, out)
+        texts = {
+            page.with_suffix(".json"): json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
+            page.with_suffix(".csv"): table(made),
+            page: html(made, sum(map(len, records.values())), thesis.result(), _link(out, page)),
+        }
+    try:
+        page.parent.mkdir(parents=True, exist_ok=True)
+        for path, text in texts.items():
+            with whole(path) as file:
+                file.write(text.encode())
+    except OSError as error:
+        raise UserError(f"the page {page} cannot be written: {error.strerror}") from error
+    print_boards(boards, console)
+    for path in sorted(texts):
+        console.print(Text(f" {path} ({path.stat().st_size / 1e6:.2f} MB)"), soft_wrap=True)
+
+
+def _read(out: Path | None) -> dict[str, pa.Table]:
+    """The records of a folder, or the published ones."""
+    if out is None:
+        every = {track.name: published(track) for track in tracks()}
+        return {name: records for name, records in every.items() if records.num_rows}
+    return reading.read_compact(out, {name for track in tracks() for name in measurements(track)})
+
+
+def html(made: Mapping[str, Any], episodes: int, thesis: Sequence[chapters.Chapter], recordings: str) -> str:
+    """The page of a document.
+
+    Args:
+        made: by `document`.
+        episodes: how many it is made of.
+        thesis: its tables beside ours.
+        recordings: the way from the page to the results folder.
+    """
+    site = files("leaderboard") / "page" / "site"
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
+    template = environment.from_string((site / "page.html").read_text(encoding="utf-8"))
+    # "<" would end the element that the data stand in.
+    data = json.dumps({**made, "recordings": recordings}, separators=(",", ":"), allow_nan=False).replace(
+        "<", "\\u003c"
+    )
+    ranked = list(dict.fromkeys(board["track"] for board in made["boards"]))
+    return template.render(
+        css=jinja2.utils.markupsafe.Markup((site / "page.css").read_text(encoding="utf-8")),
+        js=jinja2.utils.markupsafe.Markup((site / "page.js").read_text(encoding="utf-8")),
+        data=jinja2.utils.markupsafe.Markup(data),
+        made=made["made"][:10],
+        version=made["cavbench"],
+        episodes=f"{episodes:,}",
+        tracks={name: made["tracks"][name] for name in ranked},
+        flags=[{"title": title, "meaning": find.__doc__} for title, find in FLAGS.values()],
+        thesis=thesis,
+    )
+
+
+def _link(out: Path | None, page: Path) -> str:
+    """The way from the page to the results folder, as the beginning of a link."""
+    if out is None:
+        return ""
+    return quote(Path(os.path.relpath(out.resolve(), page.resolve().parent)).as_posix()) + "/"

@@ -1,0 +1,173 @@
+"""The ranking: of each defended victim the worst attack of each cell counts; flagged rows come last."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import get_args
+
+import pyarrow as pa
+
+from bench.plugins.contracts import Access
+from bench.plugins.track import Track
+from bench.statistics.episodes import Episodes
+from bench.statistics.estimates import Interval
+from leaderboard.comparisons.comparison import THREAT, Comparison
+from leaderboard.comparisons.reading import read_tracks
+from leaderboard.ranking.flags import Flag, Subject, flags
+from leaderboard.ranking.worst import Worst, worst
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A defended victim on a leaderboard.
+
+    Args:
+        attacks: those that count: first the one that is the strongest in most cells.
+        worst: the score under the strongest of each cell.
+        clean: without an attack in the same cells; None where that was not driven.
+        flags: each with its measurement, fired or not.
+        group: rank group, from 1; rows of a group cannot be told from its first. Flagged rows follow the others.
+    """
+
+    attacks: tuple[Comparison, ...]
+    worst: Worst
+    clean: Interval | None
+    flags: tuple[Flag, ...]
+    group: int = 0
+
+    @property
+    def identity(self) -> Mapping[str, object]:
+        """Of what is defended, and of its strongest attack."""
+        return self.attacks[0].identity
+
+    @property
+    def flagged(self) -> bool:
+        """Whether any flag has fired."""
+        return any(flag.fired for flag in self.flags)
+
+
+@dataclass(frozen=True, eq=False)
+class Board:
+    """The leaderboard of a threat model in a world.
+
+    Args:
+        track: of its victims.
+        world: name and parameters.
+        threat: the values of `THREAT`.
+        rows: best first; flagged ones last.
+        baselines: victims that ignore their input, by title.
+    """
+
+    track: Track
+    world: tuple[str, str]
+    threat: tuple[str, float, str, int]
+    rows: tuple[Row, ...]
+    baselines: Mapping[str, Episodes] = field(default_factory=dict)
+
+
+Key = tuple[str, str, str, str, float, str, int]
+"""Track, world and its parameters, and the values of `THREAT`."""
+
+
+def boards(comparisons: Sequence[Comparison]) -> list[Board]:
+    """A leaderboard for every threat model in which something was attacked.
+
+    The track with the most episodes comes first; then by world, the norm with the most episodes, the largest budget, the most
+    access.
+    """
+    attacked = [one for one in comparisons if one.is_attacked]
+    episodes: Counter[tuple[str, ...]] = Counter()
+    for one in attacked:
+        for key in ((one.track.name,), (one.track.name, str(one.identity["threat_norm"]))):
+            episodes[key] += one.own.table.num_rows
+    tracks = {_key(one): one.track for one in attacked}
+
+    def rank(key: Key) -> tuple[object, ...]:
+        track, world, params, norm, budget, access, queries = key
+        return (
+            -episodes[track,],
+            track,
+            world,
+            params,
+            -episodes[track, norm],
+            norm,
+            -budget,
+            -_access(access),
+            -queries,
+        )
+
+    return [_board(key, tracks[key], attacked) for key in sorted(tracks, key=rank)]
+
+
+def _key(one: Comparison) -> Key:
+    return (one.track.name, *(one.identity[name] for name in ("world", "world_params", *THREAT)))
+
+
+def _access(name: str) -> int:
+    known: tuple[str, ...] = get_args(Access)
+    return known.index(name) if name in known else len(known)
+
+
+def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
+    _, world, world_params, *threat = key
+    allowed = [one for one in attacked if _within(one, key)]
+    rows = []
+    for defended in dict.fromkeys(one.defended for one in attacked if _key(one) == key):
+        own = [one for one in allowed if one.defended == defended]
+        found = worst(own)
+        own.sort(key=lambda one: (-found.attacks.count(one), one.score.estimate))
+        others = [one for one in attacked if one.defended == defended and one.identity["threat_norm"] == threat[0]]
+        rows.append(Row(tuple(own), found, found.clean, tuple(flags(Subject(track, own, others, found)))))
+    return Board(track, (world, world_params), tuple(threat), tuple(ranked(rows)), _baselines(allowed))  # type: ignore[arg-type]
+
+
+def _within(one: Comparison, key: Key) -> bool:
+    """Whether the threat model allows what an attack did: it had no more knowledge, budget and queries."""
+    track, world, world_params, norm, budget, access, queries = key
+    identity = one.identity
+    return (
+        (one.track.name, identity["world"], identity["world_params"], identity["threat_norm"])
+        == (track, world, world_params, norm)
+        and float(str(identity["threat_budget"])) <= budget
+        and _access(str(identity["threat_access"])) <= _access(access)
+        and int(str(identity["threat_queries"])) <= queries
+    )
+
+
+def ranked(rows: Iterable[Row]) -> Iterator[Row]:
+    """Best first, flagged ones last, in groups: a group's rows have intervals that overlap that of its first."""
+    ordered = sorted(rows, key=lambda row: (row.flagged, -row.worst.score.estimate))
+    group, leader = 0, None
+    for row in ordered:
+        if leader is None or row.flagged != leader.flagged or row.worst.score.high < leader.worst.score.low:
+            group, leader = group + 1, row
+        yield replace(row, group=group)
+
+
+def _baselines(attacks: Sequence[Comparison]) -> dict[str, Episodes]:
+    """Victims that ignore their input, by title; of each type of action where they differ, on the most-driven scenarios.
+
+    They have no training seeds, so one run counts.
+    """
+    found: dict[str, dict[str, Episodes]] = {}
+    for one in sorted(attacks, key=lambda one: -one.own.table.num_rows):
+        contrast = one.track.contrast
+        if contrast is None or contrast.side != "victim":
+            continue
+        for name, drive in one.baselines.items():
+            kind = one.track.baseline_kinds.get(name)
+            kinds = found.setdefault(kind.title if kind else name, {})
+            kinds.setdefault(str(one.identity["action_type"]), drive.only(runs=drive.runs[:1]))
+    return {
+        f"{name}, {actions}" if len({drive.table["unit"][0] for drive in drives.values()}) > 1 else name: drive
+        for name, drives in found.items()
+        for actions, drive in sorted(drives.items(), reverse=True)
+    }
+
+
+def read_boards(records: Mapping[str, pa.Table]) -> tuple[list[Board], list[Comparison]]:
+    """The leaderboards that records make, by track, and all that was driven."""
+    comparisons = read_tracks(records)
+    return boards(comparisons), comparisons

@@ -1,0 +1,251 @@
+"""What casts doubt on a row of a leaderboard, each from a measurement of the runs themselves (docs/leaderboard.md).
+
+A flag fires, does not fire, or says that it was not measured; it never guesses. The first line of a measurement's docstring is
+shown to readers of the page.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow.compute as pc
+
+from bench.plugins import registry
+from bench.plugins.track import Track
+from bench.scenarios import Grid
+from bench.statistics.estimates import Interval
+from leaderboard.comparisons.alignment import gap
+from leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison, mean
+from leaderboard.ranking.families import budgets, efforts
+from leaderboard.ranking.worst import Worst, margin, worst
+
+NOTHING_LEFT = 0.01
+"""A score this low cannot fall further: attacks that reach it are not told apart."""
+STILL_FALLING = 0.02
+"""A curve that falls by more than this with its last increase has not flattened."""
+SAME, MASKED, DRAWN, ONE_DRAW = 0.99, 0.5, 0.01, 2.0
+"""Thresholds: the share of probes above which the answer depends on no input, gradients are masked, a victim is random; and the
+questions a point below which a random victim was attacked with one draw."""
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A doubt, or that there is none.
+
+    Args:
+        name: a key of `FLAGS`.
+        fired: None where it was not measured.
+        reason: the measurement in one sentence.
+    """
+
+    name: str
+    fired: bool | None
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What flags are raised on: a defended victim in a threat model.
+
+    Args:
+        track: of the victim.
+        attacks: those that count.
+        others: all attacks under the same norm, of larger budgets too.
+        worst: the score under the strongest of them in each cell.
+    """
+
+    track: Track
+    attacks: Sequence[Comparison]
+    others: Sequence[Comparison]
+    worst: Worst
+
+    def strongest(self, *knowledge: str) -> Worst | None:
+        """The score under the attacks that asked so much, the strongest in each cell."""
+        some = [attack for attack in self.attacks if attack.knowledge in knowledge]
+        return worst(some) if some else None
+
+    def shares(self, name: str) -> float:
+        """Mean of a probe over all its episodes, under attack and without; NaN where none was measured."""
+        tables = [attack.own.table for attack in self.attacks]
+        tables += [attack.clean.table for attack in self.attacks if attack.clean]
+        found = [value for table in tables if not math.isnan(value := mean(table, name))]
+        return sum(found) / len(found) if found else math.nan
+
+
+Finding = tuple[bool | None, str]
+
+
+def unattacked(of: Subject) -> Finding:
+    """Fires where no attack that was run asked the victim anything: the score is only one under noise."""
+    if of.strongest("answers", "gradients", "unknown"):
+        return False, f"{sum(attack.knowledge != 'nothing' for attack in of.attacks)} attacks asked the victim."
+    return True, "No attack that was run asks the victim anything: this is a score under noise."
+
+
+def masked_gradients(of: Subject) -> Finding:
+    """Fires where an attack without gradients lowers the score more than the best one with them: the gradients mislead."""
+    white, black = of.strongest("gradients"), of.strongest("answers", "nothing")
+    if any(attack.knowledge == "unknown" for attack in of.attacks):
+        return None, "Not measured: the records have no count of gradients."
+    if white is None or black is None:
+        return None, f"Not measured: no {'white' if white is None else 'black'}-box attack was run."
+    found = margin(white, black)
+    if found is None:
+        return None, "Not measured: the black-box and the white-box attack share no scenario."
+    names = f"{_under(black)} (black box), {_under(white)} (white box)"
+    return found.low > 0, f"{names}; the difference is {_signed(found)}."
+
+
+def noise(of: Subject) -> Finding:
+    """Fires where the best attack lowers the score no more than one that asks nothing: it is weak, or the victim random."""
+    quiet, asking = of.strongest("nothing"), of.strongest("answers", "gradients", "unknown")
+    if quiet is None or asking is None:
+        return None, f"Not measured: no {'noise' if quiet is None else 'attack that asks the victim'} was run."
+    found = margin(quiet, asking)
+    if found is None:
+        return None, "Not measured: noise and attack share no scenario."
+    names = f"{_under(quiet)}, {_under(asking)}"
+    if quiet.score.estimate <= NOTHING_LEFT:
+        return False, f"{names}: under noise the score is as low as it can be."
+    return found.low <= 0, f"{names}; noise minus attack is {_signed(found)}."
+
+
+def blind(of: Subject) -> Finding:
+    """Fires where the score under attack is not significantly above that of the best policy that ignores its input."""
+    contrast = of.track.contrast
+    if contrast is None or contrast.side != "victim":
+        return None, f"Not measured: the {of.track.name} track has no baseline that ignores its input."
+    if of.worst.lead is None:
+        return None, f"Not measured: {contrast.title} was not driven."
+    return (
+        of.worst.lead.low <= 0,
+        f"Under attack, its score minus that of {contrast.title} is {_signed(of.worst.lead)}.",
+    )
+
+
+def ignores_input(of: Subject) -> Finding:
+    """Fires where the victim gives the same answer on another input in at least 99 % of probes."""
+    share = of.shares("same_answer")
+    if math.isnan(share):
+        return None, "Not measured: the records have no probes of the input."
+    return share >= SAME, f"On {of.track.other_input} it gave the same answer in {100 * share:.1f} % of probes."
+
+
+def zero_gradients(of: Subject) -> Finding:
+    """Fires where at least half of the gradients that an attack used were zero everywhere."""
+    shares = [share for attack in of.attacks if not math.isnan(share := attack.mean("zero_gradients"))]
+    if not shares:
+        return None, "Not measured: no attack used gradients, or the records do not count them."
+    return max(
+        shares
+    ) >= MASKED, f"{100 * max(shares):.0f} % of the gradients that an attack used were zero everywhere."
+
+
+def one_draw(of: Subject) -> Finding:
+    """Fires where the victim gives another answer when asked again, and no attack asked about each observation twice."""
+    redrawn = of.shares("redrawn")
+    if math.isnan(redrawn):
+        return None, "Not measured: the records have no probes of randomness."
+    if redrawn < DRAWN:
+        return False, "Asked the same twice, it gave the same answer: it is not random."
+    if of.track.many_draws:
+        return False, of.track.many_draws
+    draws = max((value for attack in of.attacks if not math.isnan(value := attack.mean("draws"))), default=0.0)
+    asked = f"the most patient attack asked {draws:.1f} times about each observation"
+    return (
+        draws < ONE_DRAW,
+        f"Asked the same twice, it gave another answer in {100 * redrawn:.0f} % of probes; {asked}.",
+    )
+
+
+def no_fall(of: Subject) -> Finding:
+    """Fires where the same attack lowers the score no more with the largest perturbation budget than with the smallest."""
+    found = []
+    for family in budgets(of.others):
+        small, large = family[0], family[-1]
+        change = gap(small, large)
+        if change:
+            found.append((large.score.estimate, small, large, change))
+    if not found:
+        return None, "Not measured: no attack was run with two budgets."
+    _, small, large, change = min(found, key=lambda one: one[0])
+    span = f"from budget {small.identity['threat_budget']:g} to {large.identity['threat_budget']:g} {large.identity['attack']}"
+    if small.score.estimate <= NOTHING_LEFT:
+        return False, f"At the smallest budget the score under {small.identity['attack']} is as low as it can be."
+    return change.low <= 0, f"The score falls by {_signed(change)} {span}."
+
+
+def not_flattened(of: Subject) -> Finding:
+    """Fires where the last increase of an attack's steps, restarts or queries still lowered the score by more than 0.02."""
+    found = [
+        (family[-1].score.estimate, family[-2], family[-1], change)
+        for family in efforts(of.attacks)
+        if (change := gap(family[-2], family[-1]))
+    ]
+    if not found:
+        return None, "Not measured: no attack was run with two efforts."
+    _, less, more, change = min(found, key=lambda one: one[0])
+    fired = change.low > 0 and change.estimate > STILL_FALLING
+    return (
+        fired,
+        f"From {less.queries:.0f} to {more.queries:.0f} queries {more.identity['attack']} lowers the score by {_signed(change)}.",
+    )
+
+
+def too_little(of: Subject) -> Finding:
+    """Fires below 3 seeds or a track's number of scenarios a cell, or where cells of the world's grid are missing."""
+    runs, cells, episodes = of.worst.scores.shape
+    weights = {value for one in of.attacks for value in pc.unique(one.own.table["weights_sha256"]).to_pylist()}
+    seeded = of.track.artefact is not None or bool(weights - {""})
+    grid = _grid(of)
+    driven = f"{cells} cell{'s' * (cells != 1)}"
+    missing = 0
+    if grid:
+        there = len(set(grid.cells()) & set(of.worst.cells))
+        driven, missing = f"{there} of {len(grid.cells())} cells of {grid.name}", len(grid.cells()) - there
+    few = (seeded and runs < ENOUGH_SEEDS) or episodes < of.track.enough_episodes or missing > 0
+    return few, f"It was driven with {runs} seed{'s' * (runs != 1)}, {driven}, {episodes} scenarios each."
+
+
+FLAGS: dict[str, tuple[str, Callable[[Subject], Finding]]] = {
+    "unattacked": ("attacked by noise alone", unattacked),
+    "blind": ("no better than a blind policy", blind),
+    "ignores_input": ("the answer does not depend on the input", ignores_input),
+    "masked_gradients": ("a black-box attack beats the white-box one", masked_gradients),
+    "zero_gradients": ("gradients are zero", zero_gradients),
+    "noise": ("random noise lowers the score as much as the attack", noise),
+    "one_draw": ("random, but attacked with one draw", one_draw),
+    "no_fall": ("the score does not fall as the budget grows", no_fall),
+    "not_flattened": ("more effort would still lower the score", not_flattened),
+    "too_little": ("too few seeds, scenarios or cells", too_little),
+}
+"""Every flag: what it says where it fires, and its measurement."""
+
+
+def flags(of: Subject) -> Iterator[Flag]:
+    """Every flag of a defended victim, fired or not."""
+    for name, (_, find) in FLAGS.items():
+        yield Flag(name, *find(of))
+
+
+def _grid(of: Subject) -> Grid | None:
+    """The named grid that was driven, or the first one of the world; None where the world has none that is installed."""
+    named = {name for one in of.attacks for name in pc.unique(one.own.table["grid"]).to_pylist()}
+    own = registry.grids(str(of.attacks[0].identity["world"]))
+    return next((grid for grid in own if grid.name in named), own[0] if own else None)
+
+
+def _under(found: Worst) -> str:
+    return f"{found.score.estimate:.2f} under {found.name}"
+
+
+def _signed(found: Interval) -> str:
+    numbers = (
+        f"{found.estimate:+.2f} [{found.low:+.2f}, {found.high:+.2f}]"
+        if np.isfinite(found.low)
+        else f"{found.estimate:+.2f}"
+    )
+    return numbers.replace("-", "−")

@@ -1,0 +1,1 @@
+"""Reports on the terminal: of a run, and of the ranking."""

@@ -1,0 +1,58 @@
+"""The columns that a track's own measures make in tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from rich.text import Text
+
+from bench.plugins.track import Measure
+from bench.statistics.estimates import Interval
+from leaderboard.comparisons.comparison import Comparison
+from leaderboard.terminal.layout import Column
+from leaderboard.terminal.text import estimate, number, share
+
+Subject = TypeVar("Subject")
+
+
+def measure_columns(
+    comparisons: Sequence[Comparison],
+    table: str,
+    value: Callable[[Measure], Callable[[Subject], Text | str]],
+) -> list[Column[Subject]]:
+    """A column for each measure of a track, as far as the records have it.
+
+    Args:
+        comparisons: of the track, that the table is of; measures of an attack are there where one of them has an attack.
+        table: `overview` or `cells`.
+        value: makes what a column of a measure shows.
+    """
+    first = comparisons[0]
+    attacked = any(one.is_attacked for one in comparisons)
+    return [
+        Column(
+            _heading(measure, table).format_map(first.facts),
+            value(measure),
+            "left" if measure.with_interval and table == "overview" else "right",
+            spare=measure.spare,
+        )
+        for measure in first.track.measures
+        if measure.tables in (table, "both") and (attacked or not measure.of_attack)
+    ]
+
+
+def _heading(measure: Measure, table: str) -> str:
+    """In a table of cells with the unit of a share, which the overview has behind every number."""
+    if table == "overview" or measure.unit != "share" or measure.of_attack:
+        return measure.heading
+    return f"{measure.heading[1:]}\n%" if measure.heading.startswith("\n") else f"{measure.heading} %"
+
+
+def written(measure: Measure, found: Interval, *, with_interval: bool = False) -> Text | str:
+    """The number of a measure in its unit."""
+    if with_interval:
+        factor = 100 if measure.unit == "share" else 1
+        scaled = Interval(*(factor * value for value in (found.estimate, found.low, found.high)))
+        return estimate(scaled, digits=measure.digits)
+    return share(found.estimate) if measure.unit == "share" else number(found.estimate, measure.digits)

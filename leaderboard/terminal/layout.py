@@ -1,0 +1,126 @@
+"""The layout of every table: columns with headings; columns that a terminal has no room for are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby, product
+from typing import Generic, Literal, TypeVar
+
+from rich import box
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+from bench.scenarios import Axes, Cell
+from bench.scenarios.axes import written
+
+Subject = TypeVar("Subject")
+STRIP = 25
+"""Characters of a strip chart."""
+
+
+@dataclass(frozen=True)
+class Column(Generic[Subject]):
+    """A column of a table.
+
+    Args:
+        heading: at most two lines.
+        value: what it shows of a row's subject.
+        justify: numbers to the right, text to the left.
+        spare: columns are left out of a narrow terminal from the highest number down; 0 stays.
+        folds: names that may be long; they go on in the next line where there is no room otherwise.
+    """
+
+    heading: str
+    value: Callable[[Subject], Text | str]
+    justify: Literal["left", "right"] = "right"
+    spare: int = 0
+    folds: bool = False
+
+
+@dataclass(frozen=True)
+class Section(Generic[Subject]):
+    """Rows that belong together, under a title of their own where there is one."""
+
+    subjects: Sequence[Subject]
+    title: Text | None = None
+
+
+def fitted(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], console: Console) -> Table:
+    """The table with as many of the columns as the console has room for, and a space between them where there is room."""
+    room = console.width - 2
+    rows = [
+        [[_text(column.value(subject)) for column in columns] for subject in section.subjects] for section in sections
+    ]
+    titles = [section.title for section in sections]
+    limits = range(max(column.spare for column in columns), -1, -1)
+    for names, limit, gap in product((None, console.width // 3), limits, (1, 0)):
+        kept = [place for place, column in enumerate(columns) if column.spare <= limit]
+        texts = [[[row[place] for place in kept] for row in section] for section in rows]
+        made = _table([columns[place] for place in kept], list(zip(titles, texts, strict=True)), gap, names)
+        if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= room:
+            break
+    return made
+
+
+def _table(
+    columns: Sequence[Column[Subject]],
+    sections: Sequence[tuple[Text | None, Sequence[Sequence[Text]]]],
+    gap: int,
+    names: int | None,
+) -> Table:
+    """With `gap` characters between the columns; names that fold are at most `names` wide."""
+    made = Table(box=box.SIMPLE_HEAD, header_style="dim", padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
+    for column in columns:
+        whole = not column.folds or names is None
+        made.add_column(
+            column.heading,
+            justify=column.justify,
+            no_wrap=whole,
+            max_width=None if whole else names,
+            vertical="bottom",
+        )
+    for title, rows in sections:
+        if title is not None:
+            made.add_row(title)
+        for row in rows:
+            made.add_row(*row)
+        made.add_section()
+    return made
+
+
+def axis(measure: str) -> str:
+    """The heading of a strip chart: 0 at its left end, 1 at its right."""
+    return f"{measure}\n0" + "0.5".center(STRIP - 2) + "1"
+
+
+def _text(value: Text | str) -> Text:
+    """As it stands: a parameter like `speeds=[20]` is no markup."""
+    return value if isinstance(value, Text) else Text(value)
+
+
+def cell_heading(axes: Axes) -> str:
+    """The heading of a column of cells: the names of the axes that change more than what is observed."""
+    names = [axis.name for axis in axes.values() if not axis.perceptual] or list(axes)
+    return f"{names[0]}\n× {' × '.join(names[1:])}" if len(names) > 1 else f"\n{names[0]}"
+
+
+def cell_rows(cells: Iterable[Cell], axes: Axes) -> list[list[tuple[Text, list[Cell]]]]:
+    """The rows of a table of cells, grouped by the perceptual axes.
+
+    A group has a row of its own where it has several cells, then a row a cell; each with the cells that it is of. Without
+    perceptual axes all cells are one group, which has no row of its own.
+    """
+    perceptual = [axis.name for axis in axes.values() if axis.perceptual and len(axes) > 1]
+    others = [name for name in axes if name not in perceptual]
+    found = []
+    for values, group in groupby(cells, key=lambda cell: [cell[name] for name in perceptual]):
+        own = list(group)
+        title = ", ".join(map(written, values))
+        whole = [(Text(title, style="bold"), own)] if title and len(own) > 1 else []
+        indent = "  " if whole else f"{title} " if title else ""
+        names = [" × ".join(written(cell[name]) for name in others) for cell in own]
+        found.append([*whole, *((Text(f"{indent}{name}"), [cell]) for name, cell in zip(names, own, strict=True))])
+    return found
