@@ -19,13 +19,13 @@ import torch
 from torch import Tensor, nn
 
 from bench.conformance import complaints
-from envs.highway.world import HighwayWorld
 from bench.driving.drive import drive
 from bench.driving.rollout import Columns
 from bench.errors import UserError
 from bench.plugins.pair import choose
 from bench.run.config import run_config
 from bench.run.plan import plan
+from envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts
 
