@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.plugins import registry
+from bench.plugins.contracts import ANY_TRACK
 from bench.plugins.registry import GROUPS, KINDS, Kind
 from bench.plugins.sources import tracks_of
 
@@ -31,7 +32,7 @@ def print_names(console: Console) -> None:
 
 
 def print_component(name: str, console: Console) -> None:
-    """What every component of this name does, what it needs, its parameters, and the package that ships it.
+    """Print the page of every component of this name: description, track, parameters, and the package that ships it.
 
     Raises:
         UserError: if no component has the name, or if its plug-in is broken.
@@ -43,7 +44,7 @@ def print_component(name: str, console: Console) -> None:
 
 
 def heading(kind: Kind, name: str) -> Text:
-    """A component, where it is and what ships it, in a line."""
+    """One line: the component, its module, and the package that ships it."""
     entry = registry.find(GROUPS[kind], name, kind)
     return Text.assemble((f"{kind} ", "dim"), (name, "bold"), (f"   {entry.target}, {entry.shipped_by}", "dim"))
 
@@ -80,7 +81,7 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
 
 
 def _print_choices(name: str, choices: Mapping[str, str], console: Console) -> None:
-    """What an adapter offers."""
+    """The components of an adapter."""
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
     for choice, word in choices.items():
         table.add_row(Text(f"{name}:{choice}", style="bold"), word)
@@ -92,8 +93,9 @@ def _print_choices(name: str, choices: Mapping[str, str], console: Console) -> N
 
 
 def fits(kind: Kind, component: type[Any]) -> str:
-    """What decides where it fits: its track and, of an attack, what it needs, of a black box what it answers."""
-    track = f"Track: {' and '.join(component.tracks())}."
+    """Its track; of an attack the access and actions it needs, of a black box the most it answers."""
+    tracks = component.tracks()
+    track = "Track: every one." if tracks == (ANY_TRACK,) else f"Track: {' and '.join(tracks)}."
     if kind == "victim" and component.answers != "gradients":
         return f"{track} Answers {component.answers} at most: attacks that need gradients are refused."
     if kind != "attack":
@@ -113,7 +115,7 @@ def _paragraphs(text: str) -> list[str]:
 
 
 def _with_code(text: str) -> Text:
-    """Text with what stands in `backticks` set apart."""
+    """Text in which `backticked` words have a style of their own."""
     rendered = Text()
     for number, piece in enumerate(re.split(r"`([^`]+)`", text)):
         rendered.append(piece, style="cyan" if number % 2 else "")

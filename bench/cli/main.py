@@ -75,7 +75,7 @@ def check(
     name: Annotated[str, typer.Argument(help="A component, built in or a plug-in's.")],
     words: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[KEY=VALUE]...", help="Its parameters, and victim=NAME that a defence is tried on."),
+        typer.Argument(metavar="[KEY=VALUE]...", help="Its parameters; victim=NAME and world=NAME to try it with."),
     ] = None,
 ) -> None:
     """Check that a component keeps the rules of the benchmark, and say what to fix.

@@ -48,7 +48,18 @@ def install(
 
 def pip_install(folder: Path, *packages: Path) -> None:
     """Let pip install packages to `folder`, outside of the environment of the tests and without a network."""
-    pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target", folder)
+    pip = (
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--upgrade",
+        "--no-deps",
+        "--no-build-isolation",
+        "--target",
+        folder,
+    )
     subprocess.run([*pip, *packages], check=True, capture_output=True, text=True)
 
 

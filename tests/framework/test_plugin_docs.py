@@ -1,7 +1,8 @@
-"""What docs/plugins.md tells a plug-in's author to type is typed, line by line."""
+"""All code of docs/plugins.md is written to the files it names, checked and run, in the order of the page."""
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import subprocess
@@ -9,37 +10,69 @@ from pathlib import Path
 
 import pytest
 
-from bench.records import store as results
-from tests.framework.conftest import BENCH
+from bench.plugins.track import track
+from bench.records import reading
+from tests.framework.conftest import BENCH, import_path
 from tests.framework.distributions import pip_install
 
 PAGE = Path(__file__).parents[2] / "docs" / "plugins.md"
-SMALLER = ("seeds=0", "reference=false", "record=0", "world.max_steps=30")
-"""What makes a run of the page quick, beside what it says."""
+SMALLER = ("seeds=0", "reference=false", "record=0", "world.max_steps=30", "workers=1")
+"""Added to the runs of the page, so that they are quick."""
+TABLES = re.compile(r"# What makes it a plug-in.*?(?=\n\[tool\.pytest)", re.DOTALL)
+"""Of the pyproject.toml that `bench new` writes: entry points and modules."""
+
+
+def blocks() -> list[tuple[str, str, str]]:
+    """Language, content, and the file named last before each code block of the page."""
+    text = PAGE.read_text()
+    found = []
+    for match in re.finditer(r"```(\w+)\n(.*?)```", text, re.DOTALL):
+        named = re.findall(r"`(\w+\.(?:py|toml))`", text[: match.start()])
+        found.append((match[1], match[2], named[-1] if named else ""))
+    return found
 
 
 @pytest.mark.slow
-def test_the_way_to_a_scored_row_is_as_the_page_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_can_be_typed_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     site, package = tmp_path / "site", tmp_path / "cavbench-my-attack"
-    # What `pip install -e` does, but beside the environment of the tests: the package's own files are found first.
-    monkeypatch.setenv("PYTHONPATH", f"{package}:{site}")
+    # The effect of `pip install -e`, beside the environment of the tests: the package's own files are found first.
+    monkeypatch.setenv("PYTHONPATH", import_path(package, site))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    for language, block in re.findall(r"```(\w+)\n(.*?)```", PAGE.read_text(), re.DOTALL):
-        if language == "python":
-            (package / "cavbench_my_attack.py").write_text(block)
-            continue
-        for line in block.splitlines():
-            program, *words = shlex.split(line)
-            if program == "pip":
-                assert words == ["install", "-e", "cavbench-my-attack[test]"]
-                pip_install(site, package)
-                continue
-            assert program == "bench"
-            command = [*BENCH, *words, *(SMALLER if words[0] == "run" else ())]
-            ended = subprocess.run(command, capture_output=True, text=True, check=False)
-            assert ended.returncode == 0, f"{line}: {ended.stdout}{ended.stderr}"
-    rows = [row for row in results.read(tmp_path / "results").to_pylist() if row["attack"] == "my_attack"]
-    first, own = ([row for row in rows if (row["queries"] > 0) == asks] for asks in (True, False))
-    assert len(first) == len(own) == 20
-    assert {row["attack_shipped_by"] for row in rows} == {"cavbench-my-attack 0.1.0"}
+    for language, block, file in blocks():
+        match language:
+            case "python":
+                (package / file).write_text(block)
+            case "toml":
+                written = (package / "pyproject.toml").read_text()
+                assert TABLES.search(written)
+                (package / "pyproject.toml").write_text(TABLES.sub(lambda _, block=block: block, written))
+            case "sh":
+                for line in block.splitlines():
+                    typed(line, package, site)
+    rows = reading.read(tmp_path / "results", track=track("driving")).to_pylist()
+    searched = [row for row in rows if row["attack"] == "my_attack" and row["queries"] > 0]
+    own = [row for row in rows if (row["attack"], row["defense"], row["queries"]) == ("my_attack", "none", 0)]
+    assert len(searched) == len(own) == 20
+    assert {row["attack_shipped_by"] for row in own} == {"cavbench-my-attack 0.1.0"}
+    stacked = [row for row in rows if (row["attack"], row["defense"]) == ("held_offset", "frame_mean")]
+    assert len(stacked) == 20
+    followed = [row for row in rows if row["world"] == "car_following" and row["attack"] == "noise"]
+    assert {json.dumps(json.loads(row["cell"])) for row in followed} == {
+        '{"gap": 20.0, "braking": 2.0}',
+        '{"gap": 20.0, "braking": 4.0}',
+    }
+    assert {row["defense"] for row in followed} == {"none", "rounding"}
+
+
+def typed(line: str, package: Path, site: Path) -> None:
+    """Carry out a line of the page."""
+    program, *words = shlex.split(line)
+    if program == "pip":
+        assert words == ["install", "-e", "cavbench-my-attack[test]"]
+        pip_install(site, package)
+        return
+    assert program == "bench"
+    command = [*BENCH, *words, *(SMALLER if words[0] == "run" else ())]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, f"{line}: {ended.stdout}{ended.stderr}"
