@@ -69,8 +69,7 @@ class Attacker:
         if self.attack is None:
             return Shown(observation, counts[0], counts[1], counts[2], excess)
         if not self.begun:
-            self.oracle.begin_step(observation, policy_state)
-            self.state, self.begun = self.attack.initial(observation, self.oracle), True
+            self._begin(observation, policy_state)
         rows = running.nonzero().squeeze(-1)
         perturbed = observation.clone()
         start = time.perf_counter()
@@ -82,6 +81,15 @@ class Attacker:
         milliseconds = (time.perf_counter() - start) * 1000
         return Shown(perturbed, counts[0], counts[1], counts[2], excess, milliseconds)
 
+    def _begin(self, observation: Tensor, policy_state: State) -> None:
+        """Ask the attack what it remembers before the first step; the state is the run's own copy, written to in place."""
+        assert self.attack is not None
+        self.oracle.begin_step(observation, policy_state)
+        state = self.attack.initial(observation, self.oracle)
+        if bool(self.oracle.spent.any()):
+            raise UserError(f"{type(self.attack).__name__}.initial asked the victim, which only step may do")
+        self.state, self.begun = None if state is None else state.detach().clone(), True
+
     def _answer(self, observation: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and how far outside the set it was."""
         assert self.attack is not None
@@ -90,6 +98,8 @@ class Attacker:
         if not isinstance(answer, Tensor) or answer.shape != observation.shape:
             found = f"shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else f"a {type(answer).__name__}"
             raise UserError(f"{name}.perturb returned {found}, not {tuple(observation.shape)}")
+        if self.state is None and state is not None:
+            raise UserError(f"{name}.step returned a state, but initial returned none")
         if self.state is not None and state is not None:
             self.state[rows] = state.detach()
         answer = answer.detach()
