@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from bench.detection import PatchAttack, PatchOracle, Scenes
-from bench.detection.threat import check_texels
+from bench.detection.threat import Texels
 from bench.plugins.contracts import Access, Progress
+from bench.plugins.ranges import Count, NotNegative, Positive
 
 SEEN = 0.5
 """Frames in which less of the sign is to be seen teach nothing."""
@@ -51,39 +53,21 @@ class EOT(PatchAttack):
 
     access: ClassVar[Access] = "gradients"
 
-    texels: int = 100
-    steps: int = 150
-    batch: int = 8
-    learning_rate: float = 0.05
-    tv: float = 0.1
-    window: int = 320
-    rotation: float = 8.0
-    scale: float = 0.3
-    translation: float = 0.15
-    perspective: float = 0.15
-    brightness: float = 0.2
-    contrast: float = 0.2
-    saturation: float = 0.2
-    hue: float = 0.05
-    noise: float = 0.02
-
-    def __post_init__(self) -> None:
-        check_texels("eot", self.texels)
-        for name in ("steps", "batch", "window"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"eot.{name} must be at least 1, got {getattr(self, name)}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"eot.learning_rate must be above 0, got {self.learning_rate}")
-        for name in ("tv", "noise"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"eot.{name} must be at least 0, got {getattr(self, name)}")
-        if not 0 <= self.rotation <= 180:
-            raise ValueError(f"eot.rotation must be between 0 and 180, got {self.rotation}")
-        for name in ("scale", "translation", "perspective", "brightness", "contrast", "saturation"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"eot.{name} must be in [0, 1), got {getattr(self, name)}")
-        if not 0 <= self.hue <= 0.5:
-            raise ValueError(f"eot.hue must be between 0 and 0.5, got {self.hue}")
+    texels: Texels = 100
+    steps: Count = 150
+    batch: Count = 8
+    learning_rate: Positive = 0.05
+    tv: NotNegative = 0.1
+    window: Count = 320
+    rotation: Annotated[float, Interval(ge=0, le=180)] = 8.0
+    scale: Annotated[float, Interval(ge=0, lt=1)] = 0.3
+    translation: Annotated[float, Interval(ge=0, lt=1)] = 0.15
+    perspective: Annotated[float, Interval(ge=0, lt=1)] = 0.15
+    brightness: Annotated[float, Interval(ge=0, lt=1)] = 0.2
+    contrast: Annotated[float, Interval(ge=0, lt=1)] = 0.2
+    saturation: Annotated[float, Interval(ge=0, lt=1)] = 0.2
+    hue: Annotated[float, Interval(ge=0, le=0.5)] = 0.05
+    noise: NotNegative = 0.02
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         from attacks.transformations import Transformations

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bench.detection import PatchAttack, Scenes
 from bench.plugins.contracts import Access, Progress
+from bench.plugins.ranges import Share
 
 if TYPE_CHECKING:
     from bench.detection import PatchOracle
@@ -26,11 +27,7 @@ class GreyPatch(PatchAttack):
     access: ClassVar[Access] = "oblivious"
     seeded: ClassVar[bool] = False
 
-    level: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.level <= 1:
-            raise ValueError(f"grey_patch.level must be between 0 and 1, got {self.level}")
+    level: Share = 0.5
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         return torch.full((3, 8, 8), self.level)

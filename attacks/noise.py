@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from bench.driving import DrivingAttack
@@ -39,15 +40,7 @@ class Noise(DrivingAttack):
     access: ClassVar[Access] = "oblivious"
 
     distribution: Distribution = "uniform"
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.distribution not in get_args(Distribution):
-            raise ValueError(
-                f"noise.distribution must be one of {', '.join(get_args(Distribution))}, got {self.distribution!r}"
-            )
-        if not 0 < self.scale <= 1:
-            raise ValueError(f"noise.scale must be in (0, 1], got {self.scale}")
+    scale: Annotated[float, Interval(gt=0, le=1)] = 1.0
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if self.distribution == "uniform":

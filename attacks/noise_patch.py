@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.detection import PatchAttack, PatchOracle, Scenes
-from bench.detection.threat import check_texels
+from bench.detection.threat import Texels
 from bench.plugins.contracts import Access, Progress
 
 
@@ -23,10 +23,7 @@ class NoisePatch(PatchAttack):
 
     access: ClassVar[Access] = "oblivious"
 
-    texels: int = 100
-
-    def __post_init__(self) -> None:
-        check_texels("noise_patch", self.texels)
+    texels: Texels = 100
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         return torch.rand(3, self.texels, self.texels, generator=oracle.generator)

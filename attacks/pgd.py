@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Objective
 from bench.driving import DrivingAttack
 from bench.plugins.contracts import Access
+from bench.plugins.ranges import Count, Natural, Positive
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,36 +57,17 @@ class PGD(DrivingAttack):
 
     access: ClassVar[Access] = "gradients"
 
-    steps: int = 10
-    step_size: float = 0.5
-    restarts: int = 4
+    steps: Count = 10
+    step_size: Annotated[float, Interval(gt=0, le=2)] = 0.5
+    restarts: Count = 4
     random_start: bool = True
-    momentum: float = 0.0
+    momentum: Annotated[float, Interval(ge=0, lt=1)] = 0.0
     objective: Objective = "collision"
-    temperature: float = 0.5
-    target_action: int = 3
-    target_acceleration: float = 1.0
-    target_steering: float = 0.5
-    braking_action: int = 4
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "restarts"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"pgd.{name} must be at least 1, got {getattr(self, name)}")
-        if not 0 < self.step_size <= 2:
-            raise ValueError(f"pgd.step_size must be in (0, 2], got {self.step_size}")
-        if not 0 <= self.momentum < 1:
-            raise ValueError(f"pgd.momentum must be in [0, 1), got {self.momentum}")
-        if self.objective not in get_args(Objective):
-            raise ValueError(f"pgd.objective must be one of {', '.join(get_args(Objective))}, got {self.objective!r}")
-        if not self.temperature > 0:
-            raise ValueError(f"pgd.temperature must be above 0, got {self.temperature}")
-        for name in ("target_action", "braking_action"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"pgd.{name} must be at least 0, got {getattr(self, name)}")
-        for name in ("target_acceleration", "target_steering"):
-            if not -1 <= getattr(self, name) <= 1:
-                raise ValueError(f"pgd.{name} must be in [-1, 1], got {getattr(self, name)}")
+    temperature: Positive = 0.5
+    target_action: Natural = 3
+    target_acceleration: Annotated[float, Interval(ge=-1, le=1)] = 1.0
+    target_steering: Annotated[float, Interval(ge=-1, le=1)] = 0.5
+    braking_action: Natural = 4
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if not len(observation):

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion
 from bench.driving import DrivingAttack
 from bench.plugins.contracts import Access
+from bench.plugins.ranges import Count, Natural, NotNegative, Positive
 
 if TYPE_CHECKING:
     from bench.driving import Oracle
@@ -62,41 +64,21 @@ class ZOSignSGD(DrivingAttack):
 
     access: ClassVar[Access] = "scores"
 
-    steps: int = 4
-    directions: int = 10
-    smoothing: float = 1.0
-    step_size: float = 1.0
+    steps: Count = 4
+    directions: Count = 10
+    smoothing: Annotated[float, Interval(gt=0, le=2)] = 1.0
+    step_size: Annotated[float, Interval(gt=0, le=2)] = 1.0
     objective: ZOObjective = "collision"
-    temperature: float = 0.5
-    target_action: int = 3
-    target_acceleration: float = 1.0
-    target_steering: float = 0.5
-    braking_action: int = 4
-    tolerance: float = 0.1
-    distortion_weight: float = 1.0
+    temperature: Positive = 0.5
+    target_action: Natural = 3
+    target_acceleration: Annotated[float, Interval(ge=-1, le=1)] = 1.0
+    target_steering: Annotated[float, Interval(ge=-1, le=1)] = 0.5
+    braking_action: Natural = 4
+    tolerance: NotNegative = 0.1
+    distortion_weight: NotNegative = 1.0
     early_stop: bool = True
-    enough: float = 1.0
+    enough: Annotated[float, Interval(gt=0, le=1)] = 1.0
     random_start: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "directions"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"zo.{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("smoothing", "step_size"):
-            if not 0 < getattr(self, name) <= 2:
-                raise ValueError(f"zo.{name} must be in (0, 2], got {getattr(self, name)}")
-        if self.objective not in get_args(ZOObjective):
-            raise ValueError(f"zo.objective must be one of {', '.join(get_args(ZOObjective))}, got {self.objective!r}")
-        if not self.temperature > 0:
-            raise ValueError(f"zo.temperature must be above 0, got {self.temperature}")
-        for name in ("target_acceleration", "target_steering"):
-            if not -1 <= getattr(self, name) <= 1:
-                raise ValueError(f"zo.{name} must be in [-1, 1], got {getattr(self, name)}")
-        for name in ("target_action", "braking_action", "tolerance", "distortion_weight"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"zo.{name} must be at least 0, got {getattr(self, name)}")
-        if not 0 < self.enough <= 1:
-            raise ValueError(f"zo.enough must be in (0, 1], got {self.enough}")
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if not len(observation) or int(oracle.remaining.min()) < 1:

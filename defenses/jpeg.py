@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from bench.detection import Detector, DetectorDefense, DetectorVictim
@@ -40,11 +42,7 @@ class JPEG(DetectorDefense):
         quality: of the compression, from 1 to 100 (default 40).
     """
 
-    quality: int = 40
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.quality <= 100:
-            raise ValueError(f"jpeg.quality must be between 1 and 100, got {self.quality}")
+    quality: Annotated[int, Interval(ge=1, le=100)] = 40
 
     def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
         return _Compressed(victim.load(seed, facts), self.quality).eval()

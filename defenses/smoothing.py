@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -53,11 +54,7 @@ class MedianSmoothing(DetectorDefense):
         size: side of the neighbourhood in pixels, odd, from 3 to 11 (default 3).
     """
 
-    size: int = 3
-
-    def __post_init__(self) -> None:
-        if self.size % 2 == 0 or not 3 <= self.size <= 11:
-            raise ValueError(f"median.size must be odd and between 3 and 11, got {self.size}")
+    size: Literal[3, 5, 7, 9, 11] = 3
 
     def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
         return _Median(victim.load(seed, facts), self.size).eval()

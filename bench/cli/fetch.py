@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from bench.cli.progress import show_downloads
 from bench.victims import fetch
 
 
@@ -30,6 +31,7 @@ def print_fetched(names: Sequence[str], console: Console) -> None:
     Raises:
         UserError: if one is unknown (then nothing is fetched) or cannot be fetched.
     """
+    show_downloads()
     for name in names:
         fetch.place(name)
     for name in names:

@@ -138,6 +138,13 @@ class DownloadProgress:
         self.bar.update(self.task, completed=done, total=total)
 
 
+def show_downloads() -> None:
+    """Show a bar on standard error for whatever is downloaded from now on."""
+    from bench.victims import fetch
+
+    fetch.tell(lambda name: DownloadProgress(Console(stderr=True), name))
+
+
 def _bar(console: Console, *counts: ProgressColumn) -> Progress:
     return Progress(
         SpinnerColumn(),

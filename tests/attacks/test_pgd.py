@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from attacks.noise import Noise
-from attacks.none import NoAttack
 from attacks.objectives import Objective
 from attacks.pgd import PGD
 from bench.driving import ActionType, ObservationThreat
@@ -48,7 +47,7 @@ def test_pgd_finds_the_optimum_of_a_linear_victim(seed: int, random_start: bool)
 @pytest.mark.parametrize("objective", OBJECTIVES)
 def test_pgd_beats_noise_on_its_objective(objective: Objective) -> None:
     policy, observation = victim("discrete"), observations(300)
-    attacks = (PGD(objective=objective), Noise(), NoAttack())
+    attacks = (PGD(objective=objective), Noise(), None)
     attacked, noisy, clean = (left(attack, policy, observation, objective) for attack in attacks)
     assert float((attacked <= noisy).float().mean()) > 0.95
     assert float((clean - attacked).mean()) > 2 * float((clean - noisy).mean())

@@ -67,7 +67,8 @@ def perturb(
 ) -> tuple[Tensor, Tensor]:
     """What the attack shows [B, V, F], and the queries it spent [B]."""
     oracle = open_oracle(policy, attack, observation, threat, seed)
-    return attack.perturb(observation, oracle), oracle.spent
+    shown, _ = attack.step(observation, oracle, attack.initial(observation, oracle))
+    return shown, oracle.spent
 
 
 def loss_of(policy: Policy, objective: Objective, observation: Tensor) -> DiscreteLoss:
@@ -77,7 +78,10 @@ def loss_of(policy: Policy, objective: Objective, observation: Tensor) -> Discre
     )
 
 
-def left(attack: DrivingAttack, policy: Policy, observation: Tensor, objective: Objective = "collision") -> Tensor:
-    """[B] what the attack leaves of the victim's decision, by the key that attacks compare points by; lower is stronger."""
-    loss, scores = loss_of(policy, objective, observation), policy.scores(perturb(attack, policy, observation)[0])
+def left(
+    attack: DrivingAttack | None, policy: Policy, observation: Tensor, objective: Objective = "collision"
+) -> Tensor:
+    """[B] what is left of the victim's decision, by the key that attacks compare points by; lower is a stronger attack."""
+    shown = perturb(attack, policy, observation)[0] if attack else observation
+    loss, scores = loss_of(policy, objective, observation), policy.scores(shown)
     return loss.key(scores, loss(scores))

@@ -11,15 +11,18 @@ import pytest
 from safetensors import safe_open
 
 from bench.cli.show import recordings
-from bench.detection import patches
+from bench.detection.patch import Patch
 from bench.errors import UserError
 from bench.plugins.sources import names, tracks_of
-from bench.records import store as results
-from bench.run import plan, runner
+from bench.plugins.track import track
+from bench.records import reading
+from bench.run import runner
 from bench.run.config import RunConfig, run_config, train_config
+from bench.run.plan import plan
 from bench.run.replay import find, replay
-from bench.run.unit import Crafting
+from bench.run.unit import Preparation
 from bench.victims import zoo
+from envs.camera.axes import APPROACH_V1
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.framework.test_cli import TOY, assert_one_line
@@ -40,24 +43,28 @@ def run(out: Path, *more: str, watcher: Silent | None = None) -> tuple[pa.Table,
     words = dict(word.split("=", 1) for word in [*SMALL.split(), "workers=1", f"out={out}", "record=0", *more])
     watcher = watcher or Silent()
     units = runner.run(run_config([f"{key}={value}" for key, value in words.items()]), watcher)
-    return results.read(out, units, track="detection"), watcher
+    return reading.read(out, units, track=track("detection")), watcher
 
 
-def crafted(watcher: Silent) -> list[Crafting]:
-    return [work for work in watcher.done if isinstance(work, Crafting)]
+def crafted(watcher: Silent) -> list[Preparation]:
+    return [work for work in watcher.done if isinstance(work, Preparation)]
+
+
+def patch_path(out: Path, fingerprint: str) -> Path:
+    return out / "patches" / f"{fingerprint}.safetensors"
 
 
 @pytest.fixture(autouse=True)
 def without_reference_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is run is what is asked for, but where a test says otherwise."""
-    monkeypatch.setattr(plan, "REFERENCE_PATCHES", ())
+    monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ())
 
 
 def test_the_victim_decides_the_track_and_the_track_the_defaults() -> None:
     config = read("attack=paint victim=red world=red_street")
     (pair,) = config.pairs
     assert (pair.threat.norm, pair.threat.budget, pair.threat.queries) == ("patch", 0.5, 20_000)
-    assert config.grid == GRIDS["approach-v1"]
+    assert config.grid == APPROACH_V1
     assert read("victim=red world=red_street weather=night").grid.weather == ("night",)
     assert read("victim=red").pairs[0].world.name == "camera"
 
@@ -71,7 +78,7 @@ BAD = {
     "victim=red world=red_street threat.budget=1.5": "threat.budget must be in (0, 1]",
     "attack=paint victim=red world=red_street threat.budget=0": "threat.budget must be in (0, 1]",
     "attack=paint victim=red world=red_street threat.access=scores": "needs access 'gradients'",
-    "victim=toy world=toy grid=approach-v1": "unknown grid 'approach-v1'; known: standard-v1",
+    "victim=toy world=toy grid=approach-v1": "unknown grid 'approach-v1' of the world 'toy'",
     "victim=toy world=toy threat.norm=patch": "unknown threat.norm 'patch'; known: relative, linf",
 }
 
@@ -87,7 +94,7 @@ def test_what_does_not_fit_the_track_is_refused_in_one_line(line: str) -> None:
 def test_the_track_of_a_component_is_read_from_its_source() -> None:
     assert tracks_of("toy_camera_plugin:Paint") == ["detection"]
     assert tracks_of("bench.victims.drivers.dqn:DQN") == ["driving"]
-    assert tracks_of("attacks.none:NoAttack") == ["detection", "driving"]
+    assert tracks_of("attacks.none:NoAttack") == ["any"]
     assert tracks_of("nowhere:Nothing") == []
     assert {"none", "paint", "blank"} <= set(names("attack", "detection"))
 
@@ -125,14 +132,14 @@ def test_each_scenario_seed_has_its_place_and_every_frame_is_kept(tmp_path: Path
 
 
 def test_every_attack_is_held_against_patches_that_know_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan, "REFERENCE_PATCHES", ("blank", "not_installed"))
-    units = plan.plan(read(SMALL))
+    monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ("blank", "not_installed"))
+    units = plan(read(SMALL))
     blank = [unit for unit in units if unit.pair.attack.name == "blank"]
     assert {unit.training_seed for unit in blank} == {0}
     assert len(blank) == 2
     assert {unit.pair.threat for unit in blank} == {units[0].pair.threat}
-    assert not [unit for unit in plan.plan(read(f"{SMALL} reference=false")) if unit.pair.attack.name == "blank"]
-    assert {unit.pair.attack.name for unit in plan.plan(read(SMALL.replace("paint", "none")))} == {"none"}
+    assert not [unit for unit in plan(read(f"{SMALL} reference=false")) if unit.pair.attack.name == "blank"]
+    assert {unit.pair.attack.name for unit in plan(read(SMALL.replace("paint", "none")))} == {"none"}
 
 
 def test_an_interrupted_run_loses_neither_patches_nor_cells(tmp_path: Path) -> None:
@@ -160,11 +167,11 @@ def test_results_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
 
 
 def test_scoring_code_and_crafting_code_are_told_apart() -> None:
-    unit = next(unit for unit in plan.plan(read(SMALL)) if unit.crafting)
-    assert unit.crafting is not None
+    unit = next(unit for unit in plan(read(SMALL)) if unit.preparation)
+    assert unit.preparation is not None
     assert "bench.detection.approach" in unit.modules
-    assert "bench.detection.crafting" in unit.crafting.modules
-    assert "bench.detection.approach" not in unit.crafting.modules
+    assert "bench.detection.crafting" in unit.preparation.modules
+    assert "bench.detection.approach" not in unit.preparation.modules
 
 
 @pytest.mark.parametrize(
@@ -187,7 +194,7 @@ def test_texels_are_brought_into_range_and_how_far_they_were_outside_is_kept(tmp
     loud, _ = run(tmp_path, "attack.mood=loud", "weather=clear")
     attacked = loud.filter(pc.field("attack") == "paint")
     assert 0 < min(attacked["excess"].to_pylist()) <= max(attacked["excess"].to_pylist()) <= 1
-    with safe_open(patches.path_of(tmp_path, attacked["patch"][0].as_py()), "pt") as file:
+    with safe_open(patch_path(tmp_path, attacked["patch"][0].as_py()), "pt") as file:
         texels = file.get_tensor("patch")
     assert 0 <= float(texels.min()) < float(texels.max()) <= 1
 
@@ -219,9 +226,11 @@ def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path,
     assert made.code == 0, made.err
     assert "patch, seed 1" in made.err
     assert "frames" in made.out
-    assert results.tracks(tmp_path) == ["driving", "detection"]
-    assert set(results.read(tmp_path)["victim"].to_pylist()) == {"toy"}
-    assert set(results.read(tmp_path, track="detection")["victim"].to_pylist()) == {"red"}
+    both = reading.read_all(tmp_path)
+    assert {name: set(records["victim"].to_pylist()) for name, records in both.items()} == {
+        "driving": {"toy"},
+        "detection": {"red"},
+    }
     shown, report = bench("show", str(tmp_path)), bench("report", f"out={tmp_path}")
     one = bench("show", "paint", "--out", str(tmp_path))
     for said in (shown, report, one):
@@ -230,13 +239,16 @@ def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path,
     assert "safe progress" in report.out
     assert "safe progress" not in one.out
     assert "patch 0.5, access gradients, 20000 queries" in one.out
-    rows = {track: table.num_rows for track, table in results.read_all(tmp_path).items()}
+    rows = {track: table.num_rows for track, table in reading.read_all(tmp_path).items()}
     assert bench("report", "count", f"out={tmp_path}").out == f"{rows}\n"
 
 
 def test_how_a_patch_came_about_is_kept_beside_it(tmp_path: Path) -> None:
     records, _ = run(tmp_path, "weather=clear", "seeds=0", "attack=paint,blank")
-    kept = {name: patches.read(tmp_path, find(records, {"attack": name})["patch"]) for name in ("paint", "blank")}
+    kept = {
+        name: Patch.read(patch_path(tmp_path, find(records, {"attack": name})["patch"]).read_bytes())
+        for name in ("paint", "blank")
+    }
     assert kept["blank"].evolution is None
     evolution = kept["paint"].evolution
     assert evolution is not None
@@ -249,16 +261,16 @@ def test_how_a_patch_came_about_is_kept_beside_it(tmp_path: Path) -> None:
 def test_the_first_approaches_of_each_pair_that_was_asked_for_are_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench
 ) -> None:
-    monkeypatch.setattr(plan, "REFERENCE_PATCHES", ("blank",))
+    monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ("blank",))
     said = bench("run", *SMALL.split(), "workers=1", f"out={tmp_path}")
     assert said.code == 0, said.err
     assert "was not recorded" not in said.err
     (path,) = recordings(tmp_path, None)
     assert path.parent.name.startswith("paint-none-red-")
-    assert path.name == "3-lanes-density-1-clear-1000000.rrd"
+    assert path.name == "lanes-3-density-1-weather-clear-1000000.rrd"
     assert f"bench view {path}" in bench("show", str(tmp_path)).out
     run(tmp_path / "two", "attack=none", "record=2")
-    names = {path.name.removeprefix("3-lanes-density-1-") for path in recordings(tmp_path / "two", None)}
+    names = {path.name.removeprefix("lanes-3-density-1-weather-") for path in recordings(tmp_path / "two", None)}
     assert names == {f"{weather}-{seed}.rrd" for weather in ("clear", "fog") for seed in (1_000_000, 1_000_001)}
 
 
@@ -271,12 +283,14 @@ def test_a_replay_measures_what_the_record_says_and_records_it(tmp_path: Path, b
     said = bench("view", "paint", "weather=fog", "seed=1000001", "--out", str(tmp_path))
     assert said.code == 0, said.err
     assert "Replayed bit for bit" in said.out
-    assert "3-lanes-density-1-fog-1000001.rrd" in said.out.replace("\n", "")
-    path = patches.path_of(tmp_path, record["patch"])
+    assert "lanes-3-density-1-weather-fog-1000001.rrd" in said.out.replace("\n", "")
+    path = patch_path(tmp_path, record["patch"])
     path.write_bytes(path.read_bytes()[:-4])
-    assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"the patch {path} is truncated")
+    assert_one_line(
+        bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"the patch {path.name} is truncated"
+    )
     path.unlink()
-    assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"the patch {path} is not there")
+    assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"{path} is not there")
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +12,29 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bench.driving.drive import drive
 from bench.errors import UserError
+from bench.plugins.track import Columns, track
+from bench.records import reading
 from bench.records import store as results
-from bench.records.store import MEASUREMENTS, PROBES, SCHEMA
+from bench.records.generations import AXES_OF_V1, generations
+from bench.records.schema import schema
 from bench.run.config import run_config
 from bench.run.plan import plan
 from bench.run.unit import Unit
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
+TRACK = track("driving")
+SCHEMA = schema(TRACK)
 WORDS = ("attack=nudge", "victim=toy", "world=toy", "lanes=3,4", "density=1", "weather=clear", "episodes=3", "seeds=0")
+
+
+def drive(unit: Unit) -> Columns:
+    return TRACK.drive(unit.job, None, []).columns
+
+
+def read(out: Path, units: Sequence[str] | None = None) -> pa.Table:
+    return reading.read(out, units, track=TRACK)
 
 
 @pytest.fixture(scope="module")
@@ -34,18 +47,18 @@ def written(units: list[Unit], tmp_path: Path) -> Path:
     """A results folder with the records of all units."""
     results.prepare(tmp_path)
     for unit in units:
-        results.write(tmp_path, results.table(unit.constants(1.5), drive(unit)))
+        results.write(tmp_path, results.table(unit.constants(1.5), drive(unit), track=TRACK))
     return tmp_path
 
 
 def test_a_rollout_measures_exactly_what_the_schema_says(units: list[Unit]) -> None:
-    measured = {field.name for field in (*MEASUREMENTS["driving"], *PROBES)} | {"seed"}
+    measured = {field.name for field in (*TRACK.measurements, *TRACK.probes)} | {"seed"}
     assert set(drive(units[0])) == measured
     assert all(field.metadata[b"meaning"] for field in SCHEMA)
 
 
 def test_what_is_written_is_what_is_read(written: Path, units: list[Unit]) -> None:
-    records = results.read(written, [unit.fingerprint for unit in units])
+    records = read(written, [unit.fingerprint for unit in units])
     assert records.schema.equals(SCHEMA)
     assert records.num_rows == 3 * len(units)
     measured = drive(units[0])
@@ -67,22 +80,22 @@ def test_a_write_that_fails_leaves_nothing_behind(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(UserError, match="cannot be written: No space left on device"):
-        results.write(tmp_path, results.table(units[0].constants(1.0), drive(units[0])))
+        results.write(tmp_path, results.table(units[0].constants(1.0), drive(units[0]), track=TRACK))
     assert list((tmp_path / "episodes").iterdir()) == []
 
 
 def test_what_a_killed_writer_leaves_is_no_record(written: Path, units: list[Unit]) -> None:
     (written / "episodes" / f".{units[0].fingerprint}-x.tmp").write_bytes(b"PAR1 half")
-    assert results.read(written).num_rows == 3 * len(units)
+    assert read(written).num_rows == 3 * len(units)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
 def test_a_truncated_record_is_named(written: Path, units: list[Unit], share: float) -> None:
     path = results.path_of(written, units[1].fingerprint)
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    for read in (lambda: results.read(written), lambda: results.finished(written, [units[1].fingerprint])):
+    for reads in (lambda: read(written), lambda: results.finished(written, [units[1].fingerprint])):
         with pytest.raises(UserError, match=f"the record {path} is truncated or not Parquet; delete it"):
-            read()
+            reads()
 
 
 def test_a_record_whose_data_is_damaged_is_named(written: Path, units: list[Unit]) -> None:
@@ -91,22 +104,21 @@ def test_a_record_whose_data_is_damaged_is_named(written: Path, units: list[Unit
     blob[4 : len(blob) // 3] = b"\xff" * (len(blob) // 3 - 4)
     path.write_bytes(bytes(blob))
     with pytest.raises(UserError, match=f"the record {path} is truncated or not Parquet"):
-        results.read(written)
+        read(written)
 
 
 def test_a_foreign_table_is_named(written: Path) -> None:
     path = written / "episodes" / "other.parquet"
     pq.write_table(pa.table({"a": [1]}), path)
     with pytest.raises(UserError, match=f"the record {path} has other columns"):
-        results.read(written)
+        read(written)
 
 
 CANNOT_BE = {
     "safe_progress": (5.0, "safe_progress must be between 0 and 1, got 5"),
     "changed": (float("nan"), "changed must be between 0 and 1, got nan"),
-    "weather": ("hail", "lanes/density/weather 3/1.0/hail: unknown weather 'hail'; known: clear"),
-    "lanes": (-1, "lanes must be between 2 and 8, got -1"),
-    "density": (float("nan"), "density must be in (0, 4], got nan"),
+    "cell": ('{"lanes":-1,"density":1.0,"weather":"clear"}', "lanes must be "),
+    "world_facts": ("{}", "not a cell of a world that says its axes"),
     "attack_params": ("{scale: 1}", "attack_params {scale: 1}: Expecting property name"),
     "world_params": ("[1]", "world_params [1]: not a JSON object"),
     "threat_access": ("all", "threat_access all: known: oblivious, decisions, scores, gradients"),
@@ -121,9 +133,9 @@ def test_a_value_that_cannot_be_is_named_with_its_record(written: Path, units: l
     place = records.schema.get_field_index(name)
     wrong = pa.array([value] * records.num_rows, records.schema.field(name).type)
     pq.write_table(records.set_column(place, records.schema.field(name), wrong), path)
-    for read in (results.read, lambda out: results.read_compact(out, {"safe_progress", "changed"})):
+    for reads in (read, lambda out: reading.read_compact(out, {"safe_progress", "changed"})):
         with pytest.raises(UserError) as raised:
-            read(written)
+            reads(written)
         assert str(raised.value).startswith(f"the record {path} cannot be right: ")
         assert why in str(raised.value)
 
@@ -136,11 +148,11 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
 
 def test_an_empty_folder_says_how_to_fill_it(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"there are no records in .*; `bench run out="):
-        results.read(tmp_path)
+        read(tmp_path)
 
 
 def test_reading_a_folder_takes_the_newest_code_and_drives_no_scenario_twice(written: Path, units: list[Unit]) -> None:
-    old = results.read(written, [units[0].fingerprint]).to_pylist()
+    old = read(written, [units[0].fingerprint]).to_pylist()
     newer = [
         row | {"unit": "newer", "code_digest": "newer", "created_at": row["created_at"].replace(year=2999)}
         for row in old
@@ -148,7 +160,26 @@ def test_reading_a_folder_takes_the_newest_code_and_drives_no_scenario_twice(wri
     longer = [row | {"unit": "longer", "seed": row["seed"] + 1} for row in newer]
     for rows in (newer, longer):
         results.write(written, pa.Table.from_pylist(rows, SCHEMA))
-    records = results.read(written).to_pylist()
-    same_pair = [row for row in records if (row["pair"], row["lanes"]) == (old[0]["pair"], old[0]["lanes"])]
+    records = read(written).to_pylist()
+    same_pair = [row for row in records if (row["pair"], row["cell"]) == (old[0]["pair"], old[0]["cell"])]
     assert {row["code_digest"] for row in same_pair} == {"newer"}
     assert sorted(row["seed"] for row in same_pair) == sorted({row["seed"] for row in newer + longer})
+
+
+def test_records_of_the_first_format_are_read_as_those_of_today(written: Path, units: list[Unit]) -> None:
+    """They had a column each for lanes, density and weather, and said nothing of their world."""
+    today = read(written)
+    _, second, first = generations(TRACK)
+    for number, unit in enumerate(units):
+        path = results.path_of(written, unit.fingerprint)
+        older = []
+        for row in pq.read_table(path).to_pylist():
+            cell = json.loads(row["cell"])
+            older.append(row | {axis.name: cell[axis.name] for axis in AXES_OF_V1})
+        pq.write_table(pa.Table.from_pylist(older, second if number % 2 else first), path)
+    upgraded = read(written)
+    assert upgraded.schema.equals(SCHEMA)
+    assert upgraded["cell"].to_pylist() == today["cell"].to_pylist()
+    assert upgraded["return"].to_pylist() == today["return"].to_pylist()
+    assert set(upgraded["world_facts"].to_pylist()) == {json.dumps(TRACK.facts_of_v1, separators=(",", ":"))}
+    assert None in upgraded["same_answer"].to_pylist()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,15 +10,17 @@ import pyarrow as pa
 import pytest
 
 from bench.errors import UserError
-from bench.records import store as results
+from bench.plugins.track import track
+from bench.records import reading
 from bench.run import runner
 from bench.run.config import run_config
 from bench.run.plan import plan
-from bench.run.runner import Work
+from bench.run.unit import Preparation, Unit
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
 SMALL = "attack=nudge victim=toy world=toy lanes=3,4 density=1 weather=clear,fog episodes=4 seeds=0,1"
+Work = Unit | Preparation
 BESIDE = ("attack_ms", "created_at", "wall_s")
 """What two runs of the same unit may differ in."""
 
@@ -38,7 +41,7 @@ class Silent:
         if len(self.done) == self.stop_after:
             raise KeyboardInterrupt
 
-    def crafting(self, work: str, share: float, text: str) -> None:
+    def preparing(self, work: str, share: float, text: str) -> None:
         self.told.append((work, share, text))
 
     def finished(self, work: Work, wall_s: float) -> None:
@@ -52,7 +55,7 @@ def run(out: Path, *more: str, line: str = SMALL, watcher: Silent | None = None)
     words = dict(word.split("=", 1) for word in [*line.split(), "workers=1", f"out={out}", "record=0", *more])
     config = run_config([f"{key}={value}" for key, value in words.items()])
     watcher = watcher or Silent()
-    return results.read(out, runner.run(config, watcher)), watcher
+    return reading.read(out, runner.run(config, watcher), track=track("driving")), watcher
 
 
 def comparable(records: pa.Table) -> pa.Table:
@@ -70,16 +73,16 @@ def test_a_run_has_the_pair_its_clean_control_and_the_reference_drivers(tmp_path
     assert {row["training_seed"] for row in attacked} == {0, 1}
     assert {row["victim"] for row in reference} == {"blind", "random", "idm"}
     assert len({row["pair"] for row in reference}) == 6 + 1 + 1
-    assert {row["weather"] for row in reference} == {"clear"}
+    assert {json.loads(row["cell"])["weather"] for row in reference} == {"clear"}
     assert {row["training_seed"] for row in reference} == {0}
     assert watcher.episodes == records.num_rows
 
 
 def test_the_same_scenarios_are_driven_by_all(tmp_path: Path) -> None:
     records, _ = run(tmp_path)
-    cells: dict[str, set[tuple[int, float, int]]] = {}
+    cells: dict[str, set[tuple[int, int]]] = {}
     for row in records.to_pylist():
-        cells.setdefault(row["pair"], set()).add((row["lanes"], row["density"], row["seed"]))
+        cells.setdefault(row["pair"], set()).add((json.loads(row["cell"])["lanes"], row["seed"]))
     assert len(set(map(frozenset, cells.values()))) == 1
 
 
@@ -113,7 +116,7 @@ def test_results_do_not_depend_on_what_else_is_run(tmp_path: Path) -> None:
     among, _ = run(tmp_path / "among")
     units = set(alone["unit"].to_pylist())
     assert units <= set(among["unit"].to_pylist())
-    assert comparable(alone).equals(comparable(results.read(tmp_path / "among", units)))
+    assert comparable(alone).equals(comparable(reading.read(tmp_path / "among", units, track=track("driving"))))
 
 
 def test_a_finished_run_does_nothing(tmp_path: Path) -> None:
@@ -127,7 +130,7 @@ def test_a_finished_run_does_nothing(tmp_path: Path) -> None:
 def test_an_interrupted_run_keeps_what_is_finished_and_goes_on_from_there(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "broken-off", watcher=Silent(stop_after=3))
-    assert results.read(tmp_path / "broken-off").num_rows == 3 * 4
+    assert reading.read(tmp_path / "broken-off", track=track("driving")).num_rows == 3 * 4
     went_on, watcher = run(tmp_path / "broken-off")
     whole, _ = run(tmp_path / "whole")
     assert watcher.there == 3 * 4
@@ -137,7 +140,7 @@ def test_an_interrupted_run_keeps_what_is_finished_and_goes_on_from_there(tmp_pa
 def test_a_failing_attack_is_named_with_its_cell_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError) as raised:
         run(tmp_path, "attack.mood=raise")
-    assert "nudge(mood=raise) + none + toy | 4 lanes, density 1, clear" in str(raised.value)
+    assert "nudge(mood=raise) + none + toy | lanes 4, density 1, clear" in str(raised.value)
     assert "ZeroDivisionError: the attack is at a loss" in str(raised.value)
 
 

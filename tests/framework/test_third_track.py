@@ -1,4 +1,4 @@
-"""A track that nobody in the framework has heard of is listed, run, resumed, recorded and reported; so is a world of other axes."""
+"""A track that the framework has never heard of is listed, run, resumed, recorded and reported; so are its axes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A third track, as a package of its own would bring it: a listener that tells high tones from low ones, and a shift of the pitch."""
+"""A third track, as a package of its own would bring it: listeners that tell high tones from low, and a shift of pitch."""
 
 from __future__ import annotations
 

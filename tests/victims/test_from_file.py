@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from bench.conformance import complaints
+from envs.highway.world import HighwayWorld
 from bench.driving.drive import drive
 from bench.driving.rollout import Columns
 from bench.errors import UserError
