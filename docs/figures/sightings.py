@@ -23,6 +23,7 @@ from docs.figures.patches import SHARE
 from envs.camera.axes import APPROACH_V1, AXES
 from envs.camera.world import StopSignApproach
 from leaderboard.comparisons.comparison import Comparison
+from leaderboard.comparisons.pairing import beside
 from leaderboard.comparisons.reading import read_comparisons
 from leaderboard.published import published
 
@@ -111,9 +112,9 @@ def _comparisons() -> list[Comparison]:
 
 
 def clean(pair: Comparison) -> pa.Table:
-    """The records of the approaches of a pair without a patch."""
+    """The records of the approaches of a pair without a patch, once a patch seed."""
     assert pair.clean
-    return pair.clean.table
+    return beside(pair.own, pair.clean)[1].table
 
 
 def undisturbed(pair: Comparison) -> float:
