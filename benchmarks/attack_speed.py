@@ -20,7 +20,7 @@ from torch import Tensor
 
 from attacks.zo import ZOSignSGD
 from bench.driving import DrivingAttack, ObservationThreat, Policy
-from bench.driving.attacker import AttackModule
+from bench.driving.attacker import Attacker
 from bench.run.process import settle
 from bench.scenarios import SeedBlock
 from bench.victims.drivers.networks import QPolicy
@@ -107,10 +107,9 @@ def _observations(world: HighwayWorld, episodes: int) -> Tensor:
 
 def _batched(attack: DrivingAttack, policy: Policy, world: HighwayWorld, observation: Tensor) -> Callable[[], object]:
     """A step of the pipeline, with the oracle and everything it enforces."""
-    module = AttackModule(attack, policy, ObservationThreat(queries=1_000_000), world.features, seed=0)
-    done = torch.zeros(len(observation), 1, dtype=torch.bool)
-    step = TensorDict({"observation": observation, "done": done}, batch_size=[len(observation)])
-    return lambda: module(step)
+    attacker = Attacker(attack, policy, ObservationThreat(queries=1_000_000), world.features, seed=0)
+    running = torch.ones(len(observation), dtype=torch.bool)
+    return lambda: attacker.show(observation, running, None)
 
 
 def _timed(work: Callable[[], object]) -> float:

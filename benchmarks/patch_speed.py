@@ -37,7 +37,7 @@ def main() -> None:
     words = parser.parse_args()
     settle()
     torch.manual_seed(0)
-    world, detector = StopSignApproach(bank=words.bank), YOLOv3Tiny().load(0)
+    world, detector = StopSignApproach(bank=words.bank), YOLOv3Tiny().load(0, StopSignApproach().facts)
     try:
         craft(detector, world.training_scenes(), words.rounds, words.steps)
         score(detector, world, words.rounds)

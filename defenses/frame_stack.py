@@ -24,12 +24,14 @@ class _FrameStack(Policy):
         self.action_type, self.driver, self.weights_sha256 = inner.action_type, inner.driver, inner.weights_sha256
 
     def initial(self, episodes: Tensor) -> State:
-        seen = torch.zeros(len(episodes), dtype=torch.int64)
-        return TensorDict({"seen": seen, **_own(self.inner.initial(episodes))}, batch_size=[len(episodes)])
+        return TensorDict(_own(self.inner.initial(episodes)), batch_size=episodes.shape)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         assert state is not None
         return self.inner.scores(self._smoothed(observation, state), state.get("inner", None))
+
+    def choose(self, scores: Tensor) -> Tensor:
+        return self.inner.choose(scores)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         assert state is not None
@@ -37,23 +39,30 @@ class _FrameStack(Policy):
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None
-        stack = self._stack(observation, state)
         inner = self.inner.advance(self._smoothed(observation, state), action, state.get("inner", None))
-        return TensorDict({"seen": state["seen"] + 1, "stack": stack, **_own(inner)}, batch_size=state.batch_size)
+        stack = self._stack(observation, state)[..., 1:, :, :]
+        return TensorDict({"stack": stack, **_own(inner)}, batch_size=state.batch_size)
 
     def _stack(self, observation: Tensor, state: TensorDictBase) -> Tensor:
-        """[B, frames - 1, V, F] what is remembered after this observation, the newest last."""
+        """[..., frames, V, F] what was shown, the newest last; before the first step, the first observation again and again."""
+        newest = observation.unsqueeze(-3)
         if state.get("stack", None) is None:
-            return observation.unsqueeze(-3).expand(*observation.shape[:-2], self.frames - 1, *observation.shape[-2:])
-        return torch.cat((state["stack"][..., 1:, :, :], observation.unsqueeze(-3)), -3)
+            return newest.expand(*newest.shape[:-3], self.frames, *newest.shape[-2:])
+        return torch.cat((state["stack"], newest), -3)
 
     def _smoothed(self, observation: Tensor, state: TensorDictBase) -> Tensor:
-        """The observation [..., V, F] after smoothing: presence is that of now."""
+        """[..., V, F] presence as it is now; each measured feature reduced over the frames in which its row is present."""
         if state.get("stack", None) is None:
             return observation
-        stack = torch.cat((state["stack"], observation.unsqueeze(-3)), -3)
-        measured = stack[..., 1:].mean(-3) if self.reduce == "mean" else stack[..., 1:].median(-3).values
-        return torch.cat((observation[..., :1], measured * (observation[..., :1] > 0)), -1)
+        stack, present = self._stack(observation, state), observation[..., :1] > 0
+        measured = torch.where(stack[..., :1] > 0, stack[..., 1:], torch.nan)
+        reduced = measured.nanmean(-3) if self.reduce == "mean" else _median(measured)
+        return torch.cat((observation[..., :1], torch.where(present, reduced, 0.0)), -1)
+
+
+def _median(measured: Tensor) -> Tensor:
+    """The median [..., V, F - 1] over frames, without NaN; of an even number, the mean of the two in the middle."""
+    return (measured.nanmedian(-3).values - (-measured).nanmedian(-3).values) / 2
 
 
 def _own(state: State) -> dict[str, TensorDictBase]:
@@ -62,17 +71,18 @@ def _own(state: State) -> dict[str, TensorDictBase]:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameStack(DrivingDefense):
-    """The victim sees the last k observations at once, reduced to their mean or median.
+    """The victim sees the mean or the median of the last k observations.
 
-    An attack that changes its mind from frame to frame is averaged out; one that holds its perturbation is not. Rows of an
-    observation are ordered by distance, so where two cars change places their rows are mixed for k frames.
+    An attack that changes its mind from frame to frame is averaged out; one that holds its perturbation is not. What the victim
+    sees is late: by (k - 1) / 2 frames under the mean. Rows of an observation are ordered by distance, so where two cars change
+    places their rows are mixed for k - 1 frames.
 
     Args:
-        frames: k, how many observations are stacked, at least 2.
-        reduce: `mean` or `median` over them, feature by feature.
+        frames: k, how many observations are reduced, at least 2; before the first one there is nothing but the first.
+        reduce: `mean` or `median`, feature by feature, over those of the frames in which the row is present.
     """
 
-    frames: Annotated[int, Ge(2)] = 4
+    frames: Annotated[int, Ge(2)] = 2
     reduce: Reduction = "mean"
 
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:

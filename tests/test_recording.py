@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,20 +10,28 @@ import pytest
 import torch
 from rerun.chunk import Chunk, RrdReader
 
-from bench.driving import Features, ObservationThreat
+from bench.driving import DrivingFacts, Features, ObservationThreat
 from bench.driving.rollout import Trace
 from bench.driving.threat import project
 from bench.recording.driving import save
-from bench.recording.driving.episode import ACTIONS, Episode
+from bench.recording.driving.episode import Episode
+from envs.highway.axes import AXES
 
 FEATURES = Features(
     names=("x", "y", "vx", "vy"), low=(-100.0, -20.0, -40.0, -20.0), high=(100.0, 20.0, 40.0, 20.0),
     units=("m", "m", "m/s", "m/s"),
 )  # fmt: skip
+FACTS = DrivingFacts(
+    axes=AXES,
+    decision_hz=15,
+    max_steps=450,
+    actions=("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER"),
+    features=FEATURES,
+)
 META = {
     "victim": "dqn", "victim_params": '{"hidden": 128}', "defense": "none", "attack": "noise", "attack_params": "{}",
     "threat_norm": "relative", "threat_budget": 0.1, "threat_access": "scores", "threat_queries": 100,
-    "lanes": 3, "density": 1.0, "weather": "clear", "seed": 1_000_000, "training_seed": 0,
+    "cell": '{"lanes":3,"density":1.0,"weather":"clear"}', "seed": 1_000_000, "training_seed": 0,
 }  # fmt: skip
 CARS = 4
 
@@ -86,7 +95,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_every_entity_is_one_block_of_columns_over_both_timelines(path: Path) -> None:
-    save(made_up(20), features=FEATURES, meta=META, path=path)
+    save(made_up(20), facts=FACTS, meta=META, path=path)
     chunks = read(path)
     assert {"/ego/measured", "/ego/shown", "/traffic/measured", "/traffic/shown", "/queries/spent"} <= set(chunks)
     for entity, found in chunks.items():
@@ -97,16 +106,40 @@ def test_every_entity_is_one_block_of_columns_over_both_timelines(path: Path) ->
             assert set(chunk.timeline_names) == {"step", "time"}
 
 
-def test_time_is_in_seconds_at_fifteen_steps_a_second(path: Path) -> None:
-    save(made_up(16), features=FEATURES, meta=META, path=path)
+def test_time_is_in_seconds(path: Path) -> None:
+    save(made_up(16), facts=FACTS, meta=META, path=path)
     (chunk,) = (chunk for chunk in read(path)["/speed/ego"] if not chunk.is_static)
     time = chunk.to_record_batch().column("time").to_pylist()
     assert time[-1].total_seconds() == pytest.approx(1.0, abs=1e-6)
 
 
+def test_time_follows_the_decision_rate_of_the_world(path: Path) -> None:
+    save(made_up(16), facts=replace(FACTS, decision_hz=5), meta=META, path=path)
+    (chunk,) = (chunk for chunk in read(path)["/speed/ego"] if not chunk.is_static)
+    time = chunk.to_record_batch().column("time").to_pylist()
+    assert time[-1].total_seconds() == pytest.approx(3.0, abs=1e-6)
+
+
+def test_actions_have_the_names_of_the_world(path: Path) -> None:
+    names = ("A", "B", "C", "D", "E")
+    save(made_up(16), facts=replace(FACTS, actions=names), meta=META, path=path)
+    chunks = read(path)
+    assert {f"/scores/shown/{name}" for name in names} <= set(chunks)
+    assert {state[0] for state in values(chunks["/decision/taken"], "state")} <= set(names)
+
+
+def test_the_page_says_what_the_recording_is_of(path: Path) -> None:
+    save(made_up(16), facts=FACTS, meta=META, path=path)
+    (page,) = (chunk.to_record_batch() for chunk in read(path)["/about"])
+    text = next(page.column(name)[0].as_py()[0] for name in page.schema.names if name.endswith("text"))
+    assert "### dqn under noise · lanes 3, density 1, clear · seed 1000000" in text
+    assert "**drove to the end** after 16 steps (1.1 s)" in text
+    assert "**threat model** relative 0.1, access scores, at most 100 queries a step" in text
+
+
 def test_ghosts_stand_where_the_perturbation_puts_them(path: Path) -> None:
     trace = made_up(8)
-    save(trace, features=FEATURES, meta=META, path=path)
+    save(trace, facts=FACTS, meta=META, path=path)
     chunks = read(path)
     shown = values(chunks["/traffic/shown"], "centers")
     measured = values(chunks["/traffic/measured"], "strips")
@@ -118,7 +151,7 @@ def test_ghosts_stand_where_the_perturbation_puts_them(path: Path) -> None:
 
 
 def test_the_perturbation_never_leaves_its_budget(path: Path) -> None:
-    save(made_up(12), features=FEATURES, meta=META, path=path)
+    save(made_up(12), facts=FACTS, meta=META, path=path)
     chunks = read(path)
     for group, feature in (("position", "x"), ("position", "y"), ("velocity", "vx"), ("velocity", "vy")):
         moved, budget = (
@@ -131,34 +164,34 @@ def test_the_perturbation_never_leaves_its_budget(path: Path) -> None:
 
 def test_the_decision_band_names_the_clean_and_the_taken_action(path: Path) -> None:
     trace = made_up(10)
-    save(trace, features=FEATURES, meta=META, path=path)
+    save(trace, facts=FACTS, meta=META, path=path)
     chunks = read(path)
     taken = [state[0] for state in values(chunks["/decision/taken"], "state")]
-    assert taken == [ACTIONS[int(step[0])] for step in trace.steps["action"]]
+    assert taken == [FACTS.actions[int(step[0])] for step in trace.steps["action"]]
     clean = [state[0] for state in values(chunks["/decision/clean"], "state")]
-    assert clean == [ACTIONS[int(step[0].argmax())] for step in trace.steps["clean_scores"]]
+    assert clean == [FACTS.actions[int(step[0].argmax())] for step in trace.steps["clean_scores"]]
 
 
 def test_an_episode_ends_at_its_crash(path: Path) -> None:
     trace = made_up(20, crash_at=6)
-    save(trace, features=FEATURES, meta=META, path=path)
+    save(trace, facts=FACTS, meta=META, path=path)
     (chunk,) = (chunk for chunk in read(path)["/ego/measured"] if not chunk.is_static)
     assert chunk.num_rows == 7
-    assert Episode.of(trace, FEATURES, META).end == "crashed"
+    assert Episode.of(trace, FACTS, META).end == "crashed"
 
 
 def test_a_clean_episode_has_no_ghosts_and_no_budget(path: Path) -> None:
-    save(made_up(attacked=False), features=FEATURES, meta={}, path=path)
+    save(made_up(attacked=False), facts=FACTS, meta={}, path=path)
     assert not [entity for entity in read(path) if "shown" in entity.split("/")[-1] or "perturbation" in entity]
 
 
 def test_continuous_actions_are_recorded_as_acceleration_and_steering(path: Path) -> None:
-    save(made_up(discrete=False), features=FEATURES, meta=META, path=path)
+    save(made_up(discrete=False), facts=FACTS, meta=META, path=path)
     assert {"/scores/shown/acceleration", "/scores/measured/steering"} <= set(read(path))
 
 
 def test_a_recording_opens_with_a_layout_of_its_own(path: Path) -> None:
-    save(made_up(), features=FEATURES, meta=META, path=path)
+    save(made_up(), facts=FACTS, meta=META, path=path)
     assert len(list(RrdReader(path).blueprints())) == 1
 
 
@@ -168,21 +201,21 @@ def test_the_file_appears_whole_or_not_at_all(path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr("bench.recording.driving.curves.log", broken)
     with pytest.raises(RuntimeError, match="disk"):
-        save(made_up(), features=FEATURES, meta=META, path=path)
+        save(made_up(), facts=FACTS, meta=META, path=path)
     assert list(path.parent.iterdir()) == []
 
 
 def test_a_recording_holds_one_episode(path: Path) -> None:
     trace = made_up()
     with pytest.raises(ValueError, match="one episode"):
-        save(Trace(episodes=[0, 1], steps=trace.steps), features=FEATURES, meta=META, path=path)
+        save(Trace(episodes=[0, 1], steps=trace.steps), facts=FACTS, meta=META, path=path)
 
 
 def test_observations_without_positions_are_recorded_without_a_road(path: Path) -> None:
     nameless = Features(
         names=("a", "b", "c", "d"), low=FEATURES.low, high=FEATURES.high, units=("m", "m", "m/s", "m/s")
     )
-    save(made_up(), features=nameless, meta=META, path=path)
+    save(made_up(), facts=replace(FACTS, features=nameless), meta=META, path=path)
     entities = set(read(path))
     assert "/perturbation/position/a" in entities
     assert not [entity for entity in entities if entity.startswith(("/road", "/traffic"))]

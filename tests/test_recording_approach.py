@@ -15,7 +15,7 @@ from torch import Tensor
 from bench.detection import Approach, stopping
 from bench.detection.approach import Sighting, look
 from bench.detection.patch import Evolution, Patch
-from bench.recording import save_approach
+from bench.recording.detection import save
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.test_recording import META, read, values
 
@@ -37,7 +37,7 @@ def sighting(texels: Tensor | None = CYAN, evolution: Evolution | None = EVOLUTI
 
 
 def recorded(path: Path, seen: Sighting) -> dict[str, list[Chunk]]:
-    save_approach(seen, meta=META, path=path)
+    save(seen, meta=META, path=path)
     return read(path)
 
 
@@ -133,5 +133,5 @@ def test_the_page_says_when_the_sign_is_confirmed_and_where_the_car_stops(path: 
 
 
 def test_a_recording_opens_with_a_layout_of_its_own(path: Path) -> None:
-    save_approach(sighting(), meta=META, path=path)
+    save(sighting(), meta=META, path=path)
     assert len(list(RrdReader(path).blueprints())) == 1

@@ -82,14 +82,18 @@ class Attacker:
         return Shown(perturbed, counts[0], counts[1], counts[2], excess, milliseconds)
 
     def _begin(self, observation: Tensor, policy_state: State) -> None:
-        """Let the attack begin its memory, for which it may ask nothing: those queries would be in no record."""
+        """Ask the attack what it remembers before the first step. It may ask nothing: such queries would be in no record.
+
+        The state is the run's own copy, which is written to in place.
+        """
         assert self.attack is not None
         self.oracle.begin_step(observation, policy_state)
-        self.state, self.begun = self.attack.initial(observation, self.oracle), True
-        if self.oracle.spent.any():
+        state = self.attack.initial(observation, self.oracle)
+        if bool(self.oracle.spent.any()):
             raise UserError(
                 f"{type(self.attack).__name__}.initial asked the victim: ask in step, where queries are counted"
             )
+        self.state, self.begun = None if state is None else state.detach().clone(), True
 
     def _answer(self, observation: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and how far outside the set it was."""

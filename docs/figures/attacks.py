@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.plugins.pair import choose
 from docs.figures import road, style
-from docs.figures.driving import FEATURES, STEPS_PER_SECOND, Moment, attacked, episode, physical, policy
+from docs.figures.driving import FACTS, FEATURES, Moment, attacked, episode, physical, policy
 from envs.highway.config import ACTIONS
 
 STEP = 200
@@ -60,12 +60,12 @@ def pgd() -> Figure:
 def none() -> Figure:
     """No attack: an episode as it is."""
     _, steps = episode("attack=none", "victim=dqn")
-    title = f"none: the policy sees what is there; {len(steps['speed']) / STEPS_PER_SECOND:.0f} s without a crash"
+    title = f"none: the policy sees what is there; {len(steps['speed']) / FACTS.decision_hz:.0f} s without a crash"
     made = style.figure(4.6, title)
     above, speed, values = made.subplots(3, 1, height_ratios=(1.1, 1, 1.5))
-    truth = attacked(choose("attack", "none").component, _moment())
-    _bird(above, truth)
-    seconds = [step / STEPS_PER_SECOND for step in range(len(steps["speed"]))]
+    true = _moment()
+    _bird(above, Moment(true, shown=true[None], radius=torch.zeros_like(true), asked=[]))
+    seconds = [step / FACTS.decision_hz for step in range(len(steps["speed"]))]
     speed.plot(seconds, steps["speed"], color=style.TRUE)
     speed.set(ylabel="speed (m/s)", xlim=(0, seconds[-1]), xticklabels=[])
     for number, name in enumerate(ACTIONS):
@@ -74,7 +74,7 @@ def none() -> Figure:
     values.set(xlabel="time (s)", yticks=range(len(ACTIONS)), yticklabels=ACTIONS, xlim=(0, seconds[-1]))
     values.invert_yaxis()
     for axes in (speed, values):
-        axes.axvline(STEP / STEPS_PER_SECOND, color=style.GREY, lw=1, ls=":")
+        axes.axvline(STEP / FACTS.decision_hz, color=style.GREY, lw=1, ls=":")
     return made
 
 

@@ -9,40 +9,46 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict
 from torch import Tensor
 
 from bench.driving import DrivingAttack, ObservationThreat, Policy
-from bench.driving.attacker import AttackModule
+from bench.driving.attacker import Attacker
 from bench.driving.drive import drive
-from bench.driving.rollout import Columns, Trace
+from bench.driving.rollout import Trace
 from bench.plugins.pair import choose
+from bench.plugins.track import Columns, Driven
 from bench.run.config import run_config
 from bench.run.plan import plan
-from envs.highway.config import STANDARD_FEATURES as FEATURES
-from envs.highway.config import HighwayConfig
+from envs.highway.world import HighwayWorld
 
 Array = NDArray[Any]
 
-STEPS_PER_SECOND = HighwayConfig.policy_frequency
+FACTS = HighwayWorld().facts
+FEATURES = FACTS.features
 ROAD = "lanes=3 density=1 weather=clear seeds=0 reference=false"
 """The cell of the episodes that are shown."""
+
+
+def scored(episodes: int, *words: str, traced: int = 0) -> Driven:
+    """The first episodes of the first pair of a run, said as to `bench run`; the first `traced` of them step by step."""
+    unit = next(iter(plan(run_config([*ROAD.split(), f"episodes={episodes}", *words]))))
+    return drive(unit.job, unit.seeds[:traced])
 
 
 @cache
 def episode(*words: str) -> tuple[Columns, dict[str, Array]]:
     """The measurements and every step [T, ...] of the first episode of a run, said as to `bench run`."""
-    trace = Trace([0])
-    unit = next(iter(plan(run_config([*ROAD.split(), "episodes=1", *words]))))
-    columns = drive(unit, trace)
+    driven = scored(1, *words, traced=1)
+    (trace,) = driven.traces.values()
+    assert isinstance(trace, Trace)
     running = np.stack(trace.steps["running"])[:, 0]
-    return columns, {name: np.stack(steps)[running, 0] for name, steps in trace.steps.items()}
+    return driven.columns, {name: np.stack(steps)[running, 0] for name, steps in trace.steps.items()}
 
 
 @cache
 def policy(victim: str = "dqn", defense: str = "none") -> Policy:
     """The (defended) policy of training seed 0."""
-    return choose("defense", defense).component.load(choose("victim", victim).component, 0)
+    return choose("defense", defense).component.load(choose("victim", victim).component, 0, FACTS)
 
 
 @dataclass(frozen=True)
@@ -64,11 +70,10 @@ class Moment:
 
 def attacked(attack: DrivingAttack, observation: Tensor, trials: int = 1) -> Moment:
     """What an attack does at one moment [V, F] to the undefended `dqn`, under the default threat model."""
-    module = AttackModule(attack, policy(), ObservationThreat(), FEATURES, seed=0)
-    module.oracle.asked = []
-    batch = observation.repeat(trials, 1, 1)
-    shown = module(TensorDict({"observation": batch}, batch_size=[trials]))["perturbed"]
-    return Moment(observation, shown, module.oracle.radius[0], [points for _, points in module.oracle.asked])
+    attacker = Attacker(attack, policy(), ObservationThreat(), FEATURES, seed=0)
+    attacker.oracle.asked = []
+    shown = attacker.show(observation.repeat(trials, 1, 1), torch.ones(trials, dtype=torch.bool), None).observation
+    return Moment(observation, shown, attacker.oracle.radius[0], [points for _, points in attacker.oracle.asked])
 
 
 def physical(observation: Tensor) -> Tensor:

@@ -6,17 +6,16 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tensordict import TensorDict
 
 from bench.driving import ObservationThreat
-from bench.driving.attacker import AttackModule
+from bench.driving.attacker import Attacker
 from bench.plugins.pair import choose
 from bench.victims import zoo
 from bench.victims.drivers.dqn import DQN
 from defenses.advtrain import AdversarialTraining
 from docs.figures import style
 from docs.figures.driving import FEATURES, episode, policy
-from docs.figures.sightings import curve, frame_axes, patched
+from docs.figures.sightings import clean, curve, frame_axes, patched, undisturbed
 
 BUDGETS = (0.01, 0.025, 0.05, 0.1, 0.15, 0.2)
 TRAINED_AT = 0.1
@@ -39,14 +38,13 @@ def none() -> Figure:
     driving.legend(loc="upper left", bbox_to_anchor=(0.35, 0.93), fontsize=10)
     pair = patched("eot")
     measured = {
-        "none": pair.control["none"],
-        "grey": pair.control["grey_patch"],
-        "noise": pair.control["noise_patch"],
-        "eot": pair.measured,
+        "none": undisturbed(pair),
+        "grey": pair.baseline_scores["grey_patch"].estimate,
+        "noise": pair.baseline_scores["noise_patch"].estimate,
+        "eot": pair.score.estimate,
     }
-    confidence = [each.confidence.estimate for each in measured.values()]
     colours = (style.BLUE, style.GREY, style.GREY, style.RED)
-    detection.bar_label(detection.bar(list(measured), confidence, color=colours), fmt="%.2f", fontsize=10)
+    detection.bar_label(detection.bar(list(measured), list(measured.values()), color=colours), fmt="%.2f", fontsize=10)
     detection.set(ylabel="confidence", xlabel="patch", ylim=(0, 1))
     detection.set_title("yolov3_tiny", fontsize=10.5)
     return made
@@ -80,11 +78,11 @@ def advtrain() -> Figure:
 def advtrain_detection() -> Figure:
     """Confidence on the way to the sign, undefended and hardened, from the published records."""
     pairs = {"undefended": patched("eot"), "hardened": patched("eot", "advtrain_detection")}
-    left = {name: pair.measured.confidence.estimate for name, pair in pairs.items()}
+    left = {name: pair.score.estimate for name, pair in pairs.items()}
     title = f"advtrain: confidence under eot {left['undefended']:.2f} undefended,\n{left['hardened']:.2f} hardened"
     made = style.figure(4.0, title)
     for axes, (name, pair) in zip(made.subplots(1, 2, sharey=True), pairs.items(), strict=True):
-        curve(axes, pair.controls["none"].table, style.BLUE, "no patch")
+        curve(axes, clean(pair), style.BLUE, "no patch")
         curve(axes, pair.own.table, style.RED, "eot", "--")
         frame_axes(axes)
         axes.set_title(f"yolov3_tiny, {name}", fontsize=10.5)
@@ -97,10 +95,9 @@ def _changed(attack: str, defense: str, budget: float) -> float:
     """Share of the moments of a real episode at which an attack changes the decision of the (defended) DQN."""
     moments = torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"][::EVERY])
     driver = policy("dqn", defense)
-    module = AttackModule(
-        choose("attack", attack).component, driver, ObservationThreat(budget=budget), FEATURES, seed=0
-    )
-    shown = module(TensorDict({"observation": moments}, batch_size=[len(moments)]))["perturbed"]
+    threat = ObservationThreat(budget=budget)
+    attacker = Attacker(choose("attack", attack).component, driver, threat, FEATURES, seed=0)
+    shown = attacker.show(moments, torch.ones(len(moments), dtype=torch.bool), None).observation
     with torch.no_grad():
         return float((driver.decide(shown) != driver.decide(moments)).float().mean())
 

@@ -25,7 +25,7 @@ def world() -> Figure:
     engine = env.engine
     engine.reset(np.arange(len(cells)), np.full(len(cells), SEED))
     count = len(GRID.cells())
-    made = style.figure(6.8, f"highway: {count} cells, {len(cells)} roads in {len(GRID.weather)} weathers")
+    made = style.figure(6.8, f"highway: {count} cells, {len(cells)} roads in {len(GRID.values['weather'])} weathers")
     heights = [cell.lanes + 0.8 for cell in cells]
     *roads, sensor = made.subplots(len(cells) + 1, 1, height_ratios=[*heights, 8])
     for number, (axes, cell) in enumerate(zip(roads, cells, strict=True)):
@@ -36,7 +36,7 @@ def world() -> Figure:
         road.cars(axes, [(0.0, float(ego["y"]))], style.INK)
         axes.set_title(f"{cell.lanes} lanes, density {cell.density:g}", fontsize=10)
         axes.set_xticks([])
-    for number, name in enumerate(GRID.weather):
+    for number, name in enumerate(GRID.values["weather"]):
         weather = WEATHERS[name]
         sensor.barh(number, sensor_range_m(weather), color=style.SKY, height=0.85)
         said = f"{name}: {sensor_range_m(weather):.0f} m, noise {noise_sigma(weather):.2g} m"

@@ -8,14 +8,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import blended_transform_factory
 
-from bench.plugins.contracts import TRACKS, Track
+from bench.plugins.track import tracks
 from bench.statistics.episodes import unit_interval
 from bench.statistics.estimates import Interval
 from docs.figures import style
 from leaderboard.published import published
-from leaderboard.ranking import Board, Row, read_boards
+from leaderboard.ranking.boards import Board, Row, read_boards
 
-MEASURES: dict[Track, str] = {"driving": "safe progress", "detection": "confidence in the stop sign"}
+MEASURES = {"driving": "safe progress", "detection": "confidence in the stop sign"}
 MARKS = {
     "no attack": ("o", 7, style.TRUE),
     "strongest": ("o", 7, style.SHOWN),
@@ -27,12 +27,14 @@ FLAGGED = 0.4
 
 def standard() -> Figure:
     """A row a defended victim: without an attack, and where in every cell the strongest attack counts."""
-    boards, _ = read_boards({track: published(track) for track in TRACKS})
-    first = {board.track: board for board in reversed(boards)}
-    rows = [len(first[track].rows) for track in TRACKS]
+    boards, _ = read_boards({track.name: published(track) for track in tracks()})
+    first: dict[str, Board] = {}
+    for board in boards:
+        first.setdefault(board.track.name, board)
+    rows = [len(board.rows) for board in first.values()]
     made = style.figure(1.9 + 0.34 * sum(rows), "What the strongest attack leaves")
-    for axes, track in zip(made.subplots(2, 1, height_ratios=rows), TRACKS, strict=True):
-        _draw(axes, first[track])
+    for axes, board in zip(made.subplots(len(first), 1, height_ratios=rows), first.values(), strict=True):
+        _draw(axes, board)
     handles = [Line2D([], [], marker=mark, ls="", ms=size, color=colour) for mark, size, colour in MARKS.values()]
     made.legend(handles, MARKS, loc="outside lower center", ncols=3, handletextpad=0.1)
     return made
@@ -47,14 +49,14 @@ def _draw(axes: Axes, board: Board) -> None:
             axes.plot([worst.estimate, row.clean.estimate], [place, place], color=style.FAINT, lw=5, zorder=1)
             _point(axes, row.clean, place, style.TRUE, opacity)
         _point(axes, worst, place, style.SHOWN, opacity)
-        if np.isfinite(row.worst.blind).all():
-            blind = unit_interval(row.worst.blind[None]).estimate
+        if np.isfinite(row.worst.rival).all():
+            blind = unit_interval(row.worst.rival[None]).estimate
             axes.plot(blind, place, "|", color=style.INK, ms=13, mew=1.8)
         axes.text(-0.02, place, _name(row), transform=names, ha="right", va="center", alpha=max(opacity, 0.65))
-    axes.set(xlim=(0, 1), ylim=(len(board.rows) - 0.5, -0.5), yticks=[], xlabel=MEASURES[board.track])
+    axes.set(xlim=(0, 1), ylim=(len(board.rows) - 0.5, -0.5), yticks=[], xlabel=MEASURES[board.track.name])
     axes.spines["left"].set_visible(False)
     norm, budget, *_ = board.threat
-    axes.set_title(f"{board.track}, {norm} {budget:g}", fontsize=10.5)
+    axes.set_title(f"{board.track.name}, {norm} {budget:g}", fontsize=10.5)
 
 
 def _point(axes: Axes, found: Interval, place: int, colour: str, opacity: float) -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from bench.detection import PatchThreat, patches
-from bench.detection.crafting import craft
+from bench.detection import PatchThreat
+from bench.detection.crafting import prepare
 from bench.detection.patch import Patch
-from bench.errors import UserError
+from bench.plugins.fingerprint import canonical
 from bench.plugins.pair import Pair, choose
-from bench.run.unit import Crafting
+from bench.run import artefacts
+from bench.run.unit import Preparation
+from envs.camera.axes import APPROACH_V1
 
 KEPT = user_cache_path("cavbench") / "figures"
 SHARE = PatchThreat().budget
@@ -31,12 +33,18 @@ def patch_of(attack: str, defense: str = "none", **params: object) -> Patch:
         world=choose("world", "camera"),
         threat=PatchThreat(),
     )
-    crafting = Crafting(pair=pair, training_seed=0, weights_sha256=pair.weights_sha256(0))
-    try:
-        return patches.read(KEPT, crafting.fingerprint)
-    except UserError:
-        patches.write(KEPT, crafting, craft(crafting, lambda share, said: None))
-        return patches.read(KEPT, crafting.fingerprint)
+    preparation = Preparation(
+        pair=pair,
+        training_seed=0,
+        weights_sha256=pair.weights_sha256(0),
+        cell=APPROACH_V1.cells()[0],
+        seeds=APPROACH_V1.seeds(),
+    )
+    path = artefacts.path_of(KEPT, preparation)
+    if not path.exists():
+        crafted = prepare(preparation.job, canonical(preparation.origin), lambda share, said: None)
+        artefacts.write(KEPT, preparation, crafted)
+    return Patch.read(artefacts.read(path))
 
 
 def texels_of(attack: str, defense: str = "none", **params: object) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from bench.driving import Policy
 from bench.plugins.pair import choose
 from docs.figures import style
-from docs.figures.driving import STEPS_PER_SECOND, episode, policy
+from docs.figures.driving import FACTS, episode, policy
 from envs.highway.config import ACTIONS
 
 EVERY = 10
@@ -94,13 +94,13 @@ def _figure(
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         path = Path(folder) / file
         original = write(path)(observations)
-        read: Policy = choose("victim", victim, path=str(path), **params).component.load(0)
+        read: Policy = choose("victim", victim, path=str(path), **params).component.load(0, FACTS)
         values = read.scores(observations)
     same = int((values.argmax(-1) == original.argmax(-1)).sum())
     most = float((values - original).abs().max())
     made = style.figure(4.0, f"{victim}: {same} of {len(values)} decisions are those of the policy\nthat was written")
     axes = made.subplots()
-    seconds = np.arange(len(values)) / STEPS_PER_SECOND
+    seconds = np.arange(len(values)) / FACTS.decision_hz
     for number, name in enumerate(ACTIONS):
         axes.plot(seconds, original[:, number], color=style.ACTIONS[name], lw=1.2)
         axes.plot(seconds[::EVERY], values[::EVERY, number], "o", ms=4, color=style.ACTIONS[name], label=name)

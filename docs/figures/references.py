@@ -11,13 +11,16 @@ import torch
 from matplotlib.figure import Figure
 
 from bench.plugins.pair import choose
-from bench.statistics.episodes import MAX_RETURN
+from bench.plugins.track import track
+from bench.scenarios import Cell
 from docs.figures import style
-from docs.figures.driving import STEPS_PER_SECOND, episode, physical
+from docs.figures.driving import FACTS, episode, physical
+from envs.highway.axes import AXES
 from envs.highway.dynamics import LANE_WIDTH
 from leaderboard.published import published
 
 SECONDS = 30
+CELL = AXES.cell(lanes=3, density=1.0, weather="clear")
 ROAD = "3 lanes, density 1, clear, 100 scenarios"
 
 
@@ -50,15 +53,15 @@ def random() -> Figure:
         name: records.filter(pc.equal(records["victim_params"], each))["steps"].to_numpy()
         for name, each in params.items()
     }
-    half = {actions: np.median(steps) / STEPS_PER_SECOND for actions, steps in lasted.items()}
+    half = {actions: np.median(steps) / FACTS.decision_hz for actions, steps in lasted.items()}
     made = style.figure(
         3.4, f"random: half are off after {half['discrete']:.0f} s, or {half['continuous']:.0f} s steering"
     )
     axes = made.subplots()
-    steps = np.arange(SECONDS * STEPS_PER_SECOND)
+    steps = np.arange(round(SECONDS * FACTS.decision_hz))
     for actions, colour, dashes in (("discrete", style.ORANGE, "-"), ("continuous", style.BLUE, "--")):
         left = (lasted[actions][:, None] > steps).mean(0)
-        axes.plot(steps / STEPS_PER_SECOND, 100 * left, color=colour, ls=dashes, lw=2.4)
+        axes.plot(steps / FACTS.decision_hz, 100 * left, color=colour, ls=dashes, lw=2.4)
     axes.annotate("random lane changes and speeds", (12, 62), color=style.ORANGE)
     axes.annotate("random steering", (4.5, 4), color=style.BLUE)
     axes.set(xlabel="time (s)", ylabel="still driving, %", xlim=(0, SECONDS), ylim=(-2, 103))
@@ -73,7 +76,7 @@ def idm() -> Figure:
     speed, lane = made.subplots(2, 1, sharex=True, height_ratios=(1.4, 1))
     for victim, colour, dashes in (("idm", style.BLUE, "-"), ("dqn", style.RED, "--")):
         columns, steps = episode("attack=none", f"victim={victim}")
-        seconds = np.arange(len(steps["speed"])) / STEPS_PER_SECOND
+        seconds = np.arange(len(steps["speed"])) / FACTS.decision_hz
         label = f"{victim}: {columns['distance_m'][0]:.0f} m, safe progress {columns['safe_progress'][0]:.0%}"
         speed.plot(seconds, steps["speed"], color=colour, ls=dashes, lw=2.2, label=label)
         across = physical(torch.tensor(steps["observation"]))[:, 0, 1]
@@ -87,13 +90,12 @@ def idm() -> Figure:
 
 def _records(victim: str | None = None) -> pa.Table:
     """The published clean episodes of undefended drivers on one road."""
-    records = published("driving")
-    wanted = {"attack": "none", "defense": "none", "lanes": 3, "density": 1.0, "weather": "clear"}
-    if victim:
-        wanted["victim"] = victim
+    records = published(track("driving"))
+    wanted = {"attack": "none", "defense": "none"} | ({"victim": victim} if victim else {})
     for name, value in wanted.items():
         records = records.filter(pc.equal(records[name], value))
-    return records
+    cells = [text for text in pc.unique(records["cell"]).to_pylist() if Cell(**json.loads(text)) == CELL]
+    return records.filter(pc.is_in(records["cell"], pa.array(cells)))
 
 
 def _scores() -> dict[str, tuple[float, float]]:
@@ -104,5 +106,5 @@ def _scores() -> dict[str, tuple[float, float]]:
         params = json.loads(row["victim_params"])
         name = params["policy"] if row["victim"] == "blind" else row["victim"]
         if params.get("actions") != "continuous":
-            found[name] = row["return_mean"] / MAX_RETURN, row["safe_progress_mean"]
+            found[name] = row["return_mean"] / FACTS.max_steps, row["safe_progress_mean"]
     return found

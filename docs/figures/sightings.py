@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import torch
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
@@ -18,10 +17,14 @@ from bench.detection.approach import Sight, look
 from bench.detection.boxes import confidence
 from bench.detection.stopping import THRESHOLD
 from bench.plugins.pair import choose
+from bench.plugins.track import track
 from docs.figures import style
 from docs.figures.patches import SHARE
 from envs.camera.axes import APPROACH_V1, AXES
-from leaderboard.approaches import Patched, read_patched
+from envs.camera.world import StopSignApproach
+from leaderboard.comparisons.comparison import Comparison
+from leaderboard.comparisons.pairing import beside
+from leaderboard.comparisons.reading import read_comparisons
 from leaderboard.published import published
 
 LANES, DENSITY = 3, 1.0
@@ -42,7 +45,7 @@ def approaches(weather: str = "clear") -> list[Approach]:
 @cache
 def detector(victim: str = "yolov3_tiny", defense: str = "none") -> Detector:
     """The (defended) detector."""
-    return choose("defense", defense).component.load(choose("victim", victim).component, 0)
+    return choose("defense", defense).component.load(choose("victim", victim).component, 0, StopSignApproach().facts)
 
 
 def sight(of: Detector, approach: Approach, texels: Tensor | None = None) -> Sight:
@@ -89,9 +92,8 @@ def box(axes: Axes, corners: Tensor, text: str, colour: str, *, below: bool = Fa
 
 
 @cache
-def patched(attack: str, defense: str = "none") -> Patched:
+def patched(attack: str, defense: str = "none") -> Comparison:
     """The published approaches of `yolov3_tiny` under the default attack in clear weather, with their controls."""
-    records = published("detection").filter(pc.field("weather") == "clear")
     wanted: dict[str, object] = {
         "attack": attack,
         "attack_params": choose("attack", attack).params,
@@ -99,8 +101,26 @@ def patched(attack: str, defense: str = "none") -> Patched:
         "victim": "yolov3_tiny",
         "threat_budget": SHARE,
     }
-    (found,) = (pair for pair in read_patched(records) if wanted.items() <= pair.identity.items())
-    return found
+    (found,) = (pair for pair in _comparisons() if wanted.items() <= pair.identity.items())
+    return found.only(cells=[cell for cell in found.cells if cell.weather == "clear"])
+
+
+@cache
+def _comparisons() -> list[Comparison]:
+    own = track("detection")
+    return read_comparisons(published(own), own)
+
+
+def clean(pair: Comparison) -> pa.Table:
+    """The records of the approaches of a pair without a patch, once a patch seed."""
+    assert pair.clean
+    return beside(pair.own, pair.clean)[1].table
+
+
+def undisturbed(pair: Comparison) -> float:
+    """Confidence without a patch."""
+    assert pair.clean_score
+    return pair.clean_score.estimate
 
 
 def curve(axes: Axes, records: pa.Table, colour: str, label: str, dashes: str = "-") -> None:

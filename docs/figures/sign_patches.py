@@ -8,7 +8,20 @@ from matplotlib.figure import Figure, SubFigure
 
 from docs.figures import style
 from docs.figures.patches import patch_of, texels_of
-from docs.figures.sightings import FRAME, approaches, crop, curve, detector, frame_axes, patched, picture, said, show
+from docs.figures.sightings import (
+    FRAME,
+    approaches,
+    clean,
+    crop,
+    curve,
+    detector,
+    frame_axes,
+    patched,
+    picture,
+    said,
+    show,
+    undisturbed,
+)
 
 MOMENTS = 5
 """Of the crafting."""
@@ -47,7 +60,7 @@ def grey_patch() -> Figure:
 def _begun(attack: str, height: float, ratios: tuple[float, ...]) -> tuple[Figure, list[SubFigure]]:
     """A figure whose title says what the patch does, and its parts."""
     pair = patched(attack)
-    before, after = pair.control["none"].confidence.estimate, pair.measured.confidence.estimate
+    before, after = undisturbed(pair), pair.score.estimate
     made = style.figure(height, f"{attack}: confidence {before:.2f} without, {after:.2f} with it")
     return made, list(made.subfigures(len(ratios), 1, height_ratios=ratios, squeeze=False)[:, 0])
 
@@ -70,7 +83,7 @@ def _seen(part: SubFigure, attack: str) -> None:
 def _curves(axes: Axes, attack: str) -> None:
     """Of the published records."""
     pair = patched(attack)
-    curve(axes, pair.controls["none"].table, style.BLUE, "no patch")
+    curve(axes, clean(pair), style.BLUE, "no patch")
     if attack != "eot":
         curve(axes, patched("eot").own.table, style.GREY, "eot", "--")
     curve(axes, pair.own.table, style.RED, attack)

@@ -1,0 +1,63 @@
+"""Components with a state go the whole way: run, records, recordings, and a replay that is the same to the last bit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyarrow.compute as pc
+import pytest
+from rerun.chunk import RrdReader
+
+from bench.plugins.track import track
+from bench.records import reading
+from bench.run import runner
+from bench.run.config import run_config
+from bench.run.replay import find, replay
+from bench.run.unit import Preparation, Unit
+
+ATTACKS = ("bias", "pgd")
+RUN = (
+    f"attack={','.join(ATTACKS)} defense=frame_stack victim=dqn lanes=3 density=1 weather=clear episodes=3 seeds=0 "
+    "reference=false"
+)
+
+
+class Warned:
+    """A watcher that remembers what went wrong."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def begin(self, *, episodes: int, finished: int) -> None:
+        pass
+
+    def working(self, works: Sequence[Unit | Preparation]) -> None:
+        pass
+
+    def preparing(self, work: str, share: float, text: str) -> None:
+        pass
+
+    def finished(self, work: Unit | Preparation, wall_s: float) -> None:
+        pass
+
+    def warn(self, line: str) -> None:
+        self.lines.append(line)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_stateful_attack_on_a_stateful_defence_is_scored_recorded_and_replayed(tmp_path: Path, workers: int) -> None:
+    watcher = Warned()
+    runner.run(run_config([*RUN.split(), f"workers={workers}", f"out={tmp_path}"]), watcher)
+    assert watcher.lines == []
+    records = reading.read(tmp_path, track=track("driving"))
+    assert set(records["attack"].to_pylist()) >= set(ATTACKS)
+    assert pc.max(records["excess_max"]).as_py() < 1e-6
+    for attack in ATTACKS:
+        (recording,) = tmp_path.glob(f"recordings/{attack}-frame_stack-dqn-*/*-1000000.rrd")
+        entities = {str(chunk.entity_path) for chunk in RrdReader(recording).stream()}
+        assert {"/traffic/shown", "/decision/clean", "/perturbation/position/x"} <= entities
+        again = replay(tmp_path, find(records, {"attack": attack, "seed": "1000002"}))
+        assert (again.differences, again.changed) == ((), "")
+        assert again.path.name == "lanes-3-density-1-weather-clear-1000002.rrd"
