@@ -15,6 +15,7 @@ from bench.plugins import registry
 from bench.plugins.options import Options, configured
 from bench.plugins.pair import Chosen, Pair, check_track
 from bench.plugins.registry import KINDS, Kind
+from bench.run.executors import EXECUTORS
 from bench.scenarios import Grid
 
 
@@ -26,6 +27,7 @@ class RunConfig:
         pairs: what is run.
         grid: the cells and the scenario seeds.
         seeds: training seeds of the victims; of detectors also the seeds of the patches.
+        executor: the back end that carries out the work, a name in `bench.run.executors.EXECUTORS`.
         workers: worker processes; results do not depend on their number.
         out: results folder.
         record: episodes to record of every cell of each pair; None records one, of the first cell.
@@ -38,6 +40,7 @@ class RunConfig:
     pairs: tuple[Pair, ...]
     grid: Grid
     seeds: tuple[int, ...] = (0, 1, 2)
+    executor: str = "processes"
     workers: int = field(default_factory=lambda: cores())
     out: Path = Path("results")
     record: int | None = None
@@ -45,6 +48,8 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
+        if self.executor not in EXECUTORS:
+            raise ValueError(registry.unknown(f"executor {self.executor!r}", self.executor, EXECUTORS))
         if self.workers < 1:
             raise ValueError(f"workers must be at least 1, got {self.workers}")
         if self.record is not None and not 0 <= self.record <= self.grid.episodes:
@@ -92,6 +97,7 @@ class RunOptions:
     grid: str | None = None
     episodes: int | None = None
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
+    executor: str = "processes"
     workers: int = field(default_factory=cores)
     out: str = "results"
     record: int | None = None
@@ -128,6 +134,7 @@ def run_config(words: Sequence[str]) -> RunConfig:
             pairs=tuple({pair.id: pair for pair in pairs}.values()),
             grid=grid,
             seeds=tuple(settings["seeds"]),
+            executor=settings["executor"],
             workers=settings["workers"],
             out=Path(settings["out"]).expanduser(),
             record=settings["record"],

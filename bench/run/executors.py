@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.queues import SimpleQueue
@@ -111,9 +111,17 @@ def _pooled(
             yield running.pop(future), future.result()
 
 
-def executor(workers: int, tasks: int) -> Executor:
-    """The back end for so many workers: this process where one is enough."""
-    return SerialExecutor() if min(workers, tasks) <= 1 else ProcessExecutor(workers)
+EXECUTORS: dict[str, Callable[[int], Executor]] = {
+    "serial": lambda workers: SerialExecutor(),
+    "processes": ProcessExecutor,
+}
+"""Every back end by the name that `executor=` has on the command line; made with the number of workers."""
+
+
+def executor(name: str, workers: int, tasks: int) -> Executor:
+    """The back end of a name, for so many workers and tasks; `processes` is this process where one worker is enough."""
+    one = name == "processes" and min(workers, tasks) <= 1
+    return EXECUTORS["serial" if one else name](workers)
 
 
 _tell: Tell

@@ -56,7 +56,7 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
     waits: list[Unit] = []
     for unit in missing:
         (waits if unit.preparation and unit.preparation.fingerprint in absent else ready).append(unit)
-    back_end = executor(config.workers, len(missing) + len(absent))
+    back_end = executor(config.executor, config.workers, len(missing) + len(absent))
     first: list[Preparation | Unit] = [*absent.values(), *sorted(ready, key=_longest_first)]
     for works in (first, sorted(waits, key=_longest_first)):
         _carry_out(works, config.out, recorded, back_end, watcher)

@@ -109,6 +109,7 @@ BAD = {
     "grid=standard": "unknown grid 'standard' of the world 'highway'; did you mean 'standard-v1'?",
     "grid=approach-v1": "unknown grid 'approach-v1' of the world 'highway'",
     "world.vehicles=0": "world 'highway': vehicles must be between 1",
+    "executor=ray": "unknown executor 'ray'; known: serial, processes",
     "workers=0": "workers must be at least 1, got 0",
     "seeds=-1": "seeds must be different numbers of at least 0, got -1",
     "record=101": "record must be between 0 and the 100 episodes, got 101",
