@@ -73,7 +73,9 @@ def test_its_axes_are_keys_of_the_command_line(bench: Bench, tmp_path: Path) -> 
     cells = {pq.read_table(path)["cell"][0].as_py() for path in tmp_path.glob("results/episodes/*.parquet")}
     assert cells == {'{"pitch":1.2,"tones":4}', '{"pitch":1.2,"tones":6}'}
     refused = bench(*RUN, "lanes=3", f"out={tmp_path / 'results'}")
-    assert (refused.code, refused.err.strip()) == (2, "error: unknown axis 'lanes' of the world; known: pitch, tones")
+    assert refused.code == 2
+    assert refused.err.startswith("error: unknown axis 'lanes' of the world; ")
+    assert refused.err.endswith("known: pitch, tones\n")
     assert "pitch must be a number above 0, got -1" in bench(*RUN, "pitch=-1", f"out={tmp_path / 'results'}").err
     assert "pitch (of the lower tone)" in " ".join(bench("run", "--help").out.split())
 
