@@ -78,7 +78,7 @@ class FrameStack(DrivingDefense):
     places their rows are mixed for k - 1 frames.
 
     Args:
-        frames: k, how many observations are reduced, at least 2; before the first one there is nothing but the first.
+        frames: k, how many observations are reduced; in the beginning the first one stands for those before it.
         reduce: `mean` or `median`, feature by feature, over those of the frames in which the row is present.
     """
 

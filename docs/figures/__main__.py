@@ -11,6 +11,7 @@ from bench.run.process import settle
 FIGURES = {
     "attack_none.svg": "attacks:none",
     "attack_noise.svg": "attacks:noise",
+    "attack_bias.svg": "memory:bias",
     "attack_zo.svg": "attacks:zo",
     "attack_pgd.svg": "attacks:pgd",
     "attack_art.svg": "attacks:art",
@@ -18,6 +19,7 @@ FIGURES = {
     "attack_noise_patch.png": "sign_patches:noise_patch",
     "attack_grey_patch.png": "sign_patches:grey_patch",
     "defense_none.svg": "hardening:none",
+    "defense_frame_stack.svg": "memory:frame_stack",
     "defense_advtrain.svg": "hardening:advtrain",
     "defense_advtrain_detection.svg": "hardening:advtrain_detection",
     "defense_median.png": "filters:median",
