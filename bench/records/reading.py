@@ -44,7 +44,7 @@ def read(out: Path, units: Collection[str] | None = None, *, track: Track) -> pa
         UserError: if there are no records, or if a file is truncated or foreign, or has values that cannot be.
     """
     paths = _paths(out) if units is None else [path_of(out, unit) for unit in sorted(set(units))]
-    known = [(path, generation) for path in paths for found, generation in [check(path)] if found is track]
+    known = [(path, generation) for path in paths for found, generation in [check(path)] if found.name == track.name]
     if not known:
         raise UserError(_NOTHING.format(out=out))
     query = "from records" + (_NEWEST if units is None else "") + _ORDER
