@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from bench.plugins import registry
-from bench.records import store as results
-from leaderboard.entries import MEASUREMENTS
-from leaderboard.ranking import Row, read_boards
+from bench.plugins.track import track
+from bench.records import reading
+from leaderboard.comparisons.reading import measurements
+from leaderboard.ranking.boards import Row, read_boards
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 
@@ -29,8 +30,7 @@ def rows(plugins: Path, bench: Callable[..., Said], tmp_path: Path) -> dict[str,
     out = tmp_path / "results"
     said = bench("run", "attack=pgd,zo,noise", f"defense=none,{','.join(BAD)}", *WORDS, f"out={out}")
     assert said.code == 0, said.err
-    measurements = {name for names in MEASUREMENTS.values() for name in names}
-    (board,) = read_boards(results.read_compact(out, measurements))[0]
+    (board,) = read_boards(reading.read_compact(out, measurements(track("driving"))))[0]
     return {str(row.identity["defense"]): row for row in board.rows}
 
 
