@@ -24,10 +24,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bench.records.store import FOLDER, SCHEMA
+from bench.plugins.contracts import Facts
+from bench.plugins.track import track
+from bench.records.schema import schema
+from bench.records.store import FOLDER
+from bench.scenarios import Cell
+from bench.statistics.episodes import as_text
 from envs.highway.axes import STANDARD_V1
 
 SEEDS, EPISODES, ATTACKS = 3, 100, 8
+SCHEMA = schema(track("driving"))
+FACTS = json.dumps(Facts(axes=STANDARD_V1.axes, decision_hz=15, max_steps=450).written())
 POLICY = {f"parameter_{number}": 0.125 for number in range(15)}
 MEASURE = """
 import resource, subprocess, sys, time
@@ -38,9 +45,8 @@ print(code, time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_
 """
 
 
-def unit(number: int, defense: str, attack: str, seed: int, cell: object, rng: np.random.Generator) -> pa.Table:
+def unit(number: int, defense: str, attack: str, seed: int, cell: Cell, rng: np.random.Generator) -> pa.Table:
     """The records of one unit of work."""
-    lanes, density, weather = (getattr(cell, name) for name in ("lanes", "density", "weather"))
     clean = attack == "none"
     digest = hashlib.sha256(str(number).encode()).hexdigest()
     constants = {
@@ -62,9 +68,8 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: object, rng: n
         "threat_access": "oblivious" if clean else "gradients",
         "threat_queries": 0 if clean else 1000,
         "grid": "standard-v1",
-        "lanes": lanes,
-        "density": density,
-        "weather": weather,
+        "cell": as_text(cell),
+        "world_facts": FACTS,
         "attack_shipped_by": "cavbench 0.1.0",
         "weights_sha256": hashlib.sha256(f"{defense}{seed}".encode()).hexdigest(),
         "code_digest": hashlib.sha256(attack.encode()).hexdigest(),

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from bench.errors import UserError
 from bench.plugins.track import Track, tracks
-from bench.records.schema import FLOAT, TEXT, field, schema
+from bench.records.schema import FLOAT, IDENTITY, PROVENANCE, TEXT, field, schema
 
 AXES_OF_V1 = (
     field("lanes", pa.int32(), "of the cell"),
@@ -75,7 +75,9 @@ def glance(path: Path) -> tuple[Track, pa.Schema]:
 
 @cache
 def _encoded(generation: pa.Schema) -> tuple[bytes, ...]:
-    return tuple(name.encode() for name in generation.names)
+    """The names of the columns, those that only some tracks have first: a file of another track is told at the first of them."""
+    common = {field.name for field in (*IDENTITY, *PROVENANCE)}
+    return tuple(name.encode() for name in sorted(generation.names, key=common.__contains__))
 
 
 def _footer(path: Path) -> bytes:

@@ -120,6 +120,12 @@ class Cell(Mapping[str, Value]):
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError("a cell cannot be changed: make another one with `replaced`")
 
+    def __eq__(self, other: object) -> bool:
+        # Reports compare hundreds of thousands of cells; what `Mapping` does takes twenty times as long.
+        if isinstance(other, Cell):
+            return self is other or (self._hash == other._hash and self._values == other._values)
+        return super().__eq__(other)
+
     def __hash__(self) -> int:
         return self._hash
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -160,8 +161,17 @@ def _distinct(column: pa.ChunkedArray) -> tuple[list[Any], NDArray[np.int64]]:
 
 def axes_of(records: pa.Table) -> Axes:
     """The axes of the world that records are of."""
-    facts = json.loads(records["world_facts"][0].as_py())
-    return Axes.read(facts["axes"])
+    return _read_axes(records["world_facts"][0].as_py())
+
+
+@cache
+def _read_axes(world_facts: str) -> Axes:
+    return Axes.read(json.loads(world_facts)["axes"])
+
+
+@cache
+def _read_cell(text: str) -> Cell:
+    return Cell(**json.loads(text))
 
 
 def as_text(cell: Cell) -> str:
@@ -172,7 +182,7 @@ def as_text(cell: Cell) -> str:
 def _cells(records: pa.Table, axes: Axes) -> tuple[list[Cell], NDArray[np.int64]]:
     """The cells of some records in the order of tables, and the place of each record's."""
     texts, code = _distinct(records["cell"])
-    cells = [Cell(**json.loads(text)) for text in texts]
+    cells = [_read_cell(text) for text in texts]
     order = sorted(range(len(cells)), key=lambda place: axes.place(cells[place]))
     place = np.empty(len(cells), np.int64)
     place[order] = np.arange(len(cells))

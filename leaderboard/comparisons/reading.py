@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from bench.plugins.track import Track, track
+from bench.plugins.track import Measure, Track, track
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import iqm
 from leaderboard.comparisons.baselines import Baselines, identity_of
@@ -20,14 +20,15 @@ SCENARIO = ("training_seed", "cell", "seed")
 
 
 def measurements(of: Track) -> set[str]:
-    """The columns of a track's records that comparisons read, beside what was driven and what produced it."""
-    needed = {of.metric, of.failure, of.place, of.queries, of.gradients, "steps", *_artefact(of)}
-    needed |= {measure.column for measure in of.measures}
+    """The measurements of a track that leaderboards read, of columns that hold no lists."""
+    needed = {of.metric, of.failure, of.place, of.queries, of.gradients} | {one.column for one in headline(of)}
+    needed |= {f"{of.artefact[0]}_sha256"} if of.artefact else set()
     return needed & {field.name for field in of.measurements if not pa.types.is_list(field.type)}
 
 
-def _artefact(of: Track) -> tuple[str, ...]:
-    return (f"{of.artefact[0]}_sha256",) if of.artefact else ()
+def headline(of: Track) -> tuple[Measure, ...]:
+    """The measures of a victim that every table has, however narrow: what a leaderboard says beside the metric."""
+    return tuple(measure for measure in of.measures if measure.spare == 0 and not measure.of_attack)
 
 
 def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:

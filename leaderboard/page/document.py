@@ -20,6 +20,7 @@ from leaderboard.comparisons.alignment import Aligned, align
 from leaderboard.comparisons.baselines import identity_of
 from leaderboard.comparisons.comparison import THREAT, Comparison, parameters
 from leaderboard.comparisons.naming import labels
+from leaderboard.comparisons.reading import headline
 from leaderboard.page.cards import card
 from leaderboard.ranking.boards import Board, Row
 from leaderboard.ranking.families import budgets, efforts
@@ -204,7 +205,6 @@ def _pair(one: Comparison, key: int, called: Labels, folder: Path | None) -> dic
         if column in own.table.column_names:
             for cell, value in zip(cells, own.column(column).mean((0, 2)).tolist(), strict=True):
                 cell[name] = _number(value)
-    shown = [measure for measure in one.track.measures if measure.spare == 0 and not measure.of_attack]
     return {
         "key": key,
         "track": one.track.name,
@@ -215,7 +215,7 @@ def _pair(one: Comparison, key: int, called: Labels, folder: Path | None) -> dic
         "score": _interval(one.score),
         "clean": _interval(one.clean_score),
         "queries": _number(one.queries),
-        "measures": {measure.column: _interval(one.measured(measure)) for measure in shown},
+        "measures": {measure.column: _interval(one.measured(measure)) for measure in headline(one.track)},
         "cells": cells,
         "card": card(one, folder),
     }

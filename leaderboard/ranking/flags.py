@@ -196,7 +196,7 @@ def not_flattened(of: Subject) -> Finding:
 
 
 def too_little(of: Subject) -> Finding:
-    """Fires below 3 seeds or a track's number of scenarios a cell, or where cells of the world's grid are missing."""
+    """Fires with fewer than 3 seeds, too few scenarios a cell for the track, or where cells of the world's grid are missing."""
     runs, cells, episodes = of.worst.scores.shape
     weights = {value for one in of.attacks for value in pc.unique(one.own.table["weights_sha256"]).to_pylist()}
     seeded = of.track.artefact is not None or bool(weights - {""})

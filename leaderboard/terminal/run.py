@@ -104,6 +104,9 @@ def legend(track: Track) -> Text:
             ("✗", "bold red", "not better: its input is worth nothing"),
         ):
             text.append(f"{mark} ", style=f"not dim {style}").append(f"{meaning}   ")
-    said = (track.legend, "kept: retention, attacked / clean score.", f"Scores: interquartile mean over {track.run}s and cells, with a "
-            f"95 % bootstrap interval. Attacked, clean and baselines have the same {track.episode[1]}.")  # fmt: skip
+    scores = (
+        f"Scores: interquartile mean over {track.run}s and cells, with a 95 % bootstrap interval. Attacked, clean and baselines "
+        f"have the same {track.episode[1]}."
+    )
+    said = (track.legend, "kept: retention, attacked / clean score.", scores)
     return text.append("\n" + " ".join(filter(None, said)))

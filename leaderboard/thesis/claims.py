@@ -26,7 +26,7 @@ TREND, INTERVALS = "Page's trend test over patch seeds", "95 % intervals over pa
 
 @dataclass(frozen=True)
 class Claim:
-    """That the confidence left moves with a setting of the patch.
+    """That the confidence under attack moves with a setting of the patch.
 
     Args:
         question: whether it does.
@@ -40,9 +40,15 @@ class Claim:
 
 
 CLAIMS = (
-    Claim("does leaving out one transformation after the other raise the confidence left?", tuple(ABLATION), "rises"),
-    Claim("does a larger patch lower the confidence left?", ("patch_32", "patch_64", STANDARD), "falls"),
-    Claim("does the weight of the total variation change the confidence left?", (STANDARD, "tv_3", "tv_5"), None),
+    Claim(
+        "does leaving out one transformation after the other raise the confidence under attack?",
+        tuple(ABLATION),
+        "rises",
+    ),
+    Claim("does a larger patch lower the confidence under attack?", ("patch_32", "patch_64", STANDARD), "falls"),
+    Claim(
+        "does the weight of the total variation change the confidence under attack?", (STANDARD, "tv_3", "tv_5"), None
+    ),
 )
 
 
@@ -68,7 +74,7 @@ def location_claims(source: Source) -> Iterator[Text]:
     """What table 3.3 is read for."""
     for detector in source.detectors:
         lost = {theirs: _lost(source, detector, ours) for theirs, ours in WEATHERS.items()}
-        question = "does the patch leave less confidence than random noise and grey do, at every location?"
+        question = "is the confidence lower under the patch than under random noise and grey, at every location?"
         answers = {theirs: _below(source, detector, ours) for theirs, ours in WEATHERS.items()}
         yield _text(detector, question, answers, INTERVALS)
         question = "is most lost where the sun shines on the sign, least where it is behind it?"
@@ -111,7 +117,7 @@ def _unknown(needed: str, seeds: int) -> Text:
 
 
 def _left(source: Source, detector: Detector, rows: Sequence[str], place: Place) -> Array:
-    """[R, S] confidence left, patch seeds x settings, on the approaches that all settings have; no seed where one is missing."""
+    """[R, S] confidence under attack, patch seeds x settings, on the approaches of all settings; no seed where one is missing."""
     found = [each.of.own for row in rows if (each := source.find(detector, row, *place))]
     if len(found) < len(rows):
         return np.empty((0, len(rows)))

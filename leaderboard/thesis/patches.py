@@ -75,7 +75,7 @@ Made = tuple[list[Column[Line]], list[Section[Line]], list[Text]]
 
 
 def static_table(section: Mapping[str, Any], source: Source) -> Made:
-    """Table 3.1; a loss on one image has no counterpart, what the same patches leave on new approaches has."""
+    """Table 3.1; a loss on one image has no counterpart, the confidence under the same patches on new approaches has."""
     columns = [
         _label(),
         _column("thesis\nmax score", "max_score"),
@@ -95,7 +95,7 @@ def static_table(section: Mapping[str, Any], source: Source) -> Made:
         lines.append(Line(row, found, losses | surest))
     note = Text(
         "Ours is no loss: the thesis' score is on the image that the patch was crafted on, which a patch without transformations "
-        "fits best and which says nothing of other views. Beside it stands the confidence that the same configuration leaves on "
+        "fits best and which says nothing of other views. Beside it stands the confidence under the same configuration on "
         "new approaches, clear weather, all three locations."
     )
     sections = _with_controls(lines)

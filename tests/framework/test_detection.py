@@ -71,7 +71,7 @@ def test_the_victim_decides_the_track_and_the_track_the_defaults() -> None:
 
 BAD = {
     "attack=noise victim=red world=red_street": "attack 'noise' does not fit victim 'red' of the detection track; what fits:",
-    "attack=paint victim=toy world=toy": "attack 'paint' does not fit victim 'toy' of the driving track; what fits: art, bias, noise",
+    "attack=paint victim=toy world=toy": "attack 'paint' does not fit victim 'toy' of the driving track; what fits: art, bias",
     "victim=red world=highway": "world 'highway' does not fit victim 'red' of the detection track; what fits: ",
     "victim=toy,red": "victims 'toy' (driving) and 'red' (detection) are of different tracks",
     "victim=red world=red_street threat.norm=linf": "unknown threat.norm 'linf'; known: patch",
