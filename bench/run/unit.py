@@ -22,11 +22,15 @@ class Work:
         pair: attack, defence, victim, world, threat model.
         training_seed: of the victim; of what is prepared too.
         weights_sha256: of the victim's weights.
+        cell: one value on each axis of the world.
+        seeds: the scenario seed of each episode.
     """
 
     pair: Pair
     training_seed: int
     weights_sha256: str
+    cell: Cell
+    seeds: range
 
     @property
     def track(self) -> Track:
@@ -59,6 +63,23 @@ class Work:
         raise NotImplementedError
 
     @property
+    def job(self) -> Job:
+        """What its track is asked to do."""
+        return Job(
+            pair=self.pair,
+            training_seed=self.training_seed,
+            attack_seed=self.attack_seed,
+            cell=self.cell,
+            seeds=self.seeds,
+            artefact=self.artefact,
+        )
+
+    @property
+    def artefact(self) -> str:
+        """Fingerprint of what was prepared for it; empty for nothing."""
+        return ""
+
+    @property
     def origin(self) -> dict[str, object]:
         """What decides the result."""
         return {
@@ -76,12 +97,8 @@ class Work:
 class Preparation(Work):
     """What an attack makes once for a defended victim, before any cell is driven: a patch, for instance.
 
-    Args:
-        cell, seeds: of the unit it is made for; they do not matter.
+    Its cell and seeds are those of the unit it is made for; they change nothing.
     """
-
-    cell: Cell
-    seeds: range
 
     @property
     def module(self) -> str:
@@ -98,17 +115,6 @@ class Preparation(Work):
         assert self.track.artefact
         return int(digest([self.track.artefact[0], self.training_seed])[:15], 16)
 
-    @property
-    def job(self) -> Job:
-        """What its track is asked to do."""
-        return Job(
-            pair=self.pair,
-            training_seed=self.training_seed,
-            attack_seed=self.attack_seed,
-            cell=self.cell,
-            seeds=self.seeds,
-        )
-
     def __str__(self) -> str:
         noun = self.track.artefact[0] if self.track.artefact else "preparation"
         return f"{self.pair} | {noun}, seed {self.training_seed}"
@@ -116,15 +122,7 @@ class Preparation(Work):
 
 @dataclass(frozen=True, kw_only=True)
 class Unit(Work):
-    """One batch of episodes: a pair on every scenario seed of a cell, with one training seed.
-
-    Args:
-        cell: one value on each axis of the world.
-        seeds: the scenario seed of each episode.
-    """
-
-    cell: Cell
-    seeds: range
+    """One batch of episodes: a pair on every scenario seed of a cell, with one training seed."""
 
     @property
     def module(self) -> str:
@@ -148,24 +146,16 @@ class Unit(Work):
             seeds=self.seeds,
         )
 
+    @property
+    def artefact(self) -> str:
+        return self.preparation.fingerprint if self.preparation else ""
+
     @cached_property
     def fingerprint(self) -> str:
         """sha256 of everything that decides the result."""
-        before = {"artefact": self.preparation.fingerprint} if self.preparation else {}
+        before = {"artefact": self.artefact} if self.artefact else {}
         scenarios = {"cell": canonical(self.cell), "seeds": [self.seeds.start, self.seeds.stop]}
         return digest(self.origin | scenarios | before)
-
-    @property
-    def job(self) -> Job:
-        """What its track is asked to do."""
-        return Job(
-            pair=self.pair,
-            training_seed=self.training_seed,
-            attack_seed=self.attack_seed,
-            cell=self.cell,
-            seeds=self.seeds,
-            artefact=self.preparation.fingerprint if self.preparation else "",
-        )
 
     @property
     def grid(self) -> str:
