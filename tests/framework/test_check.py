@@ -362,7 +362,7 @@ def test_the_table_says_what_to_fix_and_the_exit_status_says_it_too(bench: Bench
         (("crooked", "attack.speed=2"), "unknown parameter attack.speed of crooked"),
         (("crooked", "defense.rule=2"), "unknown key 'defense.rule'"),
         (("crooked", "rule"), "cannot read 'rule'"),
-        (("pgd", "attack.steps=0"), "steps must be at least 1"),
+        (("pgd", "attack.steps=0"), "steps must be at least 1, got 0"),
     ],
 )
 def test_bad_words_of_a_check_are_refused_in_one_line(bench: Bench, words: tuple[str, ...], part: str) -> None:
