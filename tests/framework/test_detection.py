@@ -65,7 +65,7 @@ def test_the_victim_decides_the_track_and_the_track_the_defaults() -> None:
     (pair,) = config.pairs
     assert (pair.threat.norm, pair.threat.budget, pair.threat.queries) == ("patch", 0.5, 20_000)
     assert config.grid.name == "red-v1"
-    assert read("victim=red world=red_street weather=night").grid.weather == ("night",)
+    assert read("victim=red world=red_street weather=night").grid.values["weather"] == ("night",)
     assert read("victim=red").pairs[0].world.name == "camera"
 
 

@@ -20,7 +20,9 @@ def test_a_run_takes_its_axes_from_the_world(bench: Bench, tmp_path: Path) -> No
     assert "gap" in said.out
     rows = reading.read(out, track=track("driving")).to_pylist()
     cells = {row["cell"] for row in rows if row["attack"] == "nudge"}
-    assert cells == {json.dumps({"curvature": c, "gap": g}, separators=(",", ":")) for c in (0.1, 0.2) for g in (20, 40)}
+    assert cells == {
+        json.dumps({"curvature": c, "gap": g}, separators=(",", ":")) for c in (0.1, 0.2) for g in (20, 40)
+    }
     facts = json.loads(rows[0]["world_facts"])
     assert (facts["decision_hz"], len(facts["actions"])) == (5.0, 3)
     assert [axis["name"] for axis in facts["axes"]] == ["curvature", "gap"]

@@ -71,8 +71,8 @@ def test_a_run_has_the_pair_its_clean_control_and_the_reference_drivers(tmp_path
     assert len(attacked) == len(clean) == 2 * 2 * 2 * 4
     assert {row["threat_budget"] for row in clean} == {0.0}
     assert {row["training_seed"] for row in attacked} == {0, 1}
-    assert {row["victim"] for row in reference} == {"blind", "random", "idm"}
-    assert len({row["pair"] for row in reference}) == 6 + 1 + 1
+    assert {row["victim"] for row in reference} == {"blind", "random"}
+    assert len({row["pair"] for row in reference}) == 6 + 1
     assert {json.loads(row["cell"])["weather"] for row in reference} == {"clear"}
     assert {row["training_seed"] for row in reference} == {0}
     assert watcher.episodes == records.num_rows
@@ -101,7 +101,7 @@ def test_references_can_be_left_out(tmp_path: Path) -> None:
 def test_continuous_victims_are_held_against_continuous_drivers() -> None:
     config = run_config(["attack=steer", "victim=toy", "victim.actions=continuous", "world=toy"])
     kinds = {(unit.pair.victim.name, unit.pair.victim.component.action_type) for unit in plan(config)}
-    assert kinds == {("toy", "continuous"), ("blind", "continuous"), ("random", "continuous"), ("idm", "discrete")}
+    assert kinds == {("toy", "continuous"), ("blind", "continuous"), ("random", "continuous")}
 
 
 @pytest.mark.slow
@@ -167,5 +167,5 @@ def test_the_grid_of_a_record_is_named_only_where_it_is_the_whole_cell() -> None
     short = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=99"]))
     other = plan(run_config(["victim=toy", "world=toy", "lanes=2"]))
     as_few_as_approaches = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=3"]))
-    assert {unit.grid for unit in whole} == {"standard-v1"}
+    assert {unit.grid for unit in whole} == {"toy-v1"}
     assert {unit.grid for unit in (*short, *other, *as_few_as_approaches)} == {"custom"}

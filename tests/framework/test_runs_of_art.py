@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.records import store as results
+from bench.plugins.track import track
+from bench.records import reading
 from tests.framework.conftest import Said
 
 pytest.importorskip("art")
@@ -34,7 +35,7 @@ def test_a_run_says_which_attack_of_which_version(bench: Callable[..., Said], tm
     )
     assert said.code == 0, said.err
     assert all(name in said.out for name in attacks.split(","))
-    rows = [row for row in results.read(tmp_path).to_pylist() if row["attack"] != "none"]
+    rows = [row for row in reading.read(tmp_path, track=track("driving")).to_pylist() if row["attack"] != "none"]
     assert {row["attack"] for row in rows} == set(attacks.split(","))
     assert {json.loads(row["attack_params"])["max_iter"] for row in rows} == {4}
     version = metadata.version("adversarial-robustness-toolbox")
@@ -46,4 +47,7 @@ def test_a_run_says_which_attack_of_which_version(bench: Callable[..., Said], tm
 def test_continuous_victims_are_refused_in_one_line(bench: Callable[..., Said]) -> None:
     said = bench("run", "attack=art:SquareAttack", "victim=ddpg")
     assert (said.code, len(said.err.splitlines())) == (2, 1)
-    assert "attack 'art:SquareAttack' does not fit victim 'ddpg': it needs discrete actions" in said.err
+    assert (
+        "attack 'art:SquareAttack' does not fit victim 'ddpg', whose actions are continuous: it needs discrete ones"
+        in said.err
+    )
