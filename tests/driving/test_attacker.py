@@ -77,11 +77,11 @@ def test_remembering_the_observation_itself_does_not_change_it() -> None:
     torch.testing.assert_close(first, before, rtol=0, atol=0)
 
 
-def test_nothing_is_asked_before_the_first_step() -> None:
-    with pytest.raises(UserError, match=r"Hasty\.initial asked the victim, which only step may do"):
+def test_an_attack_may_not_query_the_victim_before_the_first_step() -> None:
+    with pytest.raises(UserError, match=r"Hasty\.initial asked the victim: ask in step"):
         attacker(Hasty()).show(observations(3, 0), ALL, None)
 
 
-def test_a_state_that_would_be_lost_is_refused() -> None:
-    with pytest.raises(UserError, match=r"Forgetful\.step returned a state, but initial returned none"):
+def test_a_state_without_an_initial_state_is_refused() -> None:
+    with pytest.raises(UserError, match=r"Forgetful\.step and Forgetful\.initial must both return a state or both return None"):
         attacker(Forgetful()).show(observations(3, 0), ALL, None)

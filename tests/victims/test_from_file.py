@@ -209,7 +209,7 @@ def bad_text(path: Path) -> dict[str, str]:
 BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
     "no file": ("torch", lambda path: {"path": str(path)}, "there is no file"),
     "no program": ("torch", bad_text, "cannot be read"),
-    "fixed batch": ("torch", lambda path: {"path": torch_file(path, fixed=True)}, "takes no batch but of 3: export it"),
+    "fixed batch": ("torch", lambda path: {"path": torch_file(path, fixed=True)}, "has a fixed batch size of 3: export it"),
     "rows": (
         "torch",
         lambda path: {"path": torch_file(path), "rows": "15"},
@@ -218,28 +218,28 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
     "two scores": (
         "torch",
         lambda path: {"path": torch_file(path, Scores(2))},
-        "gives [1, 2] for 1 observations, discrete actions are [1, 5]",
+        "returns [1, 2] for 1 observations, discrete actions need [1, 5]",
     ),
     "other actions": (
         "torch",
         lambda path: {"path": torch_file(path), "actions": "continuous"},
-        "gives [1, 5] for 1 observations, continuous actions are [1, 2]",
+        "returns [1, 5] for 1 observations, continuous actions need [1, 2]",
     ),
     "no rows": ("torch", lambda path: {"path": str(path), "rows": "0"}, "victim.rows must be at least 1"),
     "no onnx": ("onnx", bad_text, "cannot be read"),
-    "fixed onnx": ("onnx", lambda path: {"path": onnx_file(path, fixed=True)}, "takes no batch but of 3"),
+    "fixed onnx": ("onnx", lambda path: {"path": onnx_file(path, fixed=True)}, "has a fixed batch size of 3"),
     "no zip": ("sb3", lambda path: bad_text(path) | {"algo": "dqn"}, "cannot be read: BadZipFile"),
     "unknown algo": ("sb3", lambda path: {"path": str(path), "algo": "dqm"}, "unknown victim.algo 'dqm'"),
     "no algo": ("sb3", lambda path: {"path": str(path)}, "needs victim.algo=…"),
     "another algo": (
         "sb3",
         lambda path: {"path": sb3_file(path, "dqn"), "algo": "ppo"},
-        "holds no ppo policy: mlp_extractor.policy_net is not among its weights",
+        "has no ppo policy: mlp_extractor.policy_net is not among its weights",
     ),
     "continuous": (
         "sb3",
         lambda path: {"path": sb3_file(path, "ppo", continuous=True), "algo": "ppo"},
-        "was trained for continuous actions [2], ppo victims here have 5 discrete actions; say victim.actions=continuous",
+        "was trained for continuous actions [2], this ppo victim needs 5 discrete actions; set victim.actions=continuous",
     ),
     "other rows": (
         "sb3",

@@ -33,7 +33,7 @@ def test_every_picture_is_a_query_and_none_is_answered_beyond_the_budget(
     for count, differentiable in asked:
         ask = door.differentiable if differentiable else door.predict
         if spent + count > queries:
-            with pytest.raises(QueryBudgetError, match=f"asked about {spent + count} pictures"):
+            with pytest.raises(QueryBudgetError, match=f"asked about {spent + count} images"):
                 ask(pictures(count))
         else:
             assert len(ask(pictures(count)).boxes) == count

@@ -57,7 +57,7 @@ def test_another_size_than_the_files_is_refused_in_one_line(saved: tuple[YOLOv5N
 
 
 def test_without_a_file_it_says_how_to_name_one() -> None:
-    with pytest.raises(UserError, match=r"victim\.path=yolov5m\.pt names a file of yours"):
+    with pytest.raises(UserError, match=r"set victim\.path=yolov5m\.pt to use your own file"):
         YOLOv5(size="m").load(0, FACTS)
 
 
