@@ -1,4 +1,4 @@
-"""What an attack remembers is kept by the run, for each episode; what it may not do with it is refused."""
+"""The run keeps an attack's state for each episode, and refuses invalid use of it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ALL = torch.ones(3, dtype=torch.bool)
 
 @dataclass(frozen=True, kw_only=True)
 class Delay(DrivingAttack):
-    """Shows what was measured one step before, and remembers the observation it was given itself."""
+    """Shows the observation of the previous step; its state is the observation object it received."""
 
     access: ClassVar[Access] = "scores"
 
@@ -34,7 +34,7 @@ class Delay(DrivingAttack):
 
 
 class Hasty(Delay):
-    """Asks the victim before the first step."""
+    """Queries the victim before the first step."""
 
     def initial(self, observation: Tensor, oracle: Oracle) -> State:
         oracle.scores(observation)
@@ -42,7 +42,7 @@ class Hasty(Delay):
 
 
 class Forgetful(Delay):
-    """Remembers nothing in the beginning."""
+    """Has no initial state, but returns one in each step."""
 
     def initial(self, observation: Tensor, oracle: Oracle) -> State:
         return None
@@ -68,7 +68,7 @@ def test_each_episode_keeps_its_own_memory_when_others_have_ended() -> None:
         expected[running] = observation[running]
 
 
-def test_remembering_the_observation_itself_does_not_change_it() -> None:
+def test_keeping_the_observation_as_state_does_not_change_it() -> None:
     first, second = observations(3, 0), observations(3, 1)
     before = first.clone()
     at_work = attacker(Delay())
@@ -83,5 +83,7 @@ def test_an_attack_may_not_query_the_victim_before_the_first_step() -> None:
 
 
 def test_a_state_without_an_initial_state_is_refused() -> None:
-    with pytest.raises(UserError, match=r"Forgetful\.step and Forgetful\.initial must both return a state or both return None"):
+    with pytest.raises(
+        UserError, match=r"Forgetful\.step and Forgetful\.initial must both return a state or both return None"
+    ):
         attacker(Forgetful()).show(observations(3, 0), ALL, None)
