@@ -1,1 +1,1 @@
-"""Attacks on what a victim sees, one file an attack."""
+"""Attacks on a victim's input, one file per attack."""

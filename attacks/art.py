@@ -1,4 +1,4 @@
-"""Attacks of the Adversarial Robustness Toolbox (ART) on drivers, by name: `attack=art:SquareAttack`."""
+"""Attacks of the Adversarial Robustness Toolbox (ART) on driving policies, by name: `attack=art:SquareAttack`."""
 
 from __future__ import annotations
 
@@ -39,25 +39,25 @@ ATTACKS: dict[str, Access] = {
     "NewtonFool": "gradients",
     "ProjectedGradientDescent": "gradients",
 }
-"""The attacks of ART that fit, and what each asks the victim for."""
+"""The supported attacks of ART, with the access each needs."""
 BATCHED = ("BasicIterativeMethod", "MomentumIterativeMethod", "ProjectedGradientDescent", "SquareAttack")
-"""Those that treat the episodes of a batch each by itself. With the others every episode is a call of its own."""
+"""Attacks that treat the episodes of a batch independently. The others are called once per episode."""
 FIXED: dict[str, Any] = {"norm": np.inf, "eps": 1.0, "verbose": False}
-"""Arguments that the threat model decides, or the benchmark."""
+"""Arguments that the threat model or the benchmark sets."""
 LEFT_OUT = (*FIXED, "batch_size", "targeted", "summary_writer", "loss_type", "random_eps", "nb_restarts")
 DEFAULTS: dict[str, dict[str, object]] = {"SquareAttack": {"p_init": 0.3}}
-"""Where ART's own default needs a larger image than an observation is."""
+"""Defaults that replace ART's own, which need a larger image than an observation."""
 PLAIN: dict[str, type] = {"bool": bool, "float": float, "int": int, "str": str}
-"""Types of arguments that can be written on a command line."""
+"""Argument types that the command line supports."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ART(DrivingAttack):
     """An attack of the Adversarial Robustness Toolbox (Nicolae et al. 2018, "Adversarial Robustness Toolbox v1.0.0").
 
-    ART's own code, on a victim that it asks through the oracle. It works on the box [-1, 1]^n that the perturbation set is in
-    shares of its radius, for any other action than the clean one or, where it has a `target`, for that. An episode asks no
-    more in a step once that is reached or its queries are spent, and is shown the best point asked. For discrete actions.
+    ART's own code; it queries the victim through the oracle. It works on the box [-1, 1]^n, the perturbation set scaled by its
+    radius. Its goal is any action other than the clean one or, if set, the action `target`. An episode makes no more queries in
+    a step once the goal is reached or the query budget is spent; the result is the best queried point. For discrete actions.
 
     Needs the toolbox: pip install 'cavbench[art]'.
     """
@@ -114,7 +114,7 @@ class ART(DrivingAttack):
         return getattr(self, "target", None)
 
     def _on(self, classifier: object) -> Any:
-        """ART's attack on a victim."""
+        """ART's attack object for a classifier."""
         original = _original(self.choice)
         arguments = FIXED | {"targeted": self._target is not None} | asdict(self)
         if self.choice in BATCHED:
@@ -123,7 +123,7 @@ class ART(DrivingAttack):
 
 
 def _original(choice: str) -> Any:
-    """The class that ART has by this name."""
+    """The class of this name in ART."""
     try:
         from art.attacks import evasion
     except ImportError:
@@ -133,30 +133,30 @@ def _original(choice: str) -> Any:
 
 @cache
 def _signature(original: Any) -> dict[str, inspect.Parameter]:
-    """The arguments of the constructor after the victim."""
-    _, _, *own = inspect.signature(original.__init__).parameters.items()
-    return dict(own)
+    """The constructor's arguments after the victim."""
+    _, _, *arguments = inspect.signature(original.__init__).parameters.items()
+    return dict(arguments)
 
 
 @cache
 def _component(choice: str) -> type[ART]:
-    """One of ART's attacks as a component, its constructor's arguments as parameters."""
+    """An attack of ART as a component, with its constructor's arguments as parameters."""
     original = _original(choice)
     signature = _signature(original)
     hints, defaults = {}, {}
     for name, argument in signature.items():
-        words = str(argument.annotation).split(" | ")
-        types = [kind for word, kind in PLAIN.items() if word in words]
+        annotated = str(argument.annotation).split(" | ")
+        types = [kind for name_of_type, kind in PLAIN.items() if name_of_type in annotated]
         if name not in LEFT_OUT and types:
             hints[name] = types[0] if argument.default is not None else types[0] | None
             defaults[name] = argument.default
     if "eps_step" in hints:
-        # A step keeps the share of the largest perturbation that it is by ART's defaults.
+        # Keep ART's default ratio of step size to eps.
         defaults["eps_step"] = round(signature["eps_step"].default / signature["eps"].default, 3)
     meanings = _meanings(original.__init__)
     if "targeted" in signature:
         hints["target"], defaults["target"] = int | None, None
-        meanings["target"] = "index of the action to bring about; null is any other than the clean one."
+        meanings["target"] = "index of the target action; null for any action other than the clean one."
     summary = re.sub(r"^\| ", "", inspect.cleandoc(original.__doc__), flags=re.MULTILINE)
     lines = [f"    {name}: {meanings.get(name, '')}" for name in hints]
     body = {
@@ -172,11 +172,11 @@ def _component(choice: str) -> type[ART]:
 
 
 def _meanings(function: Any) -> dict[str, str]:
-    """What a docstring of Sphinx's kind says of each argument."""
-    found = re.findall(r":param (\w+):(.*?)(?=:param|:type|:return|\Z)", function.__doc__ or "", re.DOTALL)
-    return {name: " ".join(text.split()) for name, text in found}
+    """The description of each argument in a Sphinx docstring."""
+    entries = re.findall(r":param (\w+):(.*?)(?=:param|:type|:return|\Z)", function.__doc__ or "", re.DOTALL)
+    return {name: " ".join(text.split()) for name, text in entries}
 
 
 def _remade(choice: str, values: dict[str, Any]) -> ART:
-    """What a worker process is sent."""
+    """Rebuild a pickled attack; its class is made at run time and cannot be imported by name."""
     return _component(choice)(**values)

@@ -1,4 +1,4 @@
-"""The victim as the Adversarial Robustness Toolbox sees it: a classifier of points of a unit box, asked through the oracle."""
+"""The victim as an estimator of the Adversarial Robustness Toolbox: a classifier of points in a box, behind the oracle."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ if TYPE_CHECKING:
     from bench.driving import Oracle
 
 logging.getLogger("art").setLevel(logging.ERROR)
-"""ART warns of every attack that comes to nothing, which here is every step and every episode."""
+"""ART logs a warning for every unsuccessful attack, here for every step and episode."""
 
 Array = NDArray[np.float32]
 Value = Callable[[Tensor, Tensor], Tensor]
-"""Of scores [N, C] and a class each [N]: a number each [N], differentiable in the scores."""
+"""(scores [N, C], classes [N]) -> values [N], differentiable in the scores."""
 
 
 class OverError(Exception):
-    """No episode has anything left to ask."""
+    """No episode may make another query."""
 
 
 class Search:
-    """What the victim was asked about some of the episodes in this step, and the best point of each.
+    """The queries of one step for some episodes, and the best point of each episode.
 
-    A point z of the box [-1, 1]^n is the observation truth + radius * z. What was asked once is not asked again. An episode
-    whose goal is met, or that cannot pay for what is asked next, is over: it asks nothing more.
+    A point z of the box [-1, 1]^n stands for the observation truth + radius * z. Answers are cached. An episode is over (makes no
+    more queries) once its goal is met or its next queries would exceed the budget.
 
     Args:
-        oracle: the victim.
+        oracle: access to the victim.
         rows: the episodes [n].
-        clean: the victim's scores of the true observations [n, C] or, where only decisions are asked for, its decisions [n].
-        target: the action to bring about; None is any but the clean one.
+        clean: the victim's scores on the true observations [n, C], or its decisions [n] for a decision-based attack.
+        target: the target action; None for any action other than the clean one.
     """
 
     def __init__(self, oracle: Oracle, rows: Tensor, clean: Tensor, target: int | None) -> None:
@@ -52,8 +52,8 @@ class Search:
         self._truth, self._radius = oracle.observation[rows], oracle.radius[rows]
         decision = clean if clean.ndim == 1 else clean.argmax(-1)
         wanted = decision if target is None else torch.full_like(decision, target)
-        # Of decisions all that counts is whether they are this one: class 1, or not: class 0. Nothing is class 2; some of
-        # ART's attacks refuse less than three.
+        # A decision is class 1 if it is the wanted action, else class 0. Class 2 is never used: some of ART's attacks need at
+        # least three classes.
         self._action = wanted if clean.ndim == 1 else None
         self.labels = wanted if self._action is None else torch.ones_like(wanted)
         scores = clean if self._action is None else _classified(clean == wanted)
@@ -65,19 +65,19 @@ class Search:
 
     @property
     def over(self) -> bool:
-        """Whether every episode is."""
+        """Whether every episode is over."""
         return not any(self._running)
 
     def origin(self) -> Array:
-        """The true observations as points [n, 1, V + 1, F], images: a row a car, a column a measured value.
+        """The true observations as images [n, 1, V + 1, F]: one row per car, one column per measured value.
 
-        The last row and column are blank: the squares of ART's SquareAttack never reach them.
+        The last row and column are blank, because the squares of ART's SquareAttack never reach them.
         """
         count, rows, features = self._truth.shape
         return np.zeros((count, 1, rows + 1, features), np.float32)
 
     def scores(self, points: Array) -> Array:
-        """The victim's scores [N, C] of points [N, 1, V + 1, F]; an episode that is over counts as won, and ART lets it be."""
+        """The victim's scores [N, C] at points [N, 1, V + 1, F]; for an episode that is over, scores of a successful attack."""
         places = self._places(len(points))
 
         def ask(fresh: list[int]) -> Tensor:
@@ -90,12 +90,12 @@ class Search:
             self._judge(shown, scores, at)
             return scores
 
-        found = self._look_up(places, self._keys(places, points, [""] * len(points)), ask)
+        answers = self._look_up(places, self._keys(places, points, [""] * len(points)), ask)
         done = functional.one_hot(self.labels, self.classes).float().numpy() * (1 if self._targeted else -1)
-        return np.stack([done[at] if one is None else one for at, one in zip(places, found, strict=True)])
+        return np.stack([done[at] if one is None else one for at, one in zip(places, answers, strict=True)])
 
     def gradients(self, points: Array, value: Value, labels: Tensor) -> Array:
-        """The gradients of value(scores, labels [N]) at points [N, 1, V + 1, F], of their shape; 0 of an episode that is over."""
+        """The gradients of value(scores, labels [N]) at points [N, 1, V + 1, F], same shape; 0 for an episode that is over."""
         places = self._places(len(points))
 
         def ask(fresh: list[int]) -> Tensor:
@@ -112,16 +112,16 @@ class Search:
             return functional.pad((gradient * self._radius[at])[..., 1:], (0, 1, 0, 1)).unsqueeze(1)
 
         asked = [f"{value.__name__} {label}" for label in labels.tolist()]
-        found = self._look_up(places, self._keys(places, points, asked), ask)
-        return np.stack([np.zeros_like(points[0]) if one is None else one for one in found])
+        answers = self._look_up(places, self._keys(places, points, asked), ask)
+        return np.stack([np.zeros_like(points[0]) if one is None else one for one in answers])
 
     def _look_up(
         self, places: Sequence[int], keys: Sequence[object], ask: Callable[[list[int]], Tensor]
     ) -> list[Array | None]:
-        """What is known by the keys, after asking for what is not; None of an episode that is over.
+        """The answers for the keys, with new queries for unknown ones; None for an episode that is over.
 
         Raises:
-            OverError: if all are.
+            OverError: if all episodes are over.
         """
         if unknown := [n for n, key in enumerate(keys) if self._running[places[n]] and key not in self._known]:
             left = self._oracle.remaining[self._rows].tolist()
@@ -134,30 +134,30 @@ class Search:
         return [self._known[key] if self._running[at] else None for at, key in zip(places, keys, strict=True)]
 
     def _places(self, count: int) -> Sequence[int]:
-        """Which episode each of so many points is of: all of the only one, or one of each, or one of each that is not over."""
+        """The episode of each of `count` points: all of a single episode, one of every episode, or one of every running one."""
         everyone = range(len(self._rows))
         if len(everyone) == 1:
             return [0] * count
         return everyone if count == len(everyone) else [at for at in everyone if self._running[at]]
 
     def _keys(self, places: Sequence[int], points: Array, asked: Sequence[str]) -> list[object]:
-        """What answers are kept under: the episode, the question and the point."""
+        """The cache keys: episode, kind of query and point."""
         return [(at, what, point.tobytes()) for at, what, point in zip(places, asked, points, strict=True)]
 
     def _keep(self, keys: Sequence[object], answers: Tensor) -> None:
         self._known.update(zip(keys, answers.float().numpy(), strict=True))
 
     def _shown(self, points: Array, at: Tensor) -> Tensor:
-        """The observations [N, V, F] that points stand for."""
+        """The observations [N, V, F] of points."""
         z = functional.pad(torch.from_numpy(points[:, 0, :-1, :-1]).to(self._truth), (1, 0))
         return self._oracle.project(self._truth[at] + self._radius[at] * z, self._rows[at])
 
     def _leads(self, scores: Tensor, labels: Tensor) -> Tensor:
-        """What stands between the victim and the goal [N], of scores [N, C]; below 0 it is met."""
+        """Distance to the goal [N] in scores [N, C]; the goal is met below 0."""
         return -margin(scores, labels) if self._targeted else margin(scores, labels)
 
     def _judge(self, shown: Tensor, scores: Tensor, at: Tensor) -> None:
-        """Keep the best of what was asked."""
+        """Keep the best queried points."""
         for n, (place, lead) in enumerate(zip(at.tolist(), self._leads(scores, self.labels[at]).tolist(), strict=True)):
             if lead < self._lead[place]:
                 self._lead[place], self.best[place] = lead, shown[n]
@@ -165,21 +165,21 @@ class Search:
 
 
 class Classifier(ClassGradientsMixin, ClassifierMixin, LossGradientsMixin, NeuralNetworkMixin, BaseEstimator):
-    """An estimator of ART's that answers what a search finds out.
+    """An ART estimator that gets its answers from a search.
 
-    Its loss is the lead of the best other action over that of the label: Q-values are no logits, and a cross-entropy would
-    depend on their scale.
+    Its loss is the lead of the best other action over the label's action. Cross-entropy would depend on the scale of the
+    Q-values, which are not logits.
 
     Args:
-        shape: of a point.
-        classes: C.
+        shape: shape of a point.
+        classes: C, number of classes.
     """
 
     def __init__(self, shape: Sequence[int] = (1, 5, 5), classes: int = 2) -> None:
         super().__init__(model=None, clip_values=(-1.0, 1.0), channels_first=True, preprocessing=None)
         self.nb_classes, self._shape = classes, tuple(shape)
         self.search: Search | None = None
-        """While there is none, as when ART tries an estimator out, every score is 0 and costs nothing."""
+        """If None (ART tests an estimator first), every score is 0 and costs no query."""
 
     @property
     def input_shape(self) -> tuple[int, ...]:
@@ -200,14 +200,14 @@ class Classifier(ClassGradientsMixin, ClassifierMixin, LossGradientsMixin, Neura
     def class_gradient(self, x: Array, label: Any = None, **kwargs: Any) -> Array:
         assert self.search is not None
         labels = range(self.nb_classes) if label is None else [label]
-        of = [torch.as_tensor(one).long().expand(len(x)) for one in labels]
-        return np.stack([self.search.gradients(_points(x), _score, one) for one in of], 1)
+        classes = [torch.as_tensor(one).long().expand(len(x)) for one in labels]
+        return np.stack([self.search.gradients(_points(x), _score, one) for one in classes], 1)
 
     def fit(self, x: Array, y: Array, batch_size: int = 128, nb_epochs: int = 20, **kwargs: Any) -> None:
         raise NotImplementedError("an attack does not train its victim")
 
     def get_activations(self, x: Array, layer: int | str, batch_size: int, framework: bool = False) -> Array:
-        raise NotImplementedError("an attack sees decisions, scores and gradients only")
+        raise NotImplementedError("an attack has access to decisions, scores and gradients only")
 
 
 def _points(x: Array) -> Array:
@@ -232,9 +232,9 @@ def _score(scores: Tensor, labels: Tensor) -> Tensor:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """NumPy's and Python's global random generators, which ART draws from, begin at `seed`; afterwards they are as before.
+    """Seed NumPy's and Python's global random generators, which ART uses, and restore them afterwards.
 
-    Some of ART's attacks make a generator without a seed: it gets this one.
+    Some of ART's attacks create a generator without a seed; it also gets `seed`.
     """
     numpys, pythons, unseeded = np.random.get_state(), random.getstate(), np.random.RandomState  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002

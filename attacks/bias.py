@@ -1,4 +1,4 @@
-"""A sensor with a bias: one offset, drawn once an episode and held to its end."""
+"""A biased sensor: one random offset, constant over the episode."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from bench.plugins.contracts import Access
 
 @dataclass(frozen=True, kw_only=True)
 class Bias(DrivingAttack):
-    """Every measured value is off by the same share of its radius, with the same sign, for a whole episode.
+    """Shifts every measured value by the same share of its radius, with the same sign, for a whole episode.
 
-    What a badly calibrated or spoofed sensor does: consistent over time, so that no filter finds it in the noise. It asks the
-    victim nothing. Signs are drawn for each feature of each row; distance: whatever set the threat model defines.
+    This models a badly calibrated or spoofed sensor. The offset is constant over time, so smoothing does not remove it. It makes
+    no queries. Signs are drawn for each feature of each row. Distance: the perturbation set of the threat model.
 
     Args:
         scale: size of the offset as a share of the radius.

@@ -1,4 +1,4 @@
-"""A printed patch that hides a sign from a detector under whatever it is seen: expectation over transformation."""
+"""Expectation over transformation (EOT): a patch that hides a sign from a detector under random views and transformations."""
 
 from __future__ import annotations
 
@@ -15,36 +15,35 @@ from bench.plugins.contracts import Access, Progress
 from bench.plugins.ranges import Count, NotNegative, Positive
 
 SEEN = 0.5
-"""Frames in which less of the sign is to be seen teach nothing."""
+"""Frames in which a smaller share of the sign is visible are not used."""
 REPORT_EVERY = 5
-"""Steps between two words about the loss."""
+"""Steps between two progress reports."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EOT(PatchAttack):
     """Expectation over transformation (Athalye et al. 2018; thesis, Algorithm 3, Eq. 3.1 and 3.2).
 
-    Minimises, over views of the training places and random transformations of what the camera saw, the mean of the largest
-    objectness times class probability of a stop sign that the detector finds anywhere in a window around the sign, plus
-    `tv` times the patch's total variation. Adam, a cosine schedule, and the patch clamped to what can be printed. White box:
-    access `gradients`. Every transformation is switched off by 0.
+    Minimises the highest score (objectness times class probability) of a stop sign in a window around the sign, averaged over
+    views of the training places and random transformations of the image, plus `tv` times the patch's total variation. Uses Adam
+    with a cosine schedule and clamps the patch to [0, 1]. White box: access `gradients`. 0 disables a transformation.
 
     Args:
-        texels: side of the patch in texels, from 8 to 512 (default 100, as in the thesis; 32 and 64 are its others).
-        steps: of the optimiser, at least 1 (default 150).
-        batch: views a step, at least 1 (default 8).
-        learning_rate: of Adam, above 0 (default 0.05).
-        tv: weight of the total variation: mean absolute difference of neighbouring texels, both ways (default 0.1).
-        window: side in pixels of the square around the sign that the detector is shown; a multiple of its stride (default 320).
-        rotation: largest, in degrees (default 8).
+        texels: side of the patch in texels, from 8 to 512 (default 100, as in the thesis, which also uses 32 and 64).
+        steps: optimiser steps, at least 1 (default 150).
+        batch: views per step, at least 1 (default 8).
+        learning_rate: learning rate of Adam, above 0 (default 0.05).
+        tv: weight of the total variation: mean absolute difference of neighbouring texels, in both directions (default 0.1).
+        window: side in pixels of the square window around the sign; a multiple of the detector's stride (default 320).
+        rotation: largest rotation, in degrees (default 8).
         scale: largest change of size, as a share (default 0.3).
-        translation: largest shift, in shares of the window; without it the sign is in its middle (default 0.15).
-        perspective: distortion of the window's corners, in shares of half its side (default 0.15).
+        translation: largest shift, as a share of the window; with 0 the sign is in the middle (default 0.15).
+        perspective: distortion of the window's corners, as a share of half its side (default 0.15).
         brightness, contrast, saturation: largest change, as a share (default 0.2 each).
-        hue: largest turn, in shares of the full circle, up to 0.5 (default 0.05).
+        hue: largest rotation of the hue, as a share of the full circle, up to 0.5 (default 0.05).
         noise: standard deviation of Gaussian noise on the sRGB scale (default 0.02).
 
-    Queries: steps * batch pictures.
+    Queries: steps * batch images.
 
     Example:
         >>> from attacks.eot import EOT
@@ -106,7 +105,7 @@ class EOT(PatchAttack):
         return patch.detach()[0]
 
     def _corners(self, boxes: Tensor, picture: tuple[int, int], generator: torch.Generator) -> Tensor:
-        """int64 [N, 2] column and row where windows around the signs begin, shifted by up to `translation`."""
+        """int64 [N, 2] column and row of the first pixel of windows around the signs, shifted by up to `translation`."""
         limit = torch.tensor([picture[1], picture[0]])
         side = limit.clamp(max=self.window)
         shift = (torch.rand(len(boxes), 2, generator=generator) * 2 - 1) * self.translation * self.window
@@ -115,6 +114,6 @@ class EOT(PatchAttack):
 
 
 def total_variation(patch: Tensor) -> Tensor:
-    """Mean absolute difference of neighbouring texels, down plus across, of patches [..., H, W]."""
+    """Mean absolute difference of neighbouring texels, vertical plus horizontal, of patches [..., H, W]."""
     down, across = patch.diff(dim=-2).abs(), patch.diff(dim=-1).abs()
     return down.mean() + across.mean()

@@ -1,4 +1,4 @@
-"""A plain patch: the control that shows what covering the sign does by itself."""
+"""A plain grey patch: a baseline that measures the effect of covering the sign."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class GreyPatch(PatchAttack):
-    """A sticker of one grey.
+    """A patch of uniform grey.
 
     Args:
-        level: sRGB, in [0, 1] (default 0.5).
+        level: sRGB value, in [0, 1] (default 0.5).
     """
 
     access: ClassVar[Access] = "oblivious"

@@ -1,4 +1,4 @@
-"""Random noise: the control every attack has to beat."""
+"""Random noise: the baseline for every attack."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ Distribution = Literal["uniform", "gaussian"]
 
 @dataclass(frozen=True, kw_only=True)
 class Noise(DrivingAttack):
-    """Random noise within the budget; asks the victim nothing.
+    """Random noise within the budget, without queries.
 
-    Distance: whatever set the threat model defines; `scale` is a share of its radius, feature by feature.
+    Distance: the perturbation set of the threat model; `scale` is a share of its radius, for each feature.
 
     Args:
         distribution: `uniform` over the whole set, or `gaussian` with a standard deviation of `scale` times the radius,
-            cut off at the radius (default uniform).
+            clipped to the set (default uniform).
         scale: width of the noise as a share of the radius, in (0, 1] (default 1).
 
     Shapes: observation [B, V, F] in, the same out.

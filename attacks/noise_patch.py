@@ -1,4 +1,4 @@
-"""A patch of random colours: the control that every crafted patch is held against."""
+"""A patch of random colours: the baseline for every crafted patch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bench.plugins.contracts import Access, Progress
 
 @dataclass(frozen=True, kw_only=True)
 class NoisePatch(PatchAttack):
-    """Texels drawn uniformly from all colours: how much of a patch's effect is that it covers the sign.
+    """Uniformly random texels, to measure the effect of covering the sign.
 
     Args:
         texels: side of the patch in texels, from 8 to 512 (default 100).

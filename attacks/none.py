@@ -1,4 +1,4 @@
-"""No attack: the clean control that every table stands on."""
+"""No attack: the clean baseline."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bench.plugins.contracts import Access, Attack
 
 @dataclass(frozen=True, kw_only=True)
 class NoAttack(Attack):
-    """Shows the victim the world as it is, on every track."""
+    """Leaves the victim's input unchanged, on every track."""
 
     track: ClassVar[str] = "any"
     access: ClassVar[Access] = "oblivious"

@@ -1,4 +1,4 @@
-"""Projected gradient descent: the white-box yardstick."""
+"""Projected gradient descent (PGD), the standard white-box attack."""
 
 from __future__ import annotations
 
@@ -24,31 +24,32 @@ if TYPE_CHECKING:
 class PGD(DrivingAttack):
     """Projected gradient descent (Madry et al. 2018, "Towards Deep Learning Models Resistant to Adversarial Attacks").
 
-    Sign steps on the victim's own gradient, projected after each; the best iterate of all restarts is shown. With
+    Sign steps on the victim's gradient, each followed by a projection; returns the best iterate of all restarts. With
     `steps=1 step_size=1 random_start=false restarts=1` it is FGSM (Goodfellow et al. 2015). White box: access `gradients`.
-    All episodes share the random starts of a step, so what happens to one does not depend on the rest of the batch.
+    All episodes share the random starts of a step, so the result for one does not depend on the rest of the batch.
 
-    Distance: L-inf in shares of the threat model's radius, feature by feature.
+    Distance: L-inf in shares of the threat model's radius, for each feature.
 
     Args:
-        steps: gradient steps a restart, at least 1 (default 10).
+        steps: gradient steps per restart, at least 1 (default 10).
         step_size: length of a step as a share of the radius, in (0, 2] (default 0.5).
         restarts: independent starts, at least 1, all in one batch (default 4).
-        random_start: begin at a random point of the set instead of the true observation (default true). `margin` on a
-            continuous victim needs it: its gradient at the truth is 0.
+        random_start: start at a random point of the set instead of the true observation (default true). `margin` on a
+            continuous victim needs it: its gradient at the true observation is 0.
         momentum: decay of the accumulated gradient (MI-FGSM, Dong et al. 2018), in [0, 1); 0 is plain PGD (default 0).
-        objective: what is minimised (default `collision`). `expected`: the clean Q expected under the attacked policy (for
-            a continuous victim its critic's Q(x, mu(x'))). `collision`: the same, but braking counts as the best action (a
-            continuous one is judged as if it braked no harder than the clean one). `margin`: the lead of the clean action
-            (minus the distance from it). `target`: the lead over the target action (the distance to it).
-        temperature: of the expectation, as a share of the spread of the clean Q-values, above 0 (default 0.5).
+        objective: the loss to minimise (default `collision`); in brackets, for a continuous victim. `expected`: expected clean
+            Q-value under the attacked policy (its critic's Q(x, mu(x'))). `collision`: the same, but braking counts as the best
+            action (the action is evaluated as if it braked no harder than the clean one). `margin`: lead of the clean action
+            over the best other one (negative distance from the clean action). `target`: lead of the best other action over the
+            target (distance to the target).
+        temperature: temperature of the expectation, as a share of the spread of the clean Q-values, above 0 (default 0.5).
         target_action: discrete target, at least 0 (default 3, FASTER).
         target_acceleration: continuous target, in [-1, 1] (default 1).
         target_steering: continuous target, in [-1, 1] (default 0.5).
-        braking_action: what `collision` spares, at least 0 (default 4, SLOWER).
+        braking_action: index of the braking action for `collision`, at least 0 (default 4, SLOWER).
 
-    Shapes: observation [B, V, F] in, the same out. Queries a step: 1 + restarts * (steps + 1); fewer restarts, then fewer
-    steps, where the threat model allows less.
+    Shapes: observation [B, V, F] in, the same out. Queries per step: 1 + restarts * (steps + 1). With a smaller query budget it
+    uses fewer restarts, then fewer steps.
 
     Example:
         >>> from attacks.pgd import PGD
@@ -97,7 +98,7 @@ class PGD(DrivingAttack):
     def _loss(
         self, observation: Tensor, oracle: Oracle
     ) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], Tensor]]:
-        """The loss of the victim's scores, to be minimised, and what iterates are compared by given it; [..., B] each."""
+        """The loss to minimise, from scores, and the key to compare iterates, from scores and loss; [..., B] each."""
         clean = oracle.scores(observation)
         if oracle.action_type == "discrete":
             discrete = DiscreteLoss(
@@ -125,7 +126,7 @@ class PGD(DrivingAttack):
 def _ask(
     x: Tensor, loss: Callable[[Tensor], Tensor], key: Callable[[Tensor, Tensor], Tensor], oracle: Oracle
 ) -> tuple[Tensor, Tensor]:
-    """What iterates are compared by [R, B] and the loss's gradient [R, B, V, F], from one query."""
+    """The keys of the iterates [R, B] and the gradient of the loss [R, B, V, F], from one query."""
     keys: list[Tensor] = []
 
     def asked(scores: Tensor) -> Tensor:
@@ -138,12 +139,12 @@ def _ask(
 
 
 def _unit(gradient: Tensor) -> Tensor:
-    """`gradient` [R, B, V, F] scaled to a mean magnitude of 1 an episode: momentum weighs directions, not lengths."""
+    """`gradient` [R, B, V, F] scaled to a mean magnitude of 1 per episode, so that momentum averages directions."""
     scale = gradient.abs().mean((-2, -1), keepdim=True)
     return gradient / scale.clamp(min=torch.finfo(gradient.dtype).tiny)
 
 
 def _better(best: Tensor, lowest: Tensor, x: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Keep the better iterate, restart by restart and episode by episode."""
+    """Keep the better iterate for each restart and episode."""
     improved = key < lowest
     return torch.where(improved[..., None, None], x, best), torch.where(improved, key, lowest)

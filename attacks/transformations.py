@@ -1,7 +1,7 @@
-"""What a camera's pictures may go through before a detector sees them: kornia's random transformations, with little graph.
+"""Random transformations of camera images, with kornia's parameters, and gradients only where they are needed.
 
-A patch reaches a small part of a picture. The values are those of the whole, the graph is of that part only: the gradient is
-the same, and the way back, twice as long as the way there, costs next to nothing.
+A patch changes a small part of an image. The whole image is transformed without a graph, and only this part with a graph. The
+gradient is the same, and the backward pass, otherwise twice as slow as the forward pass, costs almost nothing.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 Places = tuple[Tensor, Tensor, Tensor]
-"""Number, row and column of pixels of a batch of pictures, each [N, h, w] or broadcast to it."""
+"""Image index, row and column of pixels in a batch of images, each [N, h, w] or broadcast to it."""
 Beyond = Literal["zeros", "reflection"]
-"""What is outside a picture, as `grid_sample` calls it."""
+"""Padding outside the image, as named by `grid_sample`."""
 
 
 class Transformations:
-    """Rotation and change of size, perspective, colour and noise, drawn anew in each call; each is left out at 0.
+    """Random rotation and scale, perspective, colour and noise, drawn in each call; 0 disables a transformation.
 
-    All that is random comes from torch's global generator, through kornia. `attacks.eot.EOT` says what the arguments are.
+    kornia draws from torch's global generator. `attacks.eot.EOT` documents the arguments.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Transformations:
         self.noise = noise
 
     def __call__(self, pictures: Tensor, boxes: Tensor) -> Tensor:
-        """Pictures [N, 3, H, W] transformed, in [0, 1], differentiable to those of their pixels that are in `boxes` [N, 4]."""
+        """Transform images [N, 3, H, W] in [0, 1]; differentiable in the pixels inside `boxes` [N, 4]."""
         shape = pictures.shape
         for warp, beyond in self.warps:
             matrices = warp.compute_transformation(pictures, warp.forward_parameters(shape), warp.flags)
@@ -72,7 +72,7 @@ class Transformations:
 
 
 def mirrored(boxes: Tensor, grid: Tensor) -> Tensor:
-    """Boxes [N, B, 4] where a box [N, 4] is seen in pictures that are reflected at their borders, as far as a grid reaches."""
+    """Boxes [N, B, 4] of all mirror images of a box [N, 4], reflected at the image borders, as far as a grid reaches."""
     height, width = grid.shape[1:3]
     farthest = grid[:, [0, 0, -1, -1], [0, -1, 0, -1]].abs().max()
     times = max(0, int(((farthest - 1) / 2).ceil()))
@@ -87,19 +87,19 @@ def mirrored(boxes: Tensor, grid: Tensor) -> Tensor:
 
 
 def moved(boxes: Tensor, matrices: Tensor, shape: torch.Size) -> Tensor:
-    """Boxes [N, 4] around all pixels that take from those in boxes [N, B, 4] when homographies [N, 3, 3] move the pictures."""
-    # A pixel takes from those less than 1 beside where it comes from; a homography's coordinates are 0 in a pixel's middle.
+    """Boxes [N, 4] around all pixels that depend on boxes [N, B, 4] after warping the images by homographies [N, 3, 3]."""
+    # Bilinear sampling reads pixels less than 1 away; the homography's coordinates are 0 in the middle of a pixel.
     wider = boxes + torch.tensor([-1.0, -1.0, 0.0, 0.0])
     corners = wider[..., [0, 1, 2, 1, 2, 3, 0, 3]].unflatten(-1, (-1, 2))
     seen = transform_points(matrices, corners.flatten(1, 2)).unflatten(1, corners.shape[1:3])
     end = torch.tensor([shape[3], shape[2]])
     low, high = seen.amin(2).floor().clamp(min=0), (seen.amax(2).ceil() + 1).minimum(end)
-    there = (low < high).all(-1, keepdim=True)
-    return torch.cat((low.where(there, end).amin(1), high.where(there, 0).amax(1)), -1)
+    inside = (low < high).all(-1, keepdim=True)
+    return torch.cat((low.where(inside, end).amin(1), high.where(inside, 0).amax(1)), -1)
 
 
 def around(boxes: Tensor, shape: torch.Size) -> Places:
-    """Rectangles of one size, within pictures [N, 3, H, W], around boxes [N, 4]."""
+    """Pixels of equal-sized rectangles around boxes [N, 4], within images [N, 3, H, W]."""
     end = torch.tensor([shape[3], shape[2]])
     low, high = (boxes[:, :2].floor().clamp(min=0), boxes[:, 2:].ceil().minimum(end))
     size = (high - low).amax(0).clamp(min=1)
@@ -111,12 +111,12 @@ def around(boxes: Tensor, shape: torch.Size) -> Places:
 
 
 def cut(pictures: Tensor, places: Places) -> Tensor:
-    """[N, 3, h, w] the pixels of pictures [N, 3, H, W] at places."""
+    """[N, 3, h, w] the pixels of images [N, 3, H, W] at `places`."""
     return pictures[_in_every_channel(places)]
 
 
 def put(pictures: Tensor, places: Places, part: Tensor) -> Tensor:
-    """The pictures [N, 3, H, W], with `part` [N, 3, h, w] written into them."""
+    """Write `part` [N, 3, h, w] into images [N, 3, H, W], in place, and return them."""
     return pictures.index_put_(_in_every_channel(places), part)
 
 
@@ -126,7 +126,7 @@ def _in_every_channel(places: Places) -> tuple[Tensor, ...]:
 
 
 def sources(matrices: Tensor, shape: torch.Size) -> Tensor:
-    """[N, H, W, 2] where the pixels of pictures come from that homographies [N, 3, 3] move, in `grid_sample`'s units."""
+    """[N, H, W, 2] sampling grid for warping images by homographies [N, 3, 3], in `grid_sample`'s units."""
     number, _, height, width = shape
     unit = torch.tensor([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
     back = (unit @ matrices.inverse())[..., None, None]
@@ -139,7 +139,7 @@ def sources(matrices: Tensor, shape: torch.Size) -> Tensor:
 
 
 def recoloured(pictures: Tensor, drawn: dict[str, Tensor]) -> Tensor:
-    """What kornia's ColorJiggle makes of pictures with the factors and in the order that it drew; a neutral step is left out."""
+    """kornia's ColorJiggle with the factors and order that it drew; neutral steps are skipped."""
     steps = (
         ("brightness", 1, lambda shown, factor: adjust_brightness(shown, factor - 1)),
         ("contrast", 1, adjust_contrast),
@@ -155,17 +155,17 @@ def recoloured(pictures: Tensor, drawn: dict[str, Tensor]) -> Tensor:
 
 
 def turned(pictures: Tensor, turn: Tensor) -> Tensor:
-    """Pictures [N, 3, H, W] with their hue (of HSV) turned by shares of the circle [N].
+    """Rotate the HSV hue of images [N, 3, H, W] by shares of the full circle [N].
 
-    kornia's adjust_hue without the way through HSV, which takes five times as long.
+    The same as kornia's adjust_hue, but without the conversion to HSV, which is five times as slow.
     """
     most, least = pictures.amax(1, keepdim=True), pictures.amin(1, keepdim=True)
     chroma = most - least
     red, green, blue = pictures.split(1, 1)
-    # In sixths of the circle, hue is 1 + (green + blue - red - least) / chroma where green is not less than blue; else it is
-    # the mirror image of that.
+    # In sixths of the circle, the hue is 1 + (green + blue - red - least) / chroma if green >= blue; otherwise it is the mirror
+    # image of this.
     far = 2 - (green + blue - red - least) / chroma.clamp(min=torch.finfo(chroma.dtype).tiny)
     hue = (3 - far.copysign(green - blue) + 6 * turn[:, None, None, None]).remainder(6)
-    # A channel is at its most within 1 of its own hue, and at its least beyond 2.
+    # A channel is largest within 1 of its own hue, and smallest beyond 2.
     away = (hue - torch.tensor([0.0, 2.0, 4.0])[:, None, None]).abs()
     return torch.addcmul(least - chroma, chroma, (away - 3).abs().clamp(1, 2))

@@ -25,36 +25,37 @@ ZOObjective = Literal["collision", "expected", "margin", "target", "thesis"]
 class ZOSignSGD(DrivingAttack):
     """ZO-SignSGD (Liu, Chen, Chen and Hong 2019, "signSGD via Zeroth-Order Oracle"; thesis Algorithm 4, Eq. 4.7 to 4.10).
 
-    Black box, access `scores`. Each of T iterations asks for the loss at x and at q random points x + mu u around it, in
-    one batch, estimates the gradient from the differences and steps by its sign, projected onto the perturbation set. The
-    best point ever asked is shown, at no extra query. All episodes share the random directions of a step, so what happens
-    to one does not depend on the rest of the batch.
+    Black box, access `scores`. Each of T iterations queries the loss at x and at q random points x + mu u in one batch,
+    estimates the gradient from the differences, takes a step along its sign, and projects onto the perturbation set. It returns
+    the best queried point, which needs no extra query. All episodes share the random directions of a step, so the result for
+    one does not depend on the rest of the batch.
 
-    Distance: L-inf in shares of the threat model's radius, feature by feature.
+    Distance: L-inf in shares of the threat model's radius, for each feature.
 
     Args:
         steps: iterations T, at least 1 (default 4).
         directions: random directions q, at least 1 (default 10).
         smoothing: mu, length of a probe as a share of the radius, in (0, 2] (default 1).
         step_size: delta as a share of the radius, in (0, 2] (default 1).
-        objective: what is minimised (default `collision`). `expected`: the clean Q expected under the attacked policy.
-            `collision`: the same, but braking counts as the best action. `margin`: the lead of the clean action (minus the
-            distance from it). `target`: the lead over the target action (the distance to it). `thesis`: Eq. 4.10,
-            |Q(target) - Q(greedy)| (the distance to the target) plus the distortion. For a continuous victim, whose critic
-            a black-box attacker cannot read, `collision` and `expected` are `target`.
-        temperature: of the expectation, as a share of the spread of the clean Q-values, above 0 (default 0.5).
+        objective: the loss to minimise (default `collision`); in brackets, for a continuous victim. `expected`: expected clean
+            Q-value under the attacked policy. `collision`: the same, but braking counts as the best action. `margin`: lead of
+            the clean action over the best other one (negative distance from the clean action). `target`: lead of the best other
+            action over the target (distance to the target). `thesis`: Eq. 4.10, |Q(target) - Q(greedy)| (distance to the
+            target) plus the distortion. For a continuous victim `collision` and `expected` are the same as `target`, because a
+            black-box attack cannot read its critic.
+        temperature: temperature of the expectation, as a share of the spread of the clean Q-values, above 0 (default 0.5).
         target_action: discrete target, at least 0 (default 3, FASTER).
         target_acceleration: continuous target, in [-1, 1] (default 1).
         target_steering: continuous target, in [-1, 1] (default 0.5).
-        braking_action: what `collision` spares, at least 0 (default 4, SLOWER).
+        braking_action: index of the braking action for `collision`, at least 0 (default 4, SLOWER).
         tolerance: a continuous action within this distance of the target has reached it, at least 0 (default 0.1).
-        distortion_weight: weight of Eq. 4.9 beside Eq. 4.7, that is 1 / a; read by `thesis`, at least 0 (default 1).
-        early_stop: an episode whose goal is met asks no more queries in this step (default true).
-        enough: the goal of an expectation: the greedy action gives up this share of what there is to lose, in (0, 1]
-            (default 1: it is the worst action).
-        random_start: begin at a random point of the set, for one query more (default false).
+        distortion_weight: weight of Eq. 4.9 relative to Eq. 4.7, 1 / a; only for `thesis`, at least 0 (default 1).
+        early_stop: stop querying for an episode in this step once its goal is met (default true).
+        enough: goal of `expected` and `collision`: the greedy action loses this share of the range from best to worst action,
+            in (0, 1] (default 1: it is the worst action).
+        random_start: start at a random point of the set, with one more query (default false).
 
-    Shapes: observation [B, V, F] in, the same out. Queries a step: at most T (q + 1), and one more with a random start; never
+    Shapes: observation [B, V, F] in, the same out. Queries per step: at most T (q + 1), one more with a random start; never
     more than the threat model allows.
 
     Example:
@@ -95,7 +96,7 @@ class ZOSignSGD(DrivingAttack):
             rows, x, loss = _running(~loss.met(clean), rows, x, loss)
         known: Tensor | None = None if self.random_start else clean[rows]
         for _ in range(self.steps):
-            # The victim's scores on the true observation are known: it is not asked a second time.
+            # The scores on the true observation are known and need no second query.
             base = 1 if known is None else 0
             count = min(self.directions, int(oracle.remaining[rows].min()) - base) if len(rows) else 0
             if count < 1:
@@ -106,9 +107,9 @@ class ZOSignSGD(DrivingAttack):
             scores = oracle.scores(points[1 - base :], rows)
             scores, known = scores if known is None else torch.cat((known.unsqueeze(0), scores)), None
             value, key = self._value(loss, scores, points, observation[rows])
-            found, at = key.min(0)
-            improved = found < lowest[rows]
-            lowest[rows] = torch.where(improved, found, lowest[rows])
+            smallest, at = key.min(0)
+            improved = smallest < lowest[rows]
+            lowest[rows] = torch.where(improved, smallest, lowest[rows])
             best[rows[improved]] = points[at, torch.arange(len(rows))][improved]
             estimate = _gradient(value, directions)
             x = oracle.project(x - self.step_size * oracle.radius[rows] * estimate.sign(), rows)
@@ -131,38 +132,38 @@ class ZOSignSGD(DrivingAttack):
         )
 
     def _value(self, loss: Loss, scores: Tensor, points: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss of every point asked, and what the best is chosen by, both [..., B]; Eq. 4.10 for `thesis`."""
+        """The loss of every queried point, and the key to choose the best, both [..., B]; Eq. 4.10 for `thesis`."""
         if self.objective != "thesis":
             value = loss(scores)
             return value, loss.key(scores, value)
         size = distortion(points, observation)
         value = loss(scores).clamp(min=0) + self.distortion_weight * size
-        # What hits the target comes before all that does not, the least distorted first.
+        # Points that reach the target come first, ordered by distortion.
         return value, torch.where(loss.met(scores), -1 / (1 + size), value)
 
 
 def _running(keep: Tensor, rows: Tensor, x: Tensor, loss: Loss) -> tuple[Tensor, Tensor, Loss]:
-    """Only the episodes whose goal is not met yet; the others ask nothing more."""
+    """Keep only the episodes whose goal is not met yet; the others make no more queries."""
     return (rows, x, loss) if bool(keep.all()) else (rows[keep], x[keep], loss.of(keep))
 
 
 def _gradient(value: Tensor, directions: Tensor) -> Tensor:
-    """[B, V, F] up to a positive factor, from the losses [q + 1, B] at x and at the probes along `directions` [q, V, F].
+    """Gradient estimate [B, V, F] up to a positive factor, from the losses [q + 1, B] at x and along `directions` [q, V, F].
 
-    The differences are taken to the mean of the losses instead of the one at x: the same expectation, less variance.
+    It uses differences to the mean loss instead of the loss at x, which have the same expectation and less variance.
     """
     return torch.einsum("qb,qvf->bvf", value[1:] - value.mean(0), directions)
 
 
 def _generator(oracle: Oracle) -> torch.Generator:
-    """This step's own generator: one draw from the run's, however many iterations the step will take."""
+    """A generator for this step, seeded by one draw from the run's, whatever the number of iterations."""
     seed = torch.randint(2**62, (1,), generator=oracle.generator)
     return torch.Generator().manual_seed(int(seed))
 
 
 @cache
 def _hadamard(order: int) -> Tensor:
-    """[order, order] Sylvester's matrix of signs with orthogonal rows; `order` is a power of two."""
+    """[order, order] Sylvester's Hadamard matrix: signs with orthogonal rows; `order` is a power of two."""
     matrix = torch.ones(1, 1)
     while len(matrix) < order:
         matrix = torch.cat((torch.cat((matrix, matrix), 1), torch.cat((matrix, -matrix), 1)))
@@ -170,10 +171,10 @@ def _hadamard(order: int) -> Tensor:
 
 
 def _directions(count: int, shape: torch.Size, generator: torch.Generator) -> Tensor:
-    """[q, V, F] random signs, nearly orthogonal to each other: rows and columns drawn from a Hadamard matrix.
+    """[q, V, F] nearly orthogonal random signs: random rows and columns of a Hadamard matrix.
 
     Orthogonal directions estimate a gradient with less variance than independent ones (Choromanski et al. 2018, "Structured
-    Evolution with Compact Architectures"). `presence` gets 0: no budget moves it.
+    Evolution with Compact Architectures"). The entry of `presence` is 0, because it cannot be changed.
     """
     vehicles, features = shape[0], shape[1] - 1
     order = 1 << (max(count, vehicles * features) - 1).bit_length()

@@ -1,1 +1,1 @@
-"""Defences of a victim, one file a defence."""
+"""Defences of a victim, one file per defence."""

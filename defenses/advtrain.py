@@ -1,4 +1,4 @@
-"""Adversarial training with a skip probability (thesis, Algorithm 5 and section 4.4.4)."""
+"""Adversarial training of a driving policy with a skip probability (thesis, Algorithm 5 and section 4.4.4)."""
 
 from __future__ import annotations
 
@@ -31,37 +31,36 @@ from bench.victims import zoo
 from bench.victims.drivers.networks import ActorPolicy
 
 CHANGES_LANE = ("LANE_LEFT", "LANE_RIGHT")
-"""The discrete actions that consistency asks for with reluctance."""
+"""The discrete actions from which the consistency target subtracts `margin`."""
 TEMPERATURE = 0.5
-"""Of the decisions that consistency compares, in standard deviations of the Q-values over the actions."""
+"""Temperature of the decisions in the consistency loss, in standard deviations of the Q-values over the actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AdversarialTraining(DrivingDefense):
-    """The victim learns while it is attacked (thesis Algorithm 5; Madry et al. 2018 for the principle).
+    """Trains the victim under attack (thesis Algorithm 5; principle of Madry et al. 2018).
 
-    Each decision of the training is attacked, except that with probability `skip` the victim sees the truth. `skip=1` is the
-    control: the same training without an attack.
+    Each observation of the training is attacked, except with probability `skip`. `skip=1` is the control: the same training
+    without an attack.
 
     Args:
-        skip: probability that a decision is not attacked, in [0, 1].
-        attack: any registered attack.
+        skip: probability that an observation is not attacked, in [0, 1].
+        attack: any registered stateless attack on driving policies.
         attack_params: its parameters, as on the command line but separated by spaces.
-        norm: perturbation set of the attack in the loop, `relative` or `linf`.
-        budget: size of that set once the ramp is over.
-        start: `trained` goes on from the victim of the same training seed, `scratch` trains a new one.
-        decisions: of the further training, on every road at once; with `scratch` it is the victim's own.
-        consistency: weight, beside the victim's own loss, of deciding under attack what the victim it started from decides on
-            the truth (TRADES, Zhang et al. 2019); 0 is the thesis' algorithm. Nothing to be consistent with from `scratch`.
-        margin: subtracted from the lane-change values of that policy (1 is perfect driving for ever) in the consistency target.
-            A wrong lane change of one frame may be a crash, a delay of one frame costs nothing: an attack has to cross the
-            margin between the two. Discrete victims only.
-        where: `acting` attacks the observations it acts on, which the replay buffer keeps as they were then, as in the thesis;
-            `replay` attacks those drawn from the buffer, afresh against the policy as it is now; `both` does both.
-        ramp_from: share of the training after which the budget begins to grow from 0.
-        ramp_to: share of the training at which it is whole.
-        trained_in: parameters of the world it was trained in where they are not the default, for instance `vehicles=5`;
-            `bench train` sets it.
+        norm: perturbation set of the training attack, `relative` or `linf`.
+        budget: size of this set after the ramp.
+        start: `trained` continues from the victim of the same training seed, `scratch` trains a new one.
+        decisions: length of the training with `start=trained`, on every road at once; `scratch` uses the victim's own length.
+        consistency: weight of the consistency loss, which makes the decision under attack equal the decision of the start policy
+            on the true observation (TRADES, Zhang et al. 2019); 0 is the thesis' algorithm. Not used with `scratch`.
+        margin: amount subtracted from the start policy's lane-change values in the consistency target (a value of 1 is perfect
+            driving forever). A wrong lane change of one frame may cause a crash, a delay of one frame costs nothing. An attack
+            must cross this margin to cause a lane change. Discrete victims only.
+        where: `acting` attacks the observations on which the learner acts, and stores them in the replay buffer, as in the
+            thesis; `replay` attacks the observations drawn from the buffer, against the current policy; `both` does both.
+        ramp_from: share of the training after which the budget starts to grow from 0.
+        ramp_to: share of the training at which it reaches `budget`.
+        trained_in: non-default parameters of the training world, for instance `vehicles=5`; set by `bench train`.
     """
 
     skip: Share = 0.3
@@ -92,7 +91,7 @@ class AdversarialTraining(DrivingDefense):
         return zoo.load(zoo.Recipe.of(victim, self), seed, victim.policy_type)
 
     def train(self, victim: DrivingVictim, world: DrivingWorld, *, seed: int, progress: Progress) -> Trained[Policy]:
-        """Train the hardened policy of training seed `seed`: the victim's own training with the attack in its loop.
+        """Train the policy of training seed `seed`: the victim's own training with the attack in the loop.
 
         Raises:
             UserError: if the attack does not fit the victim, or `start=trained` and the zoo has no such victim.
@@ -100,7 +99,7 @@ class AdversarialTraining(DrivingDefense):
         attack = configured("attack", self.attack, parameter_words(self.attack_params)).component
         if not isinstance(attack, DrivingAttack) or type(attack).perturb is DrivingAttack.perturb:
             raise UserError(
-                f"adversarial training needs an attack on drivers without a memory, {self.attack!r} is none"
+                f"adversarial training needs a stateless attack on driving policies, {self.attack!r} is not one"
             )
         if misfit := attack.misfit(victim):
             raise UserError(f"attack {self.attack!r} does not fit the victim, {misfit}")
@@ -112,13 +111,13 @@ class AdversarialTraining(DrivingDefense):
 
 
 class AttackInLoop(TrainingHooks):
-    """Algorithm 5: each decision is attacked, except that it is skipped with probability `skip`; and the loss under attack.
+    """Algorithm 5: attack each observation, except with probability `skip`; and the loss under attack.
 
     Args:
         recipe: the defence.
-        attack: in the loop.
-        facts: of the world: features of the observation, names of the actions.
-        start: the policy to continue from and to stay consistent with; None trains from fresh weights.
+        attack: the training attack.
+        facts: facts of the world: features of the observation, names of the actions.
+        start: the policy to continue from, also the teacher of the consistency loss; None trains from fresh weights.
         seed: training seed.
     """
 
@@ -145,7 +144,7 @@ class AttackInLoop(TrainingHooks):
         return observation if self.recipe.where == "acting" else self.shown(observation, policy, share)
 
     def shown(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
-        """o' [B, V, F]: each row of the observation attacked with probability 1 - skip, at the budget of the ramp."""
+        """o' [B, V, F]: each of the B observations attacked with probability 1 - skip, with the current budget of the ramp."""
         recipe = self.recipe
         if recipe.skip >= 1 or share < recipe.ramp_from:
             return observation
@@ -159,7 +158,7 @@ class AttackInLoop(TrainingHooks):
         return result
 
     def perturbed(self, observation: Tensor, policy: Policy, scale: float = 1.0) -> Tensor:
-        """attack(policy, o) [B, V, F], within `scale` times the budget."""
+        """attack(policy, o) [B, V, F], with a budget multiplied by `scale`."""
         oracle = Oracle(policy, self.threat, self.attack.access, self.facts.features, self.noise)
         oracle.begin_step(observation, scale=scale)
         return oracle.project(self.attack.perturb(observation, oracle)).detach()
@@ -168,10 +167,10 @@ class AttackInLoop(TrainingHooks):
         return {"attacked": lambda observation: self.perturbed(observation, policy)} if self.recipe.skip < 1 else {}
 
     def loss(self, policy: Policy, sample: TensorDictBase, own: Callable[[TensorDictBase], Tensor]) -> Tensor:
-        """Discrete: the victim's own loss on (o', a, r, s'). Continuous: -Q(o, mu(o')), judged by a critic that knows the truth.
+        """Discrete: the victim's own loss on (o', a, r, s'). Continuous: -Q(o, mu(o')), with the critic on the true observation.
 
-        Consistency is added. For continuous actions it is asked for on the truth as well: asked for under attack alone, the
-        policy drives faster on the truth than the one it started from.
+        The consistency loss is added. For continuous actions it is added on the true observation as well; otherwise the policy
+        drives faster without attack than the start policy.
         """
         shown, truth = sample["observation"], sample["truth"]
         if policy.action_type == "discrete":
@@ -180,9 +179,9 @@ class AttackInLoop(TrainingHooks):
         return misled + self.inconsistency(policy, shown, truth) + self.inconsistency(policy, truth, truth)
 
     def inconsistency(self, policy: Policy, shown: Tensor, truth: Tensor) -> Tensor | float:
-        """How far the decisions on `shown` are from those of `start` on `truth`, times the weight; 0 without a `start`.
+        """The weighted consistency loss: decisions on `shown` compared with those of `start` on `truth`; 0 without `start`.
 
-        The regulariser of TRADES (Zhang et al. 2019, Eq. 5), with a teacher that stays as it is.
+        The regulariser of TRADES (Zhang et al. 2019, Eq. 5) with a fixed teacher.
         """
         if self.start is None or self.recipe.consistency == 0:
             return 0.0
@@ -196,19 +195,19 @@ class AttackInLoop(TrainingHooks):
 
 
 def divergence(values: Tensor, wanted: Tensor, margin: Tensor) -> Tensor:
-    """Mean KL divergence of the decisions softmax(Q / tau) from those wanted, softmax((Q_0 - margin) / tau).
+    """Mean KL divergence of the decisions softmax(Q / tau) from the target softmax((Q_0 - margin) / tau).
 
     Args:
-        values: Q [N, A] of the policy that is trained.
+        values: Q [N, A] of the policy in training.
         wanted: Q_0 [N, A]; tau is `TEMPERATURE` times its standard deviation over the actions.
         margin: [A], subtracted from `wanted`.
     """
     tau = TEMPERATURE * wanted.std(-1, keepdim=True).clamp(min=torch.finfo(wanted.dtype).tiny)
     decided = torch.log_softmax(values / tau, -1)
-    reluctant = torch.softmax((wanted - margin) / tau, -1)
-    return torch.nn.functional.kl_div(decided, reluctant, reduction="batchmean")
+    target = torch.softmax((wanted - margin) / tau, -1)
+    return torch.nn.functional.kl_div(decided, target, reduction="batchmean")
 
 
 def squared_distance(actions: Tensor, wanted: Tensor, limit: Tensor) -> Tensor:
-    """Mean squared distance of actions [N, 2] from those wanted, in shares of the largest action [2]."""
+    """Mean squared distance of actions [N, 2] from `wanted`, in units of the largest action `limit` [2]."""
     return ((actions - wanted) / limit).square().sum(-1).mean()

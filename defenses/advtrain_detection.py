@@ -1,4 +1,4 @@
-"""Adversarial training of a detector with a skip probability (thesis, Algorithm 5, for the patches of chapter 3)."""
+"""Adversarial training of a detector with a skip probability (thesis Algorithm 5, applied to the patches of chapter 3)."""
 
 from __future__ import annotations
 
@@ -31,34 +31,34 @@ from bench.victims.detectors.training import descend
 from bench.victims.detectors.windows import Views, Windows
 
 AWAY = 0.2
-"""Share of the windows that are anywhere in the picture, and not about the sign."""
+"""Share of the windows at uniformly random places; the others are near the sign."""
 SEEN = 0.5
-"""A sign that shows less is not one to be found."""
+"""A sign with a smaller visible share is not a target."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorAdversarialTraining(DetectorDefense):
-    """The detector goes on learning with patches on the signs (thesis Algorithm 5; Madry et al. 2018 for the principle).
+    """Fine-tunes the detector with patches on the signs (thesis Algorithm 5; principle of Madry et al. 2018).
 
-    In turns, a patch is crafted against the detector as it is, and the detector learns for a while on windows of the training
-    scenes whose signs wear the newest patches; with probability `skip` a sign is left as it is. It learns to find the sign in
-    spite of the patch, and to say of everything else what it said before, of the same window without a patch: no labels are
-    needed but the sign's box. `skip=1` is the control: the same training without a patch.
+    In each round a patch is crafted against the current detector; then the detector is trained on windows of the training scenes
+    with one of the newest patches on each sign. With probability `skip` a sign has no patch. The loss asks the detector to find
+    the sign despite the patch, and otherwise to keep its original predictions on the same window without a patch. The only label
+    is the sign's box. `skip=1` is the control: the same training without patches.
 
     Args:
-        skip: probability that a window is shown without a patch, in [0, 1].
+        skip: probability that a window has no patch, in [0, 1].
         attack: any registered patch attack.
         attack_params: its parameters, as on the command line but separated by spaces.
-        budget: side of the patches as a share of the sign's, in (0, 1].
-        rounds: how many patches are crafted.
-        updates: of the weights after each.
-        shown: how many of the newest patches are on the signs; half of the windows wear the very newest.
-        batch: windows an update.
-        window: their side in pixels, a multiple of the detector's stride.
-        learning_rate: of AdamW, the highest.
-        fidelity: weight of saying what it said before, beside that of finding the sign.
-        trained: which of the zoo's is loaded, by its training seed; the seeds of a run are those of the patches.
-        trained_in: parameters of the world it was trained in where they are not the default; `bench train` sets it.
+        budget: side of the patches as a share of the sign's side, in (0, 1].
+        rounds: number of crafted patches.
+        updates: weight updates per round.
+        shown: number of newest patches in use; half of the windows have the latest one.
+        batch: windows per update.
+        window: side of a window in pixels, a multiple of the detector's stride.
+        learning_rate: maximum learning rate of AdamW.
+        fidelity: weight of keeping the original predictions, relative to finding the sign.
+        trained: training seed of the zoo's detector; the seeds of a run are patch seeds.
+        trained_in: non-default parameters of the training world; set by `bench train`.
     """
 
     skip: Share = 0.3
@@ -86,11 +86,15 @@ class DetectorAdversarialTraining(DetectorDefense):
         return zoo.load(zoo.Recipe.of(victim, self), self.trained, lambda **_: victim.load(seed, facts))
 
     def train(self, victim: DetectorVictim, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
-        """Train the hardened detector of training seed `seed`."""
+        """Train the detector of training seed `seed`.
+
+        Raises:
+            UserError: if the attack crafts no patches.
+        """
         attack = configured("attack", self.attack, parameter_words(self.attack_params)).component
         if not isinstance(attack, PatchAttack):
             raise UserError(
-                f"attack {self.attack!r} makes no patches: adversarial training of a detector needs one that does"
+                f"attack {self.attack!r} makes no patches: adversarial training of a detector needs a patch attack"
             )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -108,7 +112,7 @@ class DetectorAdversarialTraining(DetectorDefense):
 
 
 class _Hardening:
-    """The loss of each update, and the patches that are crafted on the way."""
+    """The training loss, and the patches crafted during the training."""
 
     def __init__(
         self,
@@ -127,7 +131,7 @@ class _Hardening:
         self.patches: list[Tensor] = []
 
     def loss(self, update: int) -> Tensor:
-        """Of one update; before the first of each round a patch is crafted."""
+        """The loss of one update; the first update of each round crafts a patch."""
         if update % self.recipe.updates == 0 and self.recipe.skip < 1:
             self.patches = [*self.patches, self._crafted(update // self.recipe.updates)][-self.recipe.shown :]
         views = self.windows.draw(self.recipe.batch)
@@ -135,14 +139,14 @@ class _Hardening:
         shown = self._patched(views, plain)
         shown, plain = self.windows.lit(shown, plain)
         with torch.no_grad():
-            before = self.teacher(plain)
-        now = self.detector(shown)
+            original = self.teacher(plain)
+        current = self.detector(shown)
         boxes = views.boxes(self.scenes.boxes[views.frames], self.recipe.window)
-        there = (self.scenes.visible[views.frames] >= SEEN) & ((boxes >= 0) & (boxes <= self.recipe.window)).all(1)
-        return self.recipe.fidelity * unlike(now, before) + (missed(now, self.label, boxes) * there).mean()
+        visible = (self.scenes.visible[views.frames] >= SEEN) & ((boxes >= 0) & (boxes <= self.recipe.window)).all(1)
+        return self.recipe.fidelity * unlike(current, original) + (missed(current, self.label, boxes) * visible).mean()
 
     def _crafted(self, number: int) -> Tensor:
-        """Patch `number`, against the detector as it is now."""
+        """Craft patch `number` against the current detector."""
 
         def tell(share: float, text: str) -> None:
             self.progress(number / self.recipe.rounds, f"patch {number + 1}, {share:.0%}: {text}")
@@ -156,7 +160,7 @@ class _Hardening:
         return threat.project(patch)[0]
 
     def _patched(self, views: Views, plain: Tensor) -> Tensor:
-        """The windows, with patches on the signs of those that are not skipped."""
+        """The windows, with patches on the signs except where skipped."""
         attacked = torch.rand(len(plain), generator=self.generator) >= self.recipe.skip
         if not attacked.any():
             return plain

@@ -27,19 +27,19 @@ class _Compressed(Guarded):
         return torch.from_numpy(through).permute(0, 3, 1, 2).to(pictures) / 255
 
     def _through(self, picture: np.ndarray) -> np.ndarray:
-        """[H, W, 3] uint8 RGB, written as JPEG and read again."""
-        _, written = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.quality])
-        found = cv2.imdecode(written, cv2.IMREAD_COLOR)
-        assert found is not None
-        return np.ascontiguousarray(found[..., ::-1])
+        """Encode an image [H, W, 3], uint8 RGB, as JPEG and decode it."""
+        _, encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.quality])
+        decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+        assert decoded is not None
+        return np.ascontiguousarray(decoded[..., ::-1])
 
 
 @dataclass(frozen=True, kw_only=True)
 class JPEG(DetectorDefense):
-    """The detector sees the picture after JPEG compression (Das et al. 2018, "SHIELD").
+    """JPEG compression of the detector's input (Das et al. 2018, "SHIELD").
 
     Args:
-        quality: of the compression, from 1 to 100 (default 40).
+        quality: quality of the compression, from 1 to 100 (default 40).
     """
 
     quality: Annotated[int, Interval(ge=1, le=100)] = 40

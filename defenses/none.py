@@ -1,4 +1,4 @@
-"""No defence: the victim as it was trained."""
+"""No defence: the unchanged victim."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bench.plugins.contracts import Defense, Facts, Victim
 
 @dataclass(frozen=True, kw_only=True)
 class NoDefense(Defense):
-    """Leaves the victim as it is, on every track."""
+    """Leaves the victim unchanged, on every track."""
 
     track: ClassVar[str] = "any"
 

@@ -1,4 +1,4 @@
-"""Input transformations before a detector: what a patch needs in fine detail does not come through."""
+"""Input transformations for detectors, which remove fine detail that a patch may need."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from bench.plugins.contracts import Facts
 
 
 class Guarded(Detector):
-    """A detector behind a transformation of its pictures.
+    """A detector with an input transformation.
 
-    The gradient goes straight through the transformation (BPDA, Athalye et al. 2018, "Obfuscated gradients give a false sense
-    of security"), so that an attack that knows of it can adapt.
+    The gradient of the transformation is the identity (BPDA, Athalye et al. 2018, "Obfuscated gradients give a false sense of
+    security"), so that adaptive attacks are possible.
     """
 
     def __init__(self, inner: Detector) -> None:
@@ -27,12 +27,12 @@ class Guarded(Detector):
 
     def predict(self, pictures: Tensor) -> Predictions:
         with torch.no_grad():
-            lost = self.transform(pictures) - pictures
-        return self.inner.predict(pictures + lost)
+            change = self.transform(pictures) - pictures
+        return self.inner.predict(pictures + change)
 
     @abstractmethod
     def transform(self, pictures: Tensor) -> Tensor:
-        """Pictures [N, 3, H, W] in [0, 1] as the detector shall see them."""
+        """Transform images [N, 3, H, W] in [0, 1]."""
 
 
 class _Median(Guarded):
@@ -48,7 +48,7 @@ class _Median(Guarded):
 
 @dataclass(frozen=True, kw_only=True)
 class MedianSmoothing(DetectorDefense):
-    """Every pixel becomes the median of those around it (Xu et al. 2018, "Feature squeezing", section 4.2), colour by colour.
+    """A median filter on each colour channel of the detector's input (Xu et al. 2018, "Feature squeezing", section 4.2).
 
     Args:
         size: side of the neighbourhood in pixels, odd, from 3 to 11 (default 3).

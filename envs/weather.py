@@ -1,4 +1,4 @@
-"""Weather and light, in physical units: what the sensors of every world look through."""
+"""Weather and light in physical units, shared by the sensors of all worlds."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ class Weather:
     """The air between a sensor and the road, in the units a weather station reports.
 
     Args:
-        name: how tables and command lines call it.
-        visibility_m: meteorological optical range in metres (the distance at which contrast falls to 5 %); inf is clean air.
-        precipitation_mm_h: rain rate in millimetres an hour.
-        sun_elevation_deg: height of the sun over the horizon in degrees; below 0 is night. Only cameras look at it.
+        name: name in tables and on the command line.
+        visibility_m: meteorological optical range in metres (the distance at which contrast falls to 5 %); inf for clear air.
+        precipitation_mm_h: rain rate in mm/h.
+        sun_elevation_deg: elevation of the sun above the horizon in degrees; below 0 is night. Only cameras use it.
 
     Raises:
         ValueError: if a quantity is outside its physical range.
@@ -35,7 +35,7 @@ class Weather:
 
     @property
     def extinction_per_m(self) -> float:
-        """Optical extinction coefficient in 1/m: Koschmieder's law for the visibility, plus the rain's own.
+        """Optical extinction coefficient in 1/m: Koschmieder's law for the visibility, plus the extinction of rain.
 
         Koschmieder at the 5 % contrast of the meteorological optical range: sigma = 3.0 / visibility. Rain: 1.076 R^0.67 dB/km
         (Carbonneau and Wisely 1998, adopted by ITU-R P.1814).

@@ -134,7 +134,7 @@ def test_the_page_says_what_the_recording_is_of(path: Path) -> None:
     text = next(page.column(name)[0].as_py()[0] for name in page.schema.names if name.endswith("text"))
     assert "### dqn under noise · lanes 3, density 1, clear · seed 1000000" in text
     assert "**drove to the end** after 16 steps (1.1 s)" in text
-    assert "**threat model** relative 0.1, access scores, at most 100 queries a step" in text
+    assert "**threat model** relative 0.1, access scores, at most 100 queries per step" in text
 
 
 def test_ghosts_stand_where_the_perturbation_puts_them(path: Path) -> None:

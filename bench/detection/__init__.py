@@ -1,4 +1,4 @@
-"""The detection track: detectors that look for a stop sign, attacked by a patch on it. What plug-ins need is here."""
+"""The detection track: stop-sign detectors, attacked with a patch on the sign. Plug-ins import from here."""
 
 from bench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
 from bench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions

@@ -1,4 +1,4 @@
-"""A defended detector on approaches to a stop sign, with a patch on the sign: what it sees, and what comes of it."""
+"""Score a defended detector on approaches to a stop sign that may have a patch on it."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from bench.detection.scenes import Approach, Scenes
 Columns = dict[str, NDArray[np.generic]]
 
 BATCH = 16
-"""Frames looked at at once."""
+"""Frames per forward pass."""
 SAME_CONFIDENCE = 0.01
-"""Confidences no farther apart than this are the same answer."""
+"""Two confidences count as the same answer if they differ by at most this."""
 NMS_IOU, SAME_IOU = 0.45, 0.3
-"""Of non-maximum suppression (YOLOv5's default), and from which a detection is of the sign itself (`boxes.confidence`)."""
+"""IoU of non-maximum suppression (YOLOv5's default), and smallest IoU at which a detection is the sign (`boxes.confidence`)."""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What a detector says of the F frames of an approach.
+    """The output of a detector on the F frames of an approach.
 
     Args:
-        confidence: float32 [F] in the sign at its true place, in [0, 1]; 0 where it has no box there.
-        found: the stop signs that it detects in each frame.
+        confidence: float32 [F], confidence in the sign at its true place, in [0, 1]; 0 without a box there.
+        found: the stop signs detected in each frame.
     """
 
     confidence: NDArray[np.float32]
@@ -41,14 +41,14 @@ class Sight:
 
 @dataclass(frozen=True)
 class Sighting:
-    """An approach as it was scored, and as it would have been without the patch.
+    """The detector's output on an approach, with and without the patch.
 
     Args:
-        approach: what was driven up to.
-        patch: what was on the sign; None leaves it alone.
-        share: side of the patch in shares of the sign's.
-        shown: what was scored.
-        clean: the same without the patch; None where there is none.
+        approach: the approach.
+        patch: the patch on the sign; None for no patch.
+        share: side of the patch as a share of the sign's side.
+        shown: the output that was scored.
+        clean: the output without the patch; None if there is no patch.
     """
 
     approach: Approach
@@ -59,13 +59,13 @@ class Sighting:
 
     @property
     def texels(self) -> Tensor | None:
-        """The patch, where there is one."""
+        """The patch [3, P, P]; None if there is none."""
         return self.patch.texels if self.patch else None
 
 
 @dataclass(frozen=True)
 class Trace:
-    """A few approaches of a unit, for recordings: `sightings` has one for each of `episodes`, which count its seeds."""
+    """Some approaches of a unit, for recordings: `episodes` are indices into its seeds, `sightings` has one item for each."""
 
     episodes: Sequence[int]
     sightings: list[Sighting] = field(default_factory=list)
@@ -79,14 +79,14 @@ def score(
     share: float,
     trace: Trace | None = None,
 ) -> Columns:
-    """Show a detector every frame of A approaches and return the measurements, [A] each.
+    """Run a detector on every frame of A approaches and return the measurements, [A] each.
 
     Args:
         detector: the (defended) victim.
-        approaches: what is driven up to.
-        patch: what is on the sign; None for nothing.
-        share: side of the patch in shares of the sign's.
-        trace: filled with what was seen on its episodes.
+        approaches: the approaches.
+        patch: the patch on the sign; None for no patch.
+        share: side of the patch as a share of the sign's side.
+        trace: collects the detector's output on its episodes.
     """
     texels = patch.texels if patch else None
     with torch.no_grad():
@@ -116,13 +116,13 @@ def score(
 
 
 def look(detector: Detector, scenes: Scenes, texels: Tensor | None, share: float) -> Sight:
-    """What the detector says of each frame.
+    """Run the detector on each frame.
 
     Args:
         detector: the (defended) victim.
         scenes: F frames.
-        texels: the patch [3, P, P]; None leaves the sign alone.
-        share: side of the patch in shares of the sign's.
+        texels: the patch [3, P, P]; None for no patch.
+        share: side of the patch as a share of the sign's side.
     """
     label = detector.index(STOP_SIGN)
     patches = texels.unsqueeze(0) if texels is not None else None
@@ -137,28 +137,28 @@ def look(detector: Detector, scenes: Scenes, texels: Tensor | None, share: float
 
 @torch.no_grad()
 def probed(detector: Detector, scenes: Scenes) -> dict[str, float]:
-    """Whether a detector says the same of the nearest frame twice, and of a grey picture what it says of that frame."""
+    """Whether the detector's answer on the nearest frame is random, and whether it is the same as on a grey image."""
     label, last = detector.index(STOP_SIGN), torch.tensor([len(scenes) - 1])
-    picture, box = scenes.render(last, None, 0.0), scenes.boxes[last]
+    image, box = scenes.render(last, None, 0.0), scenes.boxes[last]
     with torch.random.fork_rng(devices=[]):
-        asked = [detector(each) for each in (picture, picture, torch.full_like(picture, 0.5))]
-    first, again, grey = (confidence(each, label, box.to(each.boxes), iou=SAME_IOU) for each in asked)
+        outputs = [detector(probe) for probe in (image, image, torch.full_like(image, 0.5))]
+    first, again, grey = (confidence(output, label, box.to(output.boxes), iou=SAME_IOU) for output in outputs)
     return {"redrawn": float(first != again), "same_answer": float((first - grey).abs() <= SAME_CONFIDENCE)}
 
 
 def found_of(predictions: Predictions, label: int) -> list[Detections]:
-    """The objects of one class that are detected in each picture."""
+    """The objects of one class detected in each image."""
     only = replace(predictions, classes=predictions.classes[..., label : label + 1])
     return detections(only, threshold=stopping.THRESHOLD, iou=NMS_IOU)
 
 
 def false_alarms(found: Sequence[Detections], boxes: Tensor) -> NDArray[np.int64]:
-    """[N] detections in each picture that are not of the object at `boxes` [N, 4]."""
+    """[N] number of detections in each image that are not the object at `boxes` [N, 4]."""
     return np.array([int((overlap(one.boxes, box) < SAME_IOU).sum()) for one, box in zip(found, boxes, strict=True)])
 
 
 def measured(seen: Sequence[Sight], scenes: Sequence[Scenes]) -> Columns:
-    """What is made of what was seen on A approaches, [A] each."""
+    """The measurements of A approaches, [A] each."""
     frames = {name: np.stack([getattr(one, name) for one in scenes]) for name in ("distance", "visible")}
     alarms = [false_alarms(sight.found, one.boxes).mean() for sight, one in zip(seen, scenes, strict=True)]
     return {
@@ -172,12 +172,12 @@ def measured(seen: Sequence[Sight], scenes: Sequence[Scenes]) -> Columns:
 
 
 def measure(confidence: stopping.Array, distance_m: stopping.Array, visible: stopping.Array) -> Columns:
-    """What is made of the frames of A approaches, [A] each; frames in the order they are driven through.
+    """The measurements of A approaches, [A] each, except false alarms; frames in driving order.
 
     Args:
-        confidence: [A, F] in the sign at its true place, in [0, 1]; 0 where the detector has no box there.
-        distance_m: [A, F] to the sign.
-        visible: [A, F] share of the sign that is to be seen.
+        confidence: [A, F], confidence in the sign at its true place, in [0, 1]; 0 without a box there.
+        distance_m: [A, F], distance to the sign in m.
+        visible: [A, F], visible share of the sign.
     """
     detected = confidence > stopping.THRESHOLD
     confirmed_m = stopping.first(stopping.confirmed(detected), distance_m)
@@ -197,7 +197,7 @@ def measure(confidence: stopping.Array, distance_m: stopping.Array, visible: sto
 
 
 def check_approaches(approaches: Sequence[Approach], seeds: range, world: str) -> None:
-    """Raise ValueError unless a world gives an approach a seed, all of one number of frames, farthest first."""
+    """Raise ValueError unless there is one approach per seed, all have the same number of frames, and the farthest is first."""
     if [approach.seed for approach in approaches] != list(seeds):
         raise ValueError(f"{world}.approaches gave seeds {[a.seed for a in approaches]}, asked for {list(seeds)}")
     if len({len(approach.scenes) for approach in approaches}) != 1:

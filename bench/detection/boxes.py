@@ -1,4 +1,4 @@
-"""What is made of a detector's predictions: objects after non-maximum suppression, and the confidence in one of them."""
+"""Post-processing of a detector's predictions: non-maximum suppression, and the confidence in one object."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bench.detection.detector import Detections, Predictions
 
 
 def overlap(a: Tensor, b: Tensor) -> Tensor:
-    """Intersection over union of boxes [..., 4] and [..., 4], broadcast, in [0, 1]; 0 where neither has an area."""
+    """Intersection over union of boxes [..., 4] and [..., 4], broadcast, in [0, 1]; 0 if neither has an area."""
     low, high = torch.maximum(a[..., :2], b[..., :2]), torch.minimum(a[..., 2:], b[..., 2:])
     intersection = (high - low).clamp(min=0).prod(-1)
     union = _area(a) + _area(b) - intersection
@@ -22,14 +22,14 @@ def _area(boxes: Tensor) -> Tensor:
 
 @torch.no_grad()
 def detections(predictions: Predictions, *, threshold: float, iou: float) -> list[Detections]:
-    """The objects in each picture, after greedy non-maximum suppression within each class.
+    """The objects in each image, after greedy non-maximum suppression within each class.
 
-    A box may be found as more than one class. The time grows with the number of boxes kept, so with a falling threshold.
+    A box can have more than one class. A lower threshold keeps more boxes and takes longer.
 
     Args:
-        predictions: of N pictures.
-        threshold: a score must be above it, in [0, 1].
-        iou: a box that overlaps a better one of its class by more than this is dropped, in [0, 1].
+        predictions: predictions on N images.
+        threshold: scores must be above it, in [0, 1].
+        iou: a box is dropped if it overlaps a better box of its class by more than this, in [0, 1].
     """
     return [
         _suppressed(boxes, scores, threshold, iou)
@@ -38,7 +38,7 @@ def detections(predictions: Predictions, *, threshold: float, iou: float) -> lis
 
 
 def _suppressed(boxes: Tensor, scores: Tensor, threshold: float, iou: float) -> Detections:
-    """Of one picture: boxes [K, 4], scores [K, C]."""
+    """`detections` for one image: boxes [K, 4], scores [K, C]."""
     place, labels = (scores > threshold).nonzero(as_tuple=True)
     order = scores[place, labels].argsort(descending=True, stable=True)
     place, labels = place[order], labels[order]
@@ -55,17 +55,17 @@ def _suppressed(boxes: Tensor, scores: Tensor, threshold: float, iou: float) -> 
 
 @torch.no_grad()
 def confidence(predictions: Predictions, label: int, boxes: Tensor, *, iou: float = 0.3) -> Tensor:
-    """The best score [N] of a class at the object's true place; 0 where no prediction lies there.
+    """The best score [N] of a class at the object's true place; 0 if there is no prediction.
 
-    The default of `iou` is that of a box moved by half its width: what YOLOv3-tiny says of a stop sign that nobody attacks
-    overlaps it by 0.75 and more, and an attack shall make the sign go away, not nudge its box.
+    The default of `iou` allows a box to be shifted by half its width: an attack must hide the sign, not shift its box.
+    YOLOv3-tiny's boxes of a clean stop sign have an IoU of at least 0.75.
 
     Args:
-        predictions: of N pictures.
-        label: of the class.
-        boxes: [N, 4], the true box in each picture.
-        iou: how much a prediction must overlap the true box to count.
+        predictions: predictions on N images.
+        label: label of the class.
+        boxes: [N, 4], the true box in each image.
+        iou: smallest IoU with the true box at which a prediction counts.
     """
-    there = overlap(predictions.boxes, boxes.unsqueeze(1)) >= iou
-    scores = predictions.scores_of(label) * there
+    matches = overlap(predictions.boxes, boxes.unsqueeze(1)) >= iou
+    scores = predictions.scores_of(label) * matches
     return nn.functional.pad(scores, (0, 1)).amax(-1)

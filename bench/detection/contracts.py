@@ -1,4 +1,4 @@
-"""The base classes of the detection track: World, Victim, Attack and Defense of a detector that looks for a stop sign."""
+"""The base classes of the detection track: world, victim, attack and defence of a stop-sign detector."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from bench.scenarios import Cell
 
 
 class CameraWorld(World):
-    """Streets with a stop sign, rendered. What is scored is never shown to anyone who crafts or trains."""
+    """Rendered streets with a stop sign. Attacks and trainings never see the scored approaches."""
 
     track: ClassVar[str] = "detection"
     locations: ClassVar[tuple[str, ...]]
     """Names of the places; scenario seed s is driven at `locations[s % len(locations)]`."""
     classes: ClassVar[tuple[str, ...]] = (STOP_SIGN,)
-    """Of what there is to find in its scenes (`Scenes.objects`)."""
+    """Names of the object classes in its scenes (`Scenes.objects`)."""
 
     @abstractmethod
     def training_scenes(self) -> Scenes:
-        """All that crafting a patch or hardening a detector may look at."""
+        """The scenes for crafting patches and training detectors; nothing else may be used."""
 
     @abstractmethod
     def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
-        """One held-out approach a seed, all of the same number of frames.
+        """One held-out approach per seed, all with the same number of frames.
 
         Args:
-            cell: lanes (how far the sign stands from the ego's), traffic density (cars, which may hide it), weather.
+            cell: lanes (lateral distance to the sign), traffic density (cars may hide the sign), weather.
             seeds: scenario seeds.
         """
 
     def render(self, out: Path | None, progress: Progress) -> list[Path]:
-        """Make the frames of this world anew, going on where it was broken off, and return the files.
+        """Render the frames of this world and return the files; an interrupted rendering is resumed.
 
         Args:
-            out: folder for them; None for the world's own.
-            progress: called with the share done and what is being rendered.
+            out: output folder; None for the world's own folder.
+            progress: called with the finished share and the name of the current part.
         """
         raise NotImplementedError(f"{type(self).__name__} has nothing to render")
 
@@ -57,7 +57,7 @@ class DetectorVictim(Victim):
 
     @property
     def seeded(self) -> bool:
-        """Whether `load` gives another detector for another seed; one that does not leaves the seeds of a run to the patches."""
+        """Whether the detector depends on the training seed; if not, the seeds of a run are patch seeds only."""
         return False
 
     @abstractmethod
@@ -66,10 +66,10 @@ class DetectorVictim(Victim):
 
         Args:
             seed: training seed.
-            facts: of the world it is going to be used in.
+            facts: facts of the world in which it will be used.
 
         Raises:
-            UserError: if its weights are not there or not what they should be.
+            UserError: if its weights are missing or have the wrong hash.
         """
 
     def train(self, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
@@ -84,29 +84,29 @@ class DetectorDefense(Defense):
 
     @abstractmethod
     def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
-        """The defended detector: hardened, from the zoo, or one that transforms the pictures first.
+        """The defended detector: adversarially trained and loaded from the zoo, or wrapped to transform its input.
 
-        A transformation without a useful gradient should have a straight-through one (Athalye et al. 2018): an attack that
-        runs into a wall by accident proves nothing.
+        A transformation without a useful gradient should use a straight-through one (Athalye et al. 2018): obfuscated
+        gradients are no evidence of robustness.
         """
 
 
 class PatchAttack(Attack):
-    """Makes a patch for the middle of the sign, once, from training scenes; it is scored on approaches it never saw."""
+    """Crafts one patch for the middle of the sign on training scenes; the patch is scored on held-out approaches."""
 
     track: ClassVar[str] = "detection"
     seeded: ClassVar[bool] = True
-    """Whether its patch depends on the patch seed; one that does not is crafted for one seed only."""
+    """Whether its patch depends on the patch seed; if not, it is crafted for one seed only."""
 
     @abstractmethod
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor | None:
-        """The patch [3, P, P] sRGB in [0, 1], P from 8 to 512; None leaves the sign alone.
+        """The patch [3, P, P] sRGB in [0, 1], P from 8 to 512; None for no patch.
 
-        Its width is `oracle.threat.budget` times the sign's: what `scenes.render` takes as `share`.
+        Its side is `oracle.threat.budget` times the sign's: pass it to `scenes.render` as `share`.
 
         Args:
-            oracle: the only door to the detector; it holds the label to hide (`label`), the query budget (`remaining`) and the
-                random generator (`generator`), and can be shown how the patch comes about (`report`).
-            scenes: to craft on.
-            progress: told how far it is.
+            oracle: the only access to the detector; it holds the label to hide (`label`), the query budget (`remaining`) and
+                the random generator (`generator`), and records intermediate patches (`report`).
+            scenes: the scenes to craft on.
+            progress: called with the finished share.
         """

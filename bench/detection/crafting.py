@@ -1,4 +1,4 @@
-"""Crafts a patch: an attack on a defended detector, on the training scenes of a world."""
+"""Craft a patch: run an attack on a defended detector with the training scenes of a world."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def craft(
 
     Args:
         attack: the attack.
-        detector: its victim.
-        scenes: to craft on.
-        threat: enforced on the attack.
-        attack_seed: of the attack's random generator.
-        progress: told how far it is.
+        detector: the (defended) victim.
+        scenes: the scenes to craft on.
+        threat: threat model, enforced on the attack.
+        attack_seed: seed of the attack's random generator.
+        progress: called with the finished share.
 
     Raises:
-        UserError: if the attack asks for too much, returns what is no patch, or changes the detector's weights.
+        UserError: if the attack exceeds the threat model, returns no valid patch, or changes the detector's weights.
     """
     generator = torch.Generator().manual_seed(attack_seed)
     oracle = PatchOracle(detector, threat, attack.access, generator)
@@ -60,7 +60,7 @@ def craft(
 
 
 def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
-    """The file of the patch of a job's pair and training seed (`bench.detection.patch`)."""
+    """Craft the patch of a job's pair and training seed; return the content of its file (`bench.detection.patch`)."""
     pair = job.pair
     attack, world, threat = pair.attack.component, pair.world.component, pair.threat
     assert isinstance(attack, PatchAttack)

@@ -1,6 +1,6 @@
-"""A detector: pictures to boxes with scores, differentiable to the pixel.
+"""Object detectors: images to boxes with scores, differentiable in the pixels.
 
-A box is [x1, y1, x2, y2] in pixels of the picture given: x to the right, y down, from the outer corner of the first pixel.
+A box is [x1, y1, x2, y2] in pixels of the image: x to the right, y down, from the outer corner of the first pixel.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from bench.plugins.registry import unknown
 
 @dataclass(frozen=True)
 class Predictions:
-    """Everything a detector says of N pictures before anything is thrown away, with the graph back to the pixels.
+    """All predictions of a detector on N images, before any filtering, with the graph back to the pixels.
 
     Args:
-        boxes: [N, K, 4] in pixels; they may reach beyond the picture.
-        objectness: [N, K] in [0, 1], the probability that there is an object at all.
-        classes: [N, K, C] in [0, 1], the probability of each class if there is one; they need not sum to 1.
+        boxes: [N, K, 4] in pixels; they may extend beyond the image.
+        objectness: [N, K] in [0, 1], the probability that there is an object.
+        classes: [N, K, C] in [0, 1], the probability of each class given an object; they need not sum to 1.
     """
 
     boxes: Tensor
@@ -35,7 +35,7 @@ class Predictions:
         return self.objectness.unsqueeze(-1) * self.classes
 
     def scores_of(self, label: int) -> Tensor:
-        """[N, K] the scores of one class, without those of the others."""
+        """[N, K] the scores of one class, without computing the other classes."""
         return self.objectness * self.classes[..., label]
 
 
@@ -45,7 +45,7 @@ STOP_SIGN = "stop sign"
 
 @dataclass(frozen=True)
 class Objects:
-    """What there is to find in a picture: boxes [K, 4] in pixels, and the name of the class of each."""
+    """The true objects in an image: boxes [K, 4] in pixels, and the class name of each."""
 
     boxes: Tensor
     names: tuple[str, ...]
@@ -53,7 +53,7 @@ class Objects:
 
 @dataclass(frozen=True)
 class Detections:
-    """The objects found in one picture, best first: boxes [M, 4] in pixels, scores [M] in [0, 1], labels int64 [M]."""
+    """The objects detected in one image, best first: boxes [M, 4] in pixels, scores [M] in [0, 1], labels int64 [M]."""
 
     boxes: Tensor
     scores: Tensor
@@ -61,29 +61,29 @@ class Detections:
 
 
 class Detector(nn.Module, ABC):
-    """An object detector whose every picture of a batch is looked at by itself."""
+    """An object detector; the images of a batch do not influence each other."""
 
     names: tuple[str, ...]
-    """Of the classes, by label."""
+    """Class names, by label."""
     stride: int
-    """Height and width of a picture must be multiples of it."""
+    """Height and width of an image must be multiples of it."""
     weights_sha256: str = ""
-    """Hash of the weights file it was loaded from; empty where there is none."""
+    """Hash of the detector's weights file; empty if there is none."""
     half_precision: ClassVar[bool] = True
     """Whether the zoo stores its kernels in half precision."""
 
     @abstractmethod
     def predict(self, pictures: Tensor) -> Predictions:
-        """What `forward` returns, for pictures whose shape is right."""
+        """`forward` for images that have a valid shape."""
 
     def forward(self, pictures: Tensor) -> Predictions:
-        """All predictions for a batch of pictures.
+        """All predictions for a batch of images.
 
         Args:
             pictures: float [N, 3, H, W], sRGB in [0, 1], H and W multiples of `stride`.
 
         Raises:
-            ValueError: if the shape is another.
+            ValueError: if the shape is wrong.
         """
         if pictures.ndim != 4 or pictures.shape[1] != 3 or any(side % self.stride for side in pictures.shape[2:]):
             wanted = f"[N, 3, H, W] with H and W multiples of {self.stride}"
@@ -94,7 +94,7 @@ class Detector(nn.Module, ABC):
         """The label of a class.
 
         Raises:
-            UserError: if the detector knows no such class.
+            UserError: if the detector does not have this class.
         """
         if name not in self.names:
             raise UserError(unknown(f"class {name!r}", name, self.names))

@@ -1,4 +1,4 @@
-"""The work of the detection track: a defended detector on every approach of a cell, with the patch on the sign."""
+"""The work of the detection track: run a defended detector on every approach of a cell, with the patch on the sign."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bench.plugins.track import Driven, Job
 
 
 def drive(job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
-    """The measurements of a job's approaches, [A] each (`bench.detection.approach.score`).
+    """Run a job's approaches and return the measurements, [A] each (`bench.detection.approach.score`).
 
     Args:
-        job: what to drive up to.
-        artefact: the file of the patch; None where there is none.
-        traced: scenario seeds of the approaches that a recording is wanted of.
+        job: the job.
+        artefact: content of the patch file; None if there is no patch.
+        traced: scenario seeds of the approaches to record.
     """
     pair, world = job.pair, job.pair.world.component
     assert isinstance(world, CameraWorld)
@@ -41,5 +41,5 @@ def _patch(artefact: bytes, fingerprint: str) -> Patch:
         return Patch.read(artefact)
     except UserError as error:
         raise UserError(
-            f"the patch {fingerprint}.safetensors is {error}; delete it and run again to craft it anew"
+            f"the patch {fingerprint}.safetensors is {error}; delete it and run again to craft a new one"
         ) from error

@@ -1,4 +1,4 @@
-"""The only door of a patch attack to the detector: it enforces the access level and the query budget."""
+"""A patch attack's only access to the detector; enforces the access level and the query budget."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from bench.plugins.contracts import Access, QueryBudgetError, permit
 
 
 class PatchOracle:
-    """The only door to the (defended) detector while a patch is crafted. A picture asked about is a query.
+    """The only access to the (defended) detector while a patch is crafted. One image is one query.
 
-    `spent` counts the pictures asked about, `backwards` those whose gradient was taken, `zeros` those where it was 0 everywhere.
+    `spent` counts the queries, `backwards` the images whose gradient was computed, `zeros` the gradients that were 0 everywhere.
 
     Args:
         detector: the victim.
         threat: the threat model.
-        access: what the attack declared it needs; more than that is refused.
-        generator: the run's random generator, for attacks that draw.
+        access: the access level that the attack declares; calls above it are refused.
+        generator: the run's random generator, for randomised attacks.
     """
 
     def __init__(self, detector: Detector, threat: PatchThreat, access: Access, generator: torch.Generator) -> None:
@@ -37,17 +37,17 @@ class PatchOracle:
 
     @property
     def remaining(self) -> int:
-        """Pictures it may still be asked about."""
+        """Number of queries left."""
         return self.threat.queries - self.spent
 
     @torch.no_grad()
     def predict(self, pictures: Tensor) -> Predictions:
-        """What the detector says of pictures [N, 3, H, W] sRGB in [0, 1], without a graph; needs access `scores`."""
+        """The detector's predictions on images [N, 3, H, W] sRGB in [0, 1], without a graph; needs access `scores`."""
         self._spend(len(pictures), "scores")
         return self._detector(pictures)
 
     def differentiable(self, pictures: Tensor) -> Predictions:
-        """What the detector says of pictures [N, 3, H, W], with the graph back to the pixels; needs access `gradients`."""
+        """The detector's predictions on images [N, 3, H, W], with the graph back to the pixels; needs access `gradients`."""
         self._spend(len(pictures), "gradients")
         asked = pictures.view_as(pictures)
         if asked.requires_grad:
@@ -55,16 +55,16 @@ class PatchOracle:
         return self._detector(asked)
 
     def report(self, patch: Tensor, **losses: Tensor | float) -> None:
-        """Show how far the patch is, for recordings: `oracle.report(patch, found=loss)`, once a step of the crafting.
+        """Report an intermediate patch for recordings, once per crafting step: `oracle.report(patch, found=loss)`.
 
-        Optional, no query, and without effect on the result. A few of the steps are kept, evenly apart.
+        Optional; costs no query and does not change the result. At most `MOMENTS` evenly spaced steps are kept.
 
         Args:
-            patch: [3, P, P] as `PatchAttack.craft` returns it, of one size throughout.
-            losses: what the patch of this step scores, by names of the attack's choosing.
+            patch: [3, P, P] as `PatchAttack.craft` returns it; the size must not change.
+            losses: losses of this patch; the attack chooses the names.
 
         Raises:
-            UserError: if the shape is another.
+            UserError: if the shape is wrong or has changed.
         """
         if self._reports % self._every == 0:
             texels = (255 * self.threat.project(patch)[0]).round().to(torch.uint8)
@@ -80,7 +80,7 @@ class PatchOracle:
 
     @property
     def evolution(self) -> Evolution | None:
-        """What was reported; None if nothing was."""
+        """The reported patches and losses; None if nothing was reported."""
         if not self._moments:
             return None
         steps, texels, losses = zip(*self._moments, strict=True)
@@ -99,6 +99,6 @@ class PatchOracle:
         permit(access, self._access)
         if pictures > self.remaining:
             raise QueryBudgetError(
-                f"the attack asked about {self.spent + pictures} pictures, the threat model allows {self.threat.queries}"
+                f"the attack asked about {self.spent + pictures} images, the threat model allows {self.threat.queries}"
             )
         self.spent += pictures

@@ -1,4 +1,4 @@
-"""A crafted patch, how it came about and what it cost, and the safetensors file that it is kept in."""
+"""A crafted patch with its cost and the history of its crafting, and the safetensors file that stores them."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from torch import Tensor
 from bench.errors import UserError
 
 MOMENTS = 20
-"""Most that are kept of how a patch came about."""
+"""Largest number of crafting steps kept in an `Evolution`."""
 MEASURED = ("queries", "gradients", "zero_gradients", "seconds", "excess")
 LOSS = "loss."
 
 
 @dataclass(frozen=True)
 class Evolution:
-    """How a patch came about: K moments of its crafting, at most `MOMENTS` and evenly apart.
+    """The history of a crafting: K evenly spaced steps, at most `MOMENTS`.
 
     Args:
         steps: int64 [K], counted from 0.
         texels: uint8 [K, 3, P, P] sRGB.
-        losses: float32 [K] by name; NaN where the attack did not say.
+        losses: float32 [K] by name; NaN where the attack did not report one.
     """
 
     steps: Tensor
@@ -36,16 +36,16 @@ class Evolution:
 
 @dataclass(frozen=True)
 class Patch:
-    """A crafted patch and what it cost.
+    """A crafted patch and its cost.
 
     Args:
-        texels: float32 [3, P, P] sRGB in [0, 1]; None leaves the sign alone.
-        queries: pictures the detector was asked about.
-        gradients: pictures whose gradient was taken.
-        zero_gradients: those of them whose gradient was 0 everywhere.
+        texels: float32 [3, P, P] sRGB in [0, 1]; None for no patch.
+        queries: number of images sent to the detector.
+        gradients: number of images whose gradient was computed.
+        zero_gradients: number of these gradients that were 0 everywhere.
         seconds: wall time.
-        excess: how far outside [0, 1] the attack's own texels were.
-        evolution: what the attack reported while it crafted; None where it reported nothing.
+        excess: largest distance from the attack's texels to [0, 1], before projection.
+        evolution: intermediate patches that the attack reported; None if it reported nothing.
     """
 
     texels: Tensor | None
@@ -58,14 +58,14 @@ class Patch:
 
     @property
     def sha256(self) -> str:
-        """Of the texels; empty where there are none."""
+        """Hash of the texels; empty if there are none."""
         return "" if self.texels is None else hashlib.sha256(self.texels.contiguous().numpy().tobytes()).hexdigest()
 
     def written(self, made_by: str) -> bytes:
-        """The content of the file it is kept in: the patch, what it cost, and how it came about, if its attack reported that.
+        """The content of the patch file: texels, cost and, if the attack reported it, the history of the crafting.
 
         Args:
-            made_by: canonical JSON of what decides it.
+            made_by: canonical JSON of everything that determines the patch.
         """
         measured = {name: repr(getattr(self, name)) for name in MEASURED}
         tensors = {} if self.texels is None else {"patch": self.texels.contiguous()}
@@ -73,27 +73,27 @@ class Patch:
 
     @classmethod
     def read(cls, content: bytes) -> Patch:
-        """The patch in the content of a file.
+        """The patch from the content of its file.
 
         Raises:
-            UserError: if it cannot be read, or is not what was written.
+            UserError: if it cannot be read, or its hash does not match.
         """
         try:
             size = int.from_bytes(content[:8], "little")
-            said = json.loads(content[8 : 8 + size])["__metadata__"]
+            header = json.loads(content[8 : 8 + size])["__metadata__"]
             tensors = load(content)
             patch = cls(
                 texels=tensors.get("patch"),
-                queries=int(said["queries"]),
-                gradients=int(said["gradients"]),
-                zero_gradients=int(said.get("zero_gradients", 0)),
-                seconds=float(said["seconds"]),
-                excess=float(said["excess"]),
+                queries=int(header["queries"]),
+                gradients=int(header["gradients"]),
+                zero_gradients=int(header.get("zero_gradients", 0)),
+                seconds=float(header["seconds"]),
+                excess=float(header["excess"]),
                 evolution=_evolution(tensors),
             )
         except (SafetensorError, KeyError, TypeError, ValueError):
             raise UserError("truncated or foreign") from None
-        if patch.sha256 != said.get("sha256"):
+        if patch.sha256 != header.get("sha256"):
             raise UserError("changed since it was written")
         return patch
 

@@ -1,4 +1,4 @@
-"""Frames of a camera world, each with a sign that a patch can be stuck on."""
+"""Frames of a camera world; a patch can be rendered onto the sign in each frame."""
 
 from __future__ import annotations
 
@@ -12,47 +12,47 @@ from bench.detection.detector import STOP_SIGN, Objects
 
 
 class Scenes(ABC):
-    """Frames of a camera world, each with a sign that a patch can be stuck on.
+    """M frames of a camera world, each with a stop sign that can carry a patch.
 
-    A patch is [3, P, P] sRGB in [0, 1], its first row the top, P from 8 to 512 texels; it covers a square in the middle of the
-    sign's face, whose side is `share` of the sign's.
+    A patch is [3, P, P] sRGB in [0, 1], top row first, P from 8 to 512 texels. It covers a square in the middle of the sign's
+    face; the side of the square is `share` times the sign's side.
     """
 
     size: tuple[int, int]
     """Height and width of every frame in pixels."""
     boxes: Tensor
-    """[M, 4] the sign in each frame, clipped to the picture, in pixels."""
+    """[M, 4] box of the sign in each frame, clipped to the image, in pixels."""
     visible: Tensor
-    """[M] share of the sign that is in the picture and not hidden, in [0, 1]."""
+    """[M] share of the sign that is in the image and not hidden, in [0, 1]."""
     distance: Tensor
-    """[M] from the camera to the sign along the road, in m."""
+    """[M] distance from the camera to the sign along the road, in m."""
 
     def __len__(self) -> int:
         return len(self.boxes)
 
     def objects(self, frame: int) -> Objects:
-        """What a detector that is trained on a frame should find in it: the sign, unless a world knows more."""
+        """The objects in a frame, as training targets: the sign, unless a world overrides it."""
         return Objects(self.boxes[frame : frame + 1], (STOP_SIGN,))
 
     @abstractmethod
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
-        """Pictures [N, 3, H, W] sRGB in [0, 1], differentiable to the patches.
+        """Images [N, 3, H, W] sRGB in [0, 1], differentiable in the patches.
 
         Args:
-            frames: int64 [N], which frames.
-            patches: [N, 3, P, P], or [1, 3, P, P] for the same in all; None leaves the sign as it is.
-            share: side of the patch in shares of the sign's, in (0, 1].
+            frames: int64 [N], indices of the frames.
+            patches: [N, 3, P, P], or [1, 3, P, P] for the same patch in all frames; None for no patch.
+            share: side of the patch as a share of the sign's side, in (0, 1].
         """
 
     def windows(
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
     ) -> Tensor:
-        """Parts [N, 3, h, w] of the pictures that `render` gives; a world that renders no more than these is faster.
+        """Windows [N, 3, h, w] of the images of `render`; a world may override this to render only the windows, which is faster.
 
         Args:
-            frames, patches, share: as of `render`.
-            corners: int64 [N, 2], column and row of the first pixel of each.
-            size: height and width; every window is within its picture.
+            frames, patches, share: as in `render`.
+            corners: int64 [N, 2], column and row of the first pixel of each window.
+            size: height and width; every window lies within its image.
         """
         height, width = size
         pictures = self.render(frames, patches, share)
@@ -60,18 +60,18 @@ class Scenes(ABC):
         return torch.stack(cut)
 
     def reach(self, share: float) -> Tensor:
-        """[M, 4] boxes around all that a patch changes: the sign's, unless a world knows a smaller or needs a larger one."""
+        """[M, 4] boxes around all pixels that a patch changes: the sign's boxes, unless a world overrides it."""
         return self.boxes
 
 
 @dataclass(frozen=True)
 class Approach:
-    """A drive up to one stop sign, the sign's face as it is until a patch is rendered onto it.
+    """A drive up to one stop sign.
 
     Args:
         seed: scenario seed.
         location: name of the place.
-        scenes: its frames, farthest first, in the order they are driven through.
+        scenes: its frames in driving order, farthest first.
     """
 
     seed: int

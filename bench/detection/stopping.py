@@ -1,7 +1,7 @@
-"""Does the car stop? What a fixed controller makes of the frames in which a stop sign was detected.
+"""Whether the car stops: a fixed controller brakes for the stop sign according to the frames in which it was detected.
 
-The car comes at a constant speed. Once the sign is confirmed it brakes, after its reaction time, as hard as it must to stop at
-the line, and at least comfortably. The line is level with the sign: it is 0 m away when the distance to the sign is 0.
+The car approaches at a constant speed. After the sign is confirmed and the reaction time has passed, it brakes as hard as
+necessary to stop at the line, but at least comfortably. The line is level with the sign.
 """
 
 from __future__ import annotations
@@ -13,43 +13,43 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 THRESHOLD = 0.25
-"""Confidence from which a sign counts as detected: YOLOv5's own default."""
+"""A sign counts as detected if the confidence is above this: YOLOv5's default."""
 CONFIRMED_IN, OF_THE_LAST = 3, 5
-"""Frames in which a sign must be detected, of so many."""
+"""A sign is confirmed if it is detected in 3 of the last 5 frames."""
 SPEED_MPS = 10.0
-"""Of the approach: 36 km/h."""
+"""Speed of the approach: 36 km/h."""
 REACTION_S = 0.75
-"""From confirmation to full braking: the delay of UN Regulation 157's competent and careful driver (Annex 3, guidance)."""
+"""Time from confirmation to full braking: the delay of UN Regulation 157's competent and careful driver (Annex 3, guidance)."""
 GREATEST_DECELERATION = 0.774 * 9.81
-"""Of the same driver, in m/s^2. Up to it the car brakes as hard as it must."""
+"""Largest deceleration in m/s^2, of the same driver."""
 COMFORTABLE_DECELERATION = 3.4
-"""In m/s^2 (AASHTO, A Policy on Geometric Design of Highways and Streets): the least it brakes with."""
+"""Smallest deceleration in m/s^2 (AASHTO, A Policy on Geometric Design of Highways and Streets)."""
 RAN_M = 1.0
-"""A car that stops farther than this beyond the line has run the sign."""
+"""A car that stops more than this beyond the line has run the sign, in m."""
 
 
 def confirmed(detected: Flags) -> Flags:
-    """[A, F] whether the sign was detected in 3 of the last 5 frames; frames [A, F] in the order they are driven through."""
+    """[A, F] whether the sign was detected in 3 of the last 5 frames; `detected` [A, F] is in driving order."""
     counted = np.cumsum(np.pad(detected, ((0, 0), (OF_THE_LAST, 0))), 1)
     return np.asarray(counted[:, OF_THE_LAST:] - counted[:, :-OF_THE_LAST] >= CONFIRMED_IN)
 
 
 def first(flags: Flags, distance_m: Array) -> Array:
-    """[A] distance in m at which a flag is set first; 0 where it never is."""
+    """[A] distance in m at which a flag is first set; 0 if it is never set."""
     return np.where(flags.any(1), np.take_along_axis(distance_m, flags.argmax(1)[:, None], 1)[:, 0], 0.0)
 
 
 def deceleration(confirmed_m: Array) -> Array:
-    """[A] what the car brakes with, in m/s^2, when the sign is confirmed at these distances (0: when it is passed)."""
+    """[A] deceleration of the car in m/s^2 if the sign is confirmed at these distances in m (0: at the line)."""
     room = np.maximum(confirmed_m - SPEED_MPS * REACTION_S, 1e-3)
     needed = SPEED_MPS**2 / (2 * room)
     return np.clip(needed, COMFORTABLE_DECELERATION, GREATEST_DECELERATION)
 
 
 def overrun_m(confirmed_m: Array) -> Array:
-    """[A] how far beyond the line the car stops, in m; 0 where it stops before it.
+    """[A] distance beyond the line at which the car stops, in m; 0 if it stops before the line.
 
-    A sign that is never confirmed counts as confirmed at the line: the largest overrun there is, 14.1 m.
+    A sign that is never confirmed counts as confirmed at the line, which gives the largest overrun, 14.1 m.
     """
     stops_after = SPEED_MPS * REACTION_S + SPEED_MPS**2 / (2 * deceleration(confirmed_m))
     beyond = stops_after - confirmed_m
@@ -57,5 +57,5 @@ def overrun_m(confirmed_m: Array) -> Array:
 
 
 def ran(confirmed_m: Array) -> Flags:
-    """[A] whether the car ran the sign: it never braked for it, or stopped more than a metre too late."""
+    """[A] whether the car ran the sign: it never braked, or stopped more than `RAN_M` beyond the line."""
     return (confirmed_m <= 0) | (overrun_m(confirmed_m) > RAN_M)

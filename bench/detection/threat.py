@@ -1,4 +1,4 @@
-"""What a patch attacker may change: the perturbation set, and the projection onto it."""
+"""The threat model of the detection track: the perturbation set, and the projection onto it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from bench.plugins.contracts import ThreatModel
 from bench.plugins.ranges import Natural
 
 SIDES = range(8, 513)
-"""Texels a patch may be wide and high."""
+"""Allowed width and height of a patch in texels."""
 GREY = 0.5
-"""What a texel that is no number becomes."""
+"""Replacement for texels that are NaN or infinite."""
 
 
 Texels = Annotated[int, Interval(ge=SIDES[0], le=SIDES[-1])]
-"""The type of a parameter that says how many texels wide and high a patch is."""
+"""The type of a parameter for the width and height of a patch in texels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +28,9 @@ class PatchThreat(ThreatModel):
     """The threat model of the detection track.
 
     Args:
-        norm: `patch`: any texels on a square in the middle of the sign, nothing elsewhere.
-        budget: side of the square as a share of the sign's, in (0, 1]; 0 with no queries is nobody's.
-        queries: most pictures the detector is asked about while a patch is crafted, all together.
+        norm: `patch`: any texels on a square in the middle of the sign, no change elsewhere.
+        budget: side of the square as a share of the sign's side, in (0, 1]; 0 only with 0 queries, for runs without attack.
+        queries: largest number of queries (images) for crafting one patch.
     """
 
     norm: Literal["patch"] = "patch"
@@ -43,13 +43,13 @@ class PatchThreat(ThreatModel):
             raise ValueError(f"threat.budget must be in (0, 1], a share of the sign's side, got {self.budget}")
 
     def project(self, texels: Tensor) -> tuple[Tensor, float]:
-        """The patch that is shown, float32, and how far the texels given were outside [0, 1].
+        """The patch to render, float32, and the largest distance from `texels` to [0, 1].
 
         Args:
-            texels: [3, P, P]; what is out of range is clipped, what is no number becomes grey.
+            texels: [3, P, P]; values outside [0, 1] are clipped, NaN and infinite values become grey.
 
         Raises:
-            UserError: if the shape is another.
+            UserError: if the shape is wrong.
         """
         if (
             texels.ndim != 3

@@ -1,4 +1,4 @@
-"""The driving track: drivers on a road, attacked through what they measure. What plug-ins need is here."""
+"""The driving track: driving policies, attacked through their observations. Plug-ins import from here."""
 
 from bench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, DrivingWorld, TrainingHooks
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features

@@ -1,4 +1,4 @@
-"""An attack at work on a batch of episodes: asked about the running ones, its answer projected, its queries counted."""
+"""Runs an attack on a batch of episodes: calls it for the running ones, projects its answer and counts its queries."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from bench.errors import UserError
 
 @dataclass(frozen=True)
 class Shown:
-    """What the victim is shown in a step, and what the attack spent on it; 0 for episodes that have ended.
+    """The observation that the victim receives in a step, and its cost; the cost is 0 for episodes that have ended.
 
     Args:
         observation: [B, V, F], in the perturbation set.
         queries: int64 [B] evaluations of the victim.
-        gradients, zero_gradients: int64 [B] gradients taken, and those of them that were 0 everywhere.
-        excess: [B] how far outside the set the attack's own answer was, L-inf on the normalised scale.
-        milliseconds: the attack's wall time, for the whole batch.
+        gradients, zero_gradients: int64 [B] number of gradients computed, and number of gradients that were 0 everywhere.
+        excess: [B] L-inf distance from the attack's answer before projection to the set, on the normalised scale.
+        milliseconds: the attack's wall time for the whole batch.
     """
 
     observation: Tensor
@@ -37,14 +37,14 @@ class Shown:
 
 
 class Attacker:
-    """Runs an attack step by step, and keeps what it remembers of each episode.
+    """Runs an attack step by step and keeps its state for each episode.
 
     Args:
-        attack: the attack; None shows the victim the world as it is.
-        policy: the victim, reached by the attack through an oracle only.
+        attack: the attack; None leaves the observations unchanged.
+        policy: the victim; the attack reaches it only through an oracle.
         threat: the threat model, enforced here.
-        features: of the observation.
-        seed: of the attack's random generator.
+        features: features of the observation.
+        seed: seed of the attack's random generator.
     """
 
     def __init__(
@@ -57,12 +57,12 @@ class Attacker:
         self.begun = False
 
     def show(self, observation: Tensor, running: Tensor, policy_state: State) -> Shown:
-        """What the victim is shown.
+        """Attack the running episodes and return the observations for the victim.
 
         Args:
-            observation: true, [B, V, F].
-            running: bool [B]; the others are neither attacked nor counted.
-            policy_state: what the victim remembers of the B episodes.
+            observation: the true observation, [B, V, F].
+            running: bool [B]; the other episodes are neither attacked nor counted.
+            policy_state: the victim's state for the B episodes.
         """
         counts = torch.zeros(3, observation.shape[0], dtype=torch.int64)
         excess = observation.new_zeros(observation.shape[0])
@@ -82,9 +82,9 @@ class Attacker:
         return Shown(perturbed, counts[0], counts[1], counts[2], excess, milliseconds)
 
     def _begin(self, observation: Tensor, policy_state: State) -> None:
-        """Ask the attack what it remembers before the first step. It may ask nothing: such queries would be in no record.
+        """Get the attack's initial state. It may not query the victim: no record would count these queries.
 
-        The state is the run's own copy, which is written to in place.
+        The run keeps its own copy of the state and updates it in place.
         """
         assert self.attack is not None
         self.oracle.begin_step(observation, policy_state)
@@ -96,15 +96,15 @@ class Attacker:
         self.state, self.begun = None if state is None else state.detach().clone(), True
 
     def _answer(self, observation: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """The attack's answer for the running episodes, projected, and how far outside the set it was."""
+        """The attack's answer for the running episodes, projected, and its distance to the perturbation set."""
         assert self.attack is not None
         answer, state = self.attack.step(observation, self.oracle, rows_of(self.state, rows))
         name = type(self.attack).__name__
         if not isinstance(answer, Tensor) or answer.shape != observation.shape:
-            found = f"shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else f"a {type(answer).__name__}"
-            raise UserError(f"{name}.perturb returned {found}, not {tuple(observation.shape)}")
+            got = f"shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else f"a {type(answer).__name__}"
+            raise UserError(f"{name}.perturb returned {got}, not {tuple(observation.shape)}")
         if (self.state is None) != (state is None):
-            raise UserError(f"{name}.step and {name}.initial must both return a state, or both None")
+            raise UserError(f"{name}.step and {name}.initial must both return a state or both return None")
         if self.state is not None and state is not None:
             self.state[rows] = state.detach()
         answer = answer.detach()

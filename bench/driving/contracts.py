@@ -1,4 +1,4 @@
-"""The base classes of the driving track: World, Policy, Victim, Attack and Defense of a driver on a highway."""
+"""The base classes of the driving track: world, victim, attack, defence, and the training hooks of a defence."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 class DrivingWorld(World):
     """Makes TorchRL environments for the cells of a grid.
 
-    The environments are batched ([B] episodes), take an explicit scenario seed an episode in the reset tensordict (`seed`,
-    int64 [B]; without it seeds are drawn from `set_seed`), and write under `("next", ...)`:
+    The environments are batched ([B] episodes). The reset tensordict holds a scenario seed for each episode (`seed`, int64 [B];
+    without it, seeds are drawn from `set_seed`). They write under `("next", ...)`:
     `observation` float32 [B, V, F]; `reward` float32 [B, 1]; `done`, `terminated`, `truncated` bool [B, 1]; and `info`, the
-    ground truth that scoring reads and no policy or attack may: `progress` (Eq. 4.1 without its offset, over 0.5, in [0, 1]),
-    `speed` m/s, `x` m, `ttc` s (time to collision with the car ahead in the ego's lane, inf if none), each float32 [B, 1],
-    `crashed` and `offroad` bool [B, 1].
+    ground truth for scoring, which policies and attacks may not read: `progress` (thesis Eq. 4.1 without its offset, divided by
+    0.5, in [0, 1]), `speed` in m/s, `x` in m, `ttc` in s (time to collision with the car ahead in the ego's lane, inf if there
+    is none), each float32 [B, 1]; `crashed` and `offroad`, bool [B, 1].
     """
 
     track: ClassVar[str] = "driving"
@@ -36,14 +36,14 @@ class DrivingWorld(World):
     actions: ClassVar[tuple[str, ...]]
     """Names of the discrete actions, by number."""
     max_steps: int
-    """Decisions of an episode that runs to its end."""
+    """Number of decisions in an episode that is not terminated early."""
     drivers: ClassVar[tuple[Driver, ...]] = ("agent",)
-    """Who may be at the wheel, see `make`."""
+    """The values of `driver` that `make` supports."""
 
     @property
     @abstractmethod
     def decision_hz(self) -> float:
-        """Decisions a second."""
+        """Decisions per second."""
 
     @property
     def facts(self) -> DrivingFacts:
@@ -65,30 +65,30 @@ class DrivingWorld(World):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        """An environment of len(cells) episodes, episode b on cells[b].
+        """An environment with len(cells) episodes; episode b is on cells[b].
 
         Args:
             cells: the cell of each episode of the batch.
             action_type: discrete lane-changing actions, or continuous [acceleration, steering] in [-1, 1].
-            driver: `agent` obeys the actions; `idm` lets the world's own rule-based driver steer and ignores them.
-            action_repeat: frames a decision is held (training only): lane changes are sent once, the rest is repeated;
-                reward and progress are summed over the frames, an episode stops where it ends.
+            driver: `agent` executes the actions; `idm` ignores them and uses the world's own rule-based driver.
+            action_repeat: number of frames for which a decision is held (training only). A lane change is sent once, other
+                actions are repeated. Reward and progress are summed over the frames; an episode may end between them.
         """
 
 
 class DrivingVictim(Victim):
-    """A kind of driver; fields are its hyper-parameters."""
+    """A kind of driving policy; the fields are its hyper-parameters."""
 
     track: ClassVar[str] = "driving"
     network: ClassVar[type[Policy]] = Policy
     threat: ClassVar[type[ThreatModel]] = ObservationThreat
     policy_type: ClassVar[type[Policy] | None] = None
-    """The class of its trained policies, which the zoo builds from a card."""
+    """The class of its trained policies; the zoo builds it from a card."""
 
     @property
     @abstractmethod
     def action_type(self) -> ActionType:
-        """Whether it takes discrete lane-changing decisions or steers itself."""
+        """Whether it takes discrete lane-changing decisions or outputs continuous acceleration and steering."""
 
     @abstractmethod
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
@@ -96,67 +96,67 @@ class DrivingVictim(Victim):
 
         Args:
             seed: training seed.
-            facts: of the world it is going to drive in.
+            facts: facts of the world in which it will drive.
 
         Raises:
-            bench.errors.UserError: if the zoo has no such policy, saying which command trains it.
+            bench.errors.UserError: if the zoo has no such policy; the message has the command that trains it.
         """
 
     def train(
         self, world: DrivingWorld, *, seed: int, hooks: TrainingHooks | None = None, progress: Progress
     ) -> Trained[Policy]:
-        """Train from fresh weights (or from `hooks.start`), with the changes that the hooks of a defence make."""
+        """Train from fresh weights (or from `hooks.start`), with the changes of a defence's hooks."""
         raise NotImplementedError(f"{type(self).__name__} does not learn")
 
 
 class TrainingHooks:
-    """What a defence may change in the training of a driver; each default leaves the training as it is.
+    """The changes that a defence may make to the training of a driving policy; the defaults change nothing.
 
-    Observations are [B, V, F], `share` is the share of the training that is done, in [0, 1], and `policy` is the network that
-    is being trained: its `scores` have gradients to the weights, its `value` is a copy of the critic.
+    Observations are [B, V, F], `share` is the finished share of the training, in [0, 1], and `policy` is the network in
+    training: its `scores` have gradients to the weights, its `value` is a copy of the critic.
     """
 
     start: Policy | None = None
-    """The trained policy to continue from, frame by frame; None trains from fresh weights."""
+    """The trained policy to continue from, without action repeat; None trains from fresh weights."""
     decisions: int = 0
-    """Length of the training on every road, where there is a `start`."""
+    """Length of the training on every road, used with a `start`."""
     off_policy: bool = False
-    """Whether actions are often not those the policy would take: n-step returns then stay short."""
+    """Whether many actions differ from the policy's own choice; n-step returns then stay short."""
     checkpoints: float = 1.0
-    """Share of the victim's checkpoints that are scored, in (0, 1]; for hooks whose scoring is expensive."""
+    """Share of the victim's checkpoints that are scored, in (0, 1]; for hooks with expensive scoring."""
 
     def acting(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
-        """The observation that the learner acts on."""
+        """The observation on which the learner acts."""
         return observation
 
     def remembered(self, observation: Tensor, shown: Tensor) -> Tensor:
-        """The observation that the replay buffer keeps, of the true one and the one that was acted on."""
+        """The observation for the replay buffer, from the true one and the one the learner acted on (`shown`)."""
         return shown
 
     def replayed(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
-        """The observation that a transition drawn from the replay buffer is learned with."""
+        """The observation to learn from, for a transition drawn from the replay buffer."""
         return observation
 
     def loss(self, policy: Policy, sample: TensorDictBase, own: Callable[[TensorDictBase], Tensor]) -> Tensor:
         """The loss of the policy on a batch of transitions; a critic always learns from the truth.
 
         Args:
-            policy: being trained.
-            sample: transitions [N] with `observation` (after `replayed`), `truth` (as remembered), `action` and `next`.
+            policy: the policy in training.
+            sample: transitions [N] with `observation` (after `replayed`), `truth` (after `remembered`), `action` and `next`.
             own: the loss of the victim's algorithm on such a batch.
         """
         return own(sample)
 
     def selection(self, policy: Policy) -> dict[str, Callable[[Tensor], Tensor]]:
-        """By name, further ways to show the observation when a checkpoint is scored; a checkpoint's score is the mean of all."""
+        """Additional perturbations of the observation for scoring a checkpoint, by name; its score is the mean over all."""
         return {}
 
 
 class DrivingAttack(Attack):
-    """Changes what a driver measures. Batched over episodes.
+    """Perturbs the observation of a driving policy. Batched over episodes.
 
-    One without a memory writes `perturb` and nothing else. One that remembers something of every episode writes `initial` and
-    `step`; the run keeps its state, so that the attack object itself stays as it is.
+    A stateless attack implements only `perturb`. An attack with a state for each episode implements `initial` and `step`; the
+    run keeps the state, and the attack object does not change.
     """
 
     track: ClassVar[str] = "driving"
@@ -173,45 +173,45 @@ class DrivingAttack(Attack):
         return f"whose actions are {victim.action_type}: it needs {' or '.join(self.action_types)} ones"
 
     def initial(self, observation: Tensor, oracle: Oracle) -> State:
-        """What is remembered before the first step: a TensorDict of batch size [B], or None.
+        """The state before the first step: a TensorDict of batch size [B], or None.
 
         Args:
             observation: the first true observation, [B, V, F].
-            oracle: as of `perturb`; here it may be asked nothing.
+            oracle: as in `perturb`, but queries are not allowed here.
         """
         return None
 
     def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor, State]:
-        """What the victim is shown, as `perturb` returns it, and what is remembered from then on.
+        """The observation for the victim, as in `perturb`, and the state for the next step.
 
         Args:
-            observation, oracle: as of `perturb`.
-            state: of the same episodes, of batch size [B].
+            observation, oracle: as in `perturb`.
+            state: the state of the same episodes, batch size [B].
         """
         return self.perturb(observation, oracle), state
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
-        """The observation the victim is shown instead, [B, V, F]; of an attack without a memory.
+        """The perturbed observation for the victim, [B, V, F], from a stateless attack.
 
         Args:
             observation: the true observation, float32 [B, V, F], of the episodes that are still running.
-            oracle: the only door to the victim; it holds the perturbation set (`radius`, `project`), the query budget
+            oracle: the only access to the victim; it holds the perturbation set (`radius`, `project`), the query budget
                 (`remaining`), and the run's random generator (`generator`).
         """
-        raise NotImplementedError(f"{type(self).__name__} has neither perturb nor step")
+        raise NotImplementedError(f"{type(self).__name__} implements neither perturb nor step")
 
 
 class DrivingDefense(Defense):
-    """Protects a driver."""
+    """Protects a driving policy."""
 
     track: ClassVar[str] = "driving"
 
     @abstractmethod
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
-        """The defended policy, ready to drive: from the zoo, wrapped, or both.
+        """The defended policy, ready to drive: loaded from the zoo, wrapped, or both.
 
         Args:
-            victim: what is protected.
+            victim: the victim to protect.
             seed: training seed.
-            facts: of the world: features with units, ranges and resolutions, decision period, meaning of actions.
+            facts: facts of the world: features with units, ranges and resolutions, decision period, meaning of actions.
         """

@@ -1,4 +1,4 @@
-"""The work of the driving track: one pair at the wheel, on every scenario of a cell."""
+"""The work of the driving track: drive one pair of attack and defended victim on every scenario of a cell."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from bench.plugins.track import Driven, Job
 
 
 def drive(job: Job, traced: Sequence[int]) -> Driven:
-    """The measurements of a job's episodes, [B] each (`bench.driving.rollout.rollout`).
+    """Drive a job's episodes and return the measurements, [B] each (`bench.driving.rollout.rollout`).
 
     Args:
-        job: what to drive.
-        traced: scenario seeds of the episodes that a recording is wanted of.
+        job: the job.
+        traced: scenario seeds of the episodes to record.
     """
     pair, world, attack = job.pair, job.pair.world.component, job.pair.attack.component
     assert isinstance(world, DrivingWorld)

@@ -1,4 +1,4 @@
-"""What a driver measures: the features of an observation, with their ranges, units and resolutions."""
+"""The features of a driving observation, with their ranges, units and resolutions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bench.plugins.contracts import Facts
 ActionType = Literal["discrete", "continuous"]
 Driver = Literal["agent", "idm"]
 CONSTANT_CONTROLS = {"throttle": (1.0, 0.0), "coast": (0.0, 0.0), "brake": (-1.0, 0.0)}
-"""[acceleration, steering] in [-1, 1] of the policies that always do the same, by name."""
+"""[acceleration, steering] in [-1, 1] of the constant policies, by name."""
 RIGHT_THEN_SLOWER = "right_then_slower"
 """The policy that changes to the rightmost lane and then brakes."""
 
@@ -22,15 +22,16 @@ RIGHT_THEN_SLOWER = "right_then_slower"
 class Features:
     """The measured features of an observation row, in order, with the range that maps to [-1, 1].
 
-    An observation is a float tensor [B, V, F]: V vehicles (row 0 is the ego, absolute; the rest relative to it, nearest
-    first, all zero where absent), F = 1 + len(names): `presence` in {0, 1}, then each measured feature over its range.
+    An observation is a float tensor [B, V, F]. Row 0 of the V vehicles is the ego, in absolute values; the other rows are
+    relative to it, nearest first, and all zero if absent. F = 1 + len(names): `presence` in {0, 1}, then each measured feature,
+    normalised by its range.
 
     Args:
-        names: of the measured features.
-        low, high: what -1 and 1 stand for, in `units`.
+        names: names of the measured features.
+        low, high: values of -1 and 1, in `units`.
         units: for instance m and m/s.
-        floors: the resolution of the sensor, in `units`: the smallest deviation of the `relative` set at a budget of 0.1;
-            empty for none.
+        floors: resolution of the sensor, in `units`: the smallest radius of the `relative` set at a budget of 0.1; empty for
+            none.
     """
 
     names: tuple[str, ...]
@@ -40,24 +41,24 @@ class Features:
     floors: tuple[float, ...] = ()
 
     def half_range(self) -> Tensor:
-        """[F - 1] physical units that one unit of the normalised observation stands for."""
+        """[F - 1] size of one normalised unit, in physical units."""
         return (torch.tensor(self.high) - torch.tensor(self.low)) / 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrivingFacts(Facts):
-    """What a driver and its defences may know of their world.
+    """The facts of a world that are given to driving policies and defences.
 
     Args:
-        features: of the observation.
-        drivers: who may be at the wheel: `agent` obeys actions; `idm`, where there is one, is the world's own rule-based driver.
+        features: features of the observation.
+        drivers: supported drivers: `agent` executes the policy's actions; `idm` is the world's own rule-based driver, if any.
     """
 
     features: Features
     drivers: tuple[Driver, ...] = ("agent",)
 
     def blind_policies(self, action_type: ActionType) -> list[str]:
-        """The names of the policies that ignore their input in this world: each constant action, and a sequence if it has one."""
+        """Names of this world's input-independent policies: each constant action, and `right_then_slower` if possible."""
         if action_type == "continuous":
             return list(CONSTANT_CONTROLS)
         constant = [name.lower() for name in self.actions]

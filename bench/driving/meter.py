@@ -1,4 +1,4 @@
-"""Running sums over a batch of episodes, and the measurements that they end in."""
+"""Running sums over a batch of episodes, and the measurements computed from them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from bench.driving.metrics import safe_progress
 from bench.driving.policy import Policy, State, rows_of
 
 CHANGED = 0.1
-"""A continuous action counts as changed when it is off by more than this on its [-1, 1] scale."""
+"""A continuous action counts as changed if it differs by more than this on its [-1, 1] scale."""
 
 Columns = dict[str, NDArray[np.generic]]
 
 
 class Meter:
-    """Running sums of a batch of episodes; an episode counts until it is done.
+    """Running sums over a batch of episodes; an episode is counted until it is done.
 
-    In NumPy: a step is some forty operations on [B] numbers, and what each costs is its call.
+    Uses NumPy because a step is about forty operations on [B] numbers, where the call overhead dominates.
     """
 
     SUMS = ("steps", "return", "progress", "mean_speed", "changed", "linf", "l2", "linf_m", "linf_mps", "attack_ms")
@@ -50,11 +50,11 @@ class Meter:
 
         Args:
             truth: the true observation [B, V, F].
-            shown: what the victim was shown instead.
-            action: what it did.
-            driven: bool [B] the episodes that were running before the step.
-            state: what the victim remembered before it.
-            after: the environment's answer.
+            shown: the observation that the victim received, and its cost.
+            action: the victim's action.
+            driven: bool [B], the episodes that were running before the step.
+            state: the victim's state before the step.
+            after: the environment's output.
         """
         running = driven.numpy()
         info = {name: value.squeeze(-1).numpy() for name, value in after["info"].items()}
@@ -88,15 +88,15 @@ class Meter:
             self.actions.append(np.where(running, action.numpy(), -1))
 
     def _changed(self, truth: Tensor, action: Tensor, state: State, touched: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """[B] 1 where the attack changed the victim's decision; it can have only where the observation is `touched` [B]."""
+        """[B] 1 where the attack changed the victim's decision, which needs a perturbed observation (`touched`, bool [B])."""
         changed = np.zeros(len(touched))
         if touched.any():
             rows = torch.from_numpy(touched)
-            done, clean = action[rows], self.policy.decide(truth[rows], rows_of(state, rows))
+            taken, clean = action[rows], self.policy.decide(truth[rows], rows_of(state, rows))
             if self.policy.action_type == "discrete":
-                changed[touched] = (clean != done).numpy()
+                changed[touched] = (clean != taken).numpy()
             else:
-                changed[touched] = ((clean - done).abs().amax(-1) > CHANGED).numpy()
+                changed[touched] = ((clean - taken).abs().amax(-1) > CHANGED).numpy()
         return changed
 
     def columns(self) -> Columns:
@@ -129,7 +129,7 @@ class Meter:
         }
 
     def _action_counts(self) -> NDArray[np.generic]:
-        """[B, A] how often each discrete action was taken; [B, 0] for continuous ones."""
+        """[B, A] how often each discrete action was taken; [B, 0] for continuous actions."""
         if not self.actions:
             return np.zeros((len(self.crashed), 0), np.int32)
         actions = np.stack(self.actions, 1)

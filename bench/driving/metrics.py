@@ -1,4 +1,4 @@
-"""What an episode of driving is worth: the ranking metric."""
+"""The ranking metric of the driving track, `safe_progress`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def safe_progress(
 ) -> Tensor | NDArray[Any]:
     """The ranking metric [B] in [0, 1]: 0 for an episode that crashes or leaves the road, else its mean progress.
 
-    Progress is Eq. 4.1 of the thesis without its offset, over 0.5, in [0, 1] a step; the mean is over `max_steps`, whatever the
-    episode's length.
+    Progress is Eq. 4.1 of the thesis without its offset, divided by 0.5, in [0, 1] per step. The mean is always over
+    `max_steps`, also for shorter episodes.
 
     Args:
         progress: [B] sum over the episode's steps.
-        failed: bool [B] whether it crashed or left the road.
-        max_steps: of an episode that runs to its end.
+        failed: bool [B], whether the episode crashed or left the road.
+        max_steps: length of an episode that is not terminated early.
     """
     if isinstance(progress, Tensor) and isinstance(failed, Tensor):
         return torch.where(failed, 0.0, progress / max_steps)

@@ -1,4 +1,4 @@
-"""The only door of an attack to the driver: it enforces the access level, the perturbation set and the query budget."""
+"""An attack's only access to the driving policy; enforces the access level, the perturbation set and the query budget."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from bench.errors import UserError
 from bench.plugins.contracts import Access, QueryBudgetError, permit
 
 CHUNK = 1024
-"""Queries answered at once: larger batches leave the processor's cache and take twice as long each."""
+"""Queries per batch: a larger batch does not fit into the processor's cache and takes twice as long per query."""
 
 
 class Oracle:
-    """The only door to the victim. It refuses what the access level forbids, counts every query, and stops at the budget.
+    """The only access to the victim. It enforces the access level, counts every query, and raises at the budget.
 
-    A batch of queries has shape [..., B, V, F], B the running episodes (or those of `rows`); one evaluation of one episode's
-    observation is one query, a gradient is one query too. The victim answers from what it remembers at this step, and asking
-    changes nothing of it. `gradients` counts those of a step, `zero_gradients` those that were 0 everywhere; `asked`, where it is
-    a list, keeps what was asked.
+    A batch of queries has shape [..., B, V, F], where B counts the running episodes (or the episodes in `rows`). One evaluation
+    of one episode's observation is one query; a gradient is one query too. The victim answers with its state of this step;
+    queries do not change the state. `gradients` counts the gradients of a step, `zero_gradients` the gradients that were 0
+    everywhere; `asked`, if it is a list, collects the queries.
 
     Args:
         policy: the victim.
         threat: the threat model.
-        access: what the attack declared it needs; more than that is refused.
-        features: of the observation.
-        generator: the run's random generator, for attacks that draw.
+        access: the access level that the attack declares; calls above it are refused.
+        features: features of the observation.
+        generator: the run's random generator, for randomised attacks.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class Oracle:
         self.asked: list[tuple[Tensor | None, Tensor]] | None = None
 
     def begin_step(self, observation: Tensor, state: State = None, scale: float = 1.0) -> None:
-        """Open a step: the perturbation set follows the true observations, the query counters start at 0.
+        """Start a step: set the perturbation set from the true observations, and the query counters to 0.
 
         Args:
-            observation: true, [B, V, F].
-            state: what the victim remembers of these B episodes.
+            observation: the true observation, [B, V, F].
+            state: the victim's state for these B episodes.
             scale: multiplies the budget.
         """
         self.observation, self._state = observation, state
@@ -68,11 +68,11 @@ class Oracle:
 
     @property
     def remaining(self) -> Tensor:
-        """[B] queries each episode has left in this step."""
+        """[B] number of queries left for each episode in this step."""
         return self.threat.queries - self.spent
 
     def project(self, perturbed: Tensor, rows: Tensor | None = None) -> Tensor:
-        """`perturbed` [..., B, V, F], or of the episodes `rows`, brought into the perturbation set. Costs no query."""
+        """Project `perturbed` [..., B, V, F] (of all episodes, or of `rows`) onto the perturbation set. Costs no query."""
         if rows is None:
             return within(perturbed, *self._set)
         if rows is not self._rows:
@@ -95,7 +95,7 @@ class Oracle:
     ) -> tuple[Tensor, Tensor]:
         """The loss [..., B] of the victim's scores and its gradient [..., B, V, F] in the observation; needs `gradients`.
 
-        A victim that lets none through has a gradient of 0.
+        The gradient of a non-differentiable victim is 0.
         """
         self._spend(observation, rows, "gradients")
         leaf = observation.detach().requires_grad_(True)
@@ -111,7 +111,7 @@ class Oracle:
     def value(self, observation: Tensor, action: Tensor) -> Tensor:
         """The victim's own critic Q(observation, action) [..., B], differentiable in the action; needs access `gradients`.
 
-        White-box knowledge of the weights, evaluated by the attacker, so it costs no query.
+        It costs no query: a white-box attacker knows the weights and evaluates the critic itself.
         """
         permit("gradients", self._access)
         if self._state is None:
@@ -122,20 +122,20 @@ class Oracle:
         )
 
     def _scores(self, observation: Tensor, rows: Tensor | None) -> Tensor:
-        """The victim's scores [..., B, A] in one piece, with the graph back to the observation."""
+        """The victim's scores [..., B, A] in one batch, with the graph back to the observation."""
         if self._state is None:
             return self._policy.scores(observation)
         flat = self._policy.scores(observation.flatten(0, -3), self._remembered(observation, rows))
         return flat.unflatten(0, observation.shape[:-2])
 
     def _remembered(self, observation: Tensor, rows: Tensor | None) -> State:
-        """What the victim remembers of each of the observations [..., B, V, F], flattened to [N]."""
+        """The victim's state for each observation of [..., B, V, F], flattened to [N]."""
         state = self._state if rows is None else rows_of(self._state, rows)
         return repeated(state, observation.shape[:-3])
 
     @torch.no_grad()
     def _in_chunks(self, ask: Callable[[Tensor, State], Tensor], observation: Tensor, rows: Tensor | None) -> Tensor:
-        """One query after the other would be slow, and all at once leaves the processor's cache: a thousand at a time."""
+        """Answer queries in batches of `CHUNK`: single queries are slow, larger batches do not fit into the cache."""
         flat, state = observation.flatten(0, -3), self._remembered(observation, rows)
         if not len(flat):
             return ask(flat, state).unflatten(0, observation.shape[:-2])
@@ -145,19 +145,19 @@ class Oracle:
 
     @staticmethod
     def _count(counter: Tensor, counted: Tensor, rows: Tensor | None) -> None:
-        """Add what was counted [..., B] of the running episodes, or of those of `rows`."""
-        each = counted.long().flatten(0, -2).sum(0) if counted.ndim > 1 else counted.long()
-        counter.index_add_(0, torch.arange(len(counter)) if rows is None else rows, each)
+        """Add `counted` [..., B] to the counter of each running episode, or of the episodes in `rows`."""
+        counts = counted.long().flatten(0, -2).sum(0) if counted.ndim > 1 else counted.long()
+        counter.index_add_(0, torch.arange(len(counter)) if rows is None else rows, counts)
 
     def _spend(self, observation: Tensor, rows: Tensor | None, access: Access) -> None:
         permit(access, self._access)
         if self.asked is not None:
             self.asked.append((rows, observation.detach()))
-        each = observation.shape[:-3].numel()
+        queries = observation.shape[:-3].numel()
         if rows is None:
-            self.spent += each
+            self.spent += queries
         else:
-            self.spent.index_add_(0, rows, torch.full_like(rows, each))
+            self.spent.index_add_(0, rows, torch.full_like(rows, queries))
         worst = int(self.spent.max()) if self.spent.numel() else 0
         if worst > self.threat.queries:
             raise QueryBudgetError(

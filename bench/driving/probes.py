@@ -1,7 +1,7 @@
-"""What a victim's answers hang on, measured now and then while it drives: the flags of a leaderboard stand on it.
+"""Probes whether a victim is stochastic and whether it ignores its input; the leaderboard's flags use the results.
 
-A probe asks the victim the same thing twice and, of the same step, about another episode. It is no query of the attack's, and
-it leaves torch's global random generator as it was.
+At some steps a probe evaluates the victim twice on the same observation, and once on the observation of another episode. It
+does not count as a query of the attack, and it restores torch's global random generator.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from bench.driving.policy import Policy, State
 EVERY = 15
 """Steps between two probes: a second of driving."""
 SAME = 1e-6
-"""Scores no farther apart than this are the same answer."""
+"""Two scores count as the same answer if they differ by at most this."""
 
 
 class Probe:
-    """Counts of a batch of B episodes."""
+    """Counts over a batch of B episodes."""
 
     def __init__(self, batch: int, policy: Policy) -> None:
         self.policy = policy
@@ -31,12 +31,12 @@ class Probe:
 
     @torch.no_grad()
     def look(self, observation: Tensor, running: Tensor, state: State) -> bool:
-        """Probe the running episodes [B] of a step; whether any was answered otherwise when asked again.
+        """Probe the running episodes of a step; return whether any answer changed on the second evaluation.
 
         Args:
-            observation: true, [B, V, F].
+            observation: the true observation, [B, V, F].
             running: bool [B].
-            state: what the policy remembers.
+            state: the policy's state.
         """
         rows = running.nonzero().squeeze(-1)
         if len(rows) < 2:
@@ -44,8 +44,8 @@ class Probe:
         others = observation.clone()
         others[rows] = observation[rows].roll(len(rows) // 2, 0)
         with torch.random.fork_rng(devices=[]):
-            asked = (observation, observation, others)
-            first, again, other = (self.policy.scores(each, state)[rows] for each in asked)
+            inputs = (observation, observation, others)
+            first, again, other = (self.policy.scores(probe, state)[rows] for probe in inputs)
         redrawn = (first != again).flatten(1).any(1)
         same = ((first - other).abs() <= SAME).flatten(1).all(1)
         places = rows.numpy()
@@ -55,11 +55,11 @@ class Probe:
         return bool(redrawn.any())
 
     def count_draws(self, asked: Sequence[tuple[Tensor | None, Tensor]], running: Tensor) -> None:
-        """Count how often an attack asked about each distinct observation in a step.
+        """Count how often an attack queried each distinct observation in a step.
 
         Args:
-            asked: its queries: the episodes asked about, by their place among the running ones (None: all), and
-                observations [..., B, V, F].
+            asked: the attack's queries: the episodes, by index among the running ones (None: all), and the observations
+                [..., B, V, F].
             running: bool [B].
         """
         places = running.nonzero().squeeze(-1)
@@ -69,12 +69,12 @@ class Probe:
         all_keys = torch.cat(keys)
         asked_of = torch.bincount(all_keys[:, 0].long(), minlength=len(places))
         distinct = torch.bincount(all_keys.unique(dim=0)[:, 0].long(), minlength=len(places))
-        here = places[asked_of > 0].numpy()
-        self.draws[here] += (asked_of / distinct.clamp(min=1))[asked_of > 0].numpy()
-        self.drawn[here] += 1
+        queried = places[asked_of > 0].numpy()
+        self.draws[queried] += (asked_of / distinct.clamp(min=1))[asked_of > 0].numpy()
+        self.drawn[queried] += 1
 
     def columns(self) -> Mapping[str, NDArray[np.float64]]:
-        """Shares [B]; NaN where nothing was measured."""
+        """`redrawn` and `same_answer`, shares of the probes, and `draws`, queries per observation; [B], NaN if not measured."""
         with np.errstate(invalid="ignore"):
             return {
                 "redrawn": self.redrawn / self.probed,
@@ -84,7 +84,7 @@ class Probe:
 
 
 def _keys(rows: Tensor | None, observation: Tensor) -> Tensor:
-    """[N, 2] episode and a number that stands for the observation, one a query."""
+    """[N, 2] for each query: the episode, and a number that identifies the observation."""
     flat = observation.flatten(-2).double()
     code = flat @ torch.linspace(1, 2, flat.shape[-1], dtype=torch.float64).sin()
     episode = torch.arange(flat.shape[-2]) if rows is None else rows

@@ -1,4 +1,4 @@
-"""One batch of episodes: a victim drives, an attack looks on, and every episode leaves one row of measurements."""
+"""Drive one batch of episodes with a victim under attack, and return one row of measurements per episode."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from bench.errors import UserError
 
 @dataclass
 class Trace:
-    """Every step of a few episodes of the batch, for recordings: `steps[name][t]` is an array [len(episodes), ...]."""
+    """Every step of some episodes of the batch, for recordings: `steps[name][t]` is an array [len(episodes), ...]."""
 
     episodes: Sequence[int]
     steps: dict[str, list[NDArray[np.generic]]] = field(default_factory=dict)
 
     def append(self, values: Mapping[str, Tensor]) -> None:
-        """Take one step: tensors [B, ...] of the whole batch."""
+        """Append one step, given as tensors [B, ...] of the whole batch."""
         for name, value in values.items():
             self.steps.setdefault(name, []).append(value[list(self.episodes)].detach().numpy().copy())
 
     def by_episode(self, seeds: Sequence[int]) -> dict[int, Trace]:
-        """A trace of each episode alone, by its scenario seed."""
+        """One trace for each episode, by scenario seed."""
         return {
             seed: Trace([episode], {name: [step[[place]] for step in steps] for name, steps in self.steps.items()})
             for place, (seed, episode) in enumerate(zip(seeds, self.episodes, strict=True))
@@ -58,18 +58,18 @@ def rollout(
     Args:
         env: a batched environment of a `DrivingWorld`, one episode a seed.
         policy: the (defended) victim.
-        attack: what stands between the world and the victim; None for nothing.
-        threat: enforced on the attack.
+        attack: the attack on the observations; None for no attack.
+        threat: threat model, enforced on the attack.
         seeds: the scenario seed of each episode [B].
-        facts: of the world.
-        attack_seed: of the attack's random generator.
-        trace: filled with every step of its episodes.
+        facts: facts of the world.
+        attack_seed: seed of the attack's random generator.
+        trace: collects every step of its episodes.
 
     Returns:
-        A column [B] a measurement; names and units are those of `bench.tracks.driving`.
+        One column [B] for each measurement; `bench.tracks.driving` has the names and units.
 
     Raises:
-        UserError: if the victim has another number of actions than the world.
+        UserError: if the numbers of actions of the victim and the world differ.
     """
     attacker = Attacker(attack, policy, threat, facts.features, seed=attack_seed)
     meter, probe = Meter(len(seeds), policy, facts), Probe(len(seeds), policy)
@@ -102,7 +102,7 @@ def _check_actions(policy: Policy, observation: Tensor, state: State, facts: Dri
             count = policy.scores(observation, state).shape[-1]
         if count != len(facts.actions):
             raise UserError(
-                f"the victim chooses among {count} actions, the world has {len(facts.actions)}: {', '.join(facts.actions)}"
+                f"the victim has {count} actions, the world has {len(facts.actions)}: {', '.join(facts.actions)}"
             )
 
 
@@ -115,7 +115,7 @@ def _traced(
     after: TensorDictBase,
     policy: Policy,
 ) -> dict[str, Tensor]:
-    """What a recording shows of one step."""
+    """The values of one step that a recording needs."""
     names = ("progress", "speed", "x", "ttc", "crashed", "offroad")
     return {
         "observation": truth,

@@ -1,4 +1,4 @@
-"""What an attacker of a driver may change: the perturbation set, and the projection onto it."""
+"""The threat model of the driving track: the perturbation set, and the projection onto it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class ObservationThreat(ThreatModel):
     """The threat model of the driving track.
 
     Args:
-        norm: `relative`: each measured value of a present row may be off by `budget` times its actual value, or by the
-            feature's floor (scaled with the budget) where that is larger (thesis 4.3.1). `linf`: by `budget` on the [-1, 1]
+        norm: `relative`: each measured value of a present row may change by `budget` times its value, or by the feature's
+            floor (scaled with the budget) if that is larger (thesis 4.3.1). `linf`: it may change by `budget` on the [-1, 1]
             scale (thesis 4.4.3, read as a range; a stress test).
         budget: size of the set, in [0, 2].
-        queries: most policy evaluations an episode may spend in one step.
+        queries: largest number of policy evaluations per episode and step.
 
-    `presence` cannot be forged and absent rows cannot be filled. What leaves [-1, 1], the range of every sensor, is clipped.
+    `presence` cannot be changed and absent rows cannot be filled. Values are clipped to [-1, 1], the range of every sensor.
     """
 
     norm: Norm = "relative"
@@ -40,7 +40,7 @@ class ObservationThreat(ThreatModel):
         Args:
             observation: the true observation [..., V, F].
             features: names and ranges of the measured features.
-            scale: multiplies the budget (adversarial training ramps it).
+            scale: multiplies the budget (adversarial training increases it gradually).
         """
         measured = observation[..., 1:]
         budget = self.budget * scale
@@ -57,9 +57,9 @@ class ObservationThreat(ThreatModel):
 
 
 def project(perturbed: Tensor, observation: Tensor, radius: Tensor) -> Tensor:
-    """The nearest point of the perturbation set: within `radius` of `observation` and within the sensors' [-1, 1].
+    """The nearest point of the perturbation set: within `radius` of `observation` and within the sensors' range [-1, 1].
 
-    NaN counts as no perturbation.
+    NaN is replaced with the true value.
     """
     return within(perturbed, observation, *bounds(observation, radius))
 
@@ -70,8 +70,9 @@ def bounds(observation: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def within(perturbed: Tensor, observation: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """`perturbed` brought between the bounds, what is NaN back to the observation; one look for NaN is cheaper than a where."""
-    found = torch.clamp(perturbed, low, high)
-    if bool(found.sum().isfinite()):
-        return found
-    return torch.where(found.isnan(), observation.clamp(-1.0, 1.0), found)
+    """`perturbed`, clipped to the bounds, with NaN replaced by the observation."""
+    clipped = torch.clamp(perturbed, low, high)
+    # One sum is cheaper than a torch.where on every call.
+    if bool(clipped.sum().isfinite()):
+        return clipped
+    return torch.where(clipped.isnan(), observation.clamp(-1.0, 1.0), clipped)

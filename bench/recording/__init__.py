@@ -1,4 +1,4 @@
-"""Recordings of single episodes for the rerun viewer: what was there, what the victim was shown, what came of it.
+"""Recordings of single episodes for the rerun viewer: the true input, the attacked input and the outcome.
 
-A recording is a view of an episode, never its record: rerun reads the files of neighbouring versions only.
+A recording does not replace the episode's record: rerun reads only files of neighbouring versions.
 """

@@ -1,4 +1,4 @@
-"""What a recording is of, in words: its title, and the page that opens with it."""
+"""The description of a recording: its title and its "About" page."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from bench.scenarios import Cell
 
 
 def title(meta: Mapping[str, object]) -> str:
-    """One line: who drives or looks, under which attack, where."""
-    words = [str(meta.get("victim", "policy"))]
+    """One line: victim, defence, attack, cell and seed."""
+    parts = [str(meta.get("victim", "policy"))]
     if meta.get("defense", "none") != "none":
-        words.append(f"+ {meta['defense']}")
-    words.append("without attack" if meta.get("attack", "none") == "none" else f"under {meta['attack']}")
+        parts.append(f"+ {meta['defense']}")
+    parts.append("without attack" if meta.get("attack", "none") == "none" else f"under {meta['attack']}")
     if "cell" in meta:
-        words.append(f"· {Cell(**json.loads(str(meta['cell'])))}")
-    return " ".join(words) + (f" · seed {meta['seed']}" if "seed" in meta else "")
+        parts.append(f"· {Cell(**json.loads(str(meta['cell'])))}")
+    return " ".join(parts) + (f" · seed {meta['seed']}" if "seed" in meta else "")
 
 
 def page(meta: Mapping[str, object], outcome: Iterable[str], *, queries: str = "") -> str:
-    """A page: what came of it, then the components with their parameters, and the threat model.
+    """A Markdown page: the outcome, the components with their parameters, and the threat model.
 
     Args:
         meta: the record's identity columns.
         outcome: lines of Markdown.
-        queries: what the threat model's queries are counted over; nothing is said of the threat model without it.
+        queries: unit of the query budget, for instance "per step"; without it the threat model is left out.
     """
     lines = [f"### {title(meta)}", "", *outcome, "", "---", ""]
     lines += [f"- **{kind}** {_component(meta, kind)}" for kind in ("victim", "defense", "attack") if kind in meta]
@@ -40,5 +40,5 @@ def page(meta: Mapping[str, object], outcome: Iterable[str], *, queries: str = "
 
 
 def _component(meta: Mapping[str, object], kind: str) -> str:
-    found = json.loads(str(meta.get(f"{kind}_params") or "{}"))
-    return " ".join([str(meta[kind]), *(f"`{name}={value}`" for name, value in found.items())])
+    parameters = json.loads(str(meta.get(f"{kind}_params") or "{}"))
+    return " ".join([str(meta[kind]), *(f"`{name}={value}`" for name, value in parameters.items())])

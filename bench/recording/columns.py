@@ -1,4 +1,4 @@
-"""Whole columns at once to a rerun recording: one block an entity, over timelines of its own."""
+"""Sends whole columns to a rerun recording: one block per entity, on given timelines."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Columns:
 
     Args:
         stream: the recording.
-        timelines: by name, where each row is: integers, or seconds.
+        timelines: position of each row by timeline name: integers, or seconds.
     """
 
     def __init__(self, stream: rr.RecordingStream, timelines: Mapping[str, NDArray[np.generic]]) -> None:
@@ -26,25 +26,25 @@ class Columns:
         self.index = [rr.TimeColumn(name, **{kinds[name]: values}) for name, values in timelines.items()]
 
     def send(self, path: str, columns: Iterable[Any]) -> None:
-        """One value a step, or one list of instances a step."""
+        """Send one value, or one list of instances, per row."""
         rr.send_columns(path, self.index, columns, recording=self.stream)
 
     def fixed(self, path: str, what: rr.AsComponents) -> None:
-        """One value for the whole recording."""
+        """Send one value for the whole recording."""
         self.stream.log(path, what, static=True)
 
     def note(self, path: str, markdown: str) -> None:
-        """A page of text."""
+        """Send a page of Markdown."""
         self.fixed(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
 
     def curve(self, path: str, values: NDArray[np.generic], name: str, colour: Colour, width: float = 1.5) -> None:
-        """A curve [T] with its name in the legend; gaps where it is not finite."""
+        """Send a curve [T] with its name in the legend; it has gaps where values are not finite."""
         finite = np.where(np.isfinite(values), values, np.nan).astype(np.float64)
         self.fixed(path, rr.SeriesLines(colors=[colour], widths=[width], names=[name]))
         self.send(path, rr.Scalars.columns(scalars=finite))
 
     def states(self, path: str, values: NDArray[np.generic], names: Iterable[str], colours: Iterable[Colour]) -> None:
-        """A band of states: `values` [T] index `names`."""
+        """Send a band of states: `values` [T] are indices into `names`."""
         labels = list(names)
         self.fixed(path, rr.StateConfiguration(values=labels, labels=labels, colors=list(colours)))
         self.send(path, rr.StateChange.columns(state=[labels[int(value)] for value in values]))

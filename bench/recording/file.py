@@ -1,4 +1,4 @@
-"""The file of a recording, which appears whole or not at all."""
+"""Writes the file of a recording atomically."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bench.recording import about
 
 @contextmanager
 def written(path: Path, meta: Mapping[str, object], layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
-    """A recording that is written aside, and renamed at the end; not at all if the block raises."""
+    """A recording written to a temporary file, which is renamed at the end, or deleted if the block raises."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     name = uuid.uuid5(uuid.NAMESPACE_URL, f"{meta.get('unit', '')}/{meta.get('seed', '')}/{path.name}")
     try:

@@ -1,1 +1,1 @@
-"""Victims: the learned drivers and the reference drivers that attacks are aimed at."""
+"""Victims: the driving policies and object detectors that are attacked, and the baseline drivers."""

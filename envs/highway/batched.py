@@ -1,4 +1,4 @@
-"""The default environment: our own compiled engine, equal to highway-env and several hundred times faster."""
+"""The default environment, on the compiled engine: identical to highway-env and several hundred times faster."""
 
 from __future__ import annotations
 

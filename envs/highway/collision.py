@@ -1,4 +1,4 @@
-"""Who hits whom: highway-env's vehicle/objects.py and its separating-axes test in utils.py."""
+"""Collision detection: highway-env's vehicle/objects.py and the separating-axis test of its utils.py."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from envs.highway.state import Floats, Integers, Vehicle, Vehicles
 
 DIAGONAL = math.sqrt(VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2)
 SURELY = 1e-6
-"""Margin in m that no rounding error reaches: pairs that are apart by more need no exact test."""
+"""Margin in m, larger than any rounding error: pairs farther apart need no exact test."""
 
 
 @inner
 def interval_distance(low_a: float, high_a: float, low_b: float, high_b: float) -> float:
-    """utils.interval_distance: gap between two intervals, negative where they overlap."""
+    """utils.interval_distance: gap between two intervals, negative if they overlap."""
     return low_b - high_a if low_a < low_b else low_a - high_b
 
 
@@ -34,7 +34,7 @@ def fill_corners(vehicle: Vehicle, corners: Floats) -> None:
 
 @inner
 def project(corners: Floats, normal_x: float, normal_y: float) -> tuple[float, float]:
-    """utils.project_polygon: least and greatest coordinate of the corners along a normal."""
+    """utils.project_polygon: smallest and largest coordinate of the corners along a normal."""
     low, high = np.inf, -np.inf
     for corner in range(5):
         along = corners[corner, 0] * normal_x + corners[corner, 1] * normal_y
@@ -55,7 +55,7 @@ def polygons_intersect(
     """utils.are_polygons_intersecting.
 
     Returns:
-        Whether they overlap now, whether they will within the frame, and the push that parts them (x and y in m).
+        Whether they overlap now, whether they will overlap within the frame, and the push that separates them (x, y in m).
     """
     intersecting = will_intersect = True
     nearest, push_x, push_y = np.inf, 0.0, 0.0
@@ -91,9 +91,9 @@ def polygons_intersect(
 
 @inner
 def pass_side_by_side(first: Vehicle, second: Vehicle, displacement_x: float, displacement_y: float) -> bool:
-    """Whether the first vehicle's long side surely parts the two, now and within the frame.
+    """Whether a line along the first vehicle separates the two, now and within the frame.
 
-    One parting line is enough for `polygons_intersect` to find neither overlap nor impact, and this one is cheap.
+    One separating line implies that `polygons_intersect` finds no overlap and no impact; this line is cheap to test.
     """
     normal_x, normal_y = -first.sin_heading, first.cos_heading
     apart = abs(normal_x * (second.x - first.x) + normal_y * (second.y - first.y))
@@ -105,7 +105,7 @@ def pass_side_by_side(first: Vehicle, second: Vehicle, displacement_x: float, di
 
 @inner
 def set_impact(vehicle: Vehicle, pair: int, push_x: float, push_y: float) -> None:
-    """In highway-env the last pair of a frame decides the impact; pairs come in any order here, so they are ranked."""
+    """Set the impact; highway-env uses the last pair of a frame, so pairs are ranked because they come in any order here."""
     if pair > vehicle.impact_pair:
         vehicle.impact_x = push_x
         vehicle.impact_y = push_y
@@ -118,7 +118,7 @@ def collide(
 ) -> None:
     """RoadObject.handle_collisions for one pair, `first_number` < `second_number`.
 
-    The circle that is looked at first grows with the speed of the first vehicle only, as in highway-env.
+    The distance of the first check grows with the speed of the first vehicle only, as in highway-env.
     """
     first, second = vehicles[first_number], vehicles[second_number]
     x, y = second.x - first.x, second.y - first.y
@@ -142,9 +142,9 @@ def collide(
 
 @inner
 def find_collisions(vehicles: Vehicles, order: Integers, dt: float, corners: Floats) -> None:
-    """The second half of Road.step: every pair, but only those close enough along the road are looked at.
+    """The second half of Road.step: test every pair that is close enough along the road.
 
-    `corners` [2, 5, 2] is scratch.
+    `corners` [2, 5, 2] is a work array.
     """
     fastest = 0.0
     for number in range(vehicles.size):

@@ -1,4 +1,4 @@
-"""How the engine's functions are compiled: numba, cached on disk where a disk allows it.
+"""Compilation of the engine's functions with numba, cached on disk if possible.
 
 Inner functions are compiled into the entry points; only entry points are cached.
 """
@@ -15,7 +15,7 @@ from numba.core.caching import FunctionCache
 
 
 def _fingerprint() -> str:
-    """Hash of this folder's sources: numba only looks at the file of the cached function, not at what it calls."""
+    """Hash of this folder's sources: numba checks only the file of the cached function, not of the functions it calls."""
     digest = hashlib.sha256()
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
@@ -26,7 +26,7 @@ FINGERPRINT = _fingerprint()
 
 
 class _SourcesCache(FunctionCache):
-    """numba's cache on disk with this folder's sources in the key; a disk that cannot be written costs time only."""
+    """numba's disk cache with this folder's sources in the key; write errors are ignored."""
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         return (*super()._index_key(sig, codegen), FINGERPRINT)
@@ -39,19 +39,19 @@ class _SourcesCache(FunctionCache):
 
 
 def inner(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function that only compiled code calls: without wrappers for other callers, in two thirds of the time.
+    """Compile a function that is called only from compiled code. No wrappers are built, which saves a third of the time.
 
-    Called from Python it ends the process; what both call is an `entry_point`.
+    A call from Python crashes the process; use `entry_point` for functions called from Python.
     """
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
 
 
 def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function that Python calls: without the GIL, cached in `__pycache__` or the user's cache folder."""
+    """Compile a function that is called from Python: it releases the GIL and is cached in `__pycache__` or the user's cache."""
     dispatcher = njit(nogil=True)(function)
     try:
         dispatcher._cache = _SourcesCache(function)
     except RuntimeError:
-        # numba found no folder it may write to: the engine compiles in memory, once a process.
+        # numba found no writable folder: the engine is compiled in memory, once per process.
         return dispatcher
     return dispatcher

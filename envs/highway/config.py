@@ -1,4 +1,4 @@
-"""What the driving world can be told, checked in one place. Both environments read this and nothing else."""
+"""The checked configuration of the highway environments. Both environments read only this."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 
 UNITS = ("m", "m", "m/s", "m/s")
 FLOORS = (0.5, 0.2, 0.3, 0.2)
-"""A sensor's own resolution."""
+"""Resolution of the sensor, in `UNITS`."""
 STANDARD_FEATURES = Features(
     names=("x", "y", "vx", "vy"),
     low=(-100.0, -20.0, -40.0, -20.0),
@@ -40,29 +40,30 @@ THESIS_TARGET_SPEEDS = (20.0, 25.0, 30.0)
 
 @dataclass(frozen=True, kw_only=True)
 class HighwayConfig:
-    """highway-env's `highway-v0` on a straight road, as this project uses it.
+    """The configuration of highway-env's `highway-v0` on a straight road.
 
     Args:
         cells: lanes, density and weather of each episode of the batch (at least one).
-        vehicles: traffic vehicles beside the ego, at least 1.
+        vehicles: number of traffic vehicles besides the ego, at least 1.
         ego_spacing: highway-env's spacing factor in front of the ego at the start.
-        simulation_frequency: physics frames a second.
-        policy_frequency: decisions a second; must divide `simulation_frequency`.
-        max_steps: decisions until an episode is truncated.
-        action_type: `discrete` lane-changing actions (`ACTIONS`), or `continuous` [acceleration, steering] in [-1, 1],
-            which stand for -5 to 5 m/s2 and -45 to 45 degrees.
-        driver: `agent` obeys the actions; `idm` puts highway-env's IDMVehicle in the ego's place and ignores them.
-        action_repeat: decisions an action is held: lane changes are sent once and then IDLE, the rest is repeated.
-        target_speeds: increasing speeds in m/s among which FASTER and SLOWER choose; highway-env takes them as uniform.
+        simulation_frequency: physics frames per second.
+        policy_frequency: decisions per second; must divide `simulation_frequency`.
+        max_steps: number of decisions until an episode is truncated.
+        action_type: `discrete` lane-changing actions (`ACTIONS`), or `continuous` [acceleration, steering] in [-1, 1], mapped to
+            -5 to 5 m/s2 and -45 to 45 degrees.
+        driver: `agent` executes the actions; `idm` replaces the ego with highway-env's IDMVehicle and ignores them.
+        action_repeat: number of decisions for which an action is held: lane changes are sent once, then IDLE; other actions are
+            repeated.
+        target_speeds: increasing speeds in m/s for FASTER and SLOWER; highway-env assumes that they are uniform.
         features: observed features and the fixed ranges that map to [-1, 1].
-        observed_vehicles: rows of an observation, the ego's own included; at least 2.
+        observed_vehicles: number of rows in an observation, including the ego; at least 2.
         collision_reward, right_lane_reward, high_speed_reward: weights of highway-env's reward.
-        reward_speed_range: speeds in m/s at which the speed reward begins and is full.
-        normalize_reward: map the reward to [0, 1] as highway-env does.
+        reward_speed_range: speeds in m/s at which the speed reward is 0 and 1.
+        normalize_reward: map the reward to [0, 1] like highway-env.
         offroad_terminal: whether leaving the road ends the episode.
 
     Raises:
-        ValueError: with one line that says what is wrong and what is allowed.
+        ValueError: if a value is not allowed; the message is one line with the allowed values.
     """
 
     cells: tuple[Cell, ...] = (AXES.cell(lanes=3, density=1.0),)
@@ -102,7 +103,7 @@ class HighwayConfig:
 
     @property
     def substeps(self) -> int:
-        """Physics frames a decision."""
+        """Physics frames per decision."""
         return self.simulation_frequency // self.policy_frequency
 
     @classmethod
@@ -117,7 +118,7 @@ class HighwayConfig:
 
 
 def check_target_speeds(speeds: Sequence[float]) -> None:
-    """Raise ValueError unless the table has at least two increasing speeds within what a vehicle can drive."""
+    """Raise ValueError unless there are at least two increasing speeds from 0 to 40 m/s."""
     increasing = all(slower < faster for slower, faster in pairwise(speeds))
     if len(speeds) < 2 or not increasing or not (speeds[0] >= 0 and speeds[-1] <= 40):
         listed = ", ".join(f"{speed:g}" for speed in speeds)

@@ -1,7 +1,7 @@
-"""How a vehicle moves and where it is: highway-env's road/lane.py, vehicle/kinematics.py and vehicle/controller.py.
+"""Vehicle dynamics and lanes: highway-env's road/lane.py, vehicle/kinematics.py and vehicle/controller.py.
 
-The order of every floating-point operation is highway-env's own: the results are equal to the last bit. Shortcuts are
-taken only where they provably give the same bits (a vehicle that drives exactly along the road needs no trigonometry).
+Floating-point operations are in the same order as in highway-env, so results are equal to the last bit. Shortcuts are used only
+where they provably give the same bits (a vehicle that drives exactly along the road needs no trigonometry).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def clip(value: float, low: float, high: float) -> float:
 
 @inner
 def linear_map(value: float, from_low: float, from_high: float, to_low: float, to_high: float) -> float:
-    """highway_env.utils.lmap: `value` of [from_low, from_high] on [to_low, to_high], not clipped."""
+    """highway_env.utils.lmap: map `value` from [from_low, from_high] to [to_low, to_high], without clipping."""
     return to_low + (value - from_low) * (to_high - to_low) / (from_high - from_low)
 
 
@@ -61,7 +61,7 @@ def wrap_to_pi(angle: float) -> float:
 
 @inner
 def closest_lane(x: float, y: float, heading: float, lanes: int) -> int:
-    """RoadNetwork.get_closest_lane_index: only the two lanes around `y` can be closest; ties go to the lower one."""
+    """RoadNetwork.get_closest_lane_index; only the two lanes around `y` can be closest, and the lower one wins a tie."""
     angle = abs(wrap_to_pi(heading))
     before, beyond = max(x - ROAD_LENGTH, 0.0), max(0.0 - x, 0.0)
     below = int(clip(math.floor(y / LANE_WIDTH), 0.0, lanes - 1.0))
@@ -80,14 +80,14 @@ def is_on_lane(vehicle: Vehicle, lane: int, margin: float) -> bool:
 
 @inner
 def is_reachable(vehicle: Vehicle, lane: int) -> bool:
-    """AbstractLane.is_reachable_from: whether a lane change to `lane` may begin here."""
+    """AbstractLane.is_reachable_from: whether a lane change to `lane` may start here."""
     near = abs(vehicle.y - LANE_WIDTH * lane) <= 2 * LANE_WIDTH
     return near and 0 <= vehicle.x < ROAD_LENGTH + VEHICLE_LENGTH
 
 
 @inner
 def update_direction(vehicle: Vehicle) -> None:
-    """Keep the cosine and sine of the heading beside it."""
+    """Update the stored cosine and sine of the heading."""
     if vehicle.heading == 0.0:
         vehicle.cos_heading = 1.0
         vehicle.sin_heading = 0.0
@@ -118,7 +118,7 @@ def speed_control(vehicle: Vehicle) -> float:
 
 @inner
 def clip_actions(vehicle: Vehicle) -> None:
-    """Vehicle.clip_actions: a wreck brakes to a stop, and no one drives faster than 40 m/s."""
+    """Vehicle.clip_actions: a crashed vehicle brakes to a stop, and no vehicle drives faster than 40 m/s."""
     if vehicle.crashed:
         vehicle.steering = 0.0
         vehicle.acceleration = -1.0 * vehicle.speed
@@ -130,7 +130,7 @@ def clip_actions(vehicle: Vehicle) -> None:
 
 @inner
 def move(vehicle: Vehicle, lanes: int, dt: float) -> None:
-    """Vehicle.step and IDMVehicle.step: one frame of the kinematic bicycle model, then the lane the vehicle is in."""
+    """Vehicle.step and IDMVehicle.step: one frame of the kinematic bicycle model, then an update of the vehicle's lane."""
     vehicle.timer += dt
     clip_actions(vehicle)
     speed = vehicle.speed

@@ -1,4 +1,4 @@
-"""What the ego does with an action, and what it earns: highway-env's MDPVehicle and HighwayEnv._reward."""
+"""The ego's actions and reward: highway-env's MDPVehicle and HighwayEnv._reward."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from envs.highway.traffic import front_vehicle
 
 LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
 PROGRESS_LANE, PROGRESS_SPEED = 0.1, 0.4
-"""Eq. 4.1's weights. `progress` keeps them where the reward is told others: it is a measure, not an incentive."""
+"""Weights of Eq. 4.1 in `progress`; the configured reward weights do not change them, because `progress` is a metric."""
 
 
 @inner
@@ -46,11 +46,11 @@ def apply_meta_action(ego: Vehicle, action: int, lanes: int, target_speeds: Floa
 
 @inner
 def apply_action(ego: Vehicle, action: int, control: Floats, first: bool, lanes: int, parameters: Parameters) -> None:
-    """Hand the decision to the ego; of a decision that is held, a lane change counts only the `first` time.
+    """Apply the action to the ego; if an action is held, a lane change is applied only the `first` time.
 
     Args:
-        action: number of a discrete action.
-        control: [2] acceleration in m/s2 and steering in rad of a continuous one.
+        action: number of the discrete action.
+        control: [2] acceleration in m/s2 and steering in rad of the continuous action.
     """
     if parameters.ego == IDM:
         return
@@ -64,7 +64,7 @@ def apply_action(ego: Vehicle, action: int, control: Floats, first: bool, lanes:
 
 @inner
 def speed_share(ego: Vehicle, parameters: Parameters) -> float:
-    """Forward speed within the rewarded range, in [0, 1]."""
+    """Forward speed, mapped from the rewarded range to [0, 1]."""
     forward = ego.speed * ego.cos_heading
     low, high = parameters.reward_speed_low, parameters.reward_speed_high
     return clip(linear_map(forward, low, high, 0.0, 1.0), 0.0, 1.0)
@@ -72,7 +72,7 @@ def speed_share(ego: Vehicle, parameters: Parameters) -> float:
 
 @inner
 def lane_share(ego: Vehicle, lanes: int, parameters: Parameters) -> float:
-    """How far right, in [0, 1]: the target lane of a vehicle that has one, the current lane of a continuous ego."""
+    """Position to the right, in [0, 1]: of the target lane, or of the current lane for a continuous ego."""
     lane = ego.target_lane if parameters.ego in (DISCRETE, IDM) else ego.lane
     return lane / max(lanes - 1, 1)
 
@@ -91,7 +91,7 @@ def reward(ego: Vehicle, on_road: bool, lane: float, speed: float, parameters: P
 
 @inner
 def time_to_collision(vehicles: Vehicles, order: Integers) -> float:
-    """Seconds until the ego's bumper meets that of the car ahead in its lane at their present speeds; inf if never."""
+    """Seconds until the ego hits the car ahead in its lane at their current speeds; inf if never."""
     place = 0
     while order[place] != 0:
         place += 1
@@ -108,7 +108,7 @@ def time_to_collision(vehicles: Vehicles, order: Integers) -> float:
 
 @inner
 def score(vehicles: Vehicles, episode: Episode, parameters: Parameters) -> None:
-    """Write what one decision brought into the episode's record; reward and progress are added up."""
+    """Update the episode's record after one decision; reward and progress are sums."""
     ego = vehicles[0]
     on_road = is_on_lane(ego, ego.lane, 0.0)
     lane, speed = lane_share(ego, episode.lanes, parameters), speed_share(ego, parameters)

@@ -1,6 +1,6 @@
-"""The batched engine: highway-env's `highway-v0` for B episodes at once, step by step equal to it.
+"""The batched engine: highway-env's `highway-v0` for B episodes at once, with identical results at every step.
 
-Episodes share nothing. A finished episode is left alone until it is started again, and costs nothing.
+Episodes are independent. A finished episode does not change, and costs no time, until it is reset.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def observe_batch(
     numbers: NDArray[np.float32],
     flags: NDArray[np.bool_],
 ) -> None:
-    """The observation and record of the episodes `chosen` [R] as they are, without a step."""
+    """Write the current observation and record of the episodes `chosen` [R], without a step."""
     rows = np.empty(observation.shape[1] - 1, np.int64)
     measured = np.empty(4)
     for number in chosen:
@@ -161,7 +161,7 @@ def observe_batch(
 
 
 class HighwayEngine:
-    """B episodes of `config`, in numpy. The outputs belong to the engine and are overwritten by the next call.
+    """B episodes of `config`, in numpy. The engine owns the outputs and overwrites them in the next call.
 
     Attributes:
         observation: float32 [B, V, 5].
@@ -185,7 +185,7 @@ class HighwayEngine:
         self.episodes["lanes"] = [cell.lanes for cell in config.cells]
         self.episodes["sensor_range"] = [sensor_range_m(weather) for weather in weathers]
         self.episodes["noise_sigma"] = [noise_sigma(weather) for weather in weathers]
-        # Nothing drives before it was started.
+        # No episode runs before its reset.
         self.episodes["truncated"] = True
         self._traffic_spacing = np.array([1 / cell.density for cell in config.cells])
         self._lane_factor = lane_spacing(self.episodes["lanes"])
@@ -226,18 +226,18 @@ class HighwayEngine:
         )
 
     def step(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None = None) -> None:
-        """Carry out one action an episode; finished and paused episodes stay as they are and earn 0.
+        """Execute one action in each episode; finished and paused episodes do not change and have reward 0.
 
         Args:
-            action: int64 [B] numbers of `ACTIONS`, or float32 [B, 2] acceleration and steering in [-1, 1] (clipped).
-            paused: bool [B], episodes to leave alone beside the finished ones.
+            action: int64 [B] indices into `ACTIONS`, or float32 [B, 2] acceleration and steering in [-1, 1] (clipped).
+            paused: bool [B], episodes that do not step, besides the finished ones.
 
         Raises:
-            ValueError: if a discrete action has no such number.
+            ValueError: if a discrete action is not an index into `ACTIONS`.
         """
         actions, controls = self._no_actions, self._no_controls
         if self.parameters.ego == EgoKind.DISCRETE:
-            # One memory layout, for each other one would be compiled anew.
+            # Always one memory layout: numba would compile again for another one.
             actions = np.ascontiguousarray(action, dtype=np.int64)
             if actions.min() < 0 or actions.max() >= len(ACTIONS):
                 raise ValueError(f"actions must be between 0 and {len(ACTIONS) - 1}, got {actions.tolist()}")

@@ -1,4 +1,4 @@
-"""The TorchRL face of the driving world, shared by the batched engine and the real highway-env."""
+"""The TorchRL interface of the highway world, shared by the batched engine and the real highway-env."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ DRAWN_SEEDS = 2**31 - SeedBlock.TRAIN
 
 
 def drawn_seed(environment_seed: int, episode: int, reset: int) -> int:
-    """The scenario seed of the `reset`-th start of row `episode`, where none was asked for.
+    """The default scenario seed for the `reset`-th reset of row `episode`.
 
-    A hash, not a stream: it does not depend on when the other rows ended. Always in the training block of seeds.
+    It is a hash, so it does not depend on when the other rows ended. It is always in the training block of seeds.
     """
     value = 0
     for part in (environment_seed, episode, reset):
@@ -38,8 +38,8 @@ def drawn_seed(environment_seed: int, episode: int, reset: int) -> int:
 class HighwayEnv(EnvBase):
     """B episodes of highway driving as a TorchRL environment (keys and shapes: `bench.driving.contracts.DrivingWorld`).
 
-    Give `seed` (int64 [B]) in the tensordict of `reset` to choose the scenarios; otherwise they follow from `set_seed`.
-    A finished episode stays where it is, with `done` set and reward 0, until it is reset.
+    Set `seed` (int64 [B]) in the tensordict of `reset` to select the scenarios; otherwise they follow from `set_seed`.
+    A finished episode does not change until it is reset; `done` stays set and the reward is 0.
     """
 
     batch_locked = True
@@ -57,11 +57,11 @@ class HighwayEnv(EnvBase):
 
     @abstractmethod
     def _drive(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None) -> None:
-        """Carry out one action [B] or [B, 2] in every unfinished episode that is not `paused` [B]."""
+        """Execute one action [B] or [B, 2] in every unfinished episode that is not `paused` [B]."""
 
     @abstractmethod
     def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """Observation [B, V, 5], numbers [5, B] (rows `Number`) and flags [5, B] (rows `Flag`) as they are now."""
+        """The current observation [B, V, 5], numbers [5, B] (rows `Number`) and flags [5, B] (rows `Flag`)."""
 
     def _make_specs(self, batch: int) -> None:
         number = Unbounded(shape=(batch, 1), dtype=torch.float32)
@@ -83,7 +83,7 @@ class HighwayEnv(EnvBase):
         self._resets[:] = 0
 
     def _seeds(self, chosen: NDArray[np.int64], asked: Tensor | None) -> NDArray[np.int64]:
-        """The scenario seeds of the episodes that start now."""
+        """The scenario seeds of the episodes to start."""
         if asked is not None:
             return asked.reshape(-1).numpy().astype(np.int64)[chosen]
         resets = self._resets[chosen]
@@ -107,7 +107,7 @@ class HighwayEnv(EnvBase):
         return self._tensordict(with_reward=True)
 
     def _tensordict(self, *, with_reward: bool) -> TensorDictBase:
-        """The outputs in fresh tensors: rollouts keep them."""
+        """The outputs in new tensors, because rollouts keep them."""
         observation, numbers, flags = self._outputs()
         number = torch.from_numpy(numbers.copy()).unsqueeze(-1).unbind(0)
         flag = torch.from_numpy(flags.copy()).unsqueeze(-1).unbind(0)

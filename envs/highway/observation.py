@@ -1,4 +1,4 @@
-"""What the ego sees: highway-env's KinematicObservation (envs/common/observation.py), through the weather's sensor."""
+"""The ego's observation: highway-env's KinematicObservation (envs/common/observation.py) with the weather's sensor model."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from envs.highway.state import Episode, Floats, Integers, Vehicle, Vehicles
 
 @inner
 def is_seen(ego: Vehicle, other: Vehicle, sensor_range: float) -> bool:
-    """Road.close_objects_to: within the sensor's range and not more than two lengths behind."""
+    """Road.close_objects_to: whether `other` is within the sensor's range and less than two lengths behind."""
     x, y = other.x - ego.x, other.y - ego.y
     return x > -2 * VEHICLE_LENGTH and math.sqrt(x * x + y * y) < sensor_range
 
 
 @inner
 def nearest_vehicles(vehicles: Vehicles, order: Integers, sensor_range: float, rows: Integers) -> int:
-    """Fill `rows` [V - 1] with the vehicles seen, nearest along the road first (ties: by number); returns how many."""
+    """Fill `rows` [V - 1] with the visible vehicles, nearest along the road first (ties: by number); return their number."""
     ego = vehicles[0]
     found = 0
     for place in range(order.size):
@@ -50,7 +50,7 @@ def nearest_vehicles(vehicles: Vehicles, order: Integers, sensor_range: float, r
 
 @inner
 def measure(ego: Vehicle, other: Vehicle, relative: bool, measured: Floats) -> None:
-    """Vehicle.to_dict: x, y, vx, vy of `other` into `measured` [4], less the ego's own if `relative`."""
+    """Vehicle.to_dict: write x, y, vx, vy of `other` into `measured` [4], minus the ego's values if `relative`."""
     measured[0] = other.x
     measured[1] = other.y
     measured[2] = other.speed * other.cos_heading
@@ -82,9 +82,9 @@ def observe(
     measured: Floats,
     observation: NDArray[np.float32],
 ) -> None:
-    """Fill `observation` [V, 5]: the ego absolute, then the others relative to it, then empty rows.
+    """Fill `observation` [V, 5]: the ego in absolute values, then the others relative to it, then empty rows.
 
-    `rows` [V - 1] and `measured` [4] are scratch.
+    `rows` [V - 1] and `measured` [4] are work arrays.
     """
     ego = vehicles[0]
     observation[:] = 0.0

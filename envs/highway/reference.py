@@ -1,7 +1,7 @@
-"""The reference environment: the real highway-env behind the same TorchRL face, one episode after the other.
+"""The reference environment: the real highway-env behind the same TorchRL interface, one episode after the other.
 
-Everything the engine computes is computed here by highway-env itself; ours are only the weather's noise, the scoring
-record and the loop over episodes. Use it to check the engine, or to render.
+highway-env itself computes everything that the engine computes; this module adds only the weather's noise, the scoring record
+and the loop over episodes. Use it to check the engine, or to render.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LANE_CHANGES = (ACTIONS.index("LANE_LEFT"), ACTIONS.index("LANE_RIGHT"))
 
 
 def farama_config(config: HighwayConfig, cell: Cell) -> dict[str, Any]:
-    """The dictionary that tells highway-env what `config` and one of its cells say."""
+    """highway-env's configuration dictionary for `config` and one of its cells."""
     features = config.features
     discrete: dict[str, Any] = {"type": "DiscreteMetaAction", "target_speeds": list(config.target_speeds)}
     continuous = {"type": "ContinuousAction"}
@@ -39,9 +39,9 @@ def farama_config(config: HighwayConfig, cell: Cell) -> dict[str, Any]:
         "ego_spacing": config.ego_spacing,
         "simulation_frequency": config.simulation_frequency,
         "policy_frequency": config.policy_frequency,
-        # Floating-point time makes highway-env's own limit one step late; steps are counted instead.
+        # highway-env's own limit is one step late because of floating-point time, so steps are counted instead.
         "duration": float("inf"),
-        # The IDM driver replaces an ego that has a target lane and speed, whatever the type of the ignored actions.
+        # The IDM driver replaces an ego with a target lane and speed, so the ignored actions must be discrete.
         "action": discrete if config.driver == "idm" or config.action_type == "discrete" else continuous,
         "observation": {
             "type": "Kinematics",
@@ -61,12 +61,12 @@ def farama_config(config: HighwayConfig, cell: Cell) -> dict[str, Any]:
 
 
 class SensedKinematics(KinematicObservation):
-    """highway-env's own observation with the weather's noise added where it is still in metres."""
+    """highway-env's observation with the weather's noise, added before the normalisation."""
 
     env: SensedHighwayEnv
 
     def normalize_obs(self, df: Any) -> Any:
-        """Disturb the rows of the other vehicles, then normalise and clip as highway-env does."""
+        """Add noise to the rows of the other vehicles, then normalise and clip like highway-env."""
         if self.env.noise_sigma > 0:
             measured = df[list(self.env.feature_names)].to_numpy(dtype=np.float64, copy=True)
             for row, number in enumerate(self._seen(), start=1):
@@ -75,7 +75,7 @@ class SensedKinematics(KinematicObservation):
         return super().normalize_obs(df)
 
     def _seen(self) -> list[int]:
-        """Numbers of the vehicles in the rows after the ego's, by highway-env's own selection."""
+        """Numbers of the vehicles in the rows after the ego's, as selected by highway-env."""
         seen = self.env.road.close_objects_to(
             self.observer_vehicle,
             self.env.PERCEPTION_DISTANCE,
@@ -87,11 +87,11 @@ class SensedKinematics(KinematicObservation):
 
 
 class SensedHighwayEnv(FaramaHighwayEnv):
-    """highway-env with a weather sensor, and with its IDM driver in the ego's place if asked.
+    """highway-env with a weather sensor and, with `driver=idm`, its IDM driver as the ego.
 
     Args:
         config: the environment's configuration.
-        cell: which lanes, density and weather.
+        cell: lanes, density and weather.
         render_mode: as in gymnasium.
     """
 
@@ -106,7 +106,7 @@ class SensedHighwayEnv(FaramaHighwayEnv):
         super().__init__(config=farama_config(config, cell), render_mode=render_mode)
 
     def define_spaces(self) -> None:
-        """As highway-env's, with the sensed observation."""
+        """highway-env's spaces, with `SensedKinematics` as observation."""
         super().define_spaces()
         self.observation_type = SensedKinematics(self, **self.config["observation"])
 
@@ -118,20 +118,20 @@ class SensedHighwayEnv(FaramaHighwayEnv):
             self.controlled_vehicles = [ego]
 
     def start(self, seed: int) -> NDArray[np.float32]:
-        """Reset to a scenario; its observation [V, 5]."""
+        """Reset to a scenario and return its observation [V, 5]."""
         self.scenario_seed, self.decisions = seed, 0
         observation, _ = self.reset(seed=seed)
         return observation
 
     def decide(self, action: Any) -> tuple[NDArray[np.float32], float, bool]:
-        """One decision: observation [V, 5], reward, terminated."""
+        """Make one decision; return observation [V, 5], reward and terminated."""
         self.decisions += 1
-        # An IDMVehicle must act once a frame; highway-env would call it twice if it were sent an action.
+        # An IDMVehicle must act once per frame; with an action, highway-env would call it twice.
         observation, reward, terminated, _, _ = self.step(None if self.idm_ego else action)
         return observation, float(reward), bool(terminated)
 
     def progress(self) -> float:
-        """Eq. 4.1 without its offset, in [0, 1]; 0 for a wreck or off the road."""
+        """Eq. 4.1 without its offset, in [0, 1]; 0 after a crash or off the road."""
         rewards = self._rewards(None)
         if self.vehicle.crashed or not self.vehicle.on_road:
             return 0.0
@@ -139,7 +139,7 @@ class SensedHighwayEnv(FaramaHighwayEnv):
         return float(earned / (PROGRESS_LANE + PROGRESS_SPEED))
 
     def time_to_collision(self) -> float:
-        """Seconds, as `envs.highway.ego.time_to_collision`."""
+        """Time to collision in seconds, as in `envs.highway.ego.time_to_collision`."""
         ego = self.vehicle
         leader, _ = self.road.neighbour_vehicles(ego, ego.lane_index)
         if leader is None:
@@ -174,12 +174,12 @@ class ReferenceHighway(HighwayEnv):
                 self._drive_one(number, action[number])
 
     def _drive_one(self, number: int, action: Any) -> None:
-        """Hold one action in one episode."""
+        """Execute one action in one episode, for `action_repeat` decisions."""
         simulator = self.simulators[number]
         reward = progress = 0.0
         for held in range(self.config.action_repeat):
-            once = self.config.action_type == "discrete" and held > 0 and int(action) in LANE_CHANGES
-            self._observation[number], earned, terminated = simulator.decide(IDLE if once else action)
+            sent = self.config.action_type == "discrete" and held > 0 and int(action) in LANE_CHANGES
+            self._observation[number], earned, terminated = simulator.decide(IDLE if sent else action)
             reward += earned
             progress += simulator.progress()
             if terminated or simulator.decisions >= self.config.max_steps:

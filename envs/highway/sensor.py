@@ -1,9 +1,9 @@
-"""Weather as a sensor: how far the ego sees, and how noisy it measures. Both environments use these functions.
+"""The sensor model of the weather: range and noise of the ego's measurements. Both environments use these functions.
 
-Range: an active sensor's return from distance R falls as exp(-2 beta R) / R^2 (monostatic equation), so the range at
-which it is as weak as in clean air at 200 m (highway-env's own limit) solves R exp(beta R) = 200 m.
+Range: the return of an active sensor from distance R is proportional to exp(-2 beta R) / R^2 (monostatic equation). The range
+is the distance R whose return equals the return from 200 m (highway-env's limit) in clear air: R exp(beta R) = 200 m.
 Noise: zero-mean Gaussian on x, y (m) and vx, vy (m/s) of the other vehicles. Its size is our modelling choice.
-The draws are a hash of (scenario seed, step, vehicle, feature): no generator, no order, no dependence on the batch.
+The noise is a hash of (scenario seed, step, vehicle, feature), so it does not depend on the order of draws or on the batch.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from envs.highway.compiled import entry_point, inner
 from envs.weather import Weather
 
 CLEAR_RANGE_M = 200.0
-"""AbstractEnv.PERCEPTION_DISTANCE: 5 x the greatest speed."""
+"""AbstractEnv.PERCEPTION_DISTANCE: 5 times the maximum speed."""
 SIGMA_PER_MM_H = 0.008
 SIGMA_PER_EXTINCTION = 4.0
 
@@ -27,7 +27,7 @@ UNIT_PER_BIT = 1.0 / 2**53
 
 
 def sensor_range_m(weather: Weather) -> float:
-    """Distance in m beyond which nothing is seen: the root R of R exp(beta R) = 200, by Newton on its logarithm."""
+    """Range of the sensor in m: the root R of R exp(beta R) = 200, by Newton's method on its logarithm."""
     extinction = weather.extinction_per_m
     if extinction == 0:
         return CLEAR_RANGE_M
@@ -45,7 +45,7 @@ def noise_sigma(weather: Weather) -> float:
 
 @inner
 def mix(value: np.uint64) -> np.uint64:
-    """Finaliser of splitmix64 (Steele, Lea and Flood 2014): a bijection on 64 bits that scatters counters."""
+    """Finaliser of splitmix64 (Steele, Lea and Flood 2014): a bijection on 64 bits that decorrelates counters."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return value ^ (value >> np.uint64(31))
@@ -53,7 +53,7 @@ def mix(value: np.uint64) -> np.uint64:
 
 @inner
 def counter_hash(seed: int, step: int, vehicle: int, draw: int) -> np.uint64:
-    """64 uniform bits for one counter; each part is mixed in on its own: neighbouring counters share nothing."""
+    """64 uniform bits for one counter; each part is mixed in separately, so that neighbouring counters are unrelated."""
     step_size = np.uint64(0x9E3779B97F4A7C15)
     value = mix(np.uint64(seed) + step_size)
     value = mix((value ^ np.uint64(step)) + step_size)
@@ -63,7 +63,7 @@ def counter_hash(seed: int, step: int, vehicle: int, draw: int) -> np.uint64:
 
 @inner
 def standard_normal(seed: int, step: int, vehicle: int, feature: int) -> float:
-    """One standard normal number by Box and Muller's transform of two hashed uniforms."""
+    """One standard normal number: the Box-Muller transform of two hashed uniforms."""
     radius_bits = counter_hash(seed, step, vehicle, 2 * feature) >> np.uint64(11)
     angle_bits = counter_hash(seed, step, vehicle, 2 * feature + 1) >> np.uint64(11)
     # (bits + 1) keeps the logarithm finite.
@@ -73,7 +73,7 @@ def standard_normal(seed: int, step: int, vehicle: int, feature: int) -> float:
 
 @entry_point
 def add_noise(measured: NDArray[np.float64], sigma: float, seed: int, step: int, vehicle: int) -> None:
-    """Disturb one vehicle's measured x, y, vx, vy [4], in place and in physical units; sigma 0 leaves every bit."""
+    """Add noise to one vehicle's measured x, y, vx, vy [4], in place, in physical units; sigma 0 changes no bit."""
     if sigma > 0.0:
         for feature in range(FEATURES):
             measured[feature] += sigma * standard_normal(seed, step, vehicle, feature)

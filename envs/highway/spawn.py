@@ -1,7 +1,7 @@
-"""The start of an episode from its seed: highway-env's HighwayEnv._create_vehicles, to the last bit.
+"""The start of an episode from its seed: highway-env's HighwayEnv._create_vehicles, equal to the last bit.
 
-highway-env draws from numpy's Generator one number at a time. Here the raw 64-bit words of the same PCG64 are drawn at
-once and turned into the same numbers by the compiled code, which makes a reset some hundred times cheaper.
+highway-env draws single numbers from numpy's Generator. Here the raw 64-bit words of the same PCG64 are drawn at once, and
+compiled code converts them to the same numbers, which makes a reset about a hundred times faster.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ UNIT_PER_BIT = 1.0 / 2**53
 def draw_words(seeds: NDArray[np.int64], vehicles: int) -> NDArray[np.uint64]:
     """[len(seeds), words] the first words of each seed's generator, `gymnasium.utils.seeding.np_random(seed)`.
 
-    A vehicle takes at most 3.5 words; the rest is room for Lemire's rejections, one in a thousand million draws.
+    A vehicle needs at most 3.5 words; the rest is reserve for the rejections of Lemire's method, about one in 10^9 draws.
     """
     words = 4 * (vehicles + 1) + 16
     drawn = np.empty((len(seeds), words), dtype=np.uint64)
@@ -39,7 +39,7 @@ def draw_words(seeds: NDArray[np.int64], vehicles: int) -> NDArray[np.uint64]:
 
 
 def lane_spacing(lanes: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[...] Vehicle.create_random's factor by which more lanes shorten the spacing, computed by numpy as there."""
+    """[...] Vehicle.create_random's factor that reduces the spacing with more lanes, computed with numpy as in highway-env."""
     return np.array([np.exp(-5 / 40 * int(lane)) for lane in lanes], dtype=np.float64)
 
 
@@ -53,7 +53,7 @@ def next_double(words: Words, cursor: Integers) -> float:
 
 @inner
 def next_half_word(words: Words, cursor: Integers) -> np.uint64:
-    """PCG64's 32-bit output: the low half of a word now, its high half the next time."""
+    """PCG64's 32-bit output: the low half of a word first, its high half in the next call."""
     if cursor[1] >= 0:
         half = np.uint64(cursor[1])
         cursor[1] = -1
@@ -66,7 +66,7 @@ def next_half_word(words: Words, cursor: Integers) -> np.uint64:
 
 @inner
 def next_below(words: Words, cursor: Integers, bound: int) -> np.int64:
-    """Generator.integers(bound), and so Generator.choice(bound): Lemire's method on 32 bits."""
+    """Generator.integers(bound) and Generator.choice(bound): Lemire's method on 32 bits."""
     limit = np.uint64(bound)
     product = next_half_word(words, cursor) * limit
     threshold = (np.uint64(2**32) - limit) % limit
@@ -83,7 +83,7 @@ def next_uniform(words: Words, cursor: Integers, low: float, high: float) -> flo
 
 @inner
 def place_vehicle(vehicle: Vehicle, x: float, lane: int | np.int64, lanes: int, speed: float) -> None:
-    """Put a vehicle on the centre of a lane, driving along it."""
+    """Initialise a vehicle on the centre of a lane, driving along it."""
     vehicle.x = x
     vehicle.y = LANE_WIDTH * lane
     vehicle.heading = 0.0
@@ -111,7 +111,7 @@ def spawn_episode(
     ego: int,
     target_speeds: Floats,
 ) -> None:
-    """Fill `vehicles` [N], the ego first; each starts ahead of all before it (Vehicle.create_random)."""
+    """Fill `vehicles` [N], the ego first; each starts ahead of all previous ones (Vehicle.create_random)."""
     cursor = np.array([0, -1], dtype=np.int64)
     furthest = 0.0
     for number in range(vehicles.size):
@@ -144,10 +144,10 @@ def spawn_batch(
     lane_factors: Floats,
     parameters: Parameters,
 ) -> None:
-    """Start the episodes `chosen` [R] of `vehicles` [B, N] anew.
+    """Start the episodes `chosen` [R] of `vehicles` [B, N].
 
     Args:
-        words: [R, W] random words of each of them, from `draw_words`.
+        words: [R, W] random words of each chosen episode, from `draw_words`.
         traffic_spacing, lane_factors: [R] highway-env's spacing of the traffic, and `lane_spacing`.
     """
     for row in range(chosen.size):

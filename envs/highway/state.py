@@ -1,6 +1,6 @@
-"""The engine's memory: one record a vehicle, one record an episode, and the parameters all episodes share.
+"""The engine's state: one record per vehicle, one record per episode, and the parameters shared by all episodes.
 
-Vehicles are kept in highway-env's order (the ego is 0), on which several of its rules depend.
+Vehicles are in highway-env's order (the ego is 0), because several of its rules depend on the order.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Vehicle:
     sin_heading: float
     target_speed: float  # m/s
     timer: float  # s since a lane change was last considered
-    delta: float  # IDM exponent
+    delta: float  # exponent of the IDM
     steering: float  # rad
     acceleration: float  # m/s2
     impact_x: float  # m, the push of a collision, applied in the next frame
@@ -40,12 +40,12 @@ class Episode:
     """One episode."""
 
     lanes: int
-    seed: int  # the scenario's
+    seed: int  # scenario seed
     steps: int  # decisions so far
     sensor_range: float  # m
     noise_sigma: float  # m and m/s
     reward: float  # of the last action
-    progress: float  # of the last action, in [0, 1] a decision
+    progress: float  # of the last action, in [0, 1] per decision
     ttc: float  # s, time to collision
     crashed: bool
     offroad: bool
@@ -54,7 +54,7 @@ class Episode:
 
 
 def record_type(kind: type) -> np.dtype[np.void]:
-    """The numpy record with the fields that a class declares."""
+    """The numpy record type with the annotated fields of a class."""
     fields = {"float": np.float64, "int": np.int64, "bool": np.bool_}
     return np.dtype([(name, fields[annotation]) for name, annotation in kind.__annotations__.items()], align=True)
 
@@ -64,7 +64,7 @@ EPISODE = record_type(Episode)
 
 
 class Vehicles(Protocol):
-    """The vehicles [N] of an episode, a numpy array of `VEHICLE`, as compiled code sees it."""
+    """The vehicles [N] of an episode in compiled code: a numpy array of `VEHICLE`."""
 
     size: int
 
@@ -72,7 +72,7 @@ class Vehicles(Protocol):
 
 
 class EgoKind(IntEnum):
-    """What the ego is: highway-env's MDPVehicle, its plain Vehicle, or its IDMVehicle."""
+    """The type of the ego: highway-env's MDPVehicle, Vehicle or IDMVehicle."""
 
     DISCRETE = 0
     CONTINUOUS = 1
@@ -80,7 +80,7 @@ class EgoKind(IntEnum):
 
 
 class Parameters(NamedTuple):
-    """What all episodes of a batch share; see `HighwayConfig` for the meaning."""
+    """The parameters shared by all episodes of a batch; documented in `HighwayConfig`."""
 
     ego: int
     substeps: int
@@ -104,14 +104,14 @@ Floats = NDArray[np.float64]
 
 
 def ego_kind(config: HighwayConfig) -> EgoKind:
-    """The vehicle that stands for the ego under this configuration."""
+    """The type of the ego for a configuration."""
     if config.driver == "idm":
         return EgoKind.IDM
     return EgoKind.DISCRETE if config.action_type == "discrete" else EgoKind.CONTINUOUS
 
 
 def parameters(config: HighwayConfig) -> Parameters:
-    """The configuration as the compiled engine reads it."""
+    """The configuration for the compiled engine."""
     return Parameters(
         ego=int(ego_kind(config)),
         substeps=config.substeps,

@@ -1,6 +1,6 @@
-"""How the other drivers decide: highway-env's IDM and MOBIL (vehicle/behavior.py) and its neighbours (road/road.py).
+"""Traffic: highway-env's IDM and MOBIL (vehicle/behavior.py) and its search for neighbours (road/road.py).
 
-`order` lists the vehicles by position (ties: by number), so that a neighbour is found by looking outwards.
+`order` lists the vehicles by position (ties: by number), so that neighbours are found by searching outwards.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NO_ONE = -1
 
 @inner
 def sort_by_position(vehicles: Vehicles, order: Integers) -> None:
-    """Bring `order` [N] up to date, in place: insertion sort, for it is nearly sorted from the frame before."""
+    """Sort `order` [N] in place, by insertion sort, because it is nearly sorted from the previous frame."""
     for place in range(1, order.size):
         moved = order[place]
         x = vehicles[moved].x
@@ -50,9 +50,9 @@ def sort_by_position(vehicles: Vehicles, order: Integers) -> None:
 
 @inner
 def front_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> int:
-    """Road.neighbour_vehicles: the nearest on `lane`, level with or ahead of the vehicle at `place` of `order`.
+    """Road.neighbour_vehicles: the nearest vehicle on `lane`, level with or ahead of the vehicle at `place` of `order`.
 
-    Its number, or NO_ONE. Among vehicles at the very same position the last in highway-env's order wins.
+    Returns its number, or NO_ONE. Among vehicles at the same position the last in highway-env's order is taken.
     """
     x = vehicles[order[place]].x
     first = place
@@ -70,9 +70,9 @@ def front_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) ->
 
 @inner
 def rear_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> int:
-    """Road.neighbour_vehicles: the nearest on `lane` behind the vehicle at `place` of `order`.
+    """Road.neighbour_vehicles: the nearest vehicle on `lane` behind the vehicle at `place` of `order`.
 
-    Its number, or NO_ONE. Among vehicles at the very same position the first in highway-env's order wins.
+    Returns its number, or NO_ONE. Among vehicles at the same position the first in highway-env's order is taken.
     """
     x = vehicles[order[place]].x
     found = NO_ONE
@@ -87,7 +87,7 @@ def rear_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> 
 
 @inner
 def desired_gap(vehicle: Vehicle, leader: Vehicle) -> float:
-    """IDMVehicle.desired_gap in m; the difference of velocities is taken along the vehicle's own direction."""
+    """IDMVehicle.desired_gap in m; the difference of velocities is projected onto the vehicle's direction."""
     cos, sin = vehicle.cos_heading, vehicle.sin_heading
     along = vehicle.speed * cos - leader.speed * leader.cos_heading
     across = vehicle.speed * sin - leader.speed * leader.sin_heading
@@ -104,7 +104,7 @@ def free_acceleration(vehicle: Vehicle, target_speed: float, delta: float) -> fl
 
 @inner
 def interaction(vehicle: Vehicle, leader: Vehicle) -> float:
-    """What IDMVehicle.acceleration subtracts for the vehicle ahead, in m/s2."""
+    """The term that IDMVehicle.acceleration subtracts for the vehicle ahead, in m/s2."""
     ratio = desired_gap(vehicle, leader) / not_zero(leader.x - vehicle.x)
     return COMFORT_ACCELERATION * (ratio * ratio)
 
@@ -121,11 +121,10 @@ def following_acceleration(vehicles: Vehicles, number: int, leader: int, free: f
 def wants_lane(
     vehicles: Vehicles, order: Integers, place: int, lane: int, free: float, own_leader: int, ego: int
 ) -> bool:
-    """IDMVehicle.mobil: whether changing to `lane` pays and imposes no hard braking on the new follower.
+    """IDMVehicle.mobil: whether changing to `lane` has a gain and imposes no hard braking on the new follower.
 
-    The two conditions are independent; the cheap one is looked at first. Politeness is 0 in highway-env. The follower's
-    acceleration is evaluated with the deciding vehicle's own IDM exponent, and a continuous ego, which has no target
-    speed, with a target of 0.
+    The two conditions are independent; the cheap one is tested first. Politeness is 0 in highway-env. The follower's
+    acceleration uses the deciding vehicle's IDM exponent; a continuous ego has no target speed, so its target is 0.
     """
     number = order[place]
     new_leader = front_vehicle(vehicles, order, place, lane)
@@ -144,7 +143,7 @@ def wants_lane(
 
 @inner
 def must_abort(vehicles: Vehicles, number: int, ego: int) -> bool:
-    """Whether someone just ahead is already changing to the same lane (IDMVehicle.change_lane_policy)."""
+    """Whether a vehicle just ahead is already changing to the same lane (IDMVehicle.change_lane_policy)."""
     vehicle = vehicles[number]
     for other in range(1 if ego == CONTINUOUS else 0, vehicles.size):
         rival = vehicles[other]
@@ -160,7 +159,7 @@ def must_abort(vehicles: Vehicles, number: int, ego: int) -> bool:
 def choose_lane(
     vehicles: Vehicles, order: Integers, place: int, lanes: int, free: float, leader: int, ego: int
 ) -> None:
-    """IDMVehicle.change_lane_policy, its second half: look left, then right; right overwrites left."""
+    """The second half of IDMVehicle.change_lane_policy: test left, then right; right overwrites left."""
     vehicle = vehicles[order[place]]
     vehicle.timer = 0.0
     if abs(vehicle.speed) < 1:
@@ -198,9 +197,9 @@ def drive_idm(vehicles: Vehicles, order: Integers, place: int, lanes: int, ego: 
 
 @inner
 def act(vehicles: Vehicles, order: Integers, places: Integers, lanes: int, ego: int) -> None:
-    """Road.act: every vehicle decides, in highway-env's order, for each sees the target lanes chosen before it.
+    """Road.act: every vehicle decides, in highway-env's order, because each uses the target lanes chosen before it.
 
-    `places` [N] is scratch: the place of each vehicle in `order`.
+    `places` [N] is a work array for the position of each vehicle in `order`.
     """
     for place in range(order.size):
         places[order[place]] = place

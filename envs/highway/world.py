@@ -1,4 +1,4 @@
-"""The highway world: what `world=highway world.vehicles=50` on the command line sets."""
+"""The highway world and its parameters, as in `world=highway world.vehicles=50`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Backend = Literal["batched", "reference"]
 REFERENCE = "highway-env"
-"""The distribution that the backend `reference` runs."""
+"""The distribution that the backend `reference` needs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,17 +35,17 @@ class HighwayWorld(DrivingWorld):
     Args:
         preset: `standard` (x +-100 m, y +-20 m, vx +-40 m/s, vy +-20 m/s, 10 rows, target speeds 10 to 30 by 5) or
             `thesis` (x, y +-100 m, velocities 0 to 20 m/s, 5 rows, target speeds 20, 25, 30).
-        vehicles: traffic vehicles beside the ego.
-        observed_vehicles: rows of an observation with the ego's own; None takes the preset's.
-        target_speeds: speeds in m/s that FASTER and SLOWER choose from; None takes the preset's.
-        simulation_frequency, policy_frequency: physics frames and decisions a second.
-        max_steps: decisions until an episode is truncated.
+        vehicles: number of traffic vehicles besides the ego.
+        observed_vehicles: number of rows in an observation, including the ego; None for the preset's.
+        target_speeds: speeds in m/s for FASTER and SLOWER; None for the preset's.
+        simulation_frequency, policy_frequency: physics frames and decisions per second.
+        max_steps: number of decisions until an episode is truncated.
         offroad_terminal: whether leaving the road ends the episode.
-        backend: `batched`, our engine, or `reference`, the real highway-env (equal, and several hundred times slower; needs
-            pip install 'cavbench[reference]').
+        backend: `batched`, our engine, or `reference`, the real highway-env (identical results, several hundred times slower;
+            needs pip install 'cavbench[reference]').
 
     Raises:
-        ValueError: with one line, for what neither environment can do.
+        ValueError: if a value is not allowed; the message is one line.
     """
 
     axes: ClassVar[Axes] = AXES
@@ -73,7 +73,7 @@ class HighwayWorld(DrivingWorld):
             # A list from a configuration file would make the world unhashable.
             object.__setattr__(self, "target_speeds", tuple(float(speed) for speed in self.target_speeds))
         if self.preset == "thesis":
-            # The class says the standard's ranges; this object's own are others.
+            # The class attribute has the ranges of the standard preset.
             object.__setattr__(self, "features", THESIS_FEATURES)
         if self.backend == "reference":
             if find_spec("highway_env") is None:
@@ -122,7 +122,7 @@ class HighwayWorld(DrivingWorld):
     ) -> EnvBase:
         """See `bench.driving.DrivingWorld.make`."""
         config = self.config(cells, action_type=action_type, driver=driver, action_repeat=action_repeat)
-        # Imported here: both load torchrl and numba or pygame, which listing components must not.
+        # Imported here because both load torchrl and numba or pygame, which `bench list` must not load.
         if self.backend == "batched":
             from envs.highway.batched import BatchedHighway
 

@@ -1,4 +1,4 @@
-"""Attacks of the Adversarial Robustness Toolbox: inside the threat model, paid for, repeatable, and worth their queries."""
+"""Attacks of the Adversarial Robustness Toolbox: inside the threat model, with counted queries, repeatable, and effective."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_attacks_of_every_access_keep_the_rules(choice: str, values: dict[str, s
 
 
 def test_the_box_of_art_is_the_perturbation_set() -> None:
-    """One whole step of ART's FGSM ends where one of `pgd` does: at the corner of the set."""
+    """One full step of ART's FGSM and one of `pgd` end at the same point: the corner of the set."""
     policy, observation = Linear(0), observations(40)
     threat = ObservationThreat(norm="relative", budget=0.1)
     own = PGD(steps=1, step_size=1.0, restarts=1, random_start=False, objective="margin")
@@ -69,8 +69,8 @@ def test_the_box_of_art_is_the_perturbation_set() -> None:
     assert spent.unique().tolist() == [3]
 
 
-def test_what_is_known_is_not_paid_for_again() -> None:
-    """ART's SquareAttack asks three times about each point; an iteration costs the one query of its paper."""
+def test_known_answers_cost_no_queries() -> None:
+    """ART's SquareAttack queries each point three times; with the cache an iteration costs one query, as in its paper."""
     policy, observation = victim("discrete"), observations(30)
     threat = ObservationThreat(budget=0.001)
     _, spent = perturb(art("SquareAttack", max_iter=20), policy, observation, threat)
@@ -78,7 +78,7 @@ def test_what_is_known_is_not_paid_for_again() -> None:
 
 
 @pytest.mark.parametrize("choice", ["SquareAttack", "HopSkipJump", "ProjectedGradientDescent"])
-def test_it_changes_more_decisions_than_noise_and_then_asks_no_more(choice: str) -> None:
+def test_it_changes_more_decisions_than_noise_and_then_stops(choice: str) -> None:
     policy, observation = victim("discrete"), observations(40)
     shown, spent = perturb(art(choice), policy, observation, THREAT)
     noisy, _ = perturb(Noise(), policy, observation, THREAT)
@@ -88,7 +88,7 @@ def test_it_changes_more_decisions_than_noise_and_then_asks_no_more(choice: str)
     assert float(spent[changed].double().mean()) < 60
 
 
-def test_a_target_is_brought_about() -> None:
+def test_a_targeted_attack_reaches_its_target() -> None:
     policy, observation = victim("discrete"), observations(40)
     shown, spent = perturb(art("ProjectedGradientDescent", target=3, max_iter=10), policy, observation, THREAT)
     already, after = policy.decide(observation) == 3, policy.decide(shown) == 3
@@ -98,7 +98,7 @@ def test_a_target_is_brought_about() -> None:
         perturb(art("ProjectedGradientDescent", target=9), policy, observation)
 
 
-def test_an_episode_that_has_one_query_is_left_as_it_is() -> None:
+def test_an_episode_with_one_query_is_not_perturbed() -> None:
     observation = observations(3)
     shown, spent = perturb(art("SquareAttack"), victim("discrete"), observation, ObservationThreat(queries=1))
     assert torch.equal(shown, observation)
@@ -106,7 +106,7 @@ def test_an_episode_that_has_one_query_is_left_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("choice", ["SquareAttack", "BoundaryAttack"])
-def test_other_random_generators_are_left_as_they_were(choice: str) -> None:
+def test_global_random_generators_are_restored(choice: str) -> None:
     attack, made = art(choice), np.random.RandomState
     np.random.seed(7)  # noqa: NPY002
     random.seed(7)
@@ -118,12 +118,12 @@ def test_other_random_generators_are_left_as_they_were(choice: str) -> None:
     assert np.random.RandomState is made
 
 
-def test_a_bad_argument_is_refused_in_arts_own_words() -> None:
+def test_a_bad_argument_is_refused_with_arts_message() -> None:
     with pytest.raises(UserError, match=r"attack 'art:SquareAttack': .*p_init .* in range \[0, 1\]"):
         art("SquareAttack", p_init=3.0)
 
 
-def test_without_the_toolbox_the_command_that_installs_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_toolbox_the_error_has_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "art.attacks", None)
     _component.cache_clear()
     with pytest.raises(UserError, match=r"needs the Adversarial Robustness Toolbox: pip install 'cavbench\[art\]'"):

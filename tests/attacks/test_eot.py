@@ -1,4 +1,4 @@
-"""EOT: what it minimises, what it draws, what it may spend."""
+"""EOT: its loss, its randomness, and its query budget."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def red(patch: Tensor) -> float:
     return float(confidence(RedDetector()(shown), 1, SCENES.boxes).mean())
 
 
-def test_the_patch_takes_nearly_all_that_can_be_taken() -> None:
-    """The toy looks for red, so the best patch is cyan."""
+def test_the_patch_is_close_to_the_optimum() -> None:
+    """The toy detector measures red, so the best patch is cyan."""
     patch, oracle = crafted(EOT(texels=16, steps=40, batch=4, window=32))
     assert patch.shape == (3, 16, 16)
     assert 0 <= patch.min() <= patch.max() <= 1
@@ -49,14 +49,14 @@ def test_the_patch_takes_nearly_all_that_can_be_taken() -> None:
     assert best <= red(patch) < best + 0.1 * (min(controls) - best)
 
 
-def test_a_seed_is_a_patch() -> None:
+def test_the_patch_depends_on_the_seed_only() -> None:
     attack = EOT(texels=8, steps=3, batch=2, window=32)
     first, again, other = (crafted(attack, seed)[0] for seed in (0, 0, 1))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
-def test_what_it_reports_is_its_losses_and_changes_no_patch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_reports_its_losses_without_changing_the_patch(monkeypatch: pytest.MonkeyPatch) -> None:
     attack = EOT(texels=8, steps=6, batch=2, window=32)
     patch, oracle = crafted(attack)
     reported = oracle.evolution
@@ -68,7 +68,7 @@ def test_what_it_reports_is_its_losses_and_changes_no_patch(monkeypatch: pytest.
     assert torch.equal(crafted(attack)[0], patch)
 
 
-def test_it_stops_where_the_queries_end() -> None:
+def test_it_stops_at_the_query_budget() -> None:
     _, oracle = crafted(EOT(texels=8, steps=100, batch=8, window=32), queries=30)
     assert oracle.spent == 24
 
@@ -81,7 +81,7 @@ def test_it_stops_where_the_queries_end() -> None:
     translation=st.floats(0, 0.3),
     seed=st.integers(0, 99),
 )
-def test_the_window_shows_the_sign(x: float, y: float, side: float, translation: float, seed: int) -> None:
+def test_the_window_contains_the_sign(x: float, y: float, side: float, translation: float, seed: int) -> None:
     box = torch.tensor([[x, y, min(x + side, 1248), min(y + side, 384)]])
     generator = torch.Generator().manual_seed(seed)
     (corner,) = EOT(translation=translation)._corners(box, (384, 1248), generator)
@@ -91,7 +91,7 @@ def test_the_window_shows_the_sign(x: float, y: float, side: float, translation:
     assert box[0, 3] <= corner[1] + 320 <= 384
 
 
-def test_total_variation_of_a_plain_patch_is_none_and_of_a_chessboard_is_most() -> None:
+def test_total_variation_is_zero_for_a_plain_patch_and_largest_for_a_chessboard() -> None:
     chessboard = (torch.arange(8)[:, None] + torch.arange(8)) % 2
     assert total_variation(torch.full((1, 3, 8, 8), 0.3)) == 0
     assert total_variation(chessboard.float().expand(1, 3, 8, 8)) == 2
@@ -116,8 +116,8 @@ def test_a_parameter_out_of_range_is_named(name: str, value: float) -> None:
 
 
 @pytest.mark.slow
-def test_a_real_detector_is_blinded(published: YOLOv3TinyNetwork) -> None:
-    """On the frames it was crafted on: only that the loss reaches the patch through it all."""
+def test_a_real_detector_misses_the_sign(published: YOLOv3TinyNetwork) -> None:
+    """Tested on the crafting frames: checks only that the gradient reaches the patch."""
     detector = published
     scenes = DrawnStreet().training_scenes()
     attack = EOT(texels=32, steps=30, batch=4)

@@ -1,4 +1,4 @@
-"""What holds for every attack, whatever its parameters: it stays inside the threat model and changes nothing else."""
+"""Properties of every attack with any parameters: it stays inside the threat model and changes nothing else."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_the_answer_is_within_the_perturbation_set(
 
 @settings(max_examples=80, deadline=None)
 @given(attacks, action_types, st.integers(0, 60), st.integers(0, 99))
-def test_no_attack_asks_more_than_its_query_budget(
+def test_no_attack_exceeds_its_query_budget(
     attack: DrivingAttack, action_type: ActionType, queries: int, seed: int
 ) -> None:
     threat = ObservationThreat(budget=0.2, queries=queries)
@@ -100,7 +100,7 @@ def test_an_episode_is_attacked_the_same_alone_or_in_a_batch(
 
 @pytest.mark.parametrize("action_type", ["discrete", "continuous"])
 @pytest.mark.parametrize("attack", [ZOSignSGD(), PGD(), Noise(), Bias()], ids=lambda a: type(a).__name__)
-def test_the_victim_and_the_observation_are_left_as_they_were(attack: DrivingAttack, action_type: ActionType) -> None:
+def test_the_victim_and_the_observation_do_not_change(attack: DrivingAttack, action_type: ActionType) -> None:
     policy, observation = victim(action_type), observations(6)
     weights, truth = deepcopy(policy.state_dict()), observation.clone()
     perturb(attack, policy, observation)
@@ -110,7 +110,7 @@ def test_the_victim_and_the_observation_are_left_as_they_were(attack: DrivingAtt
 
 
 @pytest.mark.parametrize("attack", [ZOSignSGD(), PGD(), Noise(), Bias()], ids=lambda a: type(a).__name__)
-def test_an_empty_batch_is_no_work(attack: DrivingAttack) -> None:
+def test_an_empty_batch_is_returned(attack: DrivingAttack) -> None:
     shown, spent = perturb(attack, victim("discrete"), observations(0))
     assert shown.shape == (0, 4, 5)
     assert spent.shape == (0,)

@@ -1,4 +1,4 @@
-"""PGD: FGSM is its first step, more of it is never weaker, and it beats noise."""
+"""PGD: its first step is FGSM, more steps are never weaker, and it beats noise."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ def test_more_work_makes_a_stronger_attack(weak: PGD, strong: PGD) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 5), st.integers(1, 4), st.sampled_from(("discrete", "continuous")))
-def test_queries_are_the_clean_one_and_one_an_iterate(steps: int, restarts: int, action_type: ActionType) -> None:
+def test_queries_are_one_clean_and_one_per_iterate(steps: int, restarts: int, action_type: ActionType) -> None:
     _, spent = perturb(PGD(steps=steps, restarts=restarts), victim(action_type), observations(3))
     assert spent.tolist() == [1 + restarts * (steps + 1)] * 3
 
 
 @pytest.mark.parametrize("queries", [0, 1, 2])
-def test_without_queries_for_a_step_it_shows_the_truth(queries: int) -> None:
+def test_without_queries_for_a_step_it_returns_the_true_observation(queries: int) -> None:
     observation = observations(4)
     shown, _ = perturb(PGD(), victim("discrete"), observation, ObservationThreat(queries=queries))
     assert torch.equal(shown, observation)
@@ -87,7 +87,7 @@ def test_collision_never_prefers_braking() -> None:
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_a_continuous_victim_is_moved_where_the_objective_asks(objective: Objective) -> None:
+def test_a_continuous_victim_moves_towards_the_objective(objective: Objective) -> None:
     policy, observation = victim("continuous"), observations(200)
     shown, _ = perturb(PGD(objective=objective), policy, observation)
     before, after = policy.decide(observation), policy.decide(shown)

@@ -1,4 +1,4 @@
-"""What a camera's pictures go through: kornia's values, and kornia's gradient where a patch reaches."""
+"""The image transformations equal kornia's, and so does their gradient inside the patch."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def pictures(seed: int) -> Tensor:
 
 
 def by_kornia(**strength: float) -> nn.Module:
-    """All of them but the noise, with their whole graph."""
+    """All transformations except the noise, computed by kornia with the full graph."""
     size, colours = strength["scale"], ("brightness", "contrast", "saturation", "hue")
     return nn.Sequential(
         RandomAffine(strength["rotation"], scale=(1 - size, 1 + size), padding_mode="reflection", p=1.0),
@@ -43,7 +43,7 @@ def by_kornia(**strength: float) -> nn.Module:
     width=st.integers(1, 12),
     height=st.integers(1, 12),
 )
-def test_values_and_gradients_are_those_of_kornia(seed: int, left: int, top: int, width: int, height: int) -> None:
+def test_values_and_gradients_equal_kornias(seed: int, left: int, top: int, width: int, height: int) -> None:
     box = torch.tensor([left, top, min(left + width, WIDTH), min(top + height, HEIGHT)], dtype=torch.float32)
     boxes = torch.stack((box, torch.tensor([3.0, 5.0, 9.0, 11.0])))
     weight = torch.rand(2, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(seed + 1)) - 0.5
@@ -80,7 +80,7 @@ def test_each_can_be_switched_off(name: str) -> None:
     assert torch.equal(transformed, pictures(0)) == (name == "all")
 
 
-def test_noise_is_as_strong_as_asked() -> None:
+def test_noise_has_the_given_standard_deviation() -> None:
     torch.manual_seed(0)
     grey = torch.full((4, 3, 64, 64), 0.5)
     noisy = Transformations(**OFF | {"noise": 0.05})(grey, torch.tensor([[10.0, 10.0, 20.0, 20.0]]).expand(4, 4))

@@ -32,7 +32,7 @@ class Counting(Policy):
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 4), st.integers(1, 12), st.booleans(), st.sampled_from(("discrete", "continuous")))
-def test_queries_are_directions_and_base_point_an_iteration(
+def test_queries_per_iteration_are_directions_and_base_point(
     steps: int, directions: int, random_start: bool, action_type: ActionType
 ) -> None:
     attack = ZOSignSGD(steps=steps, directions=directions, early_stop=False, random_start=random_start)
@@ -66,7 +66,7 @@ def test_early_stop_saves_queries_and_meets_the_same_goals(objective: ZOObjectiv
     assert bool((few[~met] == most).all())
 
 
-def test_a_goal_that_is_met_at_once_costs_one_query() -> None:
+def test_a_goal_met_at_the_start_costs_one_query() -> None:
     policy, observation = victim("discrete"), observations(200)
     already = policy.decide(observation) == 3
     assert bool(already.any())
@@ -75,7 +75,7 @@ def test_a_goal_that_is_met_at_once_costs_one_query() -> None:
     assert torch.equal(shown[already], observation[already])
 
 
-def test_half_of_what_there_is_to_lose_is_found_sooner() -> None:
+def test_a_smaller_goal_needs_fewer_queries() -> None:
     policy, observation = victim("discrete"), observations(200)
     spent = [perturb(ZOSignSGD(enough=enough), policy, observation)[1].double().mean() for enough in (0.5, 1.0)]
     assert float(spent[0]) < float(spent[1])
@@ -83,7 +83,7 @@ def test_half_of_what_there_is_to_lose_is_found_sooner() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 99))
-def test_the_answer_is_never_worse_for_the_attacker_than_the_truth(seed: int) -> None:
+def test_the_result_is_never_worse_for_the_attacker_than_no_perturbation(seed: int) -> None:
     policy, observation = victim("discrete", seed), observations(20, seed)
     attacked, clean = (left(attack, policy, observation) for attack in (ZOSignSGD(), None))
     assert bool((attacked <= clean + 1e-5).all())
@@ -135,7 +135,7 @@ def test_a_heavier_distortion_weight_leaves_a_smaller_perturbation() -> None:
 
 
 @pytest.mark.parametrize("objective", ["collision", "expected", "margin", "target", "thesis"])
-def test_a_continuous_victim_is_moved_where_the_objective_asks(objective: ZOObjective) -> None:
+def test_a_continuous_victim_moves_towards_the_objective(objective: ZOObjective) -> None:
     policy, observation = victim("continuous"), observations(200)
     shown, _ = perturb(ZOSignSGD(objective=objective, distortion_weight=0.01), policy, observation)
     before, after = policy.decide(observation), policy.decide(shown)

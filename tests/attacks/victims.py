@@ -44,7 +44,7 @@ def victim(action_type: ActionType, seed: int = 0) -> Policy:
 
 
 def observations(count: int, seed: int = 0, rows: int = 4) -> Tensor:
-    """[count, rows, 5] of which some rows are absent; the ego's never is."""
+    """[count, rows, 5] with some absent rows; the ego is always present."""
     generator = torch.Generator().manual_seed(seed)
     measured = torch.rand(count, rows, 4, generator=generator) * 2 - 1
     present = (torch.rand(count, rows, 1, generator=generator) > 0.3).float()
@@ -65,7 +65,7 @@ def open_oracle(
 def perturb(
     attack: DrivingAttack, policy: Policy, observation: Tensor, threat: ObservationThreat | None = None, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """What the attack shows [B, V, F], and the queries it spent [B]."""
+    """The perturbed observation [B, V, F] and the number of queries [B]."""
     oracle = open_oracle(policy, attack, observation, threat, seed)
     shown, _ = attack.step(observation, oracle, attack.initial(observation, oracle))
     return shown, oracle.spent
@@ -81,7 +81,7 @@ def loss_of(policy: Policy, objective: Objective, observation: Tensor) -> Discre
 def left(
     attack: DrivingAttack | None, policy: Policy, observation: Tensor, objective: Objective = "collision"
 ) -> Tensor:
-    """[B] what is left of the victim's decision, by the key that attacks compare points by; lower is a stronger attack."""
+    """[B] the attack's key for the perturbed observation; lower is a stronger attack."""
     shown = perturb(attack, policy, observation)[0] if attack else observation
     loss, scores = loss_of(policy, objective, observation), policy.scores(shown)
     return loss.key(scores, loss(scores))

@@ -1,4 +1,4 @@
-"""Adversarial training of detectors: what it trains with, what it leaves alone, and what the one that ships withstands."""
+"""Adversarial training of detectors: its training data, its side effects, and the robustness of the shipped detector."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ QUICK = {"rounds": 2, "updates": 2, "batch": 2, "attack_params": "steps=2 batch=
 
 @pytest.fixture
 def victim(tmp_path: Path) -> YOLOv5:
-    """A small detector that has learned nothing."""
+    """A small untrained detector."""
     torch.manual_seed(0)
     path = tmp_path / "own.safetensors"
     yolov5_file.save(YOLOv5Network("n", (STOP_SIGN, "car")), path)
@@ -42,7 +42,7 @@ def trained(victim: YOLOv5, **params: object) -> tuple[Detector, list[str]]:
     return made.network, told
 
 
-def test_it_hardens_the_detector_it_is_given_and_is_found_again_in_the_zoo(
+def test_it_trains_the_given_detector_and_the_zoo_finds_it(
     victim: YOLOv5, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
@@ -66,7 +66,7 @@ def test_it_hardens_the_detector_it_is_given_and_is_found_again_in_the_zoo(
         replace(defense, trained=1).load(victim, 0, FACTS)
 
 
-def test_a_seed_is_a_training_and_the_control_is_never_attacked(victim: YOLOv5) -> None:
+def test_training_depends_on_the_seed_and_the_control_is_never_attacked(victim: YOLOv5) -> None:
     (one, told), (again, _), (control, untold) = trained(victim), trained(victim), trained(victim, skip=1.0)
     assert all(torch.equal(a, b) for a, b in zip(one.state_dict().values(), again.state_dict().values(), strict=True))
     assert any(text.startswith("patch 2, ") for text in told)
@@ -74,7 +74,7 @@ def test_a_seed_is_a_training_and_the_control_is_never_attacked(victim: YOLOv5) 
     assert not torch.equal(one.state_dict()["model.24.m.0.weight"], control.state_dict()["model.24.m.0.weight"])
 
 
-def test_what_cannot_be_is_refused_in_one_line(victim: YOLOv5) -> None:
+def test_impossible_options_are_refused_in_one_line(victim: YOLOv5) -> None:
     for bad in ({"skip": 1.5}, {"rounds": 0}, {"learning_rate": 0.0}, {"budget": 2.0}, {"fidelity": -1.0}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             DetectorAdversarialTraining(**bad)
@@ -84,7 +84,7 @@ def test_what_cannot_be_is_refused_in_one_line(victim: YOLOv5) -> None:
         trained(victim, attack_params="steps")
 
 
-def test_one_name_is_what_it_is_on_each_track() -> None:
+def test_one_name_selects_the_defence_of_each_track() -> None:
     driving = run_config(["defense=advtrain", "victim=dqn"]).pairs[0]
     detection = run_config(["defense=advtrain", "victim=yolov3_tiny"]).pairs[0]
     assert (driving.defense.name, detection.defense.name) == ("advtrain", "advtrain_detection")
@@ -94,8 +94,10 @@ def test_one_name_is_what_it_is_on_each_track() -> None:
 
 
 @pytest.mark.slow
-def test_the_one_that_ships_withstands_what_blinds_the_other(published: YOLOv3TinyNetwork) -> None:
-    """Patches crafted against each of them on the training places, 30 steps."""
+def test_the_shipped_detector_withstands_patches_that_hide_the_sign_from_the_undefended_one(
+    published: YOLOv3TinyNetwork,
+) -> None:
+    """Patches are crafted against each detector on the training places, with 30 steps."""
     scenes = StopSignApproach().training_scenes()
     hardened = DetectorAdversarialTraining().load(YOLOv3Tiny(), 0, FACTS)
     frames = (scenes.visible > 0.9).nonzero().squeeze(1)[::9]

@@ -26,7 +26,7 @@ def guarded(defense: DetectorDefense) -> Guarded:
     return found
 
 
-def test_the_median_is_that_of_opencv() -> None:
+def test_the_median_equals_opencvs() -> None:
     shown = (pictures(1) * 255).round() / 255
     transformed = guarded(MedianSmoothing(size=5)).transform(shown)[0].permute(1, 2, 0).numpy()
     wanted = cv2.medianBlur((shown[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8), 5) / 255
@@ -40,7 +40,9 @@ def test_a_lower_quality_loses_more() -> None:
 
 
 @pytest.mark.parametrize("defense", BOTH, ids=["median", "jpeg"])
-def test_the_detector_sees_what_came_through_and_the_gradient_goes_straight(defense: DetectorDefense) -> None:
+def test_the_detector_receives_the_transformed_image_and_the_gradient_is_straight_through(
+    defense: DetectorDefense,
+) -> None:
     door, shown = guarded(defense), pictures().requires_grad_(True)
     through = door.transform(shown.detach()).requires_grad_(True)
     assert torch.allclose(door(shown).scores, door.inner(through).scores, atol=1e-6)
@@ -53,7 +55,7 @@ def test_the_detector_sees_what_came_through_and_the_gradient_goes_straight(defe
 
 
 @pytest.mark.parametrize("defense", BOTH, ids=["median", "jpeg"])
-def test_a_picture_is_transformed_by_itself(defense: DetectorDefense) -> None:
+def test_images_of_a_batch_are_transformed_independently(defense: DetectorDefense) -> None:
     shown = pictures(3)
     door = guarded(defense)
     assert torch.equal(door.transform(shown)[1:2], door.transform(shown[1:2]))

@@ -1,4 +1,4 @@
-"""Real policies with a state, and what they remember after some steps."""
+"""Real policies with a state, and their state after some steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FACTS = HighwayWorld().facts
 
 
 class Echo(Policy):
-    """Its scores are the observation that reaches it, so that a test reads what a defence shows."""
+    """Its scores are its observation, so that a test can read the output of a defence."""
 
     action_type = "discrete"
 
@@ -29,7 +29,7 @@ class Echo(Policy):
 
 @dataclass(frozen=True, kw_only=True)
 class Given(DrivingVictim):
-    """A policy that is there already, as a victim."""
+    """A victim that returns a given policy."""
 
     policy: Policy
 
@@ -42,7 +42,7 @@ class Given(DrivingVictim):
 
 
 def stacked(inner: Policy, frames: int = 3, reduce: Reduction = "mean") -> Policy:
-    """A policy behind a frame stack."""
+    """A policy with a frame stack."""
     return FrameStack(frames=frames, reduce=reduce).load(Given(policy=inner), 0, FACTS)
 
 

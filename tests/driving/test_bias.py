@@ -1,4 +1,4 @@
-"""A biased sensor is off by the same share of what is allowed, at every step of an episode."""
+"""A biased sensor has the same offset, as a share of the radius, at every step of an episode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frame stack shows the last frames' mean or median, whatever the victim, the batch and the order of questions."""
+"""A frame stack returns the mean or median of the last frames, for any victim, batch and order of queries."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_the_first_step_is_the_observation_itself(reduce: Reduction) -> None:
 
 
 @every_reduction
-def test_presence_is_that_of_now_and_absent_rows_stay_empty(reduce: Reduction) -> None:
+def test_presence_is_current_and_absent_rows_stay_empty(reduce: Reduction) -> None:
     seen = frames(6)
     for now, found in zip(seen, shown(stacked(Echo(), 4, reduce), seen), strict=True):
         torch.testing.assert_close(found[..., 0], now[..., 0], rtol=0, atol=0)
@@ -75,7 +75,7 @@ def test_presence_is_that_of_now_and_absent_rows_stay_empty(reduce: Reduction) -
 
 
 @every_reduction
-def test_a_car_that_comes_into_view_is_where_it_is(reduce: Reduction) -> None:
+def test_a_newly_visible_car_has_its_true_position(reduce: Reduction) -> None:
     """An absent row holds zeros, the ego's own place: they are no measurement."""
     empty = torch.zeros(1, 2, 5)
     empty[:, 0, 0] = 1.0
@@ -99,7 +99,7 @@ def test_gradients_reach_the_newest_frame_and_are_finite(reduce: Reduction) -> N
 
 
 @pytest.mark.parametrize("victim_", [Blind(), RandomDriver(), RandomDriver(actions="continuous")], ids=repr)
-def test_the_state_of_the_victim_behind_it_is_carried(victim_: Blind | RandomDriver) -> None:
+def test_the_victims_own_state_is_kept(victim_: Blind | RandomDriver) -> None:
     alone, behind = victim_.load(0, FACTS), FrameStack(frames=3).load(victim_, 0, FACTS)
     episodes = torch.tensor([5, 6, 7])
     own, state = alone.initial(episodes), behind.initial(episodes)
@@ -109,7 +109,7 @@ def test_the_state_of_the_victim_behind_it_is_carried(victim_: Blind | RandomDri
         own, state = alone.advance(observation, action, own), behind.advance(observation, action, state)
 
 
-def test_what_the_victim_says_of_itself_is_passed_on() -> None:
+def test_the_victims_attributes_are_passed_on() -> None:
     for name in ("dqn", "idm"):
         own = choose("victim", name).component
         alone, behind = own.load(0, FACTS), FrameStack().load(own, 0, FACTS)
@@ -150,7 +150,7 @@ def test_on_the_highway_the_victim_decides_on_the_frames_it_was_shown(reduce: Re
 
 
 @pytest.mark.parametrize("name", STATEFUL)
-def test_whoever_remembers_measures_the_same_alone_and_in_a_batch(name: str) -> None:
+def test_components_with_a_state_do_not_depend_on_the_batch(name: str) -> None:
     def columns(seeds: range) -> dict[str, np.ndarray]:
         world, policy = HighwayWorld(), STATEFUL[name]()
         env = world.make([world.axes.cell(lanes=3, density=1.0)] * len(seeds), action_type=policy.action_type)

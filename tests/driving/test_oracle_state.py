@@ -1,4 +1,4 @@
-"""Asking through the oracle gives the answers of the policy itself, from what it remembers, and changes nothing."""
+"""The oracle returns the policy's own answers for its state, and queries change nothing."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def weighed(scores: Tensor) -> Tensor:
 @every_policy
 @at_any_size
 @given(leading=LEADING, rows=ROWS, steps=STEPS)
-def test_answers_are_those_of_the_policy_with_the_same_state(
+def test_answers_equal_the_policys_with_the_same_state(
     name: str, leading: tuple[int, ...], rows: list[int] | None, steps: int
 ) -> None:
     policy = STATEFUL[name]()
@@ -77,7 +77,7 @@ def test_answers_are_those_of_the_policy_with_the_same_state(
 @every_policy
 @at_any_size
 @given(leading=LEADING, rows=ROWS, steps=STEPS)
-def test_gradients_are_those_of_the_policy_with_the_same_state(
+def test_gradients_equal_the_policys_with_the_same_state(
     name: str, leading: tuple[int, ...], rows: list[int] | None, steps: int
 ) -> None:
     policy = STATEFUL[name]()
@@ -133,7 +133,7 @@ def test_more_queries_than_a_chunk_are_answered_from_the_right_episodes(name: st
         assert_same(scores[index], policy.scores(question[index], state))
 
 
-def test_what_is_remembered_decides_the_answer() -> None:
+def test_the_answer_depends_on_the_state() -> None:
     """Else the tests above would hold for an oracle that forgets."""
     policy = stacked(victim("discrete"))
     here, elsewhere = (remembered(policy, BATCH, 4, seed) for seed in (0, 1))
@@ -144,7 +144,7 @@ def test_what_is_remembered_decides_the_answer() -> None:
     assert_same(swapped, first[[1, 0]])
 
 
-def test_queries_are_counted_of_the_episodes_they_are_about() -> None:
+def test_queries_are_counted_for_their_episodes() -> None:
     policy = stacked(victim("discrete"))
     oracle = opened(policy, remembered(policy, BATCH, 4))
     oracle.scores(asked_about((3,), 2), torch.tensor([4, 1]))

@@ -1,4 +1,4 @@
-"""Components with a state go the whole way: run, records, recordings, and a replay that is the same to the last bit."""
+"""Components with a state can be run, recorded and replayed, and the replay is equal to the last bit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RUN = (
 
 
 class Warned:
-    """A watcher that remembers what went wrong."""
+    """A watcher that collects the warnings."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []

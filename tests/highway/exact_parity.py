@@ -1,6 +1,6 @@
 """The engine is highway-env, bit for bit. Run by `test_parity.py` in a process whose numpy has no AVX-512 kernels.
 
-Not collected by itself: with AVX-512 numpy rounds some functions differently from scalar code, and from itself.
+pytest does not collect this file: with AVX-512, numpy rounds some functions differently from scalar code.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def test_reset_is_bit_equal_for_many_seeds() -> None:
 
 @st.composite
 def random_cases(draw: st.DrawFn) -> Case:
-    """Any world that the configuration lets through, for a few steps."""
+    """Random cases over all valid configurations, for a few steps."""
     cell = AXES.cell(
         lanes=draw(st.integers(2, 8)),
         density=draw(st.floats(0.3, 4.0)),

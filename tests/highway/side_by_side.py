@@ -1,4 +1,4 @@
-"""Drive highway-env and the engine side by side and count every difference: what the parity tests are made of."""
+"""Drive highway-env and the engine side by side and count all differences, for the parity tests."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def compare(case: Case, tolerance: float = 0.0) -> Counter[str]:
 
 
 def differences(counts: Counter[str]) -> dict[str, int]:
-    """The counts that should not be there."""
+    """The counts of differences."""
     return {name: count for name, count in counts.items() if name.startswith("differs")}
 
 
@@ -99,7 +99,7 @@ def _events(before: np.ndarray, after: np.ndarray) -> Counter[str]:
 
 
 def state_of(simulator: SensedHighwayEnv) -> dict[str, np.ndarray]:
-    """The state of highway-env's vehicles in the engine's names; of what only some vehicles have, the last ones."""
+    """The state of highway-env's vehicles under the engine's names; attributes that only some vehicles have cover the last."""
     vehicles = simulator.road.vehicles
     drivers = [v for v in vehicles if hasattr(v, "target_lane_index")]
     idm = [v for v in vehicles if hasattr(v, "timer")]
@@ -126,7 +126,7 @@ def _differing(
     ended: bool,
     tolerance: float,
 ) -> Iterator[str]:
-    """Names of everything that is not equal now."""
+    """Names of all values that currently differ."""
     for name, values in state_of(simulator).items():
         ours = engine.vehicles[name][0][-len(values) :]
         close = np.abs(ours - values).max() <= tolerance if values.dtype.kind == "f" else (ours == values).all()

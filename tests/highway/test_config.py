@@ -41,7 +41,7 @@ ROOT = Path(__file__).parents[2]
         ({"collision_reward": 0.5}, "normalize_reward needs"),
     ],
 )
-def test_the_configuration_says_what_is_wrong(bad: dict[str, Any], message: str) -> None:
+def test_a_bad_configuration_is_refused_with_the_reason(bad: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         HighwayConfig(**bad)
     assert "\n" not in str(caught.value)
@@ -56,12 +56,12 @@ def test_the_configuration_says_what_is_wrong(bad: dict[str, Any], message: str)
         ({"target_speeds": (1.0,)}, "target_speeds must be"),
     ],
 )
-def test_the_world_says_what_is_wrong_when_it_is_made(bad: dict[str, Any], message: str) -> None:
+def test_a_bad_world_is_refused_with_the_reason(bad: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         HighwayWorld(**bad)
 
 
-def test_presets_are_the_projects_and_the_thesis() -> None:
+def test_the_presets_are_standard_and_thesis() -> None:
     standard, thesis = HighwayWorld(), HighwayWorld(preset="thesis")
     assert isinstance(standard, DrivingWorld)
     assert standard.features == HighwayWorld.features == STANDARD_FEATURES
@@ -78,7 +78,7 @@ def test_worlds_with_equal_fields_are_equal_and_hashable() -> None:
 
 
 @pytest.mark.slow
-def test_the_engine_runs_where_no_compiled_code_can_be_kept() -> None:
+def test_the_engine_runs_without_a_writable_cache() -> None:
     program = (
         "import numba.core.caching as caching\n"
         # As on a read-only installation without a home: numba finds nowhere to write.

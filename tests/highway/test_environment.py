@@ -25,7 +25,7 @@ IDLE, LANE_RIGHT, FASTER, SLOWER = 1, 2, 3, 4
 
 
 def make(cells: Sequence[Cell] = (CLEAR,), **options: Any) -> EnvBase:
-    """An environment of a small world; options go to `make` or, where it has none such, to the world."""
+    """An environment of a small world; options are passed to `make` if it has them, otherwise to the world."""
     of_make = {name: options.pop(name) for name in ("action_type", "driver", "action_repeat") if name in options}
     return HighwayWorld(**options).make(cells, **of_make)
 
@@ -35,7 +35,7 @@ def start(env: EnvBase, *seeds: int) -> TensorDictBase:
 
 
 def drive(env: EnvBase, state: TensorDictBase, actions: Tensor) -> list[TensorDictBase]:
-    """Step through actions [T, ...] (or [T, B, ...]); what came after each."""
+    """Step through actions [T, ...] (or [T, B, ...]) and return the output of each step."""
     results = []
     for action in actions:
         shape = env.action_spec.shape
@@ -55,7 +55,7 @@ def test_specs_hold(backend: Backend, driver: Driver, action_type: ActionType) -
     check_env_specs(make(MIXED, backend=backend, driver=driver, action_type=action_type, vehicles=5))
 
 
-def test_outputs_are_those_of_the_contract() -> None:
+def test_outputs_match_the_contract() -> None:
     env = make(MIXED)
     state = env.rand_step(env.reset())["next"]
     assert state["observation"].shape == (3, 10, 5)
@@ -118,7 +118,7 @@ def test_a_partial_reset_leaves_the_other_episodes_alone() -> None:
     assert env.engine.episodes["steps"].tolist() == [0, 10, 0, 10]
 
 
-def test_a_finished_episode_stays_as_it_is_and_earns_nothing() -> None:
+def test_a_finished_episode_does_not_change_and_has_no_reward() -> None:
     env = make((CLEAR,) * 2, max_steps=5)
     results = drive(env, start(env, 1, 2), torch.full((7,), IDLE))
     assert [bool(result["truncated"].all()) for result in results] == [False] * 4 + [True] * 3
@@ -208,7 +208,7 @@ def test_progress_is_zero_after_a_crash_and_full_at_full_speed_on_the_right() ->
     assert ((progress >= 0) & (progress <= 1)).all()
 
 
-def test_the_reset_says_which_seed_it_cannot_use() -> None:
+def test_a_reset_names_an_invalid_seed() -> None:
     for backend in ("batched", "reference"):
         with pytest.raises(ValueError, match="at least 0, got -1"):
             start(make(backend=backend), -1)

@@ -1,4 +1,4 @@
-"""The engine equals highway-env: exactly where numpy computes as scalar code does, closely everywhere."""
+"""The engine equals highway-env: bit for bit where numpy rounds like scalar code, and closely everywhere."""
 
 from __future__ import annotations
 

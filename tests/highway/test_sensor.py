@@ -1,4 +1,4 @@
-"""Weather as a sensor: its range equation and its noise."""
+"""The sensor model of the weather: range and noise."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def test_range_solves_the_sensor_equation(visibility: float, rain: float) -> Non
 
 
 @given(visibilities, visibilities, rains)
-def test_thicker_air_never_lets_the_sensor_see_farther_or_better(one: float, other: float, rain: float) -> None:
+def test_stronger_extinction_never_improves_the_sensor(one: float, other: float, rain: float) -> None:
     thick, thin = (Weather(name="any", visibility_m=v, precipitation_mm_h=rain) for v in sorted((one, other)))
     assert sensor_range_m(thick) <= sensor_range_m(thin) <= 200
     assert noise_sigma(thick) >= noise_sigma(thin)
 
 
-def test_clear_air_is_highway_envs_own_observation() -> None:
+def test_in_clear_air_the_observation_equals_highway_envs() -> None:
     assert sensor_range_m(WEATHERS["clear"]) == 200.0
     assert noise_sigma(WEATHERS["clear"]) == 0.0
     measured = np.array([0.1, -0.2, 1e-17, 3.0])
@@ -45,7 +45,7 @@ def test_clear_air_is_highway_envs_own_observation() -> None:
     assert (measured == before).all()
 
 
-def test_weather_changes_what_is_seen_but_not_what_happens() -> None:
+def test_weather_changes_observations_but_not_the_traffic() -> None:
     cells = tuple(AXES.cell(lanes=3, density=2.0, weather=name) for name in ("clear", "rain", "fog"))
     engine = HighwayEngine(HighwayConfig(cells=cells))
     engine.reset(np.arange(3), np.full(3, 8))

@@ -1,4 +1,4 @@
-"""Victims that come in a file: they drive as what was written to it does, and what does not fit is refused in one line."""
+"""Victims from a file: they drive like the exported policy, and a file that does not fit is refused in one line."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def onnx_file(
 
 
 def spaces(*, continuous: bool, shape: tuple[int, ...] = (10, 5), high: float = 1.0) -> gymnasium.Env[Any, Any]:
-    """An environment of these spaces, in which nothing happens."""
+    """A dummy environment with these spaces."""
     env: gymnasium.Env[Any, Any] = gymnasium.Env()
     env.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
     box = gymnasium.spaces.Box(-high, high, (2,), np.float32)
@@ -106,7 +106,7 @@ def sb3_file(path: Path, algo: str, *, continuous: bool = False, **policy: objec
 
 
 def driven(*words: str) -> Columns:
-    """What the first unit of the words measures, without the wall time."""
+    """The measurements of the first unit of these options, without the wall time."""
     unit = next(unit for unit in plan(run_config([*SHORT.split(), *words])))
     return {name: column for name, column in drive(unit).items() if name != "attack_ms"}
 
@@ -123,7 +123,7 @@ def onnx(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("attack", ["none", "zo", "pgd"])
-def test_an_exported_dqn_drives_exactly_as_the_zoos_does(exported: str, attack: str) -> None:
+def test_an_exported_dqn_drives_exactly_like_the_zoos(exported: str, attack: str) -> None:
     own, ours = driven(f"attack={attack}", "victim=torch", f"victim.path={exported}"), driven(f"attack={attack}")
     for name in ours:
         np.testing.assert_array_equal(own[name], ours[name], err_msg=name)
@@ -131,7 +131,7 @@ def test_an_exported_dqn_drives_exactly_as_the_zoos_does(exported: str, attack: 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("attack", ["none", "zo"])
-def test_a_dqn_in_an_onnx_file_decides_as_the_zoos_does(onnx: str, attack: str) -> None:
+def test_a_dqn_in_an_onnx_file_decides_like_the_zoos(onnx: str, attack: str) -> None:
     own, ours = driven(f"attack={attack}", "victim=onnx", f"victim.path={onnx}"), driven(f"attack={attack}")
     for name in ("steps", "crashed", "offroad", "action_counts", "distance_m", "queries"):
         np.testing.assert_array_equal(own[name], ours[name], err_msg=name)
@@ -146,7 +146,7 @@ def test_a_gradient_attack_on_a_black_box_is_refused_before_any_work() -> None:
 
 
 @pytest.mark.parametrize(("algo", "continuous"), ALGORITHMS)
-def test_a_policy_of_stable_baselines_acts_as_its_own_predict_does(tmp_path: Path, algo: str, continuous: bool) -> None:
+def test_a_policy_of_stable_baselines_acts_like_its_own_predict(tmp_path: Path, algo: str, continuous: bool) -> None:
     policy: dict[str, object] = {"activation_fn": nn.ELU} if algo == "ppo" and continuous else {}
     model = sb3_model(algo, spaces(continuous=continuous), **policy)
     model.save(tmp_path / "model.zip")
@@ -160,7 +160,7 @@ def test_a_policy_of_stable_baselines_acts_as_its_own_predict_does(tmp_path: Pat
 
 
 @pytest.mark.parametrize("algo", ["sac", "td3"])
-def test_a_policy_of_stable_baselines_brings_its_critic(tmp_path: Path, algo: str) -> None:
+def test_a_policy_of_stable_baselines_has_its_critic(tmp_path: Path, algo: str) -> None:
     model = sb3_model(algo, spaces(continuous=True))
     model.save(tmp_path / "model.zip")
     policy = choose("victim", "sb3", path=str(tmp_path / "model.zip"), algo=algo).component.load(0, FACTS)
@@ -193,7 +193,7 @@ def test_victims_from_files_keep_the_rules(exported: str, onnx: str, tmp_path: P
     assert complaints("victim", "sb3", path=path, algo="sac") == []
 
 
-def test_a_network_of_flat_observations_is_given_them(tmp_path: Path) -> None:
+def test_a_network_with_flat_input_receives_flat_observations(tmp_path: Path) -> None:
     path = torch_file(tmp_path / "flat.pt2", Scores(flat=True), shape=(50,))
     observation = torch.rand(2, 3, 10, 5)
     flat = choose("victim", "torch", path=path).component.load(0, FACTS)
@@ -209,7 +209,11 @@ def bad_text(path: Path) -> dict[str, str]:
 BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
     "no file": ("torch", lambda path: {"path": str(path)}, "there is no file"),
     "no program": ("torch", bad_text, "cannot be read"),
-    "fixed batch": ("torch", lambda path: {"path": torch_file(path, fixed=True)}, "takes no batch but of 3: export it"),
+    "fixed batch": (
+        "torch",
+        lambda path: {"path": torch_file(path, fixed=True)},
+        "has a fixed batch size of 3: export it",
+    ),
     "rows": (
         "torch",
         lambda path: {"path": torch_file(path), "rows": "15"},
@@ -218,28 +222,28 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
     "two scores": (
         "torch",
         lambda path: {"path": torch_file(path, Scores(2))},
-        "gives [1, 2] for 1 observations, discrete actions are [1, 5]",
+        "returns [1, 2] for 1 observations, discrete actions need [1, 5]",
     ),
     "other actions": (
         "torch",
         lambda path: {"path": torch_file(path), "actions": "continuous"},
-        "gives [1, 5] for 1 observations, continuous actions are [1, 2]",
+        "returns [1, 5] for 1 observations, continuous actions need [1, 2]",
     ),
     "no rows": ("torch", lambda path: {"path": str(path), "rows": "0"}, "victim.rows must be at least 1"),
     "no onnx": ("onnx", bad_text, "cannot be read"),
-    "fixed onnx": ("onnx", lambda path: {"path": onnx_file(path, fixed=True)}, "takes no batch but of 3"),
+    "fixed onnx": ("onnx", lambda path: {"path": onnx_file(path, fixed=True)}, "has a fixed batch size of 3"),
     "no zip": ("sb3", lambda path: bad_text(path) | {"algo": "dqn"}, "cannot be read: BadZipFile"),
     "unknown algo": ("sb3", lambda path: {"path": str(path), "algo": "dqm"}, "unknown victim.algo 'dqm'"),
     "no algo": ("sb3", lambda path: {"path": str(path)}, "needs victim.algo=…"),
     "another algo": (
         "sb3",
         lambda path: {"path": sb3_file(path, "dqn"), "algo": "ppo"},
-        "holds no ppo policy: mlp_extractor.policy_net is not among its weights",
+        "has no ppo policy: mlp_extractor.policy_net is not among its weights",
     ),
     "continuous": (
         "sb3",
         lambda path: {"path": sb3_file(path, "ppo", continuous=True), "algo": "ppo"},
-        "was trained for continuous actions [2], ppo victims here have 5 discrete actions; say victim.actions=continuous",
+        "was trained for continuous actions [2], this ppo victim needs 5 discrete actions; set victim.actions=continuous",
     ),
     "other rows": (
         "sb3",
@@ -279,7 +283,7 @@ class Harm:
         return os.mkdir, (str(self.path),)
 
 
-def test_nothing_in_a_saved_model_is_unpickled_but_tensors(tmp_path: Path) -> None:
+def test_only_tensors_of_a_saved_model_are_unpickled(tmp_path: Path) -> None:
     path, harm = Path(sb3_file(tmp_path / "dqn.zip", "dqn")), tmp_path / "harm"
     with zipfile.ZipFile(path) as archive:
         entries = {name: archive.read(name) for name in archive.namelist()}
@@ -301,7 +305,7 @@ def test_nothing_in_a_saved_model_is_unpickled_but_tensors(tmp_path: Path) -> No
     assert not harm.exists()
 
 
-def test_without_onnx_runtime_the_command_that_installs_it_is_said(
+def test_without_onnx_runtime_the_error_has_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)

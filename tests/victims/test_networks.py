@@ -1,4 +1,4 @@
-"""The networks: shapes, the set property, and what an attacker needs of them."""
+"""The networks: shapes, invariance to the order of cars, and gradients for attacks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_the_order_of_the_other_cars_does_not_matter(order: list[int], seed: int
     torch.testing.assert_close(policy.scores(x[:, [0, *order]]), policy.scores(x))
 
 
-def test_an_absent_car_says_nothing_whatever_its_row_holds(policy: Policy) -> None:
+def test_the_row_of_an_absent_car_has_no_effect(policy: Policy) -> None:
     x = observation((8,))
     y = x.clone()
     y[..., 1:] += (x[..., :1] == 0) * torch.rand_like(x[..., 1:])

@@ -17,7 +17,7 @@ RIGHT_STEPS = 60
 
 
 def driven(policy: Policy, episodes: Tensor, steps: int) -> Tensor:
-    """[steps, B] or [steps, B, 2] what it does, one step after the other."""
+    """[steps, B] or [steps, B, 2] the actions of a driver, step by step."""
     x, state, actions = torch.zeros(len(episodes), 10, 5), policy.initial(episodes), []
     for _ in range(steps):
         actions.append(policy.decide(x, state))
@@ -25,7 +25,7 @@ def driven(policy: Policy, episodes: Tensor, steps: int) -> Tensor:
     return torch.stack(actions)
 
 
-def test_a_blind_driver_does_not_look() -> None:
+def test_a_blind_driver_ignores_the_observation() -> None:
     policy = Blind(policy="faster").load(0, FACTS)
     assert policy.decide(torch.rand(6, 10, 5)).tolist() == [FASTER] * 6
     assert Blind(policy="brake").load(0, FACTS).decide(torch.rand(2, 10, 5)).tolist() == [[-1.0, 0.0]] * 2
@@ -68,6 +68,6 @@ def test_random_continuous_actions_fill_their_range() -> None:
     assert actions.max() > 0.9
 
 
-def test_idm_leaves_the_wheel_to_the_world() -> None:
+def test_idm_uses_the_worlds_own_driver() -> None:
     assert IDMDriver().load(0, FACTS).driver == "idm"
     assert not IDMDriver.sees

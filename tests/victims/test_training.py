@@ -1,4 +1,4 @@
-"""Training, for real but short: what is learned from, what is attacked, and that a seed decides it all."""
+"""Short real trainings: their data, the attack in the loop, and reproducibility by seed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ VICTIMS = [DQN(**SHORT), DDPG(**SHORT)]
 
 
 def silent(share: float, text: str) -> None:
-    """A progress bar that nobody looks at."""
+    """A progress callback that does nothing."""
     assert 0 <= share <= 1
 
 
@@ -35,13 +35,13 @@ def world() -> DrivingWorld:
 
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
-def test_a_training_depends_on_its_seed_alone(victim: LearningDriver, world: DrivingWorld) -> None:
+def test_a_training_depends_on_its_seed_only(victim: LearningDriver, world: DrivingWorld) -> None:
     first, again, other = (victim.train(world, seed=seed, progress=silent).network.state_dict() for seed in (1, 1, 2))
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert not all(torch.equal(first[name], other[name]) for name in first)
 
 
-def test_the_card_says_how_the_checkpoint_was_chosen(world: DrivingWorld) -> None:
+def test_the_card_has_the_checkpoint_selection(world: DrivingWorld) -> None:
     card = VICTIMS[0].train(world, seed=0, progress=silent).card
     assert set(card["selection"]["safe_progress"]["clean"]) == {
         "mean",
@@ -69,7 +69,7 @@ def test_returns_end_where_the_episode_ends(world: DrivingWorld) -> None:
 
 
 @pytest.mark.parametrize("skip", [0.0, 0.5, 1.0])
-def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, world: DrivingWorld) -> None:
+def test_the_skip_probability_sets_the_rate_of_attacks(skip: float, world: DrivingWorld) -> None:
     defense = AdversarialTraining(
         start="scratch", where="acting", skip=skip, ramp_to=0.0, attack="noise", attack_params=""
     )
@@ -77,7 +77,7 @@ def test_the_skip_probability_decides_how_often_the_attack_is_met(skip: float, w
     assert card["attacked_decisions"] / (160 * 6) == pytest.approx(1 - skip, abs=0.06)
 
 
-def test_the_budget_grows_along_the_ramp() -> None:
+def test_the_budget_follows_the_ramp() -> None:
     defense = AdversarialTraining(skip=0.0, attack="noise", attack_params="", ramp_from=0.2, ramp_to=0.6)
     world = registry.load("world", "highway")()
     loop = AttackInLoop(defense, registry.load("attack", "noise")(), world.facts, None, seed=0)
@@ -88,7 +88,7 @@ def test_the_budget_grows_along_the_ramp() -> None:
 
 
 class Calm(TrainingHooks):
-    """Another defence: small scores are preferred, and the replay is shown darker; it notes what it was asked."""
+    """Another defence: it prefers small scores, scales replayed observations, and logs its calls."""
 
     def __init__(self) -> None:
         self.asked: set[str] = set()
@@ -116,7 +116,7 @@ def test_any_defence_adds_its_own_loss_through_the_hooks(victim: LearningDriver,
 
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
-def test_hooks_that_change_nothing_change_nothing(victim: LearningDriver, world: DrivingWorld) -> None:
+def test_default_hooks_do_not_change_the_training(victim: LearningDriver, world: DrivingWorld) -> None:
     plain, hooked = (
         victim.train(world, seed=0, hooks=hooks, progress=silent).network.state_dict()
         for hooks in (None, TrainingHooks())
@@ -125,7 +125,7 @@ def test_hooks_that_change_nothing_change_nothing(victim: LearningDriver, world:
 
 
 class Lesson:
-    """A teacher, transitions shown otherwise than they were, and a learner that goes on from the teacher."""
+    """A teacher, transitions with perturbed observations, and a learner that continues from the teacher."""
 
     def __init__(self, victim: LearningDriver, world: DrivingWorld) -> None:
         torch.manual_seed(0)
@@ -143,7 +143,7 @@ class Lesson:
         )
 
     def decided(self, **params: float) -> torch.Tensor:
-        """What the learner decides on what is shown after 150 updates: softmax probabilities, or the action."""
+        """The learner's decisions on the perturbed observations after 150 updates: softmax probabilities, or the action."""
         defense = AdversarialTraining(**{"consistency": 0.0, "margin": 0.0, **params})
         facts = registry.load("world", "highway")().facts
         hooks = AttackInLoop(defense, registry.load("attack", "none")(), facts, self.teacher, seed=0)
@@ -156,14 +156,14 @@ class Lesson:
         return self.decision(trained.scores(self.shown).detach())
 
     def decision(self, scores: torch.Tensor) -> torch.Tensor:
-        """The probabilities that scores stand for, on the teacher's scale; an action is what it is."""
+        """Softmax probabilities of scores, on the teacher's scale; continuous actions are returned unchanged."""
         if self.victim.action_type == "continuous":
             return scores
         return torch.softmax(scores / (0.5 * self.teacher.scores(self.truth).std(-1, keepdim=True)), -1).detach()
 
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
-def test_consistency_brings_decisions_under_attack_to_those_on_the_truth(
+def test_consistency_moves_decisions_under_attack_towards_clean_decisions(
     victim: LearningDriver, world: DrivingWorld
 ) -> None:
     lesson = Lesson(victim, world)
@@ -172,7 +172,7 @@ def test_consistency_brings_decisions_under_attack_to_those_on_the_truth(
     assert float(near) < 0.7 * float(far)
 
 
-def test_a_margin_makes_changes_of_lane_less_wanted(world: DrivingWorld) -> None:
+def test_a_margin_makes_lane_changes_less_likely(world: DrivingWorld) -> None:
     lesson = Lesson(VICTIMS[0], world)
     spread = float(lesson.teacher.scores(lesson.truth).std(-1).mean())
     without, reluctant = (lesson.decided(consistency=10.0, margin=margin).mean(0) for margin in (0.0, spread))

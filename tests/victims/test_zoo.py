@@ -1,4 +1,4 @@
-"""The zoo: an entry is found by its recipe, what is saved is what is loaded, and a card is enough to train it again."""
+"""The zoo: entries are found by recipe, load as they were saved, and can be trained again from their card."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def save(victim: DQN, world: DrivingWorld, *, seed: int, card: dict[str, object]
     return zoo.save(QPolicy(5, 5, victim.hidden), zoo.Recipe.of(victim), seed=seed, world=world, card=card or {})
 
 
-def test_a_policy_comes_back_as_it_was_saved(saved: Path) -> None:
+def test_a_policy_loads_as_it_was_saved(saved: Path) -> None:
     torch.manual_seed(3)
     before, after = QPolicy(5, 5, 8), zoo.load(RECIPE, 3, QPolicy)
     x = torch.rand(4, 10, 5)
@@ -97,7 +97,7 @@ def test_training_a_variant_never_hides_the_default(home: Path, highway: Driving
 
 @dataclass(frozen=True, kw_only=True)
 class NewDQN(DQN):
-    """The DQN of a later version, with a parameter more."""
+    """The DQN of a later version, with one more parameter."""
 
     warm_up: int = 40
 
@@ -116,7 +116,7 @@ SlowDQN.__qualname__ = "DQN"
 
 
 def as_of_bench(recipe: zoo.Recipe) -> zoo.Recipe:
-    """The recipe of a class of these tests as if it stood in bench."""
+    """The recipe of a test class as if it were part of bench."""
     (part,) = recipe.parts
     return replace(recipe, parts=(replace(part, source="bench.DQN"),))
 
@@ -141,7 +141,7 @@ def test_a_training_of_another_version_is_another_recipe(home: Path, monkeypatch
         DQN().load(0, FACTS)
 
 
-def test_a_recipe_is_its_values_not_how_they_were_written() -> None:
+def test_a_recipe_depends_on_values_not_on_their_notation() -> None:
     assert zoo.Recipe.of(DQN(gamma=1)).key == zoo.Recipe.of(DQN(gamma=1.0)).key  # type: ignore[arg-type]
     assert zoo.Recipe.of(DQN(hidden=128)).key == zoo.Recipe.of(DQN()).key
     assert zoo.Recipe.of(YOLOv5(trained=3)).key == zoo.Recipe.of(YOLOv5()).key
@@ -149,7 +149,7 @@ def test_a_recipe_is_its_values_not_how_they_were_written() -> None:
     assert of_another.key != zoo.Recipe.of(YOLOv5(), registry.load("defense", "advtrain_detection")()).key
 
 
-def test_a_missing_policy_says_what_there_is_and_what_trains_it(saved: Path) -> None:
+def test_a_missing_policy_lists_variants_and_the_training_command(saved: Path) -> None:
     with pytest.raises(UserError) as error:
         DQN(hidden=16, gamma=0.9).load(4, FACTS)
     said = str(error.value)
@@ -167,7 +167,7 @@ def test_a_world_that_is_not_the_default_must_be_named(home: Path, highway: Driv
         save(DQN(trained_in="vehicles=5"), highway, seed=0)
 
 
-def test_the_shipped_policies_are_those_of_the_default_recipes(home: Path) -> None:
+def test_the_shipped_policies_have_the_default_recipes(home: Path) -> None:
     dqn, ddpg = DQN(), DDPG()
     for seed in (0, 1, 2):
         hardened = [AdversarialTraining(skip=skip).load(dqn, seed, FACTS) for skip in (0.0, 0.3, 0.5, 1.0)]
@@ -181,7 +181,7 @@ SHIPPED_CARDS = sorted(SHIPPED.rglob("*.json"))
 
 
 @pytest.mark.parametrize("path", SHIPPED_CARDS, ids=[f"{path.parent.name}-{path.stem}" for path in SHIPPED_CARDS])
-def test_the_command_of_a_shipped_card_is_its_recipe(path: Path, home: Path) -> None:
+def test_the_command_of_a_shipped_card_gives_its_recipe(path: Path, home: Path) -> None:
     entry = json.loads(path.read_text())
     assert made_by(entry["command"]).key == path.parent.name
     assert entry["recipe"]["digest"].startswith(path.parent.name.rpartition("-")[2])
@@ -225,7 +225,7 @@ def made_by(command: str) -> zoo.Recipe:
     return zoo.Recipe.of(*((config.victim.component, placed) if hardens else (placed,)))
 
 
-def test_a_card_says_all_that_is_needed_to_make_it_again(home: Path, highway: DrivingWorld) -> None:
+def test_a_card_is_enough_to_train_the_policy_again(home: Path, highway: DrivingWorld) -> None:
     save(TINY, highway, seed=3, card={"selection": "best of one"})
     entry = zoo.card(RECIPE, 3)
     assert entry["recipe"]["victim"]["changed"] == {"hidden": 8}
@@ -243,7 +243,7 @@ def test_the_zoo_depends_on_no_track() -> None:
     assert not [name for name in found if name.startswith(("bench.driving", "bench.detection"))]
 
 
-def test_a_detector_is_kept_like_a_policy_in_half_precision(home: Path) -> None:
+def test_a_detector_is_stored_in_half_precision(home: Path) -> None:
     torch.manual_seed(0)
     victim = YOLOv5(updates=1)
     world: CameraWorld = registry.load("world", "camera")()

@@ -1,4 +1,4 @@
-"""A camera world that is drawn, not rendered: a stop sign coming nearer that a detector of photographs recognises."""
+"""A camera world of simple drawings: an approach to a stop sign that a detector trained on photographs recognises."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is made of the frames of an approach: it depends on what was detected and where, and more detections never hurt."""
+"""The measurements of an approach: they depend on the detections and distances, and more detections never lower the score."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def measured(confidence: np.ndarray) -> dict[str, np.ndarray]:
 
 @settings(deadline=None)
 @given(confidence=CONFIDENCES)
-def test_every_approach_is_measured_by_itself(confidence: np.ndarray) -> None:
+def test_approaches_are_measured_independently(confidence: np.ndarray) -> None:
     together = measured(confidence)
     for row in range(len(confidence)):
         alone = measured(confidence[row : row + 1])
@@ -44,7 +44,7 @@ def test_more_confidence_is_never_worse(confidence: np.ndarray, more: np.ndarray
 
 @settings(deadline=None)
 @given(confidence=CONFIDENCES)
-def test_a_sign_is_confirmed_after_it_is_seen_and_by_three_of_five_frames(confidence: np.ndarray) -> None:
+def test_a_sign_is_confirmed_by_three_detections_in_five_frames(confidence: np.ndarray) -> None:
     found = measured(confidence)
     assert (found["confirmed_m"] <= found["first_seen_m"]).all()
     for row, one in enumerate(confidence > stopping.THRESHOLD):
@@ -54,7 +54,7 @@ def test_a_sign_is_confirmed_after_it_is_seen_and_by_three_of_five_frames(confid
 
 @settings(deadline=None)
 @given(confirmed=arrays(np.float64, 20, elements=st.floats(0, 100)))
-def test_the_car_stops_at_the_line_where_physics_lets_it(confirmed: np.ndarray) -> None:
+def test_the_car_stops_at_the_line_if_physically_possible(confirmed: np.ndarray) -> None:
     overrun, ran = stopping.overrun_m(confirmed), stopping.ran(confirmed)
     np.testing.assert_allclose(overrun, np.maximum(WORST_M - confirmed, 0), atol=1e-6)
     assert (ran == ((confirmed <= 0) | (overrun > stopping.RAN_M))).all()
@@ -70,7 +70,7 @@ def test_the_controller_in_numbers(confirmed: float, overrun: float, ran: bool) 
     assert bool(stopping.ran(np.array([confirmed]))[0]) is ran
 
 
-def test_a_stop_sign_elsewhere_is_a_false_alarm_and_the_sign_itself_is_none() -> None:
+def test_only_a_detection_away_from_the_sign_is_a_false_alarm() -> None:
     boxes = torch.tensor([[[0.0, 0, 10, 10], [1, 1, 11, 11], [40, 40, 60, 60], [80, 80, 90, 90]]])
     classes = torch.tensor([[[1.0, 0], [1, 0], [1, 0], [0, 1]]])
     predictions = Predictions(boxes, torch.full((1, 4), 0.9), classes)
@@ -79,7 +79,7 @@ def test_a_stop_sign_elsewhere_is_a_false_alarm_and_the_sign_itself_is_none() ->
     assert false_alarms(found, torch.tensor([[200.0, 200, 210, 210]])).tolist() == [2]
 
 
-def test_a_patch_changes_what_is_seen_and_no_patch_is_the_sign_itself() -> None:
+def test_a_patch_changes_the_output_and_no_patch_does_not() -> None:
     scenes, detector = RedScenes(torch.linspace(30, 8, 10)), RedDetector()
     clean, patched = (look(detector, scenes, patch, 0.5) for patch in (None, torch.zeros(3, 16, 16)))
     assert (clean.confidence.shape, len(clean.found)) == ((10,), 10)

@@ -1,4 +1,4 @@
-"""The losses of detectors, held against what they should say of predictions that are known."""
+"""The training losses of detectors, compared with known values."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_descending_finds_every_object_and_nothing_else() -> None:
     assert found.scores.min() > 0.8
 
 
-def test_a_picture_without_objects_asks_for_silence() -> None:
+def test_an_image_without_objects_has_no_targets() -> None:
     grid = Grid()
     supervised(grid.predict(), [torch.zeros(0, 4)], [torch.zeros(0, dtype=torch.int64)]).backward()
     assert grid.raw.grad is not None
@@ -52,7 +52,7 @@ def test_a_picture_without_objects_asks_for_silence() -> None:
     assert not grid.raw.grad[..., :4].any()
 
 
-def test_nothing_is_unlike_itself_and_every_change_is_seen() -> None:
+def test_unlike_is_zero_for_equal_predictions_and_positive_for_any_change() -> None:
     drawn = torch.Generator().manual_seed(0)
     grid = Grid()
     teacher = grid.predict()
@@ -69,7 +69,7 @@ def predicted(score: float, box: Tensor) -> Predictions:
     return Predictions(box[None, None], torch.full((1, 1), score), torch.ones(1, 1, 2))
 
 
-def test_a_sign_is_missed_where_it_is_not_found_at_its_place() -> None:
+def test_a_detection_elsewhere_counts_as_missed() -> None:
     there, away = BOXES[0], BOXES[0] + 25
     assert missed(predicted(1.0, there), 1, BOXES[:1]).item() == 0
     assert missed(predicted(0.5, there), 1, BOXES[:1]).item() == torch.tensor(2.0).log()

@@ -52,7 +52,7 @@ def by_hand(boxes: Tensor, scores: Tensor, threshold: float, iou: float) -> list
 
 @relaxed
 @given(predictions(pictures=2), st.sampled_from([0.0, 0.3, 0.9]), st.sampled_from([0.0, 0.31, 0.7, 1.0]))
-def test_suppression_is_that_of_the_definition(given: Predictions, threshold: float, iou: float) -> None:
+def test_suppression_matches_the_definition(given: Predictions, threshold: float, iou: float) -> None:
     found = detections(given, threshold=threshold, iou=iou)
     for one, boxes, scores in zip(found, given.boxes, given.scores, strict=True):
         got = list(zip(one.boxes.tolist(), one.scores.tolist(), one.labels.tolist(), strict=True))
@@ -79,7 +79,7 @@ def test_two_classes_at_one_place_are_both_found() -> None:
 
 @relaxed
 @given(st.tuples(*[LENGTH] * 4), st.tuples(*[LENGTH] * 4))
-def test_overlap_is_that_of_the_definition(a: tuple[int, ...], b: tuple[int, ...]) -> None:
+def test_overlap_matches_the_definition(a: tuple[int, ...], b: tuple[int, ...]) -> None:
     boxes = [[x, y, x + width, y + height] for x, y, width, height in (a, b)]
     got = overlap(*(torch.tensor(box, dtype=torch.float32) for box in boxes)).item()
     assert got == pytest.approx(area_shared(*boxes))
@@ -97,7 +97,7 @@ def test_confidence_is_the_best_score_at_the_true_place(given: Predictions, iou:
 
 
 class Blank(Detector):
-    """Sees nothing."""
+    """A detector that detects nothing."""
 
     names = ("car", "stop sign")
     stride = 32
@@ -108,7 +108,7 @@ class Blank(Detector):
 
 
 @pytest.mark.parametrize("shape", [(3, 64, 64), (1, 1, 64, 64), (1, 3, 64, 65), (1, 3, 33, 64)])
-def test_a_picture_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+def test_an_image_of_a_wrong_shape_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="multiples of 32, got"):
         Blank()(torch.zeros(shape))
 

@@ -1,4 +1,4 @@
-"""The door to a detector counts, refuses what is forbidden and lets gradients through; a patch is what can be printed."""
+"""The patch oracle counts queries, enforces access and passes gradients; a patch has texels in [0, 1]."""
 
 from __future__ import annotations
 
@@ -26,14 +26,12 @@ def pictures(count: int) -> Tensor:
 
 @given(asked=st.lists(st.tuples(st.integers(0, 9), st.booleans()), max_size=12), queries=st.integers(0, 40))
 @settings(deadline=None)
-def test_every_picture_is_a_query_and_none_is_answered_beyond_the_budget(
-    asked: list[tuple[int, bool]], queries: int
-) -> None:
+def test_every_image_is_a_query_and_the_budget_is_enforced(asked: list[tuple[int, bool]], queries: int) -> None:
     door, spent = oracle(queries=queries), 0
     for count, differentiable in asked:
         ask = door.differentiable if differentiable else door.predict
         if spent + count > queries:
-            with pytest.raises(QueryBudgetError, match=f"asked about {spent + count} pictures"):
+            with pytest.raises(QueryBudgetError, match=f"asked about {spent + count} images"):
                 ask(pictures(count))
         else:
             assert len(ask(pictures(count)).boxes) == count
@@ -42,7 +40,7 @@ def test_every_picture_is_a_query_and_none_is_answered_beyond_the_budget(
 
 
 @pytest.mark.parametrize(("access", "allowed"), [("oblivious", 0), ("decisions", 0), ("scores", 1), ("gradients", 2)])
-def test_what_the_access_forbids_is_refused(access: Access, allowed: int) -> None:
+def test_calls_above_the_access_level_are_refused(access: Access, allowed: int) -> None:
     door = oracle(access)
     for number, ask in enumerate((door.predict, door.differentiable)):
         if number < allowed:
@@ -53,7 +51,7 @@ def test_what_the_access_forbids_is_refused(access: Access, allowed: int) -> Non
     assert door.spent == allowed
 
 
-def test_a_gradient_comes_back_to_the_pixels_and_is_counted() -> None:
+def test_gradients_reach_the_pixels_and_are_counted() -> None:
     door, shown = oracle(), pictures(3).requires_grad_(True)
     assert not door.predict(shown).scores.requires_grad
     door.differentiable(shown).scores[..., door.label].sum().backward()
@@ -67,7 +65,7 @@ TEXELS = st.one_of(st.floats(-3, 4, width=32), st.sampled_from([torch.nan, torch
 
 @settings(deadline=None)
 @given(values=st.lists(TEXELS, min_size=12, max_size=12), side=st.sampled_from([8, 16, 100]))
-def test_texels_become_printable_and_their_excess_is_the_farthest_of_them(values: list[float], side: int) -> None:
+def test_texels_are_clipped_and_the_excess_is_the_largest_distance(values: list[float], side: int) -> None:
     given_ = torch.tensor(values).repeat(3 * side * side // 12 + 1)[: 3 * side * side].reshape(3, side, side)
     patch, excess = PatchThreat().project(given_)
     assert patch.shape == given_.shape
@@ -79,14 +77,14 @@ def test_texels_become_printable_and_their_excess_is_the_farthest_of_them(values
 
 
 @pytest.mark.parametrize("shape", [(3, 7, 7), (3, 8, 9), (1, 8, 8), (8, 8), (1, 3, 8, 8), (3, 513, 513)])
-def test_what_is_no_patch_is_refused(shape: tuple[int, ...]) -> None:
+def test_an_invalid_patch_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(UserError, match="a patch must be"):
         PatchThreat().project(torch.zeros(shape))
 
 
 @settings(deadline=None)
 @given(steps=st.integers(1, 500))
-def test_moments_of_a_crafting_are_few_and_evenly_apart(steps: int) -> None:
+def test_reported_steps_are_few_and_evenly_spaced(steps: int) -> None:
     door = oracle("oblivious")
     for step in range(steps):
         more = {"odd": 1.0} if step % 2 else {}
@@ -106,7 +104,7 @@ def test_moments_of_a_crafting_are_few_and_evenly_apart(steps: int) -> None:
     assert door.spent == 0
 
 
-def test_reports_are_of_patches_of_one_size() -> None:
+def test_reported_patches_must_have_one_size() -> None:
     door = oracle("oblivious")
     assert door.evolution is None
     door.report(torch.zeros(3, 8, 8))

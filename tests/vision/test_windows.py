@@ -1,4 +1,4 @@
-"""Windows of training scenes: the sign's box goes where the sign goes."""
+"""Windows of training scenes: the box stays on the sign."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def windows() -> Windows:
 
 
 def test_a_box_lies_on_the_sign_in_every_window(windows: Windows) -> None:
-    """A green patch over the whole sign is where the box is."""
+    """A green patch covers the whole sign; the box must lie on it."""
     views = windows.draw(12)
     green = torch.tensor([0.0, 1.0, 0.0])[:, None, None].expand(1, 3, 8, 8)
     shown = windows.cut(views, windows.scenes.render(views.frames, green, 1.0))
@@ -37,13 +37,13 @@ def test_a_box_lies_on_the_sign_in_every_window(windows: Windows) -> None:
     assert seen > 6
 
 
-def test_pictures_of_the_frames_as_they_are_need_not_be_rendered_again(windows: Windows) -> None:
+def test_frames_without_a_patch_are_not_rendered_again(windows: Windows) -> None:
     views = windows.draw(3)
     fresh = windows.scenes.render(views.frames, None, 0.5)
     torch.testing.assert_close(windows.cut(views), windows.cut(views, fresh), rtol=0, atol=0.5 / 255 + 1e-6)
 
 
-def test_objects_are_those_that_the_window_holds(windows: Windows) -> None:
+def test_targets_are_the_objects_inside_the_window(windows: Windows) -> None:
     box = windows.scenes.boxes[0]
     middle = (box[:2] + box[2:]) / 2
     sides = torch.tensor([100.0, 100.0])
@@ -54,7 +54,7 @@ def test_objects_are_those_that_the_window_holds(windows: Windows) -> None:
     torch.testing.assert_close((boxes[0][0, :2] + boxes[0][0, 2:]) / 2, torch.full((2,), SIDE / 2), rtol=0, atol=1e-3)
 
 
-def test_windows_are_lit_alike(windows: Windows) -> None:
+def test_batches_of_windows_get_the_same_light(windows: Windows) -> None:
     plain = torch.full((4, 3, SIDE, SIDE), 0.5)
     one, other = windows.lit(plain, plain)
     assert torch.equal(one, other)

@@ -1,4 +1,4 @@
-"""What holds of every YOLO: where boxes lie, the gradient, and that each picture is looked at by itself."""
+"""Properties of every YOLO: box positions, gradients, and independence of the images in a batch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ANCHORS = {
 
 
 def untrained(name: str) -> Detector:
-    """With statistics as if it had been trained, so that folding has something to do."""
+    """An untrained network with random batch-norm statistics, so that folding changes something."""
     torch.manual_seed(0)
     network = YOLOv3TinyNetwork() if name == "yolov3_tiny" else YOLOv5Network("n")
     for layer in network.modules():
@@ -54,7 +54,7 @@ def network(raw: Detector) -> Detector:
     return yolo.frozen(copy.deepcopy(raw))
 
 
-def test_a_frozen_network_says_what_it_said_before(raw: Detector, network: Detector) -> None:
+def test_freezing_does_not_change_the_predictions(raw: Detector, network: Detector) -> None:
     pictures = torch.rand(2, 3, 96, 64)
     before, after = raw(pictures), network(pictures)
     torch.testing.assert_close(after.scores, before.scores, rtol=0, atol=1e-4)
@@ -64,8 +64,8 @@ def test_a_frozen_network_says_what_it_said_before(raw: Detector, network: Detec
     assert before.scores.std() > 1e-3
 
 
-def test_a_head_that_says_nothing_puts_every_anchor_in_the_middle_of_every_cell(name: str) -> None:
-    """Logits of 0 are, by the papers' equations, the middle of the cell, the anchor's size, and a probability of a half."""
+def test_zero_logits_put_every_anchor_in_the_middle_of_every_cell(name: str) -> None:
+    """By the papers' equations, logits of 0 give the middle of the cell, the anchor's size, and a probability of 0.5."""
     network = untrained(name)
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d) and layer.bias is not None:
@@ -93,7 +93,7 @@ def test_scores_are_probabilities(network: Detector) -> None:
     assert (found.boxes[..., 2:] > found.boxes[..., :2]).all()
 
 
-def test_a_picture_is_seen_alike_in_any_batch(network: Detector) -> None:
+def test_predictions_do_not_depend_on_the_batch(network: Detector) -> None:
     pictures = torch.rand(3, 3, 64, 96)
     together = network(pictures)
     for row, picture in enumerate(pictures):
@@ -103,7 +103,7 @@ def test_a_picture_is_seen_alike_in_any_batch(network: Detector) -> None:
 
 
 @pytest.mark.parametrize("what", ["boxes", "objectness", "classes"])
-def test_the_gradient_reaches_every_pixel_and_only_of_that_picture(network: Detector, what: str) -> None:
+def test_the_gradient_reaches_every_pixel_of_its_own_image_only(network: Detector, what: str) -> None:
     pictures = torch.rand(2, 3, 64, 64, requires_grad=True)
     getattr(network(pictures), what)[0].sum().backward()
     assert pictures.grad is not None

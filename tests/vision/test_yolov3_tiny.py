@@ -39,7 +39,7 @@ LAYERS = (
 
 
 class Cfg:
-    """The layers of yolov3-tiny.cfg, one after the other, each taking its numbers from the file as it comes."""
+    """The layers of yolov3-tiny.cfg in order; each reads its weights from the file in sequence."""
 
     def __init__(self, path: Path) -> None:
         self.values = torch.from_numpy(np.fromfile(path, "<f4", offset=20))
@@ -71,7 +71,7 @@ class Cfg:
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A weights file of the right size, full of random numbers that keep the signal about as large as it was."""
+    """A weights file of the right size with random numbers, scaled to preserve the size of the signal."""
     draw = np.random.default_rng(0)
     parts = []
     for inputs, outputs, size, normalised in LAYERS:
@@ -96,8 +96,8 @@ def read(path: Path) -> YOLOv3TinyNetwork:
     return yolo.frozen(network)
 
 
-def test_the_graph_is_that_of_the_cfg(path: Path, network: YOLOv3TinyNetwork) -> None:
-    """With batch normalisations folded and the weights read in order, as the cfg read layer by layer computes it."""
+def test_the_network_equals_the_cfg_file(path: Path, network: YOLOv3TinyNetwork) -> None:
+    """The network with folded batch normalisation equals the cfg file, evaluated layer by layer."""
     picture = torch.rand(1, 3, 64, 96)
     cfg = Cfg(path)
     heads = [head.reshape(1, 3, 85, -1).permute(0, 1, 3, 2).reshape(1, -1, 85) for head in cfg(picture)]
@@ -109,7 +109,7 @@ def test_the_graph_is_that_of_the_cfg(path: Path, network: YOLOv3TinyNetwork) ->
     assert not len(cfg.values)
 
 
-def test_its_size_is_the_published_one() -> None:
+def test_it_has_the_published_size() -> None:
     assert sum(weight.numel() for weight in YOLOv3TinyNetwork().parameters()) == 8_852_366
 
 
@@ -123,7 +123,7 @@ def test_a_file_of_another_size_is_refused_in_one_line(path: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_the_published_weights_are_those_of_the_table(published: YOLOv3TinyNetwork) -> None:
+def test_the_published_weights_match_the_download_table(published: YOLOv3TinyNetwork) -> None:
     content = fetch.place("yolov3_tiny").read_bytes()
     assert hashlib.sha256(content).hexdigest() == published.weights_sha256 == fetch.DOWNLOADS["yolov3_tiny"].sha256
     assert len(content) == fetch.DOWNLOADS["yolov3_tiny"].size
@@ -143,7 +143,7 @@ def test_a_stop_sign_is_found_where_it_is(published: YOLOv3TinyNetwork, size: in
 
 @pytest.mark.slow
 def test_a_small_stop_sign_has_a_box_of_its_size(published: YOLOv3TinyNetwork) -> None:
-    """The fine head's anchors: with those of the cfg the boxes cover a third of the sign."""
+    """Checks the anchors of the fine head: with the anchors of the cfg file the boxes cover a third of the sign."""
     picture, box = stop_sign(60)
     assert confidence(published(picture[None]), published.index("stop sign"), box[None], iou=0.7).item() > 0.6
 
@@ -158,7 +158,7 @@ def test_a_covered_stop_sign_is_not_found(published: YOLOv3TinyNetwork) -> None:
 
 @pytest.mark.slow
 def test_gradient_steps_too_small_to_see_hide_a_stop_sign(published: YOLOv3TinyNetwork) -> None:
-    """Projected gradient descent within 8/255; a single step does not do it, the scores are too rough for that."""
+    """Projected gradient descent within 8/255; a single step is not enough, because the scores are too rough."""
     picture, box = stop_sign(160)
     label = published.index("stop sign")
     shown = picture[None]

@@ -24,7 +24,7 @@ PUBLISHED = {"n": 1_872_157, "s": 7_235_389, "m": 21_190_557, "l": 46_563_709, "
 
 
 @pytest.mark.parametrize("size", MULTIPLES)
-def test_its_sizes_are_the_published_ones(size: Size) -> None:
+def test_it_has_the_published_sizes(size: Size) -> None:
     with torch.device("meta"):
         network = YOLOv5Network(size)
     assert sum(weight.numel() for weight in network.parameters()) == PUBLISHED[size]
@@ -39,7 +39,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[YOLOv5Network, Path
     return network, path
 
 
-def test_what_is_saved_is_what_is_loaded(saved: tuple[YOLOv5Network, Path]) -> None:
+def test_saved_weights_load_unchanged(saved: tuple[YOLOv5Network, Path]) -> None:
     network, path = saved
     loaded = YOLOv5(path=str(path)).load(0, FACTS)
     pictures = torch.rand(1, 3, 64, 64)
@@ -50,18 +50,18 @@ def test_what_is_saved_is_what_is_loaded(saved: tuple[YOLOv5Network, Path]) -> N
     assert not any(weight.requires_grad for weight in loaded.parameters())
 
 
-def test_another_size_than_the_files_is_refused_in_one_line(saved: tuple[YOLOv5Network, Path]) -> None:
+def test_a_size_that_does_not_match_the_file_is_refused_in_one_line(saved: tuple[YOLOv5Network, Path]) -> None:
     with pytest.raises(UserError, match=r"does not hold a YOLOv5s \(victim.size\): size mismatch for model") as error:
         YOLOv5(size="s", path=str(saved[1])).load(0, FACTS)
     assert "\n" not in str(error.value)
 
 
-def test_without_a_file_it_says_how_to_name_one() -> None:
-    with pytest.raises(UserError, match=r"victim\.path=yolov5m\.pt names a file of yours"):
+def test_without_trained_weights_the_error_names_the_path_option() -> None:
+    with pytest.raises(UserError, match=r"set victim\.path=yolov5m\.pt to use your own file"):
         YOLOv5(size="m").load(0, FACTS)
 
 
-def test_what_is_trained_is_found_in_the_zoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trained_detector_is_found_in_the_zoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
     victim = YOLOv5(updates=3, batch=2, window=64, trained_in="DrawnStreet")
     told: list[str] = []
@@ -90,7 +90,7 @@ def test_a_recipe_out_of_range_is_named(bad: dict[str, float]) -> None:
 
 
 @pytest.mark.slow
-def test_the_one_that_ships_finds_signs_it_was_not_trained_on() -> None:
+def test_the_shipped_detector_finds_held_out_signs() -> None:
     detector, world = YOLOv5().load(0, FACTS), StopSignApproach()
     for approach in world.approaches(AXES.cell(lanes=3, density=1.0), range(3)):
         frames = torch.arange(len(approach.scenes))

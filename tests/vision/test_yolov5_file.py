@@ -1,4 +1,4 @@
-"""Reading a user's YOLOv5 checkpoint: the tensors come out, and nothing in the file is run."""
+"""Reading a user's YOLOv5 checkpoint: the tensors are read, and no code in the file is executed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def original(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 def disguised(module: nn.Module, classes: SimpleNamespace) -> nn.Module:
-    """The same tree of tensors, of the original's classes."""
+    """The same tree of tensors with the original's classes."""
     name = type(module).__name__
     other = getattr(classes, ORIGINAL[name])() if name in ORIGINAL else module
     for key, child in module.named_children():
@@ -59,7 +59,7 @@ def network() -> YOLOv5Network:
 
 @pytest.fixture
 def checkpoint(network: YOLOv5Network, original: SimpleNamespace, tmp_path: Path) -> Callable[..., Path]:
-    """Writes a network as the original code does: half precision, 25 layers of its classes, in a dictionary."""
+    """Write a network like the original code: half precision, 25 layers of its classes, in a dictionary."""
 
     def write(**changes: object) -> Path:
         layers = [original.Concat() for _ in range(25)]
@@ -80,7 +80,7 @@ def checkpoint(network: YOLOv5Network, original: SimpleNamespace, tmp_path: Path
 
 
 def forget(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take the original's classes away again."""
+    """Remove the original's classes again."""
     for name in ("models", "models.common", "models.yolo"):
         monkeypatch.delitem(sys.modules, name)
 
@@ -98,7 +98,7 @@ def test_a_checkpoint_is_read_without_the_code_that_wrote_it(
     assert loaded.weights_sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_averaged_weights_go_first_and_old_files_list_their_names(
+def test_averaged_weights_are_preferred_and_old_files_have_a_list_of_names(
     checkpoint: Callable[..., Path], original: SimpleNamespace
 ) -> None:
     averaged = original.DetectionModel()
@@ -119,7 +119,7 @@ class Harm:
         return os.system, (f"touch {self.marker}",)
 
 
-def test_a_checkpoint_that_names_anything_else_is_refused_and_not_run(
+def test_a_checkpoint_with_an_unexpected_class_is_refused_and_not_executed(
     checkpoint: Callable[..., Path], tmp_path: Path
 ) -> None:
     marker = tmp_path / "ran"
@@ -131,7 +131,7 @@ def test_a_checkpoint_that_names_anything_else_is_refused_and_not_run(
     assert marker.exists(), "the file is harmless, so this test shows nothing"
 
 
-def test_even_a_class_of_an_expected_name_is_not_run(
+def test_a_class_with_an_expected_name_is_not_executed(
     checkpoint: Callable[..., Path], original: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ran = []
@@ -144,7 +144,7 @@ def test_even_a_class_of_an_expected_name_is_not_run(
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
-def test_a_file_that_is_cut_short_is_refused_in_one_line(checkpoint: Callable[..., Path], share: float) -> None:
+def test_a_truncated_file_is_refused_in_one_line(checkpoint: Callable[..., Path], share: float) -> None:
     path = checkpoint()
     blob = path.read_bytes()
     path.write_bytes(blob[: int(share * len(blob))])
@@ -159,7 +159,7 @@ def test_a_checkpoint_of_something_else_is_refused_in_one_line(content: object, 
 
 
 @pytest.mark.parametrize("name", ["missing.pt", "missing.safetensors", "."])
-def test_a_file_that_is_not_there_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+def test_a_missing_file_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
     assert_refused(tmp_path / name)
 
 

@@ -1,4 +1,4 @@
-"""Recordings of the detection track: the frames with and without the patch, what the detector says of them, and the patch."""
+"""Recordings of the detection track: the frames with and without the patch, the detector's output, and the patch."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from bench.recording.file import written
 
 
 def save(sighting: Sighting, *, meta: Mapping[str, object], path: Path) -> None:
-    """Write the recording of one approach; the file appears whole or not at all.
+    """Write the recording of one approach, atomically.
 
     Args:
-        sighting: what was seen on it.
+        sighting: the detector's output on the approach.
         meta: the record's identity columns: names, parameters, threat model, cell, scenario seed.
-        path: of the `.rrd` file; its folder exists.
+        path: path of the `.rrd` file; its folder must exist.
     """
     with written(path, meta, blueprint.layout(sighting)) as stream:
         approach.log(sighting, meta, stream)

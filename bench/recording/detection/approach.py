@@ -1,4 +1,4 @@
-"""The recording of an approach: its frames with and without the patch, what the detector says of them, and the patch."""
+"""The content of an approach's recording: frames with and without the patch, the detector's output, and the patch."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from bench.recording.driving.scene import EGO, MEASURED, SHOWN
 COLOURS: dict[str, Colour] = {"with_patch": SHOWN, "without_patch": MEASURED}
 LOSS_COLOURS: tuple[Colour, ...] = (SHOWN, MEASURED, EGO, GREY)
 QUALITY = 60
-"""As JPEG of the frames, which are most of the file, and of the patch as it came about."""
+"""JPEG quality of the frames, which are most of the file, and of the crafting steps of the patch."""
 FAINT = 70
-"""Opacity, of 255, of what lies over the bars of a chart."""
+"""Opacity, from 0 to 255, of overlays on a bar chart."""
 ROOM = 1.5
-"""Height of a chart in heights of its highest bar; the legend is above that."""
+"""Height of a chart, relative to its highest bar; this leaves room for the legend."""
 
 Array = NDArray[np.float64]
 
 
 def log(sighting: Sighting, meta: Mapping[str, object], stream: rr.RecordingStream) -> None:
-    """Send the frames, what was said of them, and the patch."""
+    """Send the frames, the detector's output on them, and the patch."""
     scenes = sighting.approach.scenes
     distance = scenes.distance.double().numpy()
     centimetres = -np.rint(100 * distance).astype(np.int64)
@@ -66,7 +66,7 @@ def _frames(columns: Columns, path: str, scenes: Scenes, texels: Tensor | None, 
 
 
 def _boxes(columns: Columns, path: str, true: Tensor, sight: Sight) -> None:
-    """The sign's own box, and those of the stop signs that are detected, with their scores."""
+    """Send the sign's true box, and the boxes of the detected stop signs with their scores."""
     columns.fixed(f"{path}/sign", rr.Boxes2D.from_fields(colors=[EGO], radii=[-0.75]))
     columns.send(f"{path}/sign", _corners(true).partition(np.ones(len(true), np.int64)))
     found = torch.cat([one.boxes for one in sight.found])
@@ -82,7 +82,7 @@ def _corners(boxes: Tensor, **more: object) -> rr.ComponentColumnList:
 
 
 def _evolution(evolution: Evolution, stream: rr.RecordingStream) -> None:
-    """The patch as it came about: on a timeline of its own, in a strip, and its losses as a chart."""
+    """Send the steps of the crafting: the patches on their own timeline and in a strip, and the losses as a chart."""
     steps = evolution.steps.numpy()
     columns = Columns(stream, {"crafting_step": steps})
     moments = evolution.texels / 255
@@ -103,10 +103,10 @@ def _evolution(evolution: Evolution, stream: rr.RecordingStream) -> None:
 
 
 def _chart(columns: Columns, path: str, x: Array, bars: Mapping[str, tuple[Array, Colour]], *, highest: float) -> None:
-    """Bars side by side at each x, whatever the timeline, and a light on those of the row that the viewer is at."""
+    """Send a bar chart with groups of bars at each x, and an overlay that marks the current row of the viewer."""
     gap = float(np.abs(np.diff(x)).min(initial=np.inf)) if len(x) > 1 else 1.0
     width = 0.8 * gap / len(bars)
-    # An abscissa is where a bar begins.
+    # rerun's abscissa is the left edge of a bar.
     for place, (name, (values, colour)) in enumerate(bars.items()):
         left = x - 0.4 * gap + place * width
         columns.fixed(f"{path}/{name}", rr.BarChart(values, abscissa=left, widths=np.full(len(x), width), color=colour))
@@ -120,18 +120,18 @@ def _chart(columns: Columns, path: str, x: Array, bars: Mapping[str, tuple[Array
 
 
 def _tensors(values: Array) -> pa.Array:
-    """A column of tensors of one value each."""
+    """A column of tensors with one value each."""
     return pa.concat_arrays([rr.components.TensorDataBatch(value[None]).as_arrow_array() for value in values])
 
 
 def _images(columns: Columns, path: str, pictures: Iterable[Tensor]) -> None:
-    """A picture [3, H, W] a row."""
+    """Send one image [3, H, W] per row."""
     blobs = [_coded(picture, "jpeg") for picture in pictures]
     columns.send(path, rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs)))
 
 
 def _coded(picture: Tensor, form: Literal["jpeg", "png"]) -> bytes:
-    """A picture [3, H, W] sRGB in [0, 1] as a file."""
+    """Encode an image [3, H, W] sRGB in [0, 1] as JPEG or PNG."""
     pixels = (255 * picture).round().to(torch.uint8).permute(1, 2, 0).numpy()
     quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if form == "jpeg" else []
     done, blob = cv2.imencode(f".{form}", pixels[..., ::-1], quality)

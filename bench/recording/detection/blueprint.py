@@ -1,4 +1,4 @@
-"""How the recording of an approach opens: its frames side by side, how the patch came about, charts, and what it is of."""
+"""The viewer layout of an approach: its frames side by side, the crafting of the patch, charts, and the "About" page."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from bench.recording.driving.blueprint import bare
 
 NAMES = {"with_patch": "With the patch", "without_patch": "Without a patch"}
 FPS = 2.0
-"""Frames a second: half as fast as they are driven through."""
+"""Playback speed in frames per second: half of real time."""
 GAP = 8
-"""Texels between two patches of the strip."""
+"""Texels between two patches in the strip."""
 
 
 def sights(sighting: Sighting) -> dict[str, Sight]:
-    """What was seen with and without the patch, by the names of entities; without an attack there is only the latter."""
+    """The detector's output with and without the patch, by entity name; only without, if there is no attack."""
     if sighting.clean is None:
         return {"without_patch": sighting.shown}
     return {"with_patch": sighting.shown, "without_patch": sighting.clean}
 
 
 def layout(sighting: Sighting) -> rrb.Blueprint:
-    """The blueprint of an approach; views that it has nothing for are left out."""
+    """The blueprint of an approach; empty views are left out."""
     frames = [_frame(sighting, name) for name in sights(sighting)]
     below: list[rrb.View] = [rrb.BarChartView(origin="confidence", name="Confidence over distance (m)")]
     rows: list[rrb.Container | rrb.View] = [rrb.Horizontal(*frames)]
@@ -35,7 +35,7 @@ def layout(sighting: Sighting) -> rrb.Blueprint:
     if evolution:
         side = evolution.texels.shape[-1]
         first = next(iter(evolution.losses), "")
-        name = f"How the patch came about (crafting step{': ' + first if first else ''})"
+        name = f"Crafting of the patch (step{': ' + first if first else ''})"
         bounds = rrb.VisualBounds2D(
             x_range=(0, len(evolution.steps) * (side + GAP) - GAP), y_range=(-0.05 * side, 1.4 * side)
         )
@@ -54,7 +54,7 @@ def layout(sighting: Sighting) -> rrb.Blueprint:
 
 
 def _frame(sighting: Sighting, name: str) -> rrb.View:
-    """A frame; the viewer begins with the part of it in which the sign is to be seen from first to last."""
+    """The view of a frame, zoomed to the part that contains the sign in all frames."""
     boxes = sighting.approach.scenes.boxes
     low, high = boxes[:, :2].amin(0), boxes[:, 2:].amax(0)
     margin = (boxes[:, 2:] - boxes[:, :2]).max()
@@ -67,9 +67,9 @@ def _frame(sighting: Sighting, name: str) -> rrb.View:
 
 
 def outcome(sight: Sight, scenes: Scenes) -> str:
-    """When the sign is confirmed, and where the car stops."""
-    found = measured([sight], [scenes])
-    confirmed, overrun = float(found["confirmed_m"][0]), float(found["overrun_m"][0])
+    """Where the sign is confirmed, and where the car stops, as text."""
+    measurements = measured([sight], [scenes])
+    confirmed, overrun = float(measurements["confirmed_m"][0]), float(measurements["overrun_m"][0])
     if not confirmed:
         return "the sign is never confirmed, the car drives on"
     stops = f"{overrun:.1f} m beyond the line" if overrun else "in time"
@@ -77,22 +77,22 @@ def outcome(sight: Sight, scenes: Scenes) -> str:
 
 
 def page(sighting: Sighting, meta: Mapping[str, object]) -> str:
-    """What came of the approach, and whose it was."""
+    """The "About" page: the outcome of the approach and its components."""
     lines = [f"**{sighting.approach.location}**", ""]
     for name, sight in sights(sighting).items():
-        found = measured([sight], [sighting.approach.scenes])
+        measurements = measured([sight], [sighting.approach.scenes])
         lines += [
             f"**{NAMES[name]}**",
             f"- {outcome(sight, sighting.approach.scenes)}",
-            f"- mean confidence: {float(found['confidence_mean'][0]):.2f}",
-            f"- false alarms a frame: {float(found['false_alarms'][0]):.1f}",
+            f"- mean confidence: {float(measurements['confidence_mean'][0]):.2f}",
+            f"- false alarms per frame: {float(measurements['false_alarms'][0]):.1f}",
             "",
         ]
     patch = sighting.patch
     if patch and patch.texels is not None:
         side = patch.texels.shape[-1]
         lines.append(
-            f"patch of {side} x {side} texels, {sighting.share:g} of the sign's width, crafted in {patch.seconds:.0f} s "
+            f"patch: {side} x {side} texels, {sighting.share:g} of the sign's width, crafted in {patch.seconds:.0f} s "
             f"with {patch.queries} queries"
         )
-    return about.page(meta, lines, queries="a patch" if sighting.clean else "")
+    return about.page(meta, lines, queries="per patch" if sighting.clean else "")

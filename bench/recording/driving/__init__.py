@@ -1,4 +1,4 @@
-"""Recordings of the driving track: the road from above, what the policy was shown, its decisions, the perturbation."""
+"""Recordings of the driving track: road from above, attacked observations, decisions and perturbation."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from bench.recording.file import written
 
 
 def save(trace: Trace, *, facts: DrivingFacts, meta: Mapping[str, object], path: Path) -> None:
-    """Write the recording of one episode; the file appears whole or not at all.
+    """Write the recording of one episode, atomically.
 
     Args:
         trace: one episode (`bench.driving.rollout.Trace` with one entry in `episodes`).
-        facts: of the world.
+        facts: facts of the world.
         meta: the record's identity columns: names, parameters, threat model, cell, scenario seed.
-        path: of the `.rrd` file; its folder exists.
+        path: path of the `.rrd` file; its folder must exist.
 
     Raises:
         ValueError: unless the trace holds exactly one episode.

@@ -1,4 +1,4 @@
-"""What is drawn over time: decisions, perturbation against its budget, scores, what the drive was worth, queries."""
+"""The curves of a recording: decisions, scores, perturbation and its budget, queries, speed, TTC, progress and reward."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GREY: Colour = (150, 152, 158)
 
 
 def group(unit: str) -> str:
-    """Where the perturbations of features of one unit are: `m/s` makes no path of its own."""
+    """The entity path for perturbations with a unit; `m/s` cannot be part of a path."""
     return f"perturbation/{'velocity' if '/' in unit else 'position'}"
 
 
@@ -38,7 +38,7 @@ def log(episode: Episode, columns: Columns) -> None:
     _scores(episode, columns)
     if episode.attacked:
         _perturbation(episode, columns)
-        columns.curve("queries/spent", episode.steps["queries"], "queries a step", SHOWN)
+        columns.curve("queries/spent", episode.steps["queries"], "queries per step", SHOWN)
     columns.curve("speed/ego", episode.steps["speed"], "speed (m/s)", EGO)
     columns.curve("ttc/ahead", episode.steps["ttc"], "time to collision (s)", CRASHED)
     columns.curve("worth/progress", episode.steps["progress"], "progress (0 to 1)", EGO)
@@ -67,7 +67,7 @@ def _scores(episode: Episode, columns: Columns) -> None:
 def _perturbation(episode: Episode, columns: Columns) -> None:
     for feature, unit in zip(episode.features.names, episode.features.units, strict=True):
         colour = FEATURE_COLOURS.get(feature, GREY)
-        columns.curve(f"{group(unit)}/{feature}", episode.moved(feature), f"{feature} moved ({unit})", colour)
+        columns.curve(f"{group(unit)}/{feature}", episode.moved(feature), f"{feature} perturbation ({unit})", colour)
         budget = episode.budget[feature]
         columns.curve(f"{group(unit)}/{feature}_budget", budget, f"{feature} budget", _faint(colour), 1.0)
 

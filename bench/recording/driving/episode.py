@@ -14,7 +14,7 @@ from bench.driving import DrivingFacts, Features, ObservationThreat
 from bench.driving.rollout import Trace
 
 CONTROLS = ("acceleration", "steering")
-"""What a continuous action sets, in [-1, 1]."""
+"""The components of a continuous action, each in [-1, 1]."""
 
 Array = NDArray[np.float64]
 
@@ -24,9 +24,9 @@ class Episode:
     """The running steps of one episode.
 
     Args:
-        steps: arrays [T, ...] by name, as `bench.driving.rollout.Trace` has them, without the batch dimension.
-        facts: of the world.
-        meta: the record of the episode (`bench.records.store.SCHEMA`), as far as it is known.
+        steps: arrays [T, ...] by name, as in `bench.driving.rollout.Trace` but without the batch dimension.
+        facts: facts of the world.
+        meta: columns of the episode's record (`bench.records.store.SCHEMA`); some may be missing.
     """
 
     steps: Mapping[str, NDArray[np.generic]]
@@ -35,7 +35,7 @@ class Episode:
 
     @classmethod
     def of(cls, trace: Trace, facts: DrivingFacts, meta: Mapping[str, object]) -> Episode:
-        """The one episode of a trace, up to its end.
+        """The single episode of a trace, up to its end.
 
         Raises:
             ValueError: unless the trace holds exactly one episode with at least one step.
@@ -58,43 +58,43 @@ class Episode:
 
     @property
     def features(self) -> Features:
-        """Of the observation."""
+        """Features of the observation."""
         return self.facts.features
 
     @property
     def seconds(self) -> float:
-        """How long it is."""
+        """Length in seconds."""
         return len(self) / self.facts.decision_hz
 
     @property
     def discrete(self) -> bool:
-        """Whether the actions are lane-changing decisions, not accelerations and steering angles."""
+        """Whether the actions are discrete lane-changing decisions instead of acceleration and steering."""
         return bool(self.steps["action"].ndim == 1)
 
     @property
     def attacked(self) -> bool:
-        """Whether the policy was ever shown anything but what was measured."""
+        """Whether any observation was perturbed."""
         return not np.array_equal(self.steps["observation"], self.steps["perturbed"])
 
     @cached_property
     def present(self) -> NDArray[np.bool_]:
-        """[T, V - 1] the rows that hold another vehicle."""
+        """[T, V - 1] whether a row contains another vehicle."""
         return np.asarray(self.steps["observation"][:, 1:, 0], dtype=np.float64) > 0
 
     def physical(self, name: str, feature: str) -> Array:
-        """[T, V] a feature of `observation` or `perturbed`, in its own unit."""
+        """[T, V] a feature of `observation` or `perturbed` (`name`), in its physical unit."""
         place = self.features.names.index(feature)
         low, high = self.features.low[place], self.features.high[place]
         normalised = np.asarray(self.steps[name][:, :, 1 + place], dtype=np.float64)
         return normalised * (high - low) / 2 + (high + low) / 2
 
     def moved(self, feature: str) -> Array:
-        """[T] the largest deviation of a feature of any vehicle, in the feature's unit."""
+        """[T] the largest perturbation of a feature over all vehicles, in the feature's unit."""
         return np.abs(self.physical("perturbed", feature) - self.physical("observation", feature)).max(1)
 
     @cached_property
     def budget(self) -> dict[str, Array]:
-        """[T] by feature: the largest deviation the threat model allows of any vehicle, in the feature's unit."""
+        """[T] for each feature: the largest perturbation allowed for any vehicle, in the feature's unit."""
         known = {name: self.meta[f"threat_{name}"] for name in ("norm", "budget") if f"threat_{name}" in self.meta}
         threat = ObservationThreat(**known)  # type: ignore[arg-type]
         radius = threat.radius(torch.as_tensor(self.steps["observation"]), self.features)[..., 1:]
@@ -103,7 +103,7 @@ class Episode:
 
     @property
     def choices(self) -> tuple[NDArray[np.generic], NDArray[np.generic]]:
-        """The action on what was measured and the action taken: int64 [T], or [T, 2] in [-1, 1]."""
+        """The action on the true observation and the action taken: int64 [T], or [T, 2] in [-1, 1]."""
         clean = np.asarray(self.steps["clean_scores"])
         return (clean.argmax(-1) if self.discrete else clean), np.asarray(self.steps["action"])
 

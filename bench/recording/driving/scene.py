@@ -1,4 +1,4 @@
-"""The road from above, metres, moving with the ego: cars as measured, and as the attack shows them to the policy."""
+"""The road from above in metres, moving with the ego: measured cars, and cars in the attacked observation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bench.recording.driving.episode import Array, Episode
 LANE_WIDTH, CAR_LENGTH, CAR_WIDTH = 4.0, 5.0, 2.0
 """As in highway-env (road/lane.py, vehicle/kinematics.py). Lane 0 is centred on y = 0; y grows to the right."""
 BEHIND, AHEAD = 60.0, 140.0
-"""Metres of road that are drawn around the ego."""
+"""Length of the road drawn behind and ahead of the ego, in m."""
 DASH, DASH_EVERY = 3.0, 9.0
 
 ASPHALT: Colour = (46, 48, 54)
@@ -27,7 +27,7 @@ CRASHED: Colour = (247, 84, 92)
 
 
 def log(episode: Episode, columns: Columns) -> None:
-    """Send the road and the cars; nothing if the observation has no positions."""
+    """Send the road and the cars, if the observation has positions."""
     if not {"x", "y"} <= set(episode.features.names):
         return
     _road(episode, columns)
@@ -35,13 +35,13 @@ def log(episode: Episode, columns: Columns) -> None:
 
 
 def bounds(episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
-    """x and y range in metres that a viewer should begin with."""
+    """Initial x and y range of the view, in m."""
     low, high = _edges(episode)
     return (-45.0, 105.0), (low - 2.5, high + 2.5)
 
 
 def _edges(episode: Episode) -> tuple[float, float]:
-    """y of the road's left and right edge."""
+    """y of the left and right edge of the road, in m."""
     lanes = json.loads(str(episode.meta.get("cell", "{}"))).get("lanes")
     if lanes is None:
         ego = episode.physical("observation", "y")[:, 0]
@@ -61,7 +61,7 @@ def _road(episode: Episode, columns: Columns) -> None:
     between = np.arange(low + LANE_WIDTH, high - 0.1, LANE_WIDTH)
     if not len(between):
         return
-    # Dashes stand still on the road while the picture moves with the ego.
+    # Dashes are fixed to the road, while the view moves with the ego.
     x = np.asarray(episode.steps["x"], dtype=np.float64)
     first = -BEHIND - np.mod(x - BEHIND, DASH_EVERY) + DASH_EVERY
     starts = first[:, None, None] + np.arange(int((AHEAD + BEHIND) / DASH_EVERY) - 1)[None, None, :] * DASH_EVERY
@@ -76,14 +76,14 @@ def _road(episode: Episode, columns: Columns) -> None:
 
 @dataclass(frozen=True)
 class _Cars:
-    """Centres of the other vehicles, all steps one after the other, and how many a step has."""
+    """Centres of vehicles, of all steps in sequence, and their number in each step."""
 
     centres: Array
     lengths: NDArray[np.int64]
 
 
 def _others(episode: Episode, name: str) -> _Cars:
-    """Where the other vehicles are, or are shown to be, relative to the ego's true place."""
+    """Positions of the other vehicles in `observation` or `perturbed`, relative to the ego's true position."""
     ego = episode.physical("observation", "y")[:, :1]
     x, y = (episode.physical(name, feature)[:, 1:] for feature in ("x", "y"))
     centres = np.stack([x, y + ego], -1)
@@ -111,16 +111,16 @@ def _cars(episode: Episode, columns: Columns) -> None:
 def _bodies(
     columns: Columns, path: str, cars: _Cars, colour: Colour, colours: NDArray[np.generic] | None = None
 ) -> None:
-    """Filled cars: a box is only an outline, a thick line is a body. `colours`: one each, if they are not all the same."""
+    """Send filled cars as thick lines (rerun draws only outlines of boxes); `colours`: one for each car, if they differ."""
     half = np.array([(CAR_LENGTH - CAR_WIDTH) / 2, 0.0])
     strips = np.stack([cars.centres - half, cars.centres + half], 1)
-    each = np.broadcast_to(colour, (len(strips), 3)) if colours is None else colours
+    per_car = np.broadcast_to(colour, (len(strips), 3)) if colours is None else colours
     columns.fixed(path, rr.LineStrips2D.from_fields(radii=[CAR_WIDTH / 2], draw_order=2.0))
-    columns.send(path, rr.LineStrips2D.columns(strips=strips, colors=each.astype(np.uint8)).partition(cars.lengths))
+    columns.send(path, rr.LineStrips2D.columns(strips=strips, colors=per_car.astype(np.uint8)).partition(cars.lengths))
 
 
 def _ghosts(columns: Columns, path: str, cars: _Cars) -> None:
-    """Outlines where the attack puts the cars."""
+    """Send outlines of the cars in the attacked observation."""
     half = np.broadcast_to([CAR_LENGTH / 2, CAR_WIDTH / 2], cars.centres.shape)
     columns.fixed(path, rr.Boxes2D.from_fields(radii=[0.15], colors=[SHOWN], draw_order=3.0))
     columns.send(path, rr.Boxes2D.columns(centers=cars.centres, half_sizes=half).partition(cars.lengths))

@@ -1,4 +1,4 @@
-"""The classes of the COCO detection data set (Lin et al. 2014), in the order that detectors trained on it label them."""
+"""The classes of the COCO detection data set (Lin et al. 2014), in the label order of detectors trained on it."""
 
 from __future__ import annotations
 

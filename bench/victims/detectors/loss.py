@@ -1,4 +1,4 @@
-"""What a detector is trained by, said of its predictions alone: it fits every detector, whatever its heads and anchors."""
+"""Training losses on the predictions of a detector, independent of its heads and anchors."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from bench.detection import Predictions
 from bench.detection.boxes import overlap
 
 ASSIGNED = 10
-"""Predictions that answer for an object."""
+"""Number of predictions assigned to an object."""
 BOX_WEIGHT = 5.0
 
 
 def supervised(predictions: Predictions, boxes: Sequence[Tensor], labels: Sequence[Tensor]) -> Tensor:
-    """The loss of a detector that learns from labelled pictures, by task-aligned assignment (Feng et al. 2021, "TOOD").
+    """The supervised loss on labelled images, with task-aligned assignment (Feng et al. 2021, "TOOD").
 
-    An object is answered for by the `ASSIGNED` predictions of the largest s^0.5 u^3 whose centre is within it, s their score and
-    u their overlap with it. Their objectness is to be u, relative to the best of them, their class the object's, their box its
-    box; of all others the objectness is to be 0.
+    Each object is assigned the `ASSIGNED` predictions with the largest s^0.5 u^3 and a centre within its box, where s is the
+    score and u the IoU with the object. Their targets are the object's box, its class, and an objectness of s^0.5 u^3, scaled so
+    that the largest is the best u. The objectness target of all other predictions is 0.
 
     Args:
-        predictions: of N pictures.
-        boxes: [K_n, 4] of each picture, in pixels.
-        labels: int64 [K_n] of each picture.
+        predictions: predictions on N images.
+        boxes: [K_n, 4] true boxes of each image, in pixels.
+        labels: int64 [K_n] true labels of each image.
     """
     wanted = torch.zeros_like(predictions.objectness)
     classes, places = predictions.objectness.new_zeros(()), predictions.objectness.new_zeros(())
@@ -48,7 +48,7 @@ def supervised(predictions: Predictions, boxes: Sequence[Tensor], labels: Sequen
 
 
 def _assigned(here: Tensor, scores: Tensor, boxes: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-    """Of one picture: [P] the objectness each prediction [P, 4] should have, and [P] which object it answers for."""
+    """For one image: [P] target objectness of each prediction [P, 4], and [P] index of the object it is assigned to."""
     shared = overlap(boxes[:, None], here)
     centre = (here[:, :2] + here[:, 2:]) / 2
     within = ((centre > boxes[:, None, :2]) & (centre < boxes[:, None, 2:])).all(-1)
@@ -62,7 +62,7 @@ def _assigned(here: Tensor, scores: Tensor, boxes: Tensor, labels: Tensor) -> tu
 
 
 def complete_overlap(a: Tensor, b: Tensor) -> Tensor:
-    """[M] the overlap of boxes [M, 4], less what their centres and shapes differ by (Zheng et al. 2020, CIoU, Eq. 5 to 7)."""
+    """[M] complete IoU of boxes [M, 4]: IoU minus penalties for distance and aspect ratio (Zheng et al. 2020, Eq. 5 to 7)."""
     low, high = torch.minimum(a[:, :2], b[:, :2]), torch.maximum(a[:, 2:], b[:, 2:])
     diagonal = (high - low).square().sum(-1).clamp(min=1e-6)
     apart = ((a[:, :2] + a[:, 2:] - b[:, :2] - b[:, 2:]) / 2).square().sum(-1)
@@ -75,22 +75,22 @@ def complete_overlap(a: Tensor, b: Tensor) -> Tensor:
 
 
 def unlike(predictions: Predictions, teacher: Predictions) -> Tensor:
-    """How far predictions are from a teacher's of as many pictures: cross-entropies above the teacher's own entropy, and boxes.
+    """Distillation loss: cross-entropy with a teacher's predictions, minus the teacher's entropy, and box distance (1 - IoU).
 
-    Classes and boxes count by the teacher's objectness; a sum over predictions, a mean over pictures.
+    Classes and boxes are weighted by the teacher's objectness. A sum over predictions, a mean over images.
     """
 
-    def entropy(of: Tensor, wanted: Tensor) -> Tensor:
-        return torch.nn.functional.binary_cross_entropy(of, wanted, reduction="none")
+    def entropy(output: Tensor, target: Tensor) -> Tensor:
+        return torch.nn.functional.binary_cross_entropy(output, target, reduction="none")
 
-    sure = teacher.objectness
-    there = entropy(predictions.objectness, sure) - entropy(sure, sure)
-    named = (entropy(predictions.classes, teacher.classes) - entropy(teacher.classes, teacher.classes)).sum(-1)
-    moved = 1 - overlap(predictions.boxes, teacher.boxes)
-    return (there + sure * (named + moved)).sum(1).mean()
+    weight = teacher.objectness
+    objectness = entropy(predictions.objectness, weight) - entropy(weight, weight)
+    classes = (entropy(predictions.classes, teacher.classes) - entropy(teacher.classes, teacher.classes)).sum(-1)
+    boxes = 1 - overlap(predictions.boxes, teacher.boxes)
+    return (objectness + weight * (classes + boxes)).sum(1).mean()
 
 
 def missed(predictions: Predictions, label: int, boxes: Tensor, *, iou: float = 0.5) -> Tensor:
-    """[N] minus the logarithm of the best score of a class at the true box [N, 4] of each picture."""
-    there = overlap(predictions.boxes, boxes.unsqueeze(1)) >= iou
-    return -(predictions.scores_of(label) * there).amax(1).clamp(min=1e-4).log()
+    """[N] negative logarithm of the best score of a class at the true box [N, 4] of each image."""
+    matches = overlap(predictions.boxes, boxes.unsqueeze(1)) >= iou
+    return -(predictions.scores_of(label) * matches).amax(1).clamp(min=1e-4).log()

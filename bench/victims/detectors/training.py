@@ -1,4 +1,4 @@
-"""How a detector learns: one optimiser, one schedule, and the running mean of the weights that is kept."""
+"""The training loop of detectors: one optimiser, one learning-rate schedule, and an average of the weights."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bench.plugins.contracts import Progress
 Network = TypeVar("Network", bound=nn.Module)
 
 REPORT_EVERY = 5
-"""Updates between two words about the loss."""
+"""Updates between two progress reports."""
 
 
 def descend(
@@ -29,19 +29,22 @@ def descend(
     decay: float = 0.998,
     progress: Progress,
 ) -> tuple[Network, float]:
-    """Train a network by AdamW, the learning rate rising, then falling by a cosine, and return the mean of its late weights.
+    """Train a network with AdamW and a one-cycle learning rate, and return the exponential moving average of its weights.
 
     Args:
-        network: in the mode it is to be trained in; parameters without gradients stay as they are.
-        loss: of an update, by its number from 0.
-        updates: how many.
-        learning_rate: the highest.
-        warm_up: share of the updates in which it rises.
-        decay: of the running mean of the weights, an update.
-        progress: told how far it is.
+        network: the network, in the mode for training; parameters without gradients do not change.
+        loss: returns the loss of an update, given its number from 0.
+        updates: number of updates.
+        learning_rate: the maximum.
+        warm_up: share of the updates in which the learning rate rises; it then falls by a cosine.
+        decay: decay of the average of the weights, per update.
+        progress: called with the finished share and the loss.
 
     Returns:
-        The averaged network, and the seconds of processor time.
+        The averaged network, and the CPU time in seconds.
+
+    Raises:
+        FloatingPointError: if the loss is NaN or infinite.
     """
     start = time.process_time()
     mean = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(decay), use_buffers=True)

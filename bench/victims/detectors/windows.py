@@ -1,4 +1,4 @@
-"""What detectors are trained on: square windows of training scenes, at random places and sizes and in random light."""
+"""The training data of detectors: square windows of training scenes, with random places, sizes and light."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor
 from bench.detection import Scenes
 
 BATCH = 16
-"""Frames rendered at once."""
+"""Frames per rendering call."""
 LEAST_INSIDE = 0.4
-"""Share of an object's box that a window must hold for it to count as there."""
+"""Smallest share of an object's box that must be inside a window for the object to be a target."""
 
 
 @dataclass(frozen=True)
 class Views:
-    """N windows: the frame each is of, and its corner and side in pixels of that frame."""
+    """N windows: frame [N], corner [N, 2] and side [N] of each, in pixels of the frame."""
 
     frames: Tensor
     corners: Tensor
@@ -29,21 +29,21 @@ class Views:
         return Views(self.frames[which], self.corners[which], self.sides[which])
 
     def boxes(self, boxes: Tensor, side: int) -> Tensor:
-        """A box [N, 4] of each frame, in pixels of windows of `side`."""
+        """One box [N, 4] of each frame, converted to pixels of its window, scaled to `side`."""
         return (boxes - self.corners.repeat(1, 2)) * (side / self.sides)[:, None]
 
 
 class Windows:
-    """Draws windows of scenes.
+    """Draws random windows of scenes.
 
-    The pictures are rendered once and kept in 8 bits: 1.4 MB for one of 1248 x 384.
+    The images are rendered once and stored with 8 bits: 1.4 MB for an image of 1248 x 384.
 
     Args:
         scenes: the frames.
-        side: of the windows that come out, in pixels.
-        zoom: how much of a picture a window shows, in sides: the smallest and the largest.
-        away: share of the windows that are anywhere, and not about the sign.
-        generator: what is random.
+        side: side of the returned windows, in pixels.
+        zoom: smallest and largest side of the window in the image, as multiples of `side`.
+        away: share of the windows at uniformly random places; the others are near the sign.
+        generator: random generator.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Windows:
         self._objects = cache(scenes.objects)
 
     def draw(self, count: int) -> Views:
-        """Windows of random frames."""
+        """Draw `count` windows of random frames."""
         frames = torch.randint(len(self.scenes), (count,), generator=self.generator)
         height, width = self.scenes.size
         low, high = self.zoom
@@ -76,36 +76,36 @@ class Windows:
         return Views(frames, corners, sides)
 
     def cut(self, views: Views, pictures: Tensor | None = None) -> Tensor:
-        """The windows [N, 3, side, side].
+        """Cut out the windows [N, 3, side, side].
 
         Args:
-            views: where they are.
-            pictures: [N, 3, H, W] of their frames; None takes the frames as they are.
+            views: places of the windows.
+            pictures: images [N, 3, H, W] of their frames; None uses the frames without a patch.
         """
-        found = []
+        windows = []
         for number, (frame, (x, y), side) in enumerate(
             zip(views.frames.tolist(), views.corners.int().tolist(), views.sides.int().tolist(), strict=True)
         ):
             picture = self.pictures[frame] if pictures is None else pictures[number]
             window = picture[:, y : y + side, x : x + side]
             window = window.float() / 255 if pictures is None else window
-            found.append(window if side == self.side else _resized(window, self.side))
-        return torch.stack(found)
+            windows.append(window if side == self.side else _resized(window, self.side))
+        return torch.stack(windows)
 
     def objects(self, views: Views, index: Callable[[str], int]) -> tuple[list[Tensor], list[Tensor]]:
-        """The boxes [K, 4] in each window and their labels [K]: of what is there by at least `LEAST_INSIDE`."""
+        """The boxes [K, 4] and labels [K] of the objects in each window that are inside it by at least `LEAST_INSIDE`."""
         boxes, labels = [], []
         for frame, corner, side in zip(views.frames.tolist(), views.corners, views.sides, strict=True):
             known = self._objects(frame)
             whole = (known.boxes - corner.repeat(2)) * (self.side / side)
             inside = whole.clamp(0, self.side)
-            there = _area(inside) >= LEAST_INSIDE * _area(whole)
-            boxes.append(inside[there])
-            labels.append(torch.tensor([index(name) for name in known.names])[there])
+            enough = _area(inside) >= LEAST_INSIDE * _area(whole)
+            boxes.append(inside[enough])
+            labels.append(torch.tensor([index(name) for name in known.names])[enough])
         return boxes, labels
 
     def lit(self, *windows: Tensor) -> list[Tensor]:
-        """Windows [N, 3, side, side] in random light (brightness, contrast, tint, noise): number n in the same in all given."""
+        """Windows [N, 3, side, side] in random light (brightness, contrast, tint, noise), the same for all batches given."""
         count = len(windows[0])
         gain = 1 + 0.5 * (self._uniform(count, 1, 1, 1) - 0.5) + 0.1 * (self._uniform(count, 3, 1, 1) - 0.5)
         offset = 0.2 * (self._uniform(count, 1, 1, 1) - 0.5)

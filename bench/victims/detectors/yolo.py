@@ -1,4 +1,4 @@
-"""What the detectors of the YOLO family share: the block they are built of, and how the outputs of their heads are read."""
+"""Common parts of the YOLO detectors: the convolution block, batch-norm folding, and decoding of the head outputs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Place = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class Convolution(nn.Module):
-    """Convolution, batch normalisation, activation; height and width are those of the input, divided by `stride`."""
+    """Convolution, batch normalisation, activation; the output's height and width are the input's, divided by `stride`."""
 
     def __init__(
         self, inputs: int, outputs: int, size: int, stride: int = 1, *, eps: float, activation: nn.Module
@@ -33,10 +33,10 @@ class Convolution(nn.Module):
 
 
 def frozen(network: Network) -> Network:
-    """The network itself, made ready to be attacked: in eval mode, without gradients on its weights, and faster.
+    """Prepare a network for being attacked, in place: eval mode, no gradients on its weights, and faster.
 
-    A batch normalisation with fixed statistics is an affine map, so it goes into the convolution before it; and with the
-    channels last in memory a pass takes little more than half as long on a CPU.
+    Batch normalisation with fixed statistics is folded into the convolution before it. With the channels-last memory format a
+    forward pass takes little more than half the time on a CPU.
     """
     network.requires_grad_(False).eval()
     for block in network.modules():
@@ -46,13 +46,13 @@ def frozen(network: Network) -> Network:
 
 
 def decode(outputs: Sequence[Tensor], anchors: Tensor, strides: Sequence[int], place: Place) -> Predictions:
-    """Read the outputs of the heads.
+    """Decode the outputs of the heads.
 
     Args:
-        outputs: [N, A * (5 + C), h, w] of each head: raw box, objectness and classes of A anchors in h x w cells.
+        outputs: [N, A * (5 + C), h, w] for each head: raw box, objectness and classes of A anchors in h x w cells.
         anchors: width and height in pixels, [heads, A, 2].
-        strides: pixels a cell is wide and high, of each head.
-        place: turns raw boxes into boxes.
+        strides: width and height of a cell in pixels, for each head.
+        place: converts raw boxes to centres and sizes.
     """
     boxes, logits = [], []
     for output, anchor, stride in zip(outputs, anchors, strides, strict=True):

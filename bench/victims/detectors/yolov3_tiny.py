@@ -1,4 +1,4 @@
-"""YOLOv3-tiny (Redmon and Farhadi 2018) as a plain graph, with the official COCO weights in Darknet's own format."""
+"""YOLOv3-tiny (Redmon and Farhadi 2018) as a torch module, with the official COCO weights in Darknet's format."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from bench.victims import fetch
 from bench.victims.detectors import coco, yolo
 
 ANCHORS = ((10, 14), (23, 27), (37, 58), (81, 82), (135, 169), (344, 319))
-"""Width and height in pixels, at whatever size the picture is."""
+"""Width and height in pixels, for any image size."""
 HEADS = ((3, 4, 5), (1, 2, 3))
 """The anchors of the coarse and of the fine head.
 
-The cfg published with the weights says 0, 1, 2 for the fine one, but with them its boxes come out far too small: they overlap
-a stop sign by 0.2 to 0.4 (intersection over union), with 1, 2, 3 by 0.75 to 0.9. Scores do not depend on it.
+The cfg file published with the weights has 0, 1, 2 for the fine head, but its boxes are then far too small: their IoU with a
+stop sign is 0.2 to 0.4, and 0.75 to 0.9 with 1, 2, 3. Scores do not depend on the anchors.
 """
 HEADER = 20
-"""Bytes before the weights."""
+"""Size of the file header in bytes."""
 
 
 def _leaky(inputs: int, outputs: int, size: int = 3) -> yolo.Convolution:
@@ -34,7 +34,7 @@ def _leaky(inputs: int, outputs: int, size: int = 3) -> yolo.Convolution:
 
 
 class YOLOv3TinyNetwork(Detector):
-    """The graph; its modules are in the order of the weights file."""
+    """The network; its modules are in the order of the weights file."""
 
     names = coco.NAMES
     stride = 32
@@ -63,7 +63,7 @@ class YOLOv3TinyNetwork(Detector):
 
 
 class _SamePool(nn.Module):
-    """The largest of 2 x 2 at stride 1, as Darknet pads it: beyond the right and the lower edge is nothing."""
+    """2 x 2 max pooling with stride 1 and Darknet's padding: -inf beyond the right and the lower edge."""
 
     def forward(self, x: Tensor) -> Tensor:
         return nn.functional.max_pool2d(nn.functional.pad(x, (0, 1, 0, 1), value=-torch.inf), 2, 1)
@@ -75,13 +75,13 @@ def _place(raw: Tensor, cell: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def read_darknet(path: Path, network: nn.Module) -> None:
-    """Fill a network with the weights of a Darknet file.
+    """Load the weights of a Darknet file into a network.
 
-    The file is a header of 20 bytes (version, pictures seen) and then float32, little-endian: of each convolution in order
-    its bias, with a batch normalisation also scale, mean and variance, and its kernel.
+    The file has a header of 20 bytes (version, number of training images), then little-endian float32 values. For each
+    convolution in order: bias; scale, mean and variance if it has batch normalisation; kernel.
 
     Raises:
-        UserError: if the file is not of exactly this network's size.
+        UserError: if the size of the file does not match the network.
     """
     tensors = [tensor for tensor in _in_order(network) if tensor is not None]
     sizes = [tensor.numel() for tensor in tensors]
@@ -106,13 +106,13 @@ def _in_order(module: nn.Module) -> Iterator[Tensor | None]:
 
 @dataclass(frozen=True, kw_only=True)
 class YOLOv3Tiny(DetectorVictim):
-    """The smallest YOLOv3, with the weights its authors trained on COCO; they are fetched when first needed."""
+    """The smallest YOLOv3, with its authors' COCO weights, which are downloaded on first use."""
 
     def zoo_name(self) -> str:
         return "yolov3_tiny"
 
     def load(self, seed: int, facts: Facts) -> YOLOv3TinyNetwork:
-        """The one detector there is, whatever the seed."""
+        """The same detector for any seed."""
         path = fetch.weights("yolov3_tiny")
         network = YOLOv3TinyNetwork()
         read_darknet(path, network)

@@ -1,7 +1,7 @@
-"""YOLOv5 in its sizes n to x (architecture of release 6.0 and later) as a plain graph, written from its published layer table.
+"""YOLOv5 in its sizes n to x (architecture of release 6.0 and later) as a torch module, written from its published layer table.
 
 The published weights are AGPL-3.0, so cavbench does not ship them: `bench.victims.detectors.yolov5_file` reads a user's own
-file, and the zoo has a detector that was trained here.
+file, and the zoo has a detector trained with this module.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ MULTIPLES: dict[Size, tuple[float, float]] = {
     "l": (1.0, 1.0),
     "x": (1.33, 1.25),
 }
-"""Depth and width, as multiples of those of size l."""
+"""Depth and width, as multiples of size l."""
 ANCHORS = (
     ((10, 13), (16, 30), (33, 23)),
     ((30, 61), (62, 45), (59, 119)),
     ((116, 90), (156, 198), (373, 326)),
 )
-"""Width and height in pixels at 640 x 640, of the heads of strides 8, 16 and 32; a weights file brings its own."""
+"""Width and height in pixels at 640 x 640, for the heads with strides 8, 16 and 32; a weights file has its own."""
 STRIDES = (8, 16, 32)
 
 
@@ -49,7 +49,7 @@ def _silu(inputs: int, outputs: int, size: int = 1, stride: int = 1) -> yolo.Con
 
 
 class Bottleneck(nn.Module):
-    """1 x 1 then 3 x 3, added to the input where `shortcut`."""
+    """1 x 1 then 3 x 3 convolution, added to the input if `shortcut`."""
 
     def __init__(self, width: int, *, shortcut: bool) -> None:
         super().__init__()
@@ -63,7 +63,7 @@ class Bottleneck(nn.Module):
 
 
 class C3(nn.Module):
-    """A cross-stage partial block (Wang et al. 2020): half the width through `depth` bottlenecks, half around them."""
+    """A cross-stage partial block (Wang et al. 2020): half the width goes through `depth` bottlenecks, half bypasses them."""
 
     def __init__(self, inputs: int, outputs: int, depth: int, *, shortcut: bool) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class C3(nn.Module):
 
 
 class SPPF(nn.Module):
-    """Spatial pyramid pooling (He et al. 2014): maxima over 5, 9 and 13 cells, by pooling over 5 once, twice and thrice."""
+    """Spatial pyramid pooling (He et al. 2014): maxima over 5, 9 and 13 cells, by repeated pooling over 5 cells."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -93,7 +93,7 @@ class SPPF(nn.Module):
 
 
 class Detect(nn.Module):
-    """The three heads: a 1 x 1 convolution each, and the anchors in units of the head's stride."""
+    """The three heads: one 1 x 1 convolution each, and the anchors in units of the head's stride."""
 
     def __init__(self, widths: tuple[int, int, int], classes: int) -> None:
         super().__init__()
@@ -114,21 +114,21 @@ def _place(raw: Tensor, cell: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
 
 
 ZOOM = (0.6, 1.2)
-"""Sides of a training window: how much of a picture it shows, at least and at most."""
+"""Smallest and largest side of a training window in the image, as multiples of `window`."""
 AWAY = 0.3
-"""Share of the training windows that are anywhere in the picture, and not about the sign."""
+"""Share of the training windows at uniformly random places; the others are near the sign."""
 CALIBRATION = 40
-"""Batches that the statistics of the normalisations are taken from in the end."""
+"""Batches for computing the statistics of the batch normalisations after the training."""
 RARE = (-5.0, -1.5)
-"""Bias of objectness and of classes in a network that has learned nothing: most predictions are of nothing (Lin et al. 2017)."""
+"""Initial bias of objectness and of classes: most predictions contain no object (Lin et al. 2017)."""
 
 
 class YOLOv5Network(Detector):
-    """The graph. Layers are numbered as in the published table, so that its state dict has the names of the originals.
+    """The network. Layers are numbered as in the published table, so that its state dict has the original names.
 
     Args:
         size: n, s, m, l or x.
-        names: of the classes.
+        names: class names.
     """
 
     stride = STRIDES[-1]
@@ -164,7 +164,7 @@ class YOLOv5Network(Detector):
         self.model = nn.ModuleDict({str(number): layer for number, layer in layers.items()})
 
     def expect_little(self) -> None:
-        """Make a network that has learned nothing say that there is next to nothing."""
+        """Initialise the biases so that an untrained network predicts almost no objects."""
         detect = self.model["24"]
         assert isinstance(detect, Detect)
         for head in detect.m:
@@ -176,7 +176,7 @@ class YOLOv5Network(Detector):
         fine = self._through(pictures, 0, 1, 2, 3, 4)
         middle = self._through(fine, 5, 6)
         coarse = self._through(middle, 7, 8, 9, 10)
-        # What is seen coarsely goes down to the fine cells, and from there up again (Liu et al. 2018).
+        # Path aggregation (Liu et al. 2018): from the coarse to the fine cells and back.
         lateral = self._through(_doubled(coarse), 13, 14, beside=middle)
         small = self._through(_doubled(lateral), 17, beside=fine)
         medium = self._through(self._through(small, 18), 20, beside=lateral)
@@ -197,17 +197,17 @@ def _doubled(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class YOLOv5(DetectorVictim):
-    """YOLOv5 in one of its sizes: trained on the camera world's training places, or with the weights of a file of yours.
+    """YOLOv5 in one of its sizes: trained on the camera world's training places, or with weights from your own file.
 
     Args:
-        size: n, s, m, l or x: 1.9, 7.2, 21, 47 and 87 million parameters. The n ships trained.
-        path: a `yolov5*.pt` of release 6.0 or later, or a .safetensors of ours; empty for the one of the zoo.
-        trained: which of the zoo's, by its training seed; the seeds of a run are those of the patches.
-        updates: of the weights, when it is trained.
-        batch: windows an update.
-        window: their side in pixels, a multiple of 32.
-        learning_rate: of AdamW, the highest.
-        trained_in: parameters of the world it was trained in where they are not the default; `bench train` sets it.
+        size: n, s, m, l or x: 1.9, 7.2, 21, 47 and 87 million parameters. The zoo ships a trained n.
+        path: a `yolov5*.pt` of release 6.0 or later, or a .safetensors file written by cavbench; empty for the zoo's detector.
+        trained: training seed of the zoo's detector; the seeds of a run are patch seeds.
+        updates: number of weight updates in training.
+        batch: windows per update.
+        window: side of a window in pixels, a multiple of 32.
+        learning_rate: maximum learning rate of AdamW.
+        trained_in: non-default parameters of the training world; set by `bench train`.
     """
 
     learns: ClassVar[bool] = True
@@ -230,12 +230,12 @@ class YOLOv5(DetectorVictim):
         return f"yolov5{self.size}"
 
     def load(self, seed: int, facts: Facts) -> YOLOv5Network:
-        """The detector in the file, or that of the zoo, whatever the seed."""
+        """The detector from the file or the zoo, the same for any seed."""
         if not self.path:
             recipe = zoo.Recipe.of(self)
             if self.trained not in zoo.seeds(recipe):
-                own = f"victim.path=yolov5{self.size}.pt names a file of yours"
-                raise UserError(f"{zoo.missing(recipe, self.trained)}; or {own}")
+                hint = f"set victim.path=yolov5{self.size}.pt to use your own file"
+                raise UserError(f"{zoo.missing(recipe, self.trained)}; or {hint}")
             return yolo.frozen(zoo.load(recipe, self.trained, YOLOv5Network))
         weights = yolov5_file.read(Path(self.path).expanduser())
         network = YOLOv5Network(self.size, weights.names)
@@ -248,10 +248,10 @@ class YOLOv5(DetectorVictim):
         return yolo.frozen(network)
 
     def train(self, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
-        """Train a detector from nothing on windows of the training scenes, with all that there is to find in them.
+        """Train a detector from scratch on windows of the training scenes, with all objects in them as targets.
 
         Raises:
-            UserError: if there is a file: that is trained already.
+            UserError: if `path` is set, because the detector in the file is trained already.
         """
         if self.path:
             raise UserError("victim.path names a detector that is trained already; leave it out to train one")
@@ -275,7 +275,7 @@ class YOLOv5(DetectorVictim):
             trained, seconds = descend(
                 network, loss, updates=self.updates, learning_rate=self.learning_rate, progress=progress
             )
-            # The statistics of the weights on the way are not those of their mean.
+            # The averaged weights need their own batch-norm statistics.
             update_bn((drawn()[1] for _ in range(CALIBRATION)), trained)
         card = {"frames": len(scenes), "cpu_seconds": round(seconds)}
         return Trained(trained.eval().requires_grad_(False), card)

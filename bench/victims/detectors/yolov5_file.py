@@ -1,7 +1,7 @@
-"""Reads the weights of a YOLOv5 from a user's file. Nothing in the file is run, and no class of it is imported.
+"""Read the weights of a YOLOv5 from a user's file without executing code from it or importing its classes.
 
-A published `yolov5*.pt` is not a table of tensors but a pickled model, whose classes are those of the AGPL-3.0 code that trained
-it. Torch's restricted unpickler reads it here with one inert class in the place of them all; the tensors lie in the same tree.
+A published `yolov5*.pt` is a pickled model with classes of the AGPL-3.0 training code, not a table of tensors. Torch's
+restricted unpickler reads it with one inert class in place of all of them, which keeps the tree of tensors.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ EXPECTED = re.compile(
     r"models\.(yolo|common)\.\w+|torch\.nn\.modules\.\w+\.\w+"
     r"|pathlib\.(_local\.)?\w*Path|argparse\.Namespace|numpy\.(dtype|ndarray)|numpy\._?core\.multiarray\.(scalar|_reconstruct)"
 )
-"""What a checkpoint names: the model's classes, and those of the training's options and figures."""
+"""Allowed class names in a checkpoint: the model's classes, and classes of the training's options and metrics."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """What a file holds: tensors by their names in the state dict, the names of the classes, the sha256 of the file."""
+    """The content of a file: tensors by their names in the state dict, class names, and the sha256 of the file."""
 
     tensors: dict[str, Tensor]
     names: tuple[str, ...]
@@ -41,7 +41,7 @@ class Weights:
 
 
 class _Inert:
-    """Stands for every class of a checkpoint: takes what it is given and does nothing."""
+    """Replaces every class of a checkpoint: stores its state and does nothing."""
 
     def __init__(self, *arguments: object) -> None:
         pass
@@ -52,24 +52,24 @@ class _Inert:
 
 
 def read(path: Path) -> Weights:
-    """The weights in a file, by its ending: .safetensors as `save` writes them, or else a pickled checkpoint.
+    """Read a weights file: .safetensors as written by `save`, any other ending as a pickled checkpoint.
 
     Raises:
-        UserError: if the file cannot be read, or names anything that such a checkpoint does not.
+        UserError: if the file cannot be read, or names a class that is not `EXPECTED`.
     """
     try:
         tensors, names = _safetensors(path) if path.suffix == ".safetensors" else _checkpoint(path)
         return Weights(tensors, names, hashlib.sha256(path.read_bytes()).hexdigest())
     except UserError:
         raise
-    # A file that is cut short or made to harm can fail anywhere in the unpickler.
+    # A truncated or malicious file can fail anywhere in the unpickler.
     except Exception as error:
         reason = shorten(f"{type(error).__name__}: {error}", 200)
         raise UserError(f"the weights {path} cannot be read: {reason}") from None
 
 
 def save(detector: Detector, path: Path) -> None:
-    """Write the weights of a detector whose batch-norms are not folded yet, atomically, with the names of its classes."""
+    """Write the weights of a detector with unfolded batch normalisation, atomically, with its class names."""
     tensors = {name: tensor.contiguous() for name, tensor in detector.state_dict().items()}
     blob = save_tensors(tensors, metadata={"names": json.dumps(detector.names)})
     with whole(path) as file:
@@ -84,18 +84,18 @@ def _safetensors(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
 
 def _checkpoint(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
     named = get_unsafe_globals_in_checkpoint(path)
-    if strange := sorted(name for name in named if not EXPECTED.fullmatch(name)):
-        raise UserError(f"the weights {path} are refused: they name {shorten(', '.join(strange), 200)}")
+    if unexpected := sorted(name for name in named if not EXPECTED.fullmatch(name)):
+        raise UserError(f"the weights {path} are refused: they name {shorten(', '.join(unexpected), 200)}")
     with safe_globals([(_Inert, name) for name in named]):
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     model = isinstance(checkpoint, dict) and (checkpoint.get("ema") or checkpoint.get("model"))
     if not isinstance(model, _Inert):
-        raise UserError(f"the weights {path} cannot be read: they are no checkpoint with a model")
+        raise UserError(f"the weights {path} cannot be read: the file is not a checkpoint with a model")
     return dict(_tensors(model)), _names(vars(model)["names"])
 
 
 def _tensors(module: _Inert, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
-    """The parameters and buffers of an inert module tree, by the names of its state dict."""
+    """The parameters and buffers of an inert module tree, with their names in the state dict."""
     state = vars(module)
     for name, tensor in {**state["_parameters"], **state["_buffers"]}.items():
         if tensor is not None:
@@ -105,5 +105,5 @@ def _tensors(module: _Inert, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
 
 
 def _names(found: list[str] | dict[int, str]) -> tuple[str, ...]:
-    """The names of the classes, which older files keep as a list and newer ones by label."""
+    """The class names: a list in older files, a dict by label in newer files."""
     return tuple(found[label] for label in range(len(found)))

@@ -25,21 +25,21 @@ from bench.victims.drivers.training import LearningDriver
 
 @dataclass(frozen=True, kw_only=True)
 class DDPG(LearningDriver):
-    """A deterministic actor (Lillicrap et al. 2016) that steers and accelerates by itself.
+    """A deterministic actor (Lillicrap et al. 2016) with continuous steering and acceleration.
 
     TorchRL's TD3Loss: twin critics, smoothed target actions and delayed actor updates (Fujimoto et al. 2018) on top of DDPG,
-    with n-step returns. Leaving the road ends an episode and costs as much as a crash, else the policy learns to drive in
-    circles beside it.
+    with n-step returns. Leaving the road ends an episode and has the same penalty as a crash; otherwise the policy learns to
+    drive in circles beside the road.
 
     Args:
-        steering_limit: largest |steering| the actor can ask for, in shares of 45 degrees.
-        noise: standard deviation of the final exploration noise, in shares of the actor's own range.
-        actor_delay: critic updates an actor update.
+        steering_limit: largest |steering| of the actor, as a share of 45 degrees.
+        noise: standard deviation of the final exploration noise, as a share of the actor's range.
+        actor_delay: critic updates per actor update.
     """
 
     policy_type = ActorPolicy
 
-    # Smaller and shorter than the DQN's: actor and critic learn in turns, and it is the clock that ends it.
+    # Smaller and shorter than for DQN, because training actor and critic in turns takes longer.
     decisions: Count = 24_000
     hidden: Count = 64
     steering_limit: Annotated[float, Interval(gt=0, le=1)] = 0.1
@@ -84,14 +84,14 @@ class _ActorCriticLearner(Learner):
             noise_clip=0.5 * limit,
             deactivate_vmap=True,
         )
-        # The loss trains twin critics of its own; the policy's is a copy of the first.
+        # The loss trains its own twin critics; the policy's critic is a copy of the first.
         self.policy.critic.requires_grad_(False)
         self.target = SoftUpdate(self.loss, tau=recipe.tau)
         self.actor_adam = torch.optim.Adam(list(self.loss.actor_network_params.flatten_keys().values()))
         self.critic_adam = torch.optim.Adam(list(self.loss.qvalue_network_params.flatten_keys().values()))
 
     def enter(self, phase: Phase) -> None:
-        # Noise is drawn at every decision: frame by frame it averages out by itself, so its size stays.
+        # The noise is drawn at every decision and averages out over single frames, so its scale does not change.
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
 
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:

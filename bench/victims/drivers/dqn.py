@@ -26,10 +26,10 @@ class DQN(LearningDriver):
     """A deep Q-network (Mnih et al. 2015) that chooses lane changes and target speeds.
 
     TorchRL's DQNLoss with double Q-learning (van Hasselt et al. 2016), n-step returns, a smooth L1 loss and a Polyak-averaged
-    target network, whose weights are also what drives in the end.
+    target network; the trained policy has the weights of the target network.
 
     Args:
-        final_epsilon: random share of actions from 30 % of the training on, falling linearly from 1 until then.
+        final_epsilon: share of random actions after the first 30 % of the training; it falls linearly from 1 until then.
     """
 
     policy_type = QPolicy
@@ -91,7 +91,7 @@ class _QLearner(Learner):
 
     @torch.no_grad()
     def _disadvantage(self, sample: TensorDictBase) -> Tensor:
-        """V(s) - Q(s, a) [N, 1]: what advantage learning takes from the reward (Bellemare et al. 2016, Eq. 6)."""
+        """V(s) - Q(s, a) [N, 1], which advantage learning subtracts from the reward (Bellemare et al. 2016, Eq. 6)."""
         values = self.policy.scores(sample["observation"])
         return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
 

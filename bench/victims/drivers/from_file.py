@@ -1,4 +1,4 @@
-"""What drivers that come in a user's file have in common, whatever the file holds."""
+"""The base classes of drivers loaded from a user's file, independent of the file format."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from bench.errors import UserError, reason
 from bench.plugins.ranges import Count
 
 CONTROLS = 2
-"""Numbers of a continuous action: acceleration and steering."""
+"""Size of a continuous action: acceleration and steering."""
 TRIED = (1, 2, 1500)
-"""Batches that a policy is tried on: attacks ask about many points of many episodes at once."""
+"""Batch sizes on which a policy is tested: attacks query many points of many episodes at once."""
 
 
 class FilePolicy(Policy):
-    """A network of a file at the wheel.
+    """A driving policy whose network comes from a file.
 
     Args:
-        network: from observations [N, *shape] to [N, A] scores, or [N, 2] actions, which are clipped to [-1, 1].
-        shape: of what it takes: [V, F] or, flattened, [V * F].
-        action_type: what it decides.
-        width: numbers it gives for an observation.
-        sha256: of the file.
-        critic: from (observations, actions) to [N, 1] values, for white-box attacks on continuous actions; None if there is none.
+        network: maps observations [N, *shape] to scores [N, A], or to actions [N, 2], which are clipped to [-1, 1].
+        shape: input shape: [V, F] or, flattened, [V * F].
+        action_type: discrete or continuous.
+        width: size of the output for one observation.
+        sha256: hash of the file.
+        critic: maps (observations, actions) to values [N, 1], for white-box attacks on continuous actions; None if there is none.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class FilePolicy(Policy):
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> FilePolicy:
-        """Into eval mode and no other: an exported network has one mode only, that of its export."""
+        """Stay in eval mode: an exported network has only the mode in which it was exported."""
         self.training = False
         return self
 
@@ -58,9 +58,9 @@ class FilePolicy(Policy):
         leading = observation.shape[:-2]
         if not leading.numel():
             return observation.new_zeros(*leading, self.width)
-        answer = self.network(observation.reshape(-1, *self.shape))
-        answer = answer if self.action_type == "discrete" else answer.clamp(-1, 1)
-        return answer.reshape(*leading, answer.shape[-1])
+        output = self.network(observation.reshape(-1, *self.shape))
+        output = output if self.action_type == "discrete" else output.clamp(-1, 1)
+        return output.reshape(*leading, output.shape[-1])
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         if self.critic is None:
@@ -74,10 +74,10 @@ class FileDriver(DrivingVictim):
 
     Args:
         path: the file.
-        actions: `discrete`: it gives values or logits of the world's actions (on the highway LANE_LEFT, IDLE, LANE_RIGHT,
-            FASTER, SLOWER), and the largest is done; `continuous`: it gives [acceleration, steering] in [-1, 1].
-        rows: of the observation it was trained on, the ego's own among them; the world must show as many.
-        features: numbers in a row: presence and the measured ones.
+        actions: `discrete`: the output is the values or logits of the world's actions (on the highway LANE_LEFT, IDLE,
+            LANE_RIGHT, FASTER, SLOWER), and the largest is taken; `continuous`: it is [acceleration, steering] in [-1, 1].
+        rows: number of rows of its observation, including the ego; the world must have the same number.
+        features: size of a row: presence and the measured features.
     """
 
     path: str
@@ -90,20 +90,20 @@ class FileDriver(DrivingVictim):
         return self.actions
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
-        """The policy in the file, whatever the seed.
+        """The policy in the file, for any seed.
 
         Raises:
-            UserError: if the file is not there, cannot be read or does not fit the other parameters.
+            UserError: if the file is missing, cannot be read or does not match the other parameters.
         """
         path = Path(self.path).expanduser()
         if not path.is_file():
-            raise UserError(f"there is no file {self.path}; say victim.path=… where it is")
+            raise UserError(f"there is no file {self.path}; set victim.path=… to the policy's file")
         try:
             width = len(facts.actions) if self.action_type == "discrete" else CONTROLS
             policy = self.read(path, hashlib.sha256(path.read_bytes()).hexdigest(), width)
         except UserError:
             raise
-        # A file that is cut short or of another kind can fail anywhere in the library that reads it.
+        # A truncated file, or one in another format, can fail anywhere in the library that reads it.
         except Exception as error:
             raise UserError(f"{self.path} cannot be read: {reason(error)}") from error
         self._try(policy)
@@ -111,37 +111,37 @@ class FileDriver(DrivingVictim):
 
     @abstractmethod
     def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
-        """The policy in a file.
+        """Read the policy from a file.
 
         Args:
-            path: of the file.
-            sha256: of its content.
-            width: numbers that the policy must give for an observation.
+            path: path of the file.
+            sha256: hash of its content.
+            width: required size of the output for one observation.
 
         Raises:
-            UserError: if it is not what the parameters say.
+            UserError: if it does not match the parameters.
         """
 
     def check_observation(self, shape: Sequence[object]) -> None:
-        """Raise UserError unless observations of the shape [V, F] or [V * F] are those of `rows` and `features`."""
+        """Raise UserError unless `shape`, [V, F] or [V * F], matches `rows` and `features`."""
         if list(shape) not in ([self.rows, self.features], [self.rows * self.features]):
             wanted = f"[{self.rows}, {self.features}] or [{self.rows * self.features}]"
             raise UserError(
                 f"{self.path} takes observations {list(shape)}, victim.rows and victim.features say {wanted}; "
-                "the world must show the same"
+                "they must match each other and the world"
             )
 
     def _try(self, policy: FilePolicy) -> None:
         for batch in TRIED:
             try:
                 with torch.no_grad():
-                    answer = policy.scores(torch.zeros(batch, self.rows, self.features))
+                    scores = policy.scores(torch.zeros(batch, self.rows, self.features))
             except Exception as error:
                 raise UserError(
-                    f"{self.path} takes no batch of {batch}: export it with a batch of any size ({reason(error)})"
+                    f"{self.path} fails on a batch of {batch}: export it with a dynamic batch size ({reason(error)})"
                 ) from error
             wanted = [batch, policy.width]
-            if list(answer.shape) != wanted:
+            if list(scores.shape) != wanted:
                 raise UserError(
-                    f"{self.path} gives {list(answer.shape)} for {batch} observations, {self.action_type} actions are {wanted}"
+                    f"{self.path} returns {list(scores.shape)} for {batch} observations, {self.action_type} actions need {wanted}"
                 )

@@ -1,4 +1,4 @@
-"""A learning algorithm: its networks, loss and optimiser. `dqn` and `ddpg` implement it, `training` drives it."""
+"""The base class of a learning algorithm: networks, loss and optimiser. `dqn` and `ddpg` implement it, `training` runs it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ CHUNK = 8
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of the training in which a decision is held for `repeat` frames.
+    """A phase of the training in which each decision is held for `repeat` frames.
 
     Args:
-        repeat: frames a decision is held.
-        decisions: taken on every road in this phase.
-        gamma: discount a decision.
-        n_step: decisions in a return.
-        exploration: final exploration of the recipe is multiplied by this: random actions a second stay as rare.
-        gap: of advantage learning, in [0, 1): gaps between the values of actions grow by 1 / (1 - gap).
+        repeat: number of frames for which a decision is held.
+        decisions: number of decisions on every road in this phase.
+        gamma: discount per decision.
+        n_step: number of decisions in a return.
+        exploration: multiplies the recipe's final exploration, so that the rate of random actions per second does not change.
+        gap: gap of advantage learning, in [0, 1); it widens the action gap by 1 / (1 - gap).
     """
 
     repeat: int
@@ -39,28 +39,28 @@ class Learner(ABC):
     """One algorithm: networks, loss, optimiser.
 
     Args:
-        hooks: what a defence changes in the training; the policy continues from `hooks.start` where there is one.
+        hooks: the changes of a defence; the policy continues from `hooks.start` if it is set.
     """
 
     policy: Policy
-    """The network that is trained."""
+    """The network in training."""
     explore: nn.Module
-    """Takes a tensordict with `observation` [B, V, F], writes an exploring `action`."""
+    """Reads `observation` [B, V, F] from a tensordict and writes `action`, with exploration."""
 
     def __init__(self, hooks: TrainingHooks) -> None:
         self.hooks = hooks
 
     @abstractmethod
     def enter(self, phase: Phase) -> None:
-        """Take on the phase's discount and exploration."""
+        """Set the discount and exploration of a phase."""
 
     @abstractmethod
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
-        """One gradient step on a batch of transitions, with the loss that `hooks.loss` makes of the algorithm's own."""
+        """One gradient step on a batch of transitions; `hooks.loss` may change the algorithm's loss."""
 
     @abstractmethod
     def anneal(self) -> None:
-        """Explore less: a chunk of decisions more has been taken."""
+        """Reduce the exploration after a chunk of decisions."""
 
     @abstractmethod
     def averaged(self) -> Policy:
@@ -68,10 +68,10 @@ class Learner(ABC):
 
 
 def copy_weights(params: TensorDictBase, module: nn.Module) -> None:
-    """Copy the parameters that a TorchRL loss holds into a module of the same structure as the one the loss was given.
+    """Copy the parameters of a TorchRL loss into a module of the same structure.
 
     Args:
-        params: for instance `loss.target_value_network_params`; one of `loss.qvalue_network_params`, which are stacked.
-        module: a TensorDictModule of the same structure.
+        params: for instance `loss.target_value_network_params`, or one item of the stacked `loss.qvalue_network_params`.
+        module: a TensorDictModule with the structure of the module given to the loss.
     """
     TensorDict.from_module(module).data.update_(params.data)

@@ -1,4 +1,4 @@
-"""The networks of the learned drivers, as policies: small enough that an attack's hundred queries a step stay cheap."""
+"""The networks of the trained driving policies; they are small, because an attack makes hundreds of queries per step."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from bench.driving import Policy, State
 class Encoder(nn.Module):
     """The cars around the ego as a set (Zaheer et al. 2017, PointNet's max): [..., V, F] -> [..., F - 1 + `pooled`].
 
-    Every other car goes through the same small network together with the ego's own row, and the largest response of any car
-    is kept. What a car means does not depend on its row: on the same frames this crashes half as often as a plain MLP.
+    The same small network reads every other car together with the ego's row, and the outputs are max-pooled over the cars. The
+    output does not depend on the order of the rows. With the same training frames it crashes half as often as a plain MLP.
     """
 
     width, pooled = 32, 32
@@ -27,7 +27,7 @@ class Encoder(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         ego, cars = observation[..., 0, 1:], observation[..., 1:, :]
-        # One product on contiguous rows: a third faster than one a layer, and these are what an attack's queries cost.
+        # One product on contiguous rows is a third faster than one per layer; it dominates the cost of a query.
         rows = torch.cat((cars, ego.unsqueeze(-2).expand(*cars.shape[:-1], -1)), -1)
         weight = torch.cat((self.car.weight, self.ego.weight), 1)
         hidden = nn.functional.linear(rows, weight, self.car.bias).relu_()
@@ -52,9 +52,9 @@ class QPolicy(Policy):
     """The greedy policy of a Q-network.
 
     Args:
-        features: F, entries an observation row.
-        actions: A.
-        hidden: width of the two hidden layers behind the encoder.
+        features: F, size of an observation row.
+        actions: A, number of actions.
+        hidden: width of the two hidden layers after the encoder.
     """
 
     action_type = "discrete"
@@ -104,13 +104,13 @@ def _head(inputs: int, outputs: int, hidden: int) -> MLP:
 
 
 class ActorPolicy(Policy):
-    """A deterministic actor, and the critic it was trained by.
+    """A deterministic actor with the critic of its training.
 
     Args:
-        features: F, entries an observation row.
-        hidden: width of the two hidden layers of actor and critic, behind an encoder each.
-        steering_limit: largest |steering| it asks for, on the [-1, 1] scale of 45 degrees; a car at 25 m/s that steers
-            further leaves its lane within a control period or two.
+        features: F, size of an observation row.
+        hidden: width of the two hidden layers of actor and critic; each has its own encoder.
+        steering_limit: largest |steering| of the actor, on the [-1, 1] scale of 45 degrees. At 25 m/s a car that steers more
+            leaves its lane within one or two control periods.
     """
 
     action_type = "continuous"

@@ -1,4 +1,4 @@
-"""A driver in an ONNX file: computed by ONNX Runtime, outside of torch, and so a black box."""
+"""A driver from an ONNX file, evaluated with ONNX Runtime. It is a black box without gradients."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from bench.victims.drivers.from_file import FileDriver, FilePolicy
 
 @dataclass(frozen=True, kw_only=True)
 class ONNX(FileDriver):
-    """A policy of yours as an ONNX file. It has no gradients: attacks that need them are refused.
+    """Your own policy as an ONNX file. It has no gradients: attacks that need gradients are refused.
 
-    It maps observations [batch, rows, features], or flattened ones, to scores or actions, its first output; its batch must be
-    of any size. Needs ONNX Runtime: pip install 'cavbench[onnx]'.
+    Its first output maps observations [batch, rows, features], flattened or not, to scores or actions. The batch size must be
+    dynamic. Needs ONNX Runtime: pip install 'cavbench[onnx]'.
     """
 
     answers: ClassVar[Access] = "scores"
@@ -34,12 +34,12 @@ class ONNX(FileDriver):
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         inputs = session.get_inputs()
         if len(inputs) != 1 or inputs[0].type != "tensor(float)":
-            found = ", ".join(f"{one.name} {one.type}" for one in inputs)
-            raise UserError(f"{self.path} takes {found}; a driver takes one tensor(float), the observation")
+            types = ", ".join(f"{one.name} {one.type}" for one in inputs)
+            raise UserError(f"{self.path} takes {types}; a driver takes one tensor(float), the observation")
         batch, *shape = inputs[0].shape
         self.check_observation(shape)
         if isinstance(batch, int):
-            raise UserError(f"{self.path} takes no batch but of {batch}: export it with a dynamic first axis")
+            raise UserError(f"{self.path} has a fixed batch size of {batch}: export it with a dynamic first axis")
         name, output = inputs[0].name, session.get_outputs()[0].name
 
         def network(observation: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Practice: the roads a learner drives on, its reward, and the replay buffer of n-step transitions."""
+"""Collects the training experience: the roads, the reward, and the replay buffer of n-step transitions."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from bench.victims.drivers.learner import Learner, Phase
 
 
 def roads(world: DrivingWorld, copies: int) -> list[Cell]:
-    """The roads of a world's own grid, `copies` of each: one batch practises on all of them.
+    """The training cells of a world: its default grid, `copies` of each cell.
 
-    Perceptual axes are at their first value: it practises in clear weather.
+    Perceptual axes have their first value: training is in clear weather.
     """
     cells = dict.fromkeys(world.axes.unperceived(cell) for cell in registry.grid(world.grid).cells())
     return [cell for cell in cells for _ in range(copies)]
 
 
 class Practice:
-    """Drives the roads in one phase of the training and remembers n-step transitions.
+    """Drives the roads in one phase of the training and stores n-step transitions.
 
-    The reward is Eq. 4.1 of the thesis without highway-env's normalisation, over 0.5, with a failure at -`crash_penalty`; the
-    mean over the frames a decision is held, times (1 - gamma), so that values stay in one range. (On the normalised reward a
-    car that only brakes earns 0.70 of the maximum, and learners stay there.)
+    The reward is Eq. 4.1 of the thesis without highway-env's normalisation, divided by 0.5, minus `crash_penalty` on a failure.
+    It is the mean over the frames of a decision, times (1 - gamma), which keeps the values in one range. (With the normalised
+    reward, a car that only brakes earns 0.70 of the maximum, and training stops at this policy.)
 
     Args:
-        env: one episode a road, decisions held for `phase.repeat` frames.
-        learner: takes the decisions.
-        phase: of the training.
-        crash_penalty: reward of a crash or of leaving the road, in frames of perfect driving.
-        memory: transitions in the replay buffer.
-        batch: transitions in a sample.
+        env: one episode per road; decisions are held for `phase.repeat` frames.
+        learner: makes the decisions.
+        phase: the phase of the training.
+        crash_penalty: cost of a crash or of leaving the road, in frames of perfect driving.
+        memory: size of the replay buffer in transitions.
+        batch: size of a sample in transitions.
     """
 
     def __init__(
@@ -43,13 +43,13 @@ class Practice:
     ) -> None:
         self.env, self.learner, self.phase, self.crash_penalty = env, learner, phase, crash_penalty
         self.buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(memory), batch_size=batch)
-        # Without done_keys=[] the transform keeps the first step's `terminated` and bootstraps through crashes.
+        # Without done_keys=[] the transform keeps `terminated` of the first step and bootstraps through crashes.
         self.multi_step = MultiStepTransform(n_steps=phase.n_step, gamma=phase.gamma, done_keys=[])
         self.td = env.reset()
 
     @torch.no_grad()
     def drive(self, decisions: int, share: float) -> None:
-        """Take `decisions` on every road; `share` of the training is done."""
+        """Make `decisions` decisions on every road; `share` of the training is finished."""
         hooks, policy = self.learner.hooks, self.learner.policy
         chunk = []
         for _ in range(decisions):
@@ -66,7 +66,7 @@ class Practice:
             self.buffer.extend(transitions.exclude("gamma", "nonterminal", ("next", "original_reward")).reshape(-1))
 
     def sample(self, share: float) -> TensorDictBase:
-        """A batch of transitions: `truth` is the observation that was remembered, `observation` what is learned with."""
+        """A batch of transitions: `truth` is the stored observation, `observation` is after `hooks.replayed`."""
         sample = self.buffer.sample()
         truth = sample["observation"]
         sample.set("truth", truth)

@@ -1,4 +1,4 @@
-"""Baseline drivers that ignore their input: any victim must beat them to be worth attacking."""
+"""Baseline drivers that ignore the observation; a victim that does not beat them is not worth attacking."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from bench.errors import UserError
 from bench.plugins.registry import unknown
 
 RIGHT_S = 4.0
-"""Seconds of changing to the right: enough to cross four lanes at 25 m/s, one after the other."""
+"""Seconds of lane changes to the right: enough to cross four lanes at 25 m/s, one after the other."""
 DRAWS = 1024
-"""Actions drawn for an episode; a longer one begins with the first again."""
+"""Number of random actions drawn for an episode; a longer episode repeats them."""
 
 
 class _Constant(Policy):
@@ -54,13 +54,13 @@ class _FirstThen(Policy):
 
 @dataclass(frozen=True, kw_only=True)
 class Blind(DrivingVictim):
-    """A driver that ignores what it sees: a constant action, or the rightmost lane and then the brake.
+    """An input-independent policy: a constant action, or a change to the rightmost lane and then braking.
 
-    The best of these in a cell is the bar under attack: a victim below it would do better without its input.
+    The best of these policies in a cell is the baseline under attack: a victim with a lower score would do better without input.
 
     Args:
-        policy: `throttle`, `coast` and `brake` are continuous. Any other is the name of a discrete action of the world, in small
-            letters; `right_then_slower` changes to the right for as long as it takes from any lane, then slows down.
+        policy: `throttle`, `coast` and `brake` are continuous. Other values are names of the world's discrete actions, in lower
+            case; `right_then_slower` changes to the rightmost lane, then slows down.
     """
 
     sees: ClassVar[bool] = False
@@ -85,15 +85,15 @@ class Blind(DrivingVictim):
 
 
 class _RandomPolicy(Policy):
-    """Actions drawn from a generator of each episode's own, so that they do not depend on the rest of the batch."""
+    """Random actions from one generator per episode, so that they do not depend on the rest of the batch."""
 
     def __init__(self, action_type: ActionType, actions: int) -> None:
         super().__init__()
         self.action_type, self.actions = action_type, actions
 
     def initial(self, episodes: Tensor) -> State:
-        each = [torch.Generator().manual_seed(int(episode)) for episode in episodes]
-        draws = torch.stack([torch.rand(DRAWS, self.actions, generator=generator) for generator in each])
+        generators = [torch.Generator().manual_seed(int(episode)) for episode in episodes]
+        draws = torch.stack([torch.rand(DRAWS, self.actions, generator=generator) for generator in generators])
         return TensorDict({"step": torch.zeros_like(episodes), "draws": draws}, batch_size=episodes.shape)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
@@ -128,9 +128,9 @@ class RandomDriver(DrivingVictim):
 
 @dataclass(frozen=True, kw_only=True)
 class IDMDriver(DrivingVictim):
-    """The world's own traffic driver at the wheel: IDM for speed, MOBIL for lanes (Treiber et al. 2000, Kesting et al. 2007).
+    """The world's own traffic driver: IDM for speed, MOBIL for lane changes (Treiber et al. 2000, Kesting et al. 2007).
 
-    It reads the simulator's true state, not the observation, so that attacks and weather cannot touch it.
+    It reads the simulator's true state instead of the observation, so attacks and weather have no effect on it.
     """
 
     sees: ClassVar[bool] = False

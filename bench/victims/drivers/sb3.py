@@ -1,7 +1,7 @@
-"""A driver trained with Stable-Baselines3, rebuilt from its file. Nothing in the file is unpickled but tensors.
+"""A driver trained with Stable-Baselines3, rebuilt from its file. Only tensors are unpickled.
 
-A saved model is a zip: `policy.pth` holds the weights, which torch's restricted unpickler reads, and `data` is JSON in which
-every object stands twice: pickled, which is left alone, and in plain words, from which the spaces and the activation are read.
+A saved model is a zip file. `policy.pth` holds the weights, which torch's restricted unpickler reads. `data` is JSON with two
+versions of every object: a pickle, which is ignored, and text, from which the spaces and the activation are read.
 """
 
 from __future__ import annotations
@@ -30,23 +30,22 @@ STEMS: dict[Algorithm, tuple[str, ...]] = {
     "td3": ("actor.mu",),
     "ddpg": ("actor.mu",),
 }
-"""Where the layers from the observation to the action are, in order."""
+"""Names of the layers from the observation to the action, in order."""
 EITHER = ("ppo", "a2c")
-"""Algorithms for both kinds of action; the others are for one."""
+"""Algorithms that support both action types; the others support one."""
 CRITIC = "critic.qf0"
 
 
 @dataclass(frozen=True, kw_only=True)
 class StableBaselines3(FileDriver):
-    """A policy trained with Stable-Baselines3 on highway-env, from the zip that `model.save` wrote; SB3 need not be installed.
+    """A policy trained with Stable-Baselines3 on highway-env, from the zip of `model.save`; SB3 need not be installed.
 
-    `MlpPolicy` only: fully connected layers on the flattened observation. It acts as `predict(deterministic=True)` does. What
-    a `VecNormalize` around the environment did is not in the file: train without one. Nothing in the file but its tensors is
-    unpickled.
+    Only `MlpPolicy`: fully connected layers on the flattened observation. It acts like `predict(deterministic=True)`. Train
+    without `VecNormalize`: the file does not contain its statistics. Only the tensors in the file are unpickled.
 
     Args:
-        algo: that trained it.
-        actions: `discrete` or `continuous`; of PPO and A2C, the others have one kind each.
+        algo: the algorithm of the training.
+        actions: `discrete` or `continuous`, for PPO and A2C; the other algorithms support one action type.
     """
 
     algo: Algorithm
@@ -66,9 +65,9 @@ class StableBaselines3(FileDriver):
         shape = self._observation(data["observation_space"])
         self._check_actions(data["action_space"], width)
         options = data.get("policy_kwargs") or {}
-        if strange := sorted({"features_extractor_class", "squash_output"} & options.keys()):
+        if unsupported := sorted({"features_extractor_class", "squash_output"} & options.keys()):
             raise UserError(
-                f"{self.path} has a policy with {', '.join(strange)}; victim 'sb3' reads a plain MlpPolicy only"
+                f"{self.path} has a policy with {', '.join(unsupported)}; victim 'sb3' reads a plain MlpPolicy only"
             )
         activation = _activation(options, default=nn.Tanh if self.algo in EITHER else nn.ReLU)
         layers = [layer for stem in STEMS[self.algo] for layer in _layers(weights, stem)]
@@ -82,19 +81,19 @@ class StableBaselines3(FileDriver):
 
     def _observation(self, space: dict[str, Any]) -> list[int]:
         if not str(space.get(":type:")).endswith(".Box'>"):
-            raise UserError(f"{self.path} was trained on observations of {space.get(':type:')}; a driver reads a Box")
+            raise UserError(f"{self.path} was trained on observations of {space.get(':type:')}; the type must be Box")
         shape = [int(side) for side in space["_shape"]]
         self.check_observation(shape)
         return shape
 
     def _check_actions(self, space: dict[str, Any], width: int) -> None:
         discrete = str(space.get(":type:")).endswith(".Discrete'>")
-        found = [int(space["n"])] if discrete else [int(side) for side in space.get("_shape") or []]
-        if discrete != (self.action_type == "discrete") or found != [width]:
-            kind = f"{found[0]} discrete actions" if discrete else f"continuous actions {found}"
-            hint = "; say victim.actions=continuous" if self.algo in EITHER and not discrete else ""
+        shape = [int(space["n"])] if discrete else [int(side) for side in space.get("_shape") or []]
+        if discrete != (self.action_type == "discrete") or shape != [width]:
+            trained = f"{shape[0]} discrete actions" if discrete else f"continuous actions {shape}"
+            hint = "; set victim.actions=continuous" if self.algo in EITHER and not discrete else ""
             wanted = f"{width} {self.action_type} actions"
-            raise UserError(f"{self.path} was trained for {kind}, {self.algo} victims here have {wanted}{hint}")
+            raise UserError(f"{self.path} was trained for {trained}, this {self.algo} victim needs {wanted}{hint}")
         if not discrete:
             ends = [float(number) for key in ("low", "high") for number in re.findall(r"-?[\d.]+", str(space[key]))]
             if ends != [-1.0, -1.0, 1.0, 1.0]:
@@ -104,10 +103,10 @@ class StableBaselines3(FileDriver):
 
     def _check_width(self, layers: list[tuple[Tensor, Tensor]], entries: int) -> None:
         if not layers:
-            raise UserError(f"{self.path} holds no {self.algo} policy: {STEMS[self.algo][0]} is not among its weights")
+            raise UserError(f"{self.path} has no {self.algo} policy: {STEMS[self.algo][0]} is not among its weights")
         if layers[0][0].shape[1] != entries:
             raise UserError(
-                f"{self.path} has a policy of {layers[0][0].shape[1]} inputs for {entries} numbers; "
+                f"{self.path} has a policy with {layers[0][0].shape[1]} inputs, the observation has {entries} numbers; "
                 "victim 'sb3' reads a plain MlpPolicy only"
             )
 
@@ -116,14 +115,14 @@ def _activation(options: dict[str, Any], default: type[nn.Module]) -> type[nn.Mo
     named = options.get("activation_fn")
     if named is None:
         return default
-    found = re.fullmatch(r"<class 'torch\.nn\.modules\.activation\.(\w+)'>", str(named))
-    if found is None:
+    match = re.fullmatch(r"<class 'torch\.nn\.modules\.activation\.(\w+)'>", str(named))
+    if match is None:
         raise UserError(f"the activation {named} is not one of torch's")
-    return getattr(nn, found[1])
+    return getattr(nn, match[1])
 
 
 def _layers(weights: dict[str, Tensor], stem: str) -> list[tuple[Tensor, Tensor]]:
-    """Weight and bias of the linear layers under a name, which are numbered or one alone."""
+    """Weight and bias of the linear layers under a name: a numbered sequence or a single layer."""
     numbers = sorted(
         int(found[1]) for key in weights if (found := re.fullmatch(rf"{re.escape(stem)}\.(\d+)\.weight", key))
     )
@@ -133,9 +132,9 @@ def _layers(weights: dict[str, Tensor], stem: str) -> list[tuple[Tensor, Tensor]
 
 def _stack(layers: list[tuple[Tensor, Tensor]], activation: type[nn.Module]) -> list[nn.Module]:
     """The layers with an activation between them."""
-    found: list[nn.Module] = []
+    modules: list[nn.Module] = []
     for weight, bias in layers:
         linear = nn.Linear(weight.shape[1], weight.shape[0])
         linear.load_state_dict({"weight": weight, "bias": bias})
-        found += [linear, activation()]
-    return found[:-1]
+        modules += [linear, activation()]
+    return modules[:-1]

@@ -1,4 +1,4 @@
-"""Which checkpoint of a training is kept: the one that drives best on seeds that are never reported."""
+"""Checkpoint selection: keep the checkpoint with the best score on seeds that are never reported."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from bench.victims.drivers.practice import roads
 def selection_score(
     policy: Policy, world: DrivingWorld, episodes: int, show: Callable[[Tensor], Tensor] | None = None
 ) -> dict[str, float]:
-    """Mean `safe_progress`, by road and over all, on the seeds that select checkpoints and are never reported.
+    """Mean `safe_progress` for each road and over all, on the selection seeds, which are never reported.
 
     Args:
-        policy: what drives.
-        world: where.
-        episodes: a road.
-        show: what the policy is shown for an observation [B, V, F]; None is the truth.
+        policy: the policy.
+        world: the world.
+        episodes: number of episodes per road.
+        show: perturbs the observation [B, V, F] before the policy receives it; None for no perturbation.
     """
     cells = roads(world, episodes)
     env = world.make(cells, action_type=policy.action_type)
@@ -52,12 +52,13 @@ def selection_score(
 
 @dataclass
 class Best:
-    """The best checkpoint so far, by the mean of its `selection_score` on the truth and on what `hooks.selection` shows.
+    """The best checkpoint so far, by the mean `selection_score` over true and perturbed (`hooks.selection`) observations.
 
     Args:
-        world: where checkpoints drive.
-        hooks: of the training.
-        episodes: a road, on the truth; a third as many on what hooks show, which may cost ten times as much.
+        world: the world for scoring.
+        hooks: hooks of the training.
+        episodes: number of episodes per road on true observations; a third of it on perturbed ones, which may cost ten times
+            as much.
     """
 
     world: DrivingWorld
@@ -70,11 +71,11 @@ class Best:
     history: list[tuple[float, float]] = field(default_factory=list)
 
     def offer(self, policy: Policy, share: float) -> None:
-        """Score `policy` and keep its weights if none before was better."""
+        """Score `policy` and keep its weights if it is the best so far."""
         scores = {"clean": selection_score(policy, self.world, self.episodes)}
         for name, show in self.hooks.selection(policy).items():
             scores[name] = selection_score(policy, self.world, self.episodes // 3, show)
-        score = sum(found["mean"] for found in scores.values()) / len(scores)
+        score = sum(by_road["mean"] for by_road in scores.values()) / len(scores)
         self.history.append((round(share, 3), round(score, 4)))
         if score > self.score:
             self.score, self.scores, self.share = score, scores, share
@@ -86,7 +87,7 @@ class Best:
         return policy.requires_grad_(False).eval()
 
     def card(self) -> dict[str, object]:
-        """What the card says of the selection."""
+        """The entries of the card about the selection."""
         return {
             "selection": {"safe_progress": self.scores, "share_of_training": self.share, "episodes": self.episodes},
             "selection_history": self.history,

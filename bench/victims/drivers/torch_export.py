@@ -1,4 +1,4 @@
-"""A driver exported by `torch.export`: a graph of tensor operations, without the code that made it."""
+"""A driver exported with `torch.export`: a graph of tensor operations, without its original code."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from bench.victims.drivers.from_file import FileDriver, FilePolicy
 
 @dataclass(frozen=True, kw_only=True)
 class TorchExport(FileDriver):
-    """A policy of yours, written by `torch.export.save`; white-box attacks go through it.
+    """Your own policy, written by `torch.export.save`. It has gradients for white-box attacks.
 
-    It maps observations [batch, rows, features], or flattened ones, to scores or actions; its batch must be of any size
+    It maps observations [batch, rows, features], flattened or not, to scores or actions. The batch size must be dynamic
     (`torch.export.Dim`).
     """
 
@@ -29,7 +29,7 @@ class TorchExport(FileDriver):
         self.check_observation(shape)
         if not isinstance(batch, torch.SymInt):
             raise UserError(
-                f"{self.path} takes no batch but of {batch}: export it with "
+                f"{self.path} has a fixed batch size of {batch}: export it with "
                 'dynamic_shapes={"observation": {0: torch.export.Dim("batch")}}'
             )
         return FilePolicy(program.module(), shape, self.action_type, width, sha256)

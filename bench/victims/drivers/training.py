@@ -1,4 +1,4 @@
-"""How a driver learns, whatever its algorithm: two phases of practice, gradient updates, and checkpoints to choose from."""
+"""The training of driving policies for any algorithm: two phases, gradient updates and checkpoint selection."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from bench.victims.drivers.practice import Practice, roads
 from bench.victims.drivers.selection import Best
 
 WARM_UP = 40
-"""Decisions taken before the first update."""
+"""Decisions before the first update."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LearningDriver(DrivingVictim):
-    """What all trained drivers share.
+    """The base class of all trained driving policies.
 
-    At 15 Hz single frames explore nothing, so a first phase holds each decision for `repeat` frames; but a lane change sent twice
-    in a row crosses two lanes, so a second phase decides at every frame, as the scored policy does.
+    Deciding at every frame (15 Hz) explores too little, so the first phase holds each decision for `repeat` frames. But a lane
+    change sent twice in a row crosses two lanes, so the second phase decides at every frame, like the scored policy.
 
     Args:
-        decisions: of the whole training, on every road at once.
-        fine: share of them taken frame by frame, in the second phase.
-        repeat: frames a decision is held in the first phase.
-        hidden: width of the hidden layers behind the encoder.
-        gamma: discount a decision of the first phase; a frame's share of it in the second.
-        n_step: decisions in a return of the first phase; as many frames in the second.
-        crash_penalty: reward of a crash or of leaving the road, in frames of perfect driving.
-        learning_rate: of Adam; falls linearly to a twentieth over the second half; half of it where a trained policy goes on.
-        batch: transitions an update.
-        updates: gradient updates a decision of the whole batch of roads.
-        copies: of each of the six roads, driven at once.
-        memory: transitions in the replay buffer.
+        decisions: number of decisions in the training, on every road at once.
+        fine: share of the decisions in the second phase, which decides at every frame.
+        repeat: number of frames for which a decision is held in the first phase.
+        hidden: width of the hidden layers after the encoder.
+        gamma: discount per decision in the first phase; gamma^(1/repeat) in the second.
+        n_step: decisions in a return of the first phase; the second phase uses the same time span.
+        crash_penalty: cost of a crash or of leaving the road, in frames of perfect driving.
+        learning_rate: initial rate of Adam; it falls linearly to a twentieth over the second half. With a trained start it is
+            half of this.
+        batch: transitions per update.
+        updates: gradient updates per decision of the whole batch of roads.
+        copies: number of parallel episodes on each road of the grid.
+        memory: size of the replay buffer in transitions.
         tau: rate of the target networks' soft update.
-        checkpoints: candidates for the final weights, spread over the last `fine` of the training.
-        trained_in: parameters of the world it was trained in where they are not the default, for instance `vehicles=5`;
-            `bench train` sets it.
+        checkpoints: number of candidates for the final weights, spread over the last share `fine` of the training.
+        trained_in: non-default parameters of the training world, for instance `vehicles=5`; set by `bench train`.
     """
 
     learns: ClassVar[bool] = True
@@ -73,13 +73,13 @@ class LearningDriver(DrivingVictim):
         return zoo.load(zoo.Recipe.of(self), seed, self.policy_type)
 
     def phases(self, hooks: TrainingHooks) -> list[Phase]:
-        """Held decisions first, then frame by frame; a policy that drives already goes on frame by frame. Whole chunks."""
+        """The phases in whole chunks: decisions held for `repeat` frames, then for one; a trained start has only the second."""
         started = hooks.start is not None
         fine = hooks.decisions if started else round(self.decisions * self.fine)
         phases = [
             Phase(self.repeat, self.decisions - fine, self.gamma, self.n_step),
-            # One frame of another action is worth a fifth of five: the gap keeps the size it had. An n-step return takes what
-            # was done for what the policy would do, so it is short where that is wrong.
+            # One frame of another action changes the value a fifth as much as five frames: `gap` restores the action gap. An
+            # n-step return assumes that the actions are the policy's own, so it is short if they are not (`off_policy`).
             Phase(
                 1,
                 fine,
@@ -99,7 +99,7 @@ class LearningDriver(DrivingVictim):
     def train(
         self, world: DrivingWorld, *, seed: int, hooks: TrainingHooks | None = None, progress: Progress
     ) -> Trained[Policy]:
-        """Train on all roads of the standard grid at once, and keep the best checkpoint."""
+        """Train on all roads of the world's default grid at once, and keep the best checkpoint."""
         torch.manual_seed(seed)
         started = time.process_time()
         hooks = hooks or TrainingHooks()

@@ -1,4 +1,4 @@
-"""The zoo: trained policies and detectors, kept by the recipe that made them and by training seed."""
+"""The zoo: trained policies and detectors, stored by recipe and training seed."""
 
 from __future__ import annotations
 

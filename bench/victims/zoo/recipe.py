@@ -1,10 +1,10 @@
-"""Recipes: everything that decides what a training makes, except its seed. An entry of the zoo is named after one.
+"""Recipes: everything that determines the result of a training, except the seed. Entries of the zoo are named by their recipe.
 
-Only parameters that differ from their default count, so a new parameter with a default changes no recipe. The code counts by
-`training`, a number on the class of a victim or defence that its author raises when the training makes something else.
+Only non-default parameters are part of a recipe, so a new parameter with a default changes no recipe. Code is represented by
+`training`, a version number on the class of a victim or defence; its author raises it when the training changes.
 
-Two parameters have a meaning of their own, where a component has them. `trained` chooses a training seed of the zoo, and is no
-part of the recipe of what that component trains. `trained_in` names the world of the training where it is not the default.
+Two parameter names are special. `trained` selects a training seed of the zoo and is not part of the component's own recipe.
+`trained_in` names the training world if it is not the default.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from bench.plugins.parameters import Parameter, parameters
 from bench.plugins.registry import GROUPS, Kind
 
 DIGITS = 8
-"""Of a digest in the name of a folder."""
+"""Number of digits of the digest in a folder name."""
 MEANT_OTHERWISE = ("null", "true", "false")
-"""Texts that the command line reads as something else."""
+"""Strings that the command line would not read as strings."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """A component, as far as a training depends on it.
+    """The properties of a component that influence a training.
 
     Args:
         kind: victim, defense or world.
-        name: on the command line; the name of its class if it is not installed.
-        source: top-level package and class, `bench.DQN`: stays when a class moves within its package.
-        module: of the class.
-        libraries: distributions that compute for it.
+        name: name on the command line; the class name if it is not installed.
+        source: top-level package and class, for instance `bench.DQN`; it does not change when a class moves within its package.
+        module: module of the class.
+        libraries: distributions whose versions influence the result.
         training: version of its training.
-        parameters: all of them.
-        changed: those that differ from their default.
+        parameters: all parameters.
+        changed: parameters that differ from their default.
     """
 
     kind: Kind
@@ -54,44 +54,44 @@ class Part:
 
     @classmethod
     def of(cls, kind: Kind, component: Component, *, without: str = "") -> Part:
-        """A component's part, leaving out the parameter `without`."""
-        own = type(component)
-        owned = {name: each for name, each in parameters(own).items() if name != without}
-        values = {name: _value(component, each) for name, each in owned.items()}
+        """The part of a component, without the parameter `without`."""
+        component_type = type(component)
+        declared = {name: each for name, each in parameters(component_type).items() if name != without}
+        values = {name: _value(component, parameter) for name, parameter in declared.items()}
         return cls(
             kind=kind,
-            name=_registered(kind, own),
-            source=f"{own.__module__.partition('.')[0]}.{own.__qualname__}",
-            module=own.__module__,
-            libraries=own.libraries,
-            training=own.training,
+            name=_registered(kind, component_type),
+            source=f"{component_type.__module__.partition('.')[0]}.{component_type.__qualname__}",
+            module=component_type.__module__,
+            libraries=component_type.libraries,
+            training=component_type.training,
             parameters=values,
-            changed={name: value for name, value in values.items() if _differs(value, owned[name])},
+            changed={name: value for name, value in values.items() if _differs(value, declared[name])},
         )
 
     @property
     def options(self) -> list[str]:
-        """Its parameters that differ from their default, as on the command line: `victim.hidden=64`."""
+        """Its non-default parameters, as on the command line: `victim.hidden=64`."""
         return [f"{self.kind}.{name}={_text(value)}" for name, value in self.changed.items()]
 
     @property
     def identity(self) -> dict[str, object]:
-        """What goes into the digest."""
+        """The input of the digest."""
         return {"class": self.source, "training": self.training, "changed": self.changed}
 
     def described(self) -> dict[str, object]:
-        """What the card says of it."""
+        """Its entry in the card."""
         named = {"name": self.name, "class": self.source, "training": self.training}
         return {**named, "parameters": self.parameters, "changed": self.changed}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What decides a training: the victim and, where one hardens it, the defence, each with where it was trained.
+    """Everything that determines a training: the victim and, if there is one, the defence.
 
     Args:
-        name: readable, of all variants: `dqn`, `dqn-advtrain-pgd-skip0.3`.
-        parts: the victim; then the defence, if there is one.
+        name: readable name, shared by all variants: `dqn`, `dqn-advtrain-pgd-skip0.3`.
+        parts: the victim, then the defence, if there is one.
     """
 
     name: str
@@ -99,10 +99,10 @@ class Recipe:
 
     @classmethod
     def of(cls, victim: Victim, defense: Defense | None = None) -> Recipe:
-        """The recipe of a victim's own training, or of what a defence makes of the victim.
+        """The recipe of a victim's training, or of a defence's training of the victim.
 
         Raises:
-            NotImplementedError: if it trains nothing.
+            NotImplementedError: if the component has no training.
         """
         if defense is None:
             return cls(name=_safe(victim.zoo_name()), parts=(Part.of("victim", victim, without="trained"),))
@@ -111,43 +111,43 @@ class Recipe:
 
     @property
     def trained(self) -> Part:
-        """The part that is trained: the defence, or else the victim."""
+        """The part that is trained: the defence if there is one, otherwise the victim."""
         return self.parts[-1]
 
     @property
     def digest(self) -> str:
-        """sha256 of everything but the name and the seed, in hexadecimal."""
+        """Hexadecimal sha256 of everything except the name and the seed."""
         return digest({part.kind: part.identity for part in self.parts})
 
     @property
     def key(self) -> str:
-        """The name of the folder that holds the seeds of this recipe."""
+        """The name of this recipe's folder."""
         return f"{self.name}-{self.digest[:DIGITS]}"
 
     @property
     def options(self) -> list[str]:
-        """The parameters that differ from their default, as on the command line."""
+        """The non-default parameters, as on the command line."""
         return [option for part in self.parts for option in part.options]
 
     @property
     def trained_in(self) -> str:
-        """The world of the training, as `trained_in` has it; empty for the default."""
+        """The training world, in the format of `trained_in`; empty for the default."""
         return str(self.trained.changed.get("trained_in", ""))
 
     @property
     def use(self) -> str:
-        """The command that scores what it makes."""
+        """The command that scores the trained component."""
         return shlex.join(["bench", "run", *self._components(), *self.options])
 
     def train(self, seed: int) -> str:
         """The command that trains it."""
         where = f"{self.trained.kind}.trained_in="
         options = [option for option in self.options if not option.startswith(where)]
-        world = [f"world.{word}" if "=" in word else f"world={word}" for word in shlex.split(self.trained_in)]
+        world = [f"world.{part}" if "=" in part else f"world={part}" for part in shlex.split(self.trained_in)]
         return shlex.join(["bench", "train", *self._components(), *options, *world, f"seeds={seed}"])
 
     def described(self) -> dict[str, object]:
-        """What the card says of it."""
+        """Its entry in the card."""
         return {"digest": self.digest, **{part.kind: part.described() for part in self.parts}}
 
     def _components(self) -> list[str]:
@@ -155,10 +155,10 @@ class Recipe:
 
 
 def trained_in(world: World, *, default: str) -> str:
-    """A world as `trained_in` has it: name and parameters where they are not the default; empty for the default world.
+    """A world in the format of `trained_in`: non-default name and parameters, for instance `vehicles=5`.
 
     Args:
-        world: to name, for instance `vehicles=5`.
+        world: the training world.
         default: name of the track's default world.
     """
     part = Part.of("world", world)
@@ -166,17 +166,17 @@ def trained_in(world: World, *, default: str) -> str:
 
 
 def check_world(recipe: Recipe, world: World) -> None:
-    """Refuse a recipe that does not name the parameters of the world of its training.
+    """Check that a recipe names the non-default parameters of its training world.
 
     Raises:
-        UserError: naming what `trained_in` should be.
+        UserError: if it does not; the message has the correct `trained_in`.
     """
     part = Part.of("world", world)
     fitting = (_where(part.options, ""), _where(part.options, part.name))
     if recipe.trained_in not in fitting:
-        said = f"trained_in={recipe.trained_in!r}" if recipe.trained_in else "the default world"
+        named = f"trained_in={recipe.trained_in!r}" if recipe.trained_in else "the default world"
         raise UserError(
-            f"{recipe.name!r} was trained in {' '.join([part.name, *part.options])!r}, but its recipe says {said}: "
+            f"{recipe.name!r} was trained in {' '.join([part.name, *part.options])!r}, but its recipe says {named}: "
             f"{recipe.trained.kind} {recipe.trained.name!r} needs a parameter trained_in={fitting[0]!r}"
         )
 
@@ -187,7 +187,7 @@ def _where(options: Sequence[str], name: str) -> str:
 
 
 def _value(component: Component, parameter: Parameter) -> Any:
-    """A parameter's value; the same number is the same value, an int or a float."""
+    """A parameter's value; an int for a float parameter becomes a float, so that equal numbers have one digest."""
     value = getattr(component, parameter.name)
     return float(value) if isinstance(parameter.default, float) and type(value) is int else value
 
@@ -203,7 +203,7 @@ def _registered(kind: Kind, component: type[Component]) -> str:
 
 
 def _safe(name: str) -> str:
-    """A name that is the name of a folder."""
+    """A name with characters that are safe in a folder name."""
     return re.sub(r"[^\w.+-]", "-", name)
 
 

@@ -1,6 +1,6 @@
-"""Entries of the zoo on disk: weights as safetensors with a card each, hash-checked when loaded. Nothing is unpickled.
+"""Zoo entries on disk: safetensors weights with a JSON card each. Hashes are checked on loading; nothing is unpickled.
 
-An entry is `<name>-<first digits of the recipe's digest>/seed<k>.safetensors`, with its card beside it as JSON.
+An entry is `<name>-<first digits of the recipe's digest>/seed<k>.safetensors`; its card is the `.json` file beside it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SHIPPED = Path(__file__).parents[1] / "policies"
 
 
 class Network(Protocol):
-    """What the zoo asks of a network: the methods of torch.nn.Module, and an attribute for the hash of its weights."""
+    """The interface of a network in the zoo: methods of torch.nn.Module, and an attribute for the hash of its weights."""
 
     weights_sha256: str
 
@@ -44,19 +44,19 @@ class Network(Protocol):
 class Shaped(Network, Protocol):
     """A network that can be saved.
 
-    With a true attribute `half_precision` its tensors of two and more dimensions are stored in half precision.
+    If its attribute `half_precision` is true, tensors with two or more dimensions are stored in half precision.
     """
 
     @property
     def shape(self) -> Mapping[str, object]:
-        """The keyword arguments that build it."""
+        """The keyword arguments of its constructor."""
 
 
 N = TypeVar("N", bound=Network)
 
 
 def own() -> Path:
-    """Where networks trained on this machine are kept: CAVBENCH_ZOO, or the user's data folder."""
+    """The folder of networks trained on this machine: CAVBENCH_ZOO, or the user's data folder."""
     return Path(os.environ.get("CAVBENCH_ZOO") or user_data_path("cavbench") / "zoo")
 
 
@@ -66,15 +66,15 @@ def save(
     """Write the weights and the card of a trained network, atomically, and return the path of the weights.
 
     Args:
-        network: to save.
-        recipe: that made it.
+        network: the network to save.
+        recipe: its recipe.
         seed: training seed.
-        world: that it was trained in.
-        card: further facts of the training, for instance how the checkpoint was chosen.
-        root: a zoo; by default the user's own, which takes precedence over the shipped one.
+        world: the training world.
+        card: further facts about the training, for instance the checkpoint selection.
+        root: folder of a zoo; by default the user's own, which takes precedence over the shipped one.
 
     Raises:
-        UserError: if the recipe does not name the parameters of the world.
+        UserError: if the recipe does not name the non-default parameters of the world.
     """
     check_world(recipe, world)
     folder = (root or own()) / recipe.key
@@ -107,7 +107,7 @@ def card(recipe: Recipe, seed: int) -> dict[str, Any]:
     """The card of an entry.
 
     Raises:
-        UserError: if there is none, with the command that trains it, or if it cannot be read.
+        UserError: if there is no entry (the message has the training command), or its card cannot be read.
     """
     path = _find(recipe, seed).with_suffix(".json")
     try:
@@ -120,20 +120,20 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N]) -> N:
     """The network of an entry, frozen and in eval mode.
 
     Args:
-        recipe: that made it.
+        recipe: its recipe.
         seed: training seed.
-        build: makes the network that is filled with the weights, of the card's `shape`; its class, for instance.
+        build: builds the network from the card's `shape` before the weights are loaded; usually its class.
 
     Raises:
-        UserError: if there is no such entry, if a default has changed since, or if its weights are not those of its card.
+        UserError: if there is no such entry, a default has changed since, or the weights do not match the card.
     """
     path, entry = _find(recipe, seed), card(recipe, seed)
     _check_parameters(recipe, seed, entry)
     blob = path.read_bytes()
-    found = hashlib.sha256(blob).hexdigest()
-    if found != entry.get("sha256"):
+    sha256 = hashlib.sha256(blob).hexdigest()
+    if sha256 != entry.get("sha256"):
         raise UserError(
-            f"the weights {path} have sha256 {found[:12]}…, their card says {str(entry.get('sha256'))[:12]}…: "
+            f"the weights {path} have sha256 {sha256[:12]}…, their card says {str(entry.get('sha256'))[:12]}…: "
             "the file was changed; restore it or train it again"
         )
     try:
@@ -142,25 +142,25 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N]) -> N:
     except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"the weights {path} do not fit {recipe.name!r}: {reason}") from None
-    network.weights_sha256 = found
+    network.weights_sha256 = sha256
     network.requires_grad_(False).eval()
     return network
 
 
 def seeds(recipe: Recipe) -> list[int]:
-    """The training seeds of a recipe, in the user's zoo and the shipped one."""
+    """The training seeds of a recipe in the user's zoo and the shipped one."""
     return _seeds(recipe.key)
 
 
 def missing(recipe: Recipe, seed: int) -> str:
-    """Why there is no entry, in a line: what was asked for, which variants and seeds there are, and what trains it."""
+    """The error message for a missing entry: the requested recipe, the available variants and seeds, the training command."""
     asked = " ".join([repr(recipe.name), *(["with", *recipe.options] if recipe.options else [])])
     variants = "; ".join(_variants(recipe)) or "none"
     return f"the zoo has no {asked} of training seed {seed}. Variants: {variants}. To train it: `{recipe.train(seed)}`"
 
 
 def _check_parameters(recipe: Recipe, seed: int, entry: Mapping[str, Any]) -> None:
-    """Refuse an entry made with other values than are asked for: a default that has changed since is not in the digest."""
+    """Check the parameters of an entry: the digest does not notice a default that has changed since."""
     for part in recipe.parts:
         made = entry.get("recipe", {}).get(part.kind, {}).get("parameters", {})
         for name, value in part.parameters.items():
@@ -189,7 +189,7 @@ def _seeds(key: str) -> list[int]:
 
 
 def _variants(recipe: Recipe) -> Iterator[str]:
-    """Every recipe of this name in the zoo, with its seeds: `default (seeds 0, 1, 2)`, `victim.hidden=64 (seed 0)`."""
+    """All recipes of this name in the zoo, with their seeds: `default (seeds 0, 1, 2)`, `victim.hidden=64 (seed 0)`."""
     keys = {path.name for root in _roots() if root.is_dir() for path in root.iterdir()}
     for key in sorted(keys):
         if not re.fullmatch(f"{re.escape(recipe.name)}-[0-9a-f]{{{DIGITS}}}", key):
@@ -202,22 +202,22 @@ def _variants(recipe: Recipe) -> Iterator[str]:
 
 
 def _differences(recipe: Recipe, path: Path) -> str:
-    """What makes the entry of a card other than the default, in words."""
+    """The differences between the entry of a card and the default, as text."""
     try:
         made = json.loads(path.read_text())["recipe"]
-        words = []
+        differences = []
         for part in recipe.parts:
-            found = made[part.kind]
-            words += [f"{part.kind}.{name}={value}" for name, value in found["changed"].items()]
-            if found["training"] != part.training:
-                words.append(f"training version {found['training']} of {part.kind}, now {part.training}")
-        return ", ".join(words) or "default"
+            trained = made[part.kind]
+            differences += [f"{part.kind}.{name}={value}" for name, value in trained["changed"].items()]
+            if trained["training"] != part.training:
+                differences.append(f"training version {trained['training']} of {part.kind}, now {part.training}")
+        return ", ".join(differences) or "default"
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return f"{path.parent.name} with a card that cannot be read"
 
 
 def _provenance(parts: tuple[Part, ...]) -> dict[str, object]:
-    """The versions of everything that computed, the machine and the time."""
+    """The versions of the code and libraries, the machine and the time."""
     modules = sorted({part.module for part in parts} - {"__main__"})
     return {
         "cavbench": metadata.version("cavbench"),
