@@ -1,4 +1,4 @@
-"""The figures of the documentation: a command makes them, and makes the same ones again."""
+"""The figures of the documentation are reproducible."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ pytest.importorskip("matplotlib")
 from docs.figures.__main__ import FIGURES, FOLDER, make
 
 LARGEST, ALL = 150_000, 2_000_000
-"""Bytes of one figure, and of all."""
+"""Largest size in bytes of one figure, and of all."""
 
 
 @pytest.mark.parametrize("file", ["victim_blind.svg", "victim_dqn.svg"])
@@ -21,11 +21,11 @@ def test_a_figure_is_made_the_same_again(file: str, tmp_path: Path) -> None:
 
 
 def test_a_figure_of_published_records_is_the_one_that_ships(tmp_path: Path) -> None:
-    """Nothing in it is computed by a network, so it does not depend on the machine."""
+    """No network computes anything in it, so it does not depend on the machine."""
     assert make("victim_blind.svg", tmp_path).read_bytes() == (FOLDER / "victim_blind.svg").read_bytes()
 
 
-def test_every_figure_is_there_and_small() -> None:
+def test_every_figure_ships_and_is_small() -> None:
     sizes = [(FOLDER / file).stat().st_size for file in FIGURES]
     assert min(sizes) > 0
     assert max(sizes) < LARGEST

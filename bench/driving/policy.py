@@ -116,5 +116,5 @@ def rows_of(state: State, rows: Tensor) -> State:
 
 
 def repeated(state: State, leading: torch.Size) -> State:
-    """The state of [B] episodes for observations [*leading, B, V, F], flattened to [N]: each episode's, again and again."""
+    """The state of [B] episodes, repeated for observations `[*leading, B, V, F]` and flattened to [N]."""
     return None if state is None else state.expand(*leading, *state.batch_size).reshape(leading.numel() * len(state))
