@@ -1,5 +1,5 @@
-# make run: from nothing to the first score; installs what running needs. make test, make lint, make docs: what CI runs.
-# make bench: the speed figures. These install what development needs.
+# make run: installs what running needs and prints the first score. make test, make lint, make docs: the checks of CI.
+# make bench: the speed figures. All but `run` install what development needs.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -20,7 +20,7 @@ lint: install-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The site, in docs/_build/html. A broken link, a page in no table of contents or an unknown component is an error.
+# The site, in docs/_build/html. A broken link, a page missing from the contents or an unknown component is an error.
 docs: install-dev
 	rm -rf docs/_build
 	$(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
@@ -32,7 +32,7 @@ install: $(RUN_STAMP)
 
 install-dev: $(DEV_STAMP)
 
-# torch goes first and by itself: left to the resolver it may come with gigabytes of CUDA.
+# torch is installed first and alone: the resolver may otherwise choose a build with gigabytes of CUDA.
 $(RUN_STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
@@ -43,8 +43,8 @@ $(DEV_STAMP): $(RUN_STAMP)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	touch $@
 
-# The browser that the tests of the leaderboard's page drive: one on the PATH, else Debian's (as root), else Playwright's own.
-# Without any they are skipped, and say why.
+# The browser for the tests of the leaderboard's page: one on the PATH, else Debian's (as root), else Playwright's own.
+# Without a browser these tests are skipped, and say why.
 browser: install-dev
 	@for name in $(BROWSERS); do command -v $$name >/dev/null && exit 0; done; \
 	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \

@@ -1,4 +1,4 @@
-"""How the site of the documentation is built: `make docs`."""
+"""Sphinx configuration of the documentation site (`make docs`)."""
 
 import sys
 from importlib import metadata
@@ -19,7 +19,7 @@ myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False
-# Docstrings set names apart by `single backticks`.
+# Docstrings mark names with `single backticks`.
 default_role = "code"
 
 html_theme = "furo"

@@ -1,4 +1,4 @@
-"""Recordings, read back from their files."""
+"""Recordings of the driving track, read back from their files."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def read(path: Path) -> dict[str, list[Chunk]]:
 
 
 def values(chunks: list[Chunk], component: str) -> list[object]:
-    """The column of the component whose name ends so, a list of instances a step."""
+    """The column of the component whose name ends with `component`: a list of instances for each step."""
     for chunk in chunks:
         batch = chunk.to_record_batch()
         for name in batch.schema.names:

@@ -42,14 +42,14 @@ def recorded(path: Path, seen: Sighting) -> dict[str, list[Chunk]]:
 
 
 def picture(blob: list[bytes]) -> np.ndarray:
-    """[H, W, 3] in [0, 1] of one instance of an encoded image."""
+    """Decode one instance of an encoded image to [H, W, 3] in [0, 1]."""
     decoded = cv2.imdecode(np.asarray(blob[0], np.uint8), cv2.IMREAD_COLOR)
     assert decoded is not None
     return decoded[..., ::-1] / 255
 
 
 def fixed(chunks: list[Chunk], component: str) -> pa.Scalar:
-    """The component whose name ends so, of those that hold for the whole recording."""
+    """The static component whose name ends with `component`."""
     for chunk in chunks:
         batch = chunk.to_record_batch()
         for name in batch.schema.names:
@@ -59,7 +59,7 @@ def fixed(chunks: list[Chunk], component: str) -> pa.Scalar:
 
 
 def bars(chunks: list[Chunk]) -> np.ndarray:
-    """The heights of a bar chart's bars."""
+    """The heights of the bars of a bar chart."""
     return np.asarray(fixed(chunks, "values")[0]["buffer"], np.float64)
 
 
@@ -115,7 +115,7 @@ def test_the_patch_evolves_on_a_timeline_of_crafting_steps(path: Path) -> None:
     assert fixed(chunks["/evolution/steps"], "labels") == ["0: 1.00", "4: 0.20", "8: 0.11"]
 
 
-def test_what_there_is_nothing_to_show_of_is_left_out(path: Path) -> None:
+def test_views_without_content_are_left_out(path: Path) -> None:
     everything = set(recorded(path, sighting()))
     unreported = set(recorded(path, sighting(evolution=None)))
     clean = set(recorded(path, sighting(texels=None, evolution=None)))

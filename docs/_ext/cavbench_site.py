@@ -1,4 +1,4 @@
-"""What the site adds to Sphinx: parameters read from the code, formulas as MathML, docstrings, and the leaderboard's page."""
+"""Sphinx extension of the site: parameters read from the code, MathML formulas, docstrings, and the leaderboard's page."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from bench.plugins.parameters import parameters
 from bench.plugins.registry import GROUPS, Kind
 
 LEADERBOARD = ("leaderboard/index.html", "leaderboard/index.json", "leaderboard/index.csv")
-"""Files of the repository that the site holds at the same place."""
+"""Files of the repository that are copied to the same path in the site."""
 
 logger = logging.getLogger(__name__)
 
 
 class ComponentDirective(SphinxDirective):
-    """What `bench list NAME` says of a component: where it is, what ships it, what it fits, its parameters.
+    """The text of `bench list NAME`: module, package, track and parameters of a component.
 
-    Its argument is the kind of component, its content the command line. So it tells a reader of the plain Markdown what to type.
+    The argument is the kind of component. The content is the command line, so a reader of the plain Markdown sees what to type.
     """
 
     required_arguments = 1
@@ -51,10 +51,10 @@ class ComponentDirective(SphinxDirective):
 
 
 def described(kind: Kind, name: str) -> str:
-    """A component in Markdown: a paragraph and a table of its parameters, or of what an adapter offers.
+    """A component in Markdown: a paragraph and a table of its parameters, or of the choices of an adapter.
 
     Raises:
-        UserError: if there is no such component, or if its plug-in is broken.
+        UserError: if the component is unknown or its plug-in is broken.
     """
     entry = registry.find(GROUPS[kind], name, kind)
     shipped = f"`{entry.target}`, {entry.shipped_by}."
@@ -75,7 +75,7 @@ def described(kind: Kind, name: str) -> str:
 
 
 def _formula(translator: Any, node: nodes.math | nodes.math_block) -> None:
-    """Write a formula as MathML, which browsers draw by themselves; one that cannot be read is a warning."""
+    """Write a formula as MathML, which browsers render natively; an invalid formula is a warning."""
     block = isinstance(node, nodes.math_block)
     try:
         mathml = tex2mathml(node.astext(), as_block=block)
@@ -87,13 +87,13 @@ def _formula(translator: Any, node: nodes.math | nodes.math_block) -> None:
 
 
 def _google_style(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
-    """Read `Args:` and the like; of attributes napoleon would take all before a colon for a type, so they stay as they are."""
+    """Read `Args:` sections. Attributes are skipped, because napoleon takes all text before a colon for a type."""
     if what not in ("attribute", "data", "property"):
         lines[:] = GoogleDocstring(lines, what=what, name=name, obj=obj, options=options).lines()
 
 
 def _link_leaderboard(app: Sphinx, doctree: nodes.document) -> None:
-    """A link to a file of the leaderboard opens the site's own copy; it would be offered for download otherwise."""
+    """Point links to the leaderboard's files at the copies in the site; Sphinx would make them downloads."""
     up = "../" * app.env.docname.count("/")
     for link in list(doctree.findall(addnodes.download_reference)):
         target = link["reftarget"].lstrip("./")
@@ -104,7 +104,7 @@ def _link_leaderboard(app: Sphinx, doctree: nodes.document) -> None:
 def _copy_leaderboard(app: Sphinx, failure: Exception | None) -> None:
     for name in LEADERBOARD if failure is None else ():
         source, target = app.srcdir.parent / name, Path(app.outdir) / name
-        # Where it is missing, the pages that link it say so.
+        # If a file is missing, Sphinx warns on the pages that link it.
         if source.exists():
             target.parent.mkdir(exist_ok=True)
             shutil.copyfile(source, target)
@@ -115,7 +115,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("component", ComponentDirective)
     app.add_html_math_renderer("mathml", inline_renderers=(_formula, None), block_renderers=(_formula, None))
     app.connect("autodoc-process-docstring", _google_style)
-    # Before Sphinx notes what is to be offered for download.
+    # Before Sphinx collects downloads.
     app.connect("doctree-read", _link_leaderboard, priority=400)
     app.connect("build-finished", _copy_leaderboard)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

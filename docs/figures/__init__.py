@@ -1,1 +1,1 @@
-"""The figures of the documentation, each made from the real code, weights and records: `python -m docs.figures NAME...`."""
+"""The figures of the documentation, made from the project's code, weights and records: `python -m docs.figures NAME...`."""

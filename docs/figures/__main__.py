@@ -1,4 +1,4 @@
-"""`python -m docs.figures [NAME...] [--out FOLDER]`: make figures, all of them without a name."""
+"""`python -m docs.figures [NAME...] [--out FOLDER]`: make the named figures, or all of them."""
 
 from __future__ import annotations
 
@@ -53,20 +53,20 @@ def make(file: str, folder: Path) -> Path:
 
 
 def main() -> None:
-    """Make what the command line names."""
+    """Make the figures that the command line names."""
     names = {Path(file).stem: file for file in FIGURES}
     parser = argparse.ArgumentParser(
         prog="python -m docs.figures", description="Make the figures of the documentation."
     )
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}; none makes all")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"figures to make, by default all: {', '.join(names)}")
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder to write to")
-    words = parser.parse_args()
-    if unknown := set(words.names) - set(names):
-        parser.error(f"no figure {', '.join(sorted(unknown))}")
+    options = parser.parse_args()
+    if unknown := set(options.names) - set(names):
+        parser.error(f"unknown figure {', '.join(sorted(unknown))}; known: {', '.join(names)}")
     settle()
-    words.out.mkdir(parents=True, exist_ok=True)
-    for name in words.names or names:
-        print(make(names[name], words.out))
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name in options.names or names:
+        print(make(names[name], options.out))
 
 
 if __name__ == "__main__":

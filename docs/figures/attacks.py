@@ -1,4 +1,4 @@
-"""Attacks on drivers: the same moment of the same episode under each of them."""
+"""Attacks on drivers: the same moment of one episode under each attack."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ STEP = 200
 """The moment: 13.3 s into the episode, close behind a slower car."""
 LANES = 3
 FAR = 2.5
-"""From how many m on a car that is shown elsewhere gets an arrow."""
+"""A car that is shown displaced by more than this many m gets an arrow."""
 NEAR = -0.12
-"""Actions that are never worth more than this beside the one that is taken are left out."""
+"""Actions whose Q-value beyond that of the taken action never exceeds this are not drawn."""
 DRAWS = 40
-"""Of the noise, which asks nothing."""
+"""Number of draws of the noise, which makes no queries."""
 
 
 def noise() -> Figure:
-    """Random noise: the policy's values under many draws of it."""
+    """Random noise: the policy's Q-values under many draws."""
     moment = attacked(choose("attack", "noise").component, _moment(), DRAWS)
     flipped = int((_decisions(moment.shown) != _decisions(moment.true)).sum())
     title = f"noise: {flipped} of {DRAWS} random draws change the decision"
@@ -32,21 +32,21 @@ def noise() -> Figure:
 
 
 def zo() -> Figure:
-    """ZO-SignSGD: every query that it asks."""
+    """ZO-SignSGD: all of its queries."""
     moment = attacked(choose("attack", "zo").component, _moment())
     asked = torch.cat([points.flatten(0, -3) for points in moment.asked])
     return _figure(moment, asked, f"zo: {len(asked)} queries turn {_turned(moment)}", "query")
 
 
 def art() -> Figure:
-    """An attack of the Adversarial Robustness Toolbox: every query that its SquareAttack asks."""
+    """An attack of the Adversarial Robustness Toolbox: all queries of its SquareAttack."""
     moment = attacked(choose("attack", "art:SquareAttack").component, _moment())
     asked = torch.cat([points.flatten(0, -3) for points in moment.asked])
     return _figure(moment, asked, f"art:SquareAttack: {len(asked)} queries turn {_turned(moment)}", "query")
 
 
 def pgd() -> Figure:
-    """Projected gradient descent: the steps of the restart that won."""
+    """Projected gradient descent: the steps of the best restart."""
     moment = attacked(choose("attack", "pgd").component, _moment())
     clean, *restarts = moment.asked
     steps = torch.stack(restarts)[:, :, 0]
@@ -58,7 +58,7 @@ def pgd() -> Figure:
 
 
 def none() -> Figure:
-    """No attack: an episode as it is."""
+    """No attack: a clean episode."""
     _, steps = episode("attack=none", "victim=dqn")
     title = f"none: the policy sees what is there; {len(steps['speed']) / FACTS.decision_hz:.0f} s without a crash"
     made = style.figure(4.6, title)
@@ -92,7 +92,7 @@ def _turned(moment: Moment) -> str:
 
 
 def _figure(moment: Moment, points: Tensor, title: str, counted: str) -> Figure:
-    """The road, the perturbation against its budget, and the values of every one of `points` [N, V, F]."""
+    """The road, the perturbation as a share of its budget, and the Q-values of `points` [N, V, F]."""
     made = style.figure(5.4, title)
     above, below = made.subfigures(2, 1, height_ratios=(1, 1.8))
     _bird(above.subplots(), moment)
@@ -103,7 +103,7 @@ def _figure(moment: Moment, points: Tensor, title: str, counted: str) -> Figure:
 
 
 def _bird(axes: Axes, moment: Moment) -> None:
-    """The cars around the ego, and where the policy is shown them."""
+    """The true and the shown positions of the cars around the ego."""
     present = moment.true[:, 0] > 0
     true, shown = (physical(each)[present] for each in (moment.true, moment.shown[0]))
     ego = float(true[0, 1])
@@ -127,7 +127,7 @@ def _bird(axes: Axes, moment: Moment) -> None:
 
 
 def _budget(axes: Axes, moment: Moment) -> None:
-    """The share of what is allowed that each value is off by."""
+    """The deviation of each value as a share of the allowed one."""
     rows = int((moment.true[:, 0] > 0).sum())
     share = ((moment.shown[0] - moment.true) / moment.radius)[:rows, 1:]
     axes.imshow(share, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
@@ -137,7 +137,7 @@ def _budget(axes: Axes, moment: Moment) -> None:
 
 
 def _values(axes: Axes, moment: Moment, points: Tensor, counted: str) -> None:
-    """How much more each action is worth to the policy than the one it takes on the truth, the first of `points` [N, V, F]."""
+    """Q-values of `points` [N, V, F] minus that of the clean action, which the policy takes at the first point."""
     with torch.no_grad():
         values = policy().scores(points)
     clean, now = int(values[0].argmax()), int(_decisions(moment.shown[0]))

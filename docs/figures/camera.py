@@ -1,4 +1,4 @@
-"""The camera world: its places in its weathers."""
+"""The camera world: every place in every weather."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from docs.figures.sightings import FRAME, approaches, picture, show
 from envs.weather import WEATHERS
 
 WINDOW = 400, 230
-"""Width and height in pixels of what is shown of each frame."""
+"""Width and height in pixels of the shown part of each frame."""
 
 
 def world() -> Figure:

@@ -1,4 +1,4 @@
-"""Decision maps: what a learned driver does about a car ahead."""
+"""Decision maps: the action of a trained driver for a car ahead."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from envs.highway.dynamics import LANE_WIDTH
 ROWS = 10
 EGO_SPEED = 25.0
 FROM_START = 100.0
-"""m: where the sensor's range along the road ends, and where the ego is for all but the first seconds."""
+"""Observed position of the ego along the road in m: clipped to the sensor's range after the first seconds."""
 DISTANCE = np.linspace(8, 100, 93)
 CLOSING = np.linspace(-5, 15, 81)
 BLOCKED = (-8.0, 0.0, 8.0, 16.0)
-"""m ahead of the ego: the cars beside it, at its own speed."""
+"""Positions in m ahead of the ego of the cars in the neighbouring lanes, which have the ego's speed."""
 ROADS = {"lanes beside free": (), "cars on both sides": BLOCKED}
 
 
 def dqn() -> Figure:
-    """The greedy action by distance and closing speed, with the lanes beside free and blocked."""
+    """The greedy action by distance and closing speed, with the neighbouring lanes free and blocked."""
     made = style.figure(4.1, "dqn: passes on the right, brakes where it is boxed in")
     with torch.no_grad():
         for axes, (name, beside) in zip(made.subplots(1, 2, sharey=True), ROADS.items(), strict=True):

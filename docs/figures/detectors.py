@@ -1,4 +1,4 @@
-"""Detectors: what they find in one frame of an approach, and the sign's confidence in every weather."""
+"""Detectors: detections in one frame of an approach, and the confidence in the sign in every weather."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from envs.weather import WEATHERS
 COLOURS = {"clear": style.ORANGE, "rain": style.BLUE, "fog": style.GREY, "night": style.INK}
 DASHES = {"clear": "-", "rain": "--", "fog": "-.", "night": ":"}
 AROUND = 140
-"""Pixels of the picture that are shown beside the outermost boxes."""
+"""Pixels of the image that are shown beside the outermost boxes."""
 BOXES = (style.GREEN, style.SKY, style.YELLOW, style.PURPLE)
 
 
@@ -25,7 +25,7 @@ def yolov3_tiny() -> Figure:
 
 
 def yolov5() -> Figure:
-    """The one that was trained on the camera world."""
+    """The detector trained on the camera world."""
     return _figure("yolov5")
 
 

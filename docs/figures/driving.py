@@ -1,4 +1,4 @@
-"""Real episodes on the highway, and what an attack asks and shows at one moment of them."""
+"""Episodes on the highway, and the queries and the result of an attack at one moment."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ Array = NDArray[Any]
 FACTS = HighwayWorld().facts
 FEATURES = FACTS.features
 ROAD = "lanes=3 density=1 weather=clear seeds=0 reference=false"
-"""The cell of the episodes that are shown."""
+"""Options of the episodes in the figures."""
 
 
-def scored(episodes: int, *words: str, traced: int = 0) -> Driven:
-    """The first episodes of the first pair of a run, said as to `bench run`; the first `traced` of them step by step."""
-    unit = next(iter(plan(run_config([*ROAD.split(), f"episodes={episodes}", *words]))))
+def scored(episodes: int, *options: str, traced: int = 0) -> Driven:
+    """The first episodes of the first pair of a run, by options of `bench run`; the first `traced` of them step by step."""
+    unit = next(iter(plan(run_config([*ROAD.split(), f"episodes={episodes}", *options]))))
     return drive(unit.job, unit.seeds[:traced])
 
 
 @cache
-def episode(*words: str) -> tuple[Columns, dict[str, Array]]:
-    """The measurements and every step [T, ...] of the first episode of a run, said as to `bench run`."""
-    driven = scored(1, *words, traced=1)
+def episode(*options: str) -> tuple[Columns, dict[str, Array]]:
+    """The measurements and all steps [T, ...] of the first episode of a run, by options of `bench run`."""
+    driven = scored(1, *options, traced=1)
     (trace,) = driven.traces.values()
     assert isinstance(trace, Trace)
     running = np.stack(trace.steps["running"])[:, 0]
@@ -56,10 +56,10 @@ class Moment:
     """One decision under attack.
 
     Args:
-        true: [V, F] what was measured.
-        shown: [N, V, F] what the policy is shown, in each of N independent trials.
-        radius: [V, F] the largest deviation allowed.
-        asked: the points [..., N, V, F] that the attack asked the policy about, question by question.
+        true: measured observation, [V, F].
+        shown: observation shown to the policy in each of N independent trials, [N, V, F].
+        radius: largest deviation allowed, [V, F].
+        asked: points that the attack queried, [..., N, V, F] for each batch of queries.
     """
 
     true: Tensor
@@ -69,7 +69,7 @@ class Moment:
 
 
 def attacked(attack: DrivingAttack, observation: Tensor, trials: int = 1) -> Moment:
-    """What an attack does at one moment [V, F] to the undefended `dqn`, under the default threat model."""
+    """Attack the undefended `dqn` at one moment [V, F], under the default threat model."""
     attacker = Attacker(attack, policy(), ObservationThreat(), FEATURES, seed=0)
     attacker.oracle.asked = []
     shown = attacker.show(observation.repeat(trials, 1, 1), torch.ones(trials, dtype=torch.bool), None).observation

@@ -1,4 +1,4 @@
-"""Input transformations before the detector: what they leave of a patch, and what it still does."""
+"""Input transformations before the detector: the filtered patch, and the confidence under it."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def median() -> Figure:
 
 
 def jpeg() -> Figure:
-    """JPEG's compression; 40 steps of the crafting instead of 150 are enough against it."""
+    """JPEG compression; 40 crafting steps instead of 150 are enough against it."""
     return _figure("jpeg", texels_of("eot", "jpeg", steps=40))
 
 
 def _figure(defense: str, aware: Tensor) -> Figure:
-    """The sign and the confidence with a patch that was crafted without the defence, and with `aware`, crafted against it."""
+    """The sign and the confidence with a patch crafted without the defence, and with `aware`, crafted against it."""
     guarded = detector(defense=defense)
     assert isinstance(guarded, Guarded)
     unaware = texels_of("eot")

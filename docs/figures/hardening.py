@@ -1,4 +1,4 @@
-"""What an attack leaves of a victim, undefended and hardened by adversarial training."""
+"""Victims under attack, undefended and adversarially trained (hardened)."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from docs.figures.sightings import clean, curve, frame_axes, patched, undisturbe
 BUDGETS = (0.01, 0.025, 0.05, 0.1, 0.15, 0.2)
 TRAINED_AT = 0.1
 EVERY = 5
-"""Every how many steps of the episode a moment is attacked."""
+"""A moment is attacked every so many steps of the episode."""
 SKIPS = ("0", "0.3", "0.5", "1")
 SEEDS = (0, 1, 2)
 
 
 def none() -> Figure:
-    """How many decisions of the undefended DQN attacks change, and the confidence of YOLOv3-tiny under patches."""
+    """Share of decisions of the undefended DQN that attacks change, and the confidence of YOLOv3-tiny under patches."""
     made = style.figure(3.7, "none: small changes turn the undefended")
     driving, detection = made.subplots(1, 2, width_ratios=(1.25, 1))
     for attack, colour, dashes in (("pgd", style.RED, "-"), ("zo", style.ORANGE, "--"), ("noise", style.GREY, "-.")):
@@ -51,7 +51,7 @@ def none() -> Figure:
 
 
 def advtrain() -> Figure:
-    """How many decisions PGD changes, undefended and hardened, and what the skip probability trades."""
+    """Share of decisions that PGD changes, undefended and hardened, and the trade-off of the skip probability."""
     made = style.figure(3.9, "advtrain: the hardened policy is harder to turn")
     turned, traded = made.subplots(1, 2)
     for defense, colour, dashes in (("none", style.UNDEFENDED, "-"), ("advtrain", style.HARDENED, "--")):
@@ -76,7 +76,7 @@ def advtrain() -> Figure:
 
 
 def advtrain_detection() -> Figure:
-    """Confidence on the way to the sign, undefended and hardened, from the published records."""
+    """Confidence during the approach, undefended and hardened, from the published records."""
     pairs = {"undefended": patched("eot"), "hardened": patched("eot", "advtrain_detection")}
     left = {name: pair.score.estimate for name, pair in pairs.items()}
     title = f"advtrain: confidence under eot {left['undefended']:.2f} undefended,\n{left['hardened']:.2f} hardened"
@@ -92,7 +92,7 @@ def advtrain_detection() -> Figure:
 
 
 def _changed(attack: str, defense: str, budget: float) -> float:
-    """Share of the moments of a real episode at which an attack changes the decision of the (defended) DQN."""
+    """Share of the moments of one episode at which an attack changes the decision of the (defended) DQN."""
     moments = torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"][::EVERY])
     driver = policy("dqn", defense)
     threat = ObservationThreat(budget=budget)
@@ -103,7 +103,7 @@ def _changed(attack: str, defense: str, budget: float) -> float:
 
 
 def _card(skip: str, seed: int) -> dict[str, float]:
-    """Safe progress on the seeds that chose the checkpoint of a hardened DQN, by `clean` and `attacked`."""
+    """Safe progress, `clean` and `attacked`, of a hardened DQN on the seeds that selected its checkpoint."""
     recipe = zoo.Recipe.of(DQN(), AdversarialTraining(skip=float(skip)))
     scores = zoo.card(recipe, seed)["selection"]["safe_progress"]
     return {name: float(score["mean"]) for name, score in scores.items()}

@@ -1,4 +1,4 @@
-"""The highway: its six roads in clear weather, and how far the weathers let the ego see."""
+"""The highway: its six roads in clear weather, and the sensor range by weather."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def world() -> Figure:
     for number, name in enumerate(GRID.values["weather"]):
         weather = WEATHERS[name]
         sensor.barh(number, sensor_range_m(weather), color=style.SKY, height=0.85)
-        said = f"{name}: {sensor_range_m(weather):.0f} m, noise {noise_sigma(weather):.2g} m"
-        sensor.annotate(said, (2, number), va="center", fontsize=9.5)
+        label = f"{name}: {sensor_range_m(weather):.0f} m, noise {noise_sigma(weather):.2g} m"
+        sensor.annotate(label, (2, number), va="center", fontsize=9.5)
     sensor.set(xlim=REACH, yticks=[], xlabel="m ahead")
     sensor.invert_yaxis()
     sensor.spines["left"].set_visible(False)

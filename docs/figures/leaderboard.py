@@ -1,4 +1,4 @@
-"""What stands on the leaderboard: the published records in the standard threat model of each track."""
+"""The leaderboard: the published records under the first threat model of each track."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FLAGGED = 0.4
 
 
 def standard() -> Figure:
-    """A row a defended victim: without an attack, and where in every cell the strongest attack counts."""
+    """One row a defended victim: without an attack, and under the strongest attack in each cell."""
     boards, _ = read_boards({track.name: published(track) for track in tracks()})
     first: dict[str, Board] = {}
     for board in boards:

@@ -1,4 +1,4 @@
-"""Patches for the figures: crafted once, then kept in the user's cache."""
+"""Patches for the figures: crafted once, then stored in the user's cache."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from envs.camera.axes import APPROACH_V1
 
 KEPT = user_cache_path("cavbench") / "figures"
 SHARE = PatchThreat().budget
-"""Side of a patch in shares of the sign's."""
+"""Side of a patch as a share of the sign's side."""
 
 
 def patch_of(attack: str, defense: str = "none", **params: object) -> Patch:
     """The patch of patch seed 0 against the (defended) YOLOv3-tiny; crafting one with `eot` takes some minutes.
 
     Args:
-        attack, defense: names.
-        params: of the attack; the defaults of the others.
+        attack, defense: names of the components.
+        params: parameters of the attack; others have their defaults.
     """
     pair = Pair(
         attack=choose("attack", attack, **params),

@@ -1,4 +1,4 @@
-"""Drivers from a file: a policy is written to one, read back as a victim, and asked about every moment of a real episode."""
+"""Drivers from a file: a policy is saved, loaded as a victim, and evaluated at every step of one episode."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from docs.figures.driving import FACTS, episode, policy
 from envs.highway.config import ACTIONS
 
 EVERY = 10
-"""Every how many steps a value of the file is drawn."""
+"""A value of the loaded victim is drawn every so many steps."""
 ROWS, FEATURES = 10, 5
 
 
 class _Values(nn.Module):
-    """The zoo's DQN as an ordinary network."""
+    """The zoo's DQN as a plain network."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ def onnx_file() -> Figure:
 
 
 def sb3_file() -> Figure:
-    """A DQN of Stable-Baselines3, from the zip that it wrote; of random weights, as none is shipped."""
+    """A DQN saved by Stable-Baselines3, with random weights because none ships."""
 
     def write(path: Path) -> Callable[[Tensor], Tensor]:
         from stable_baselines3 import DQN
@@ -89,7 +89,7 @@ def _any_batch() -> dict[str, dict[int, object]]:
 def _figure(
     victim: str, file: str, write: Callable[[Path], Callable[[Tensor], Tensor]], access: str, **params: str
 ) -> Figure:
-    """Values of what `write` wrote to a file, which it returns, and of the victim that is read from it."""
+    """Q-values of the policy that `write` saves and returns, and of the victim loaded from its file."""
     observations = torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"])
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         path = Path(folder) / file

@@ -1,4 +1,4 @@
-"""The reference drivers, from the published records of one road, and one scenario driven again."""
+"""The baseline drivers: published records of one road, and one scenario driven again."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROAD = "3 lanes, density 1, clear, 100 scenarios"
 
 
 def blind() -> Figure:
-    """Reward against safe progress: why reward alone is no score."""
+    """Reward and safe progress: reward alone is a broken score."""
     points = _scores()
     braking = points["slower"]
     title = f"blind: braking alone earns {braking[0]:.0%} of the reward,\nbut {braking[1]:.0%} safe progress"
@@ -46,7 +46,7 @@ def blind() -> Figure:
 
 
 def random() -> Figure:
-    """How long random drivers last."""
+    """How long random drivers stay on the road."""
     records = _records("random")
     params = {actions: choose("victim", "random", actions=actions).params for actions in ("discrete", "continuous")}
     lasted = {

@@ -11,11 +11,11 @@ from docs.figures import style
 from envs.highway.dynamics import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH
 
 Place = tuple[float, float]
-"""Along the road and across it, in m; lane i has its centre at 4 i."""
+"""Position along and across the road in m; the centre of lane i is at 4 i."""
 
 
 def lanes(axes: Axes, count: int, reach: tuple[float, float]) -> None:
-    """The lines of a road, and an axis along it."""
+    """Draw the lines of a road, and an axis along it."""
     for line in range(count + 1):
         edge = line in (0, count)
         axes.axhline(
@@ -26,7 +26,7 @@ def lanes(axes: Axes, count: int, reach: tuple[float, float]) -> None:
 
 
 def cars(axes: Axes, places: Iterable[Place], colour: str, *, filled: bool = True) -> None:
-    """A rectangle of a car's size at each place."""
+    """Draw a rectangle of a car's size at each position."""
     for x, y in places:
         corner = x - VEHICLE_LENGTH / 2, y - VEHICLE_WIDTH / 2
         face = colour if filled else "none"

@@ -1,4 +1,4 @@
-"""What detectors see on real approaches: frames, crops of the sign, and confidence on the way to it."""
+"""Detectors on approaches: frames, crops of the sign, and confidence over the distance."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from leaderboard.published import published
 
 LANES, DENSITY = 3, 1.0
 FRAME = 6
-"""Of an approach, from its beginning: some 15 m before the sign."""
+"""Index of the shown frame of an approach: some 15 m before the sign."""
 MARGIN = 1.1
-"""Around the sign in a crop, in shares of its width."""
+"""Margin around the sign in a crop, in half widths of the sign."""
 
 
 @cache
 def approaches(weather: str = "clear") -> list[Approach]:
-    """One approach a place."""
+    """One approach at each place."""
     return choose("world", "camera").component.approaches(
         AXES.cell(lanes=LANES, density=DENSITY, weather=weather), APPROACH_V1.seeds()
     )
@@ -49,26 +49,26 @@ def detector(victim: str = "yolov3_tiny", defense: str = "none") -> Detector:
 
 
 def sight(of: Detector, approach: Approach, texels: Tensor | None = None) -> Sight:
-    """What a detector says of an approach, with a patch on the sign or without."""
+    """The detections on an approach, with or without a patch on the sign."""
     with torch.no_grad():
         return look(of, approach.scenes, texels, SHARE)
 
 
 def picture(approach: Approach, frame: int, texels: Tensor | None = None) -> Tensor:
-    """[3, H, W] one frame, with a patch on the sign or without."""
+    """One frame [3, H, W], with or without a patch on the sign."""
     patches = None if texels is None else texels[None]
     with torch.no_grad():
         return approach.scenes.render(torch.tensor([frame]), patches, SHARE)[0]
 
 
 def show(axes: Axes, shown: Tensor) -> None:
-    """A picture [3, H, W], without an axis."""
+    """Show an image [3, H, W] without axes."""
     axes.imshow(shown.clamp(0, 1).permute(1, 2, 0).numpy(), interpolation="lanczos")
     style.bare(axes)
 
 
 def crop(shown: Tensor, approach: Approach, frame: int) -> Tensor:
-    """The part of a picture around the sign."""
+    """The part of an image around the sign."""
     left, top, right, bottom = approach.scenes.boxes[frame].tolist()
     around = MARGIN * (right - left) / 2
     x, y = (round(max(0, low - around)) for low in (left, top))
@@ -76,14 +76,14 @@ def crop(shown: Tensor, approach: Approach, frame: int) -> Tensor:
 
 
 def said(of: Detector, shown: Tensor, approach: Approach, frame: int) -> float:
-    """Confidence in the sign of one picture."""
+    """Confidence in the sign in one image."""
     with torch.no_grad():
         predictions = of(shown[None])
     return float(confidence(predictions, of.index(STOP_SIGN), approach.scenes.boxes[frame : frame + 1]))
 
 
 def box(axes: Axes, corners: Tensor, text: str, colour: str, *, below: bool = False) -> None:
-    """A box with a word above or below it."""
+    """Draw a box with a label above or below it."""
     left, top, right, bottom = corners.tolist()
     axes.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, lw=1.8))
     ground = {"facecolor": style.GROUND, "edgecolor": "none", "alpha": 0.7, "pad": 1}
@@ -112,7 +112,7 @@ def _comparisons() -> list[Comparison]:
 
 
 def clean(pair: Comparison) -> pa.Table:
-    """The records of the approaches of a pair without a patch, once a patch seed."""
+    """The records of a pair's approaches without a patch, repeated for each patch seed."""
     assert pair.clean
     return beside(pair.own, pair.clean)[1].table
 
@@ -124,7 +124,7 @@ def undisturbed(pair: Comparison) -> float:
 
 
 def curve(axes: Axes, records: pa.Table, colour: str, label: str, dashes: str = "-") -> None:
-    """The median confidence of approaches on the way to the sign, and where eight of ten lie."""
+    """Draw the median confidence over the distance, with a band that holds eight of ten approaches."""
     distance, seen = (_frames(records, name) for name in ("frame_distance_m", "frame_confidence"))
     low, middle, high = np.quantile(seen, (0.1, 0.5, 0.9), axis=0)
     axes.fill_between(distance[0], low, high, color=colour, alpha=0.18, lw=0)
@@ -132,7 +132,7 @@ def curve(axes: Axes, records: pa.Table, colour: str, label: str, dashes: str = 
 
 
 def frame_axes(axes: Axes) -> None:
-    """Confidence over the way to the sign."""
+    """Label axes for confidence over distance."""
     axes.axhline(THRESHOLD, color=style.GREY, lw=1, ls=":")
     axes.set(xlabel="m before the sign", ylabel="confidence", ylim=(-0.03, 1.03))
     axes.invert_xaxis()

@@ -1,4 +1,4 @@
-"""Patches on the sign: what they look like, and what they do to the confidence of YOLOv3-tiny on the way to it."""
+"""Patches on the sign: their look, and the confidence of YOLOv3-tiny over the distance."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from docs.figures.sightings import (
 )
 
 MOMENTS = 5
-"""Of the crafting."""
+"""Number of crafting steps to show."""
 
 
 def eot() -> Figure:
-    """How the patch came about, the sign with it, and the confidence."""
+    """The patch at several crafting steps, the sign with it, and the confidence."""
     made, (crafted, below) = _begun("eot", 6.4, (1.15, 3.6))
     evolution = patch_of("eot").evolution
     assert evolution is not None
@@ -58,7 +58,7 @@ def grey_patch() -> Figure:
 
 
 def _begun(attack: str, height: float, ratios: tuple[float, ...]) -> tuple[Figure, list[SubFigure]]:
-    """A figure whose title says what the patch does, and its parts."""
+    """A figure whose title gives the confidence without and with the patch, and its subfigures."""
     pair = patched(attack)
     before, after = undisturbed(pair), pair.score.estimate
     made = style.figure(height, f"{attack}: confidence {before:.2f} without, {after:.2f} with it")
@@ -81,7 +81,7 @@ def _seen(part: SubFigure, attack: str) -> None:
 
 
 def _curves(axes: Axes, attack: str) -> None:
-    """Of the published records."""
+    """Draw the confidence from the published records."""
     pair = patched(attack)
     curve(axes, clean(pair), style.BLUE, "no patch")
     if attack != "eot":

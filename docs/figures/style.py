@@ -1,4 +1,4 @@
-"""How all figures look: light ground, colours that the colour-blind tell apart, letters that are legible at 360 pixels."""
+"""Style of all figures: light background, colours safe for colour-blind readers, text legible at a width of 360 pixels."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW = (
 INK, GREY, FAINT, GROUND = "#222222", "#767676", "#d9d9d4", "#fcfcfa"
 
 TRUE, SHOWN = BLUE, RED
-"""Of what was measured, and of what an attack makes of it."""
+"""Colours of the measured and of the attacked observation."""
 UNDEFENDED, HARDENED = RED, GREEN
 ACTIONS = {"LANE_LEFT": PURPLE, "IDLE": GREY, "LANE_RIGHT": ORANGE, "FASTER": RED, "SLOWER": BLUE}
-"""By the name in `envs.highway.config.ACTIONS`, in its order."""
+"""Colours by name of the action, in the order of `envs.highway.config.ACTIONS`."""
 
 WIDTH = 6.0
-"""Of a figure in inches."""
+"""Width of a figure in inches."""
 PNG_DPI, PNG_COLOURS = 110, 128
 
 STYLE = {
@@ -60,14 +60,14 @@ STYLE = {
 
 
 def figure(height: float, title: str) -> Figure:
-    """An empty figure, `height` inches high, whose title says what it shows."""
+    """An empty figure of `height` inches with a title."""
     made = Figure(figsize=(WIDTH, height), layout="constrained")
     made.suptitle(title, x=0.01, ha="left", fontsize=12.5, fontweight="bold")
     return made
 
 
 def bare(axes: Axes) -> None:
-    """Take ticks and frame away."""
+    """Remove ticks and frame."""
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
 

@@ -9,14 +9,14 @@ AXES = Axes(
         Axis(
             name="lanes",
             kind="int",
-            meaning="number of lanes: how far from the ego's the sign stands",
+            meaning="number of lanes: more lanes put the sign farther to the right",
             choices=(3, 4, 5),
         ),
-        Axis(name="density", kind="float", meaning="density of the cars, which may hide the sign", choices=(1.0, 2.0)),
+        Axis(name="density", kind="float", meaning="traffic density: cars may hide the sign", choices=(1.0, 2.0)),
         Axis(
             name="weather",
             kind="str",
-            meaning="the air and the light",
+            meaning="air and light",
             choices=("clear", "rain", "fog", "night"),
             default="clear",
             perceptual=True,

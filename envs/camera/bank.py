@@ -1,4 +1,4 @@
-"""The transport bank: every frame of the camera world, rendered once; a file for each place in each weather."""
+"""The bank of rendered frames: one file for each place and weather."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ SHIPPED = Path(__file__).parent / "data"
 
 
 def path_of(folder: Path, location: str, weather: str) -> Path:
-    """Where the frames of a place in a weather are."""
+    """The file of the frames of a place in a weather."""
     return folder / f"{location}-{weather}.safetensors"
 
 
 def write(
     folder: Path, location: str, weather: str, poses: Sequence[Pose], frames: Sequence[Frame], made_by: object
 ) -> Path:
-    """Keep the frames of a place in a weather, atomically."""
+    """Write the frames of a place in a weather, atomically; return the file."""
     tensors: dict[str, NDArray[np.generic]] = {
         "crop": np.array([frame.crop for frame in frames], np.int32),
         "scale": np.array([frame.scale for frame in frames], np.float32),
@@ -60,17 +60,17 @@ def read(folder: Path, location: str, weather: str) -> list[tuple[Pose, Frame]]:
     """The frames of a place in a weather.
 
     Raises:
-        UserError: if they are not there, saying what renders them, or cannot be read.
+        UserError: if the file is missing or cannot be read.
     """
     path = path_of(folder, location, weather)
     if not path.exists():
-        raise UserError(f"there are no frames of {location} in {weather} at {path}; `bench render` makes them")
+        raise UserError(f"no frames of {location} in {weather} at {path}; `bench render` makes them")
     try:
         with safe_open(path, "np") as file:
             held = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             poses = [Pose(**fields) for fields in json.loads(file.metadata()["poses"])]
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"the frames {path} cannot be read: {str(error).splitlines()[0]}") from None
+        raise UserError(f"cannot read the frames {path}: {str(error).splitlines()[0]}") from None
     parts = {name: np.split(held[name], held[f"{name}_ends"][:-1]) for name in ("picture", "black", "gain")}
     found = []
     for number, pose in enumerate(poses):
@@ -90,12 +90,12 @@ def read(folder: Path, location: str, weather: str) -> list[tuple[Pose, Frame]]:
 
 
 GRAIN_SHIFT = 97
-"""One field of noise serves all frames, each from a place of its own within so many pixels down and to the right."""
+"""All frames share one noise field; each frame starts at its own offset of fewer pixels than this, down and right."""
 
 
 @cache
 def _grain(height: int, width: int) -> Tensor:
-    """[3, height, width] the sensor's noise at a standard deviation of 1."""
+    """Sensor noise [3, height, width] with standard deviation 1."""
     return torch.randn(3, height, width, generator=torch.Generator().manual_seed(0))
 
 
@@ -104,7 +104,7 @@ class BankScenes(Scenes):
 
     Args:
         frames: poses with their frames.
-        weathers: the name of each one's weather.
+        weathers: name of the weather of each frame.
     """
 
     def __init__(self, frames: Sequence[tuple[Pose, Frame]], weathers: Sequence[str]) -> None:
@@ -151,14 +151,14 @@ class BankScenes(Scenes):
         return torch.tensor([_reach(pose, share) for pose in self.poses], dtype=torch.float32)
 
     def _plate(self, number: int) -> Plate:
-        """Of a frame, kept as long as the scenes are: about 1.6 MB."""
+        """The opened plate of a frame, cached in these scenes: about 1.6 MB."""
         if number not in self._plates:
             pose = self.poses[number]
             self._plates[number] = opened(self.frames[number], pose.camera, sign_x(pose.lanes))
         return self._plates[number]
 
     def _add_noise(self, picture: Tensor, number: int, part: Box) -> Tensor:
-        """Add the sensor's noise to a part [3, h, w] of a frame's picture, in place."""
+        """Add sensor noise in place to a part [3, h, w] of the image of a frame."""
         height, width = self.size
         seed = self.poses[number].seed
         down, right = seed % GRAIN_SHIFT, seed // GRAIN_SHIFT % GRAIN_SHIFT
@@ -168,6 +168,6 @@ class BankScenes(Scenes):
 
 @cache
 def _reach(pose: Pose, share: float) -> Box:
-    """Around the pixels that a patch changes: those it covers, and one more where the texture's filter mixes it in."""
+    """The box of the pixels that a patch can change: those it covers, plus one on each side for texture filtering."""
     x0, y0, x1, y1 = sign.patch_box(share, sign_x(pose.lanes), pose.camera)
     return floor(x0) - 1, floor(y0) - 1, ceil(x1) + 1, ceil(y1) + 1

@@ -1,4 +1,4 @@
-"""From light to a picture: exposure and the camera's tone curve."""
+"""From light to an image: exposure and the camera's tone curve."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Of linear sRGB (ITU-R BT.709)."""
+"""Luminance weights of linear sRGB (ITU-R BT.709)."""
 MIDDLE_GREY = 0.18
 HIGHLIGHTS = 0.9
 NOISE = {"sun": 0.005, "overcast": 0.008, "night": 0.02}
-"""Standard deviation of the sensor's noise on the sRGB scale: it amplifies more in less light."""
+"""Standard deviation of the sensor noise on the sRGB scale: in less light the gain is higher."""
 
 
 def exposure(light: NDArray[np.float32]) -> float:
-    """The factor that an automatic exposure puts before the light [H, W, 3] of a frame.
+    """Factor by which automatic exposure multiplies the light [H, W, 3] of a frame.
 
-    The logarithmic mean becomes middle grey, or less where more than 4 % of the picture would burn out.
+    The logarithmic mean becomes middle grey, or less if otherwise more than 4 % of the image would be overexposed.
     """
     luminance = light @ np.array(LUMINANCE, np.float32)
     dim = np.minimum(luminance, np.quantile(luminance, 0.97))
@@ -27,7 +27,7 @@ def exposure(light: NDArray[np.float32]) -> float:
 
 
 def tone(light: Tensor) -> Tensor:
-    """sRGB in [0, 1] of exposed light, by a film-like curve (Narkowicz 2015, "ACES filmic tone mapping curve") and sRGB's own."""
+    """sRGB in [0, 1] of exposed light: a film-like curve (Narkowicz 2015, "ACES filmic tone mapping curve"), then sRGB coding."""
     x = 0.8 * light.clamp(min=0)
     curved = (x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)).clamp(0, 1)
     return srgb(curved)

@@ -1,4 +1,4 @@
-"""The TorchRL face of the camera world: approaches that a driver can end by braking."""
+"""The camera world as a TorchRL environment: the driver can brake during an approach."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ HARDEST_MPS2 = 8.0
 
 
 class ApproachEnv(EnvBase):
-    """B cars that come towards a stop sign at 10 m/s.
+    """B cars that approach a stop sign at 10 m/s.
 
-    The action is the braking in m/s2, float32 [B, 1] in [0, 8]. A step lasts as long as an unbraked car takes from one frame
-    to the next. `observation` is what the camera shows, [B, 3, H, W]: the frame whose distance is nearest (the last one
-    stays in view after it). `info` has the `distance` to the sign in m, the `speed` in m/s, the sign's `box` in pixels [B, 4]
-    and its `visible` share. An episode ends when the car stands or is past the sign, which the stop line is level with
-    (`bench.detection.stopping`); the reward is 1 for standing before it, else 0.
+    The action is the deceleration in m/s2, float32 [B, 1] in [0, 8]. A step is the time in which a car that does not brake
+    drives from one frame to the next. `observation` is the image of the nearest frame by distance, [B, 3, H, W]; after the
+    last frame it stays the same. `info` has the `distance` to the sign in m, the `speed` in m/s, the `box` of the sign in
+    pixels [B, 4] and its `visible` share. An episode ends when the car stands still or passes the sign; the stop line is level
+    with it (`bench.detection.stopping`). The reward is 1 for stopping before the line, else 0.
 
     Args:
-        scenes: of each approach, farthest first, all of one size and at the same distances.
-        patches: [B or 1, 3, P, P] sRGB in [0, 1] on the signs; None for none.
-        share: side of the patch in shares of the sign's.
+        scenes: frames of each approach, farthest first, all of one size and at the same distances.
+        patches: sRGB in [0, 1], [B or 1, 3, P, P]; None for no patch.
+        share: side of the patch as a share of the sign's side.
     """
 
     batch_locked = True
@@ -58,7 +58,7 @@ class ApproachEnv(EnvBase):
         self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=(batch,))
 
     def _set_seed(self, seed: int | None) -> None:
-        """Nothing is random: an approach is what its frames are."""
+        """Nothing is random: an approach is given by its frames."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -70,7 +70,7 @@ class ApproachEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         running = ~self._ended()
         braking = tensordict["action"].clamp(0, HARDEST_MPS2)
-        # It stands still once it has stopped, within the step.
+        # A car that stops within the step does not move backwards.
         seconds = torch.where(braking > 0, (self.speed / braking.clamp(min=1e-6)).clamp(max=self.step_s), self.step_s)
         driven = self.speed * seconds - braking * seconds.square() / 2
         self.distance = torch.where(running, self.distance - driven, self.distance)

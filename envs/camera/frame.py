@@ -1,6 +1,6 @@
-"""One frame of the bank: a developed picture, and on the sign's crop the light that a texture is put into.
+"""One frame of the bank: a developed image, and the light on the sign's crop, which depends on the texture.
 
-On the crop the light is L = black + gain * texture, exposed and with the weather's air in it (`envs.camera.weather`).
+On the crop, the light is L = black + gain * texture, with exposure and weather applied (`envs.camera.weather`).
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from envs.camera.weather import air
 from envs.weather import Weather
 
 QUALITY = 85
-"""Of the WebP picture; the sign's crop does not go through it."""
+"""WebP quality of the image; the sign's crop is stored separately."""
 GAMMA = 2.2
-"""The crop's light is kept in 8 bits like a picture: (value / largest) ** (1 / GAMMA)."""
+"""The light of the crop is stored in 8 bits as (value / largest) ** (1 / GAMMA)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame as it is kept.
+    """A frame as it is stored.
 
     Args:
-        picture: WebP of the developed frame with a black sign, without the sensor's noise.
-        crop: x0, y0, x1, y1 around the sign in pixels, within the picture; empty if the sign is outside.
-        black, gain: uint8 [h, w, 3], coded as `GAMMA` says.
-        scale: what codes of 255 stand for in black and gain.
-        visible: share of the sign that is in the picture and not hidden, in [0, 1].
+        picture: WebP of the developed frame with a black sign, without sensor noise.
+        crop: x0, y0, x1, y1 around the sign in pixels, inside the image; empty if the sign is outside.
+        black, gain: uint8 [h, w, 3], coded with `GAMMA`.
+        scale: light of code 255 in black and in gain.
+        visible: share of the sign that is inside the image and not hidden, in [0, 1].
     """
 
     picture: NDArray[np.uint8]
@@ -48,7 +48,7 @@ class Frame:
 
 
 def frame(traced: Traced, pose: Pose, weather: Weather) -> Frame:
-    """A traced pose in a weather, developed."""
+    """Develop a traced pose in a weather."""
     x0, y0, x1, y1 = traced.crop
     between = air(weather, traced.depth, traced.black, SPEED_MPS, pose.camera.focal, pose.seed)
     light = traced.black * between.transmitted + between.added
@@ -71,5 +71,5 @@ def _coded(light: NDArray[np.float32]) -> tuple[NDArray[np.uint8], float]:
 
 
 def noise_level(weather: Weather) -> float:
-    """Standard deviation of the sensor's noise, on the sRGB scale."""
+    """Standard deviation of the sensor noise on the sRGB scale."""
     return develop.NOISE[lighting(weather)]

@@ -1,4 +1,4 @@
-"""What there is to find in a frame beside its sign: vehicles and other signs, from their outlines."""
+"""Labels of a frame: the stop sign, vehicles and other signs, from their outlines."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from envs.camera.street.layout import LOCATIONS, OtherSign, other_signs, sign_x,
 from envs.camera.street.vehicles import PAINTS, Model, vehicle
 
 NAMES = (STOP_SIGN, "car", "truck", "traffic sign")
-"""Of the classes. Vans are trucks; signs that are no stop signs have a class of their own, so that they are told apart."""
+"""Class names. Vans are trucks; other signs have their own class, so that detectors learn to tell them from stop signs."""
 CLASSES: dict[Model, str] = {"saloon": "car", "hatchback": "car", "van": "truck", "lorry": "truck"}
 LEAST_VISIBLE, LEAST_PX = 0.3, 6
-"""What shows less of its outline, or is narrower or lower, is not there to be found."""
+"""An object that shows a smaller share of its outline, or is narrower or lower in pixels, has no label."""
 AHEAD_M = 1.0
-"""What is not wholly so far ahead of the camera hides other things and is not there to be found."""
+"""An object that is not entirely this far ahead of the camera hides other objects but has no label."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class _Outlined:
 
 
 def objects(pose: Pose) -> list[tuple[str, Array]]:
-    """Class and box [4] in pixels, clipped to the picture, of everything that is to be seen from a pose.
+    """Class and box [4] in pixels, clipped to the image, of every labelled object.
 
-    A thing counts where enough of its outline is in the picture and before all others.
+    An object has a label if enough of its outline is inside the image and not hidden by nearer objects.
     """
     camera = pose.camera
     found = sorted(_outlined(pose), key=lambda one: -one.depth)
@@ -54,7 +54,7 @@ def objects(pose: Pose) -> list[tuple[str, Array]]:
 
 
 def _outlined(pose: Pose) -> list[_Outlined]:
-    """Every vehicle and sign ahead of the camera; those that are partly beside it have no name."""
+    """Every vehicle and sign ahead of the camera; those partly beside the camera have an empty name."""
     camera, location = pose.camera, LOCATIONS[pose.location]
     found = [_Outlined(STOP_SIGN, camera.project(sign.corners(sign_x(pose.lanes))), -camera.y)]
     for placed in traffic(location, pose.lanes, pose.density):
@@ -73,12 +73,12 @@ def _outlined(pose: Pose) -> list[_Outlined]:
 
 
 def _corners(other: OtherSign) -> Array:
-    """[4, 3] of the square or rectangle around a sign, in m."""
+    """Corners [4, 3] in m of the rectangle around a sign."""
     wide, high = {"limit": (0.33, 0.33), "warning": (0.5, 0.5), "direction": (0.55, 0.25)}[other.kind]
     return np.array([(other.x + dx, other.y, other.z + dz) for dx in (-wide, wide) for dz in (-high, high)])
 
 
 @cache
 def _points(model: Model) -> NDArray[np.float32]:
-    """[N, 3] the vertices of a vehicle at the origin, in m."""
+    """Vertices [N, 3] in m of a vehicle at the origin."""
     return np.concatenate([mesh.vertices for mesh, _ in vehicle(model, PAINTS[0])])

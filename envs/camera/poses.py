@@ -1,4 +1,4 @@
-"""Which pictures of the street there are: approaches for scoring, and other views of other places for training."""
+"""All views of the street: approaches for scoring, and views of other places for training."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from envs.camera.street.light import Lighting
 LANES = [int(lanes) for lanes in AXES["lanes"].choices]
 DENSITIES = [float(density) for density in AXES["density"].choices]
 TRAINING_VIEWS = 12
-"""Of each training place under each lighting."""
+"""Number of views of each training place under each lighting."""
 TRAINING_LIGHTINGS: tuple[Lighting, ...] = ("sun", "overcast")
-"""Those of the weathers of the standard grid."""
+"""The lightings of the weathers in the standard grid."""
 LEAST_VISIBLE = 0.6
-"""Share of the sign that a training view shows, about."""
+"""Approximate share of the sign that a training view shows at least."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,12 +31,12 @@ class Pose:
 
     Args:
         location: a name in `LOCATIONS`.
-        lanes: of the road.
-        density: of the traffic.
-        lighting: what it is traced under.
-        distance: of the camera before the sign in m.
-        x: of the camera, to the right of the lane's middle in m.
-        yaw_deg, pitch_deg: of the camera.
+        lanes: number of lanes of the road.
+        density: traffic density.
+        lighting: light that it is traced in.
+        distance: distance of the camera to the sign in m.
+        x: camera position to the right of the middle of the lane, in m.
+        yaw_deg, pitch_deg: direction of the camera.
     """
 
     location: str
@@ -50,18 +50,18 @@ class Pose:
 
     @property
     def camera(self) -> Camera:
-        """Where it is seen from."""
+        """The camera of this view."""
         return Camera(x=self.x, y=-self.distance, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg)
 
     @cached_property
     def seed(self) -> int:
-        """Of everything random in its picture."""
+        """Seed of everything random in the image."""
         text = ",".join(f"{key}={value}" for key, value in asdict(self).items())
         return int(hashlib.sha256(text.encode()).hexdigest()[:8], 16)
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Name of its files."""
         road = f"{self.lanes}-lanes-density-{self.density:g}"
         return f"{self.location}-{self.lighting}-{road}-{self.distance:.2f}m-{self.seed:08x}"
 
@@ -90,7 +90,7 @@ def scored() -> tuple[Pose, ...]:
 
 @cache
 def training() -> tuple[Pose, ...]:
-    """Views of the training places, at random distances and a little off the lane's middle and direction."""
+    """Views of the training places, at random distances, slightly off the middle and the direction of the lane."""
     poses: list[Pose] = []
     for number, lighting in enumerate(TRAINING_LIGHTINGS):
         for location in LOCATIONS.values():
@@ -113,7 +113,7 @@ def training() -> tuple[Pose, ...]:
 
 
 def _visible(pose: Pose) -> float:
-    """Share of the sign that a view shows, about."""
+    """Approximate share of the sign that a view shows."""
     placed = traffic(LOCATIONS[pose.location], pose.lanes, pose.density)
     vehicles = [(each.model, each.x, each.later(pose.distance)) for each in placed]
     return occlusion.visible(pose.camera, sign_x(pose.lanes), vehicles)

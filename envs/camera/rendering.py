@@ -1,6 +1,6 @@
-"""Making the bank: every pose traced once and kept, then developed in each weather that has its light.
+"""Renders the bank: traces every pose once, then develops it in each weather with that lighting.
 
-A pose is a file of its own, so a render that was broken off goes on.
+Each traced pose is a file, so rendering is resumable.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from envs.camera.street.render import Traced, trace, variant
 from envs.weather import WEATHERS
 
 VERSION = 2
-"""Of everything that decides what is traced; raised when the street or its light change."""
+"""Version of the traced scene; raise it when the street or its light change."""
 
 
 def path_of(folder: Path, pose: Pose) -> Path:
-    """Where a traced pose is kept."""
+    """The file of a traced pose."""
     return folder / f"v{VERSION}-{variant()}" / f"{pose.name}.npz"
 
 
 def traced(folder: Path, pose: Pose) -> Traced:
-    """A pose, out of `folder` or traced now and kept there."""
+    """A traced pose, read from `folder`, or traced now and saved there."""
     path = path_of(folder, pose)
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,10 +55,10 @@ def traced(folder: Path, pose: Pose) -> Traced:
 
 
 def make(poses: Sequence[Pose], *, kept: Path, out: Path, progress: Callable[[float, str], None]) -> list[Path]:
-    """Trace the poses that are not there yet, and write the bank of all of them.
+    """Trace the missing poses, and write the bank of all poses.
 
     Args:
-        poses: of any places and lightings.
+        poses: poses of any places and lightings.
         kept: folder of traced poses, some 4 MB each.
         out: folder of the bank.
         progress: called with the share done and a short text.
@@ -87,7 +87,7 @@ def make(poses: Sequence[Pose], *, kept: Path, out: Path, progress: Callable[[fl
 
 
 def _made_by() -> dict[str, object]:
-    """What a file of the bank says of its making."""
+    """Provenance in the metadata of a file of the bank."""
     return {
         "version": VERSION,
         "variant": variant(),

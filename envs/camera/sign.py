@@ -1,4 +1,4 @@
-"""The stop sign: its octagon, its face as a texture, and where a patch is stuck on it."""
+"""The stop sign: its octagon, the texture of its face, and the place of a patch."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from envs.camera.camera import Array, Camera
 from envs.camera.develop import linear
 
 SIZE_M = 1.2
-"""Across flats: 48 inches, the oversized R1-1 of the MUTCD (2009, table 2B-1)."""
+"""Width across flats: 48 inches, the oversized R1-1 of the MUTCD (2009, table 2B-1)."""
 HEIGHT_M = 2.7
-"""Of its middle above the road: 7 feet (2.1 m) to its lower edge (MUTCD 2009, section 2A.18)."""
+"""Height of its middle above the road; the lower edge is at 7 feet (2.1 m) (MUTCD 2009, section 2A.18)."""
 TEXELS = 512
-"""Side of the face's texture, which covers the octagon's bounding square."""
+"""Side of the texture of the face, which covers the bounding square of the octagon."""
 RED, WHITE = (0.68, 0.08, 0.12), (0.94, 0.94, 0.92)
 """sRGB."""
 
 _LETTER_HEIGHT, _STROKE, _LETTER_WIDTH, _GAP = 1 / 3, 0.05, 0.165, 0.05
-"""In shares of the sign's side: 16 of 48 inches high (Standard Highway Signs 2004, R1-1)."""
+"""As shares of the sign's side: letters are 16 of 48 inches high (Standard Highway Signs 2004, R1-1)."""
 
 
 def corners(x: float) -> Array:
-    """[8, 3] corners of the octagon of a sign that stands at `x`, in m."""
+    """Corners [8, 3] in m of the octagon of a sign at `x`."""
     angle = np.deg2rad(22.5 + 45 * np.arange(8))
     radius = SIZE_M / 2 / np.cos(np.pi / 8)
     return np.stack([x + radius * np.cos(angle), np.zeros(8), HEIGHT_M + radius * np.sin(angle)], 1)
 
 
 def box(x: float, camera: Camera) -> Array:
-    """[4] x0, y0, x1, y1 of the sign in pixels, not clipped to the picture."""
+    """x0, y0, x1, y1 of the sign in pixels, [4], not clipped to the image."""
     return _bounds(camera.project(corners(x)))
 
 
 def patch_box(share: float, x: float, camera: Camera) -> Array:
-    """[4] x0, y0, x1, y1 of a patch whose side is `share` of the sign's, in pixels, not clipped to the picture."""
+    """x0, y0, x1, y1 in pixels, [4], of a patch whose side is `share` of the sign's side, not clipped to the image."""
     return _bounds(camera.project(_square(share, x)))
 
 
@@ -48,7 +48,7 @@ def _bounds(seen: Array) -> Array:
 
 
 def _square(share: float, x: float) -> Array:
-    """[4, 3] corners of a square in the middle of the sign, its side `share` of the sign's: clockwise from the top left."""
+    """Corners [4, 3] of a centred square whose side is `share` of the sign's side, clockwise from the top left."""
     half = share * SIZE_M / 2
     return np.array(
         [(x + half * across, 0, HEIGHT_M + half * up) for across, up in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
@@ -56,21 +56,21 @@ def _square(share: float, x: float) -> Array:
 
 
 def pixel_to_face(x: float, camera: Camera) -> Array:
-    """[3, 3] homography from pixels to the face's texture: (0, 0) is its top left corner, (1, 1) its bottom right one."""
+    """Homography [3, 3] from pixels to texture coordinates: (0, 0) is the top left corner, (1, 1) the bottom right one."""
     seen = camera.project(_square(1.0, x)).astype(np.float32)
     face = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
     return np.asarray(cv2.getPerspectiveTransform(seen, face), np.float64)
 
 
 def inside(face: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which points [..., 2] of the texture's unit square are on the octagon."""
+    """Whether points [..., 2] of the unit square of the texture are on the octagon."""
     across, down = (np.abs(2 * face[..., axis] - 1) for axis in (0, 1))
     return (np.maximum(across, down) <= 1) & (across + down <= np.sqrt(2))
 
 
 @cache
 def _strokes() -> list[tuple[list[tuple[float, float]], bool]]:
-    """Centre lines of S, T, O, P in letter boxes of width 1 and height 1, and whether each is closed."""
+    """Centre lines of S, T (two strokes), O and P in letter boxes of width and height 1, and whether each line is closed."""
 
     def arc(x: float, y: float, rx: float, ry: float, start: float, end: float) -> list[tuple[float, float]]:
         angles = np.deg2rad(np.linspace(start, end, 24))
@@ -85,7 +85,7 @@ def _strokes() -> list[tuple[list[tuple[float, float]], bool]]:
 
 @cache
 def face() -> NDArray[np.float32]:
-    """[3, TEXELS, TEXELS] the stop sign's face, sRGB in [0, 1]. Do not write into it."""
+    """The face of the stop sign [3, TEXELS, TEXELS], sRGB in [0, 1]. Cached: do not modify it."""
     scale = 4
     side = TEXELS * scale
     picture = np.empty((side, side, 3), np.float32)
@@ -106,11 +106,11 @@ def face() -> NDArray[np.float32]:
 
 
 def painted(patches: Tensor | None, share: float) -> Tensor:
-    """Reflectances of the face with patches on it, linear [N, 3, TEXELS, TEXELS]; every texel of a patch is a printed square.
+    """Linear reflectances of the face with patches, [N, 3, TEXELS, TEXELS]; each texel of a patch is a square.
 
     Args:
-        patches: [N, 3, P, P] sRGB in [0, 1]; None for the face alone, N = 1.
-        share: side of the patch in shares of the sign's, in (0, 1].
+        patches: sRGB in [0, 1], [N, 3, P, P]; None for the plain face, N = 1.
+        share: side of the patch as a share of the sign's side, in (0, 1].
     """
     plain = _reflectance().unsqueeze(0)
     if patches is None:
@@ -124,7 +124,7 @@ def painted(patches: Tensor | None, share: float) -> Tensor:
 
 
 def patch_texels(share: float) -> slice:
-    """The rows, and columns, of the face that a patch covers whose side is `share` of the sign's."""
+    """Rows (and columns) of the face that a patch covers; its side is `share` of the sign's side."""
     side = max(1, round(share * TEXELS))
     first = (TEXELS - side) // 2
     return slice(first, first + side)
@@ -132,5 +132,5 @@ def patch_texels(share: float) -> slice:
 
 @cache
 def _reflectance() -> Tensor:
-    """[3, TEXELS, TEXELS] of the plain face, linear."""
+    """Linear reflectances of the plain face, [3, TEXELS, TEXELS]."""
     return linear(torch.from_numpy(face()))

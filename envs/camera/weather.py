@@ -1,6 +1,6 @@
 """The air between the camera and the street: extinction, fog and rain, in linear light.
 
-Everything here is affine in the light that arrives, L -> T L + A, so what it does to a sign's texture is only a gain.
+All effects are affine in the arriving light, L -> T L + A, so for the texture of the sign they are only a gain.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from envs.weather import Weather
 Image = NDArray[np.float32]
 
 EXPOSURE_S = 1 / 250
-"""Of a frame, by day: how long a drop draws its streak."""
+"""Exposure time of a frame by day: the time in which a drop draws its streak."""
 NEAREST_M, FARTHEST_M = 0.3, 5.0
-"""Between which drops are drawn one by one; those beyond are in the extinction."""
+"""Drops between these distances are drawn one by one; drops beyond are part of the extinction."""
 SMALLEST_MM = 0.6
-"""Diameter of the drops that are drawn."""
+"""Smallest diameter of the drawn drops."""
 SKY_M = 1500.0
-"""Depth given to the sky: what is beyond is not seen through rain or fog."""
+"""Depth of the sky: nothing beyond it is visible through rain or fog."""
 
 
 @dataclass(frozen=True)
 class Air:
-    """What the air does to a frame: L -> transmitted * L + added.
+    """Effect of the air on a frame: L -> transmitted * L + added.
 
     Args:
-        transmitted: [H, W, 1].
-        added: [H, W, 3].
+        transmitted: share of the light, [H, W, 1].
+        added: light, [H, W, 3].
     """
 
     transmitted: Image
@@ -39,18 +39,18 @@ class Air:
 
 
 def air(weather: Weather, depth: Image, street: Image, speed_mps: float, focal: float, seed: int) -> Air:
-    """The air of a weather between the camera and a street.
+    """The air between the camera and a street in a weather.
 
     Args:
         weather: visibility and rain.
         depth: [H, W] in m, inf for the sky.
-        street: [H, W, 3] linear light without weather; the airlight's colour is that of its sky.
-        speed_mps: of the car, which draws the streaks out.
-        focal: in pixels.
-        seed: of the drops.
+        street: linear light without weather, [H, W, 3]; the airlight has the colour of its sky.
+        speed_mps: speed of the car, which lengthens the streaks.
+        focal: focal length in pixels.
+        seed: seed of the drops.
     """
     airlight = _airlight(street, depth)
-    # Koschmieder (1924): contrast falls exponentially, and what is lost is replaced by scattered skylight.
+    # Koschmieder (1924): contrast falls exponentially, and scattered skylight replaces the lost light.
     transmitted = np.exp(-weather.extinction_per_m * np.minimum(depth, SKY_M))[..., None].astype(np.float32)
     if weather.sun_elevation_deg < 0:
         airlight = airlight * 0.0
@@ -65,7 +65,7 @@ def air(weather: Weather, depth: Image, street: Image, speed_mps: float, focal: 
 
 
 def _airlight(street: Image, depth: Image) -> NDArray[np.float32]:
-    """[3] the mean of the sky that is to be seen, or of the brightest twentieth of the street."""
+    """Mean colour [3] of the visible sky, or of the brightest twentieth of the street."""
     sky = np.isinf(depth)
     if sky.mean() > 0.01:
         return street[sky].mean(0)
@@ -74,7 +74,7 @@ def _airlight(street: Image, depth: Image) -> NDArray[np.float32]:
 
 
 def streaks(rate_mm_h: float, depth: Image, speed_mps: float, focal: float, rng: np.random.Generator) -> Image:
-    """[H, W] share of the exposure in which drops hide what is behind them.
+    """Share of the exposure during which drops hide the background, [H, W].
 
     Drop sizes by Marshall and Palmer (1948), N(D) = 8000 exp(-4.1 R^-0.21 D) drops a m3 and mm; terminal speeds by Atlas et al.
     (1973), v = 9.65 - 10.3 exp(-0.6 D) m/s with D in mm; each drop is projected at both ends of the exposure.
@@ -95,7 +95,7 @@ def streaks(rate_mm_h: float, depth: Image, speed_mps: float, focal: float, rng:
     end += np.array([width, height]) / 2
     wide = np.maximum(diameter / 1000 / z * focal, 1e-3)
     length = np.linalg.norm(end - start, axis=1) + wide
-    # Thinner than a pixel, it hides a share of it; it is anywhere on its streak for a share of the exposure.
+    # A drop thinner than a pixel hides a share of it, and is at each point of its streak for a share of the exposure.
     share = np.minimum(wide, 1.0) * wide / length
     clear = np.ones((height, width), np.float32)
     for layer in np.array_split(np.argsort(-z), 12):

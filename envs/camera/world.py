@@ -1,4 +1,4 @@
-"""The camera world as a component: approaches to score on, scenes to train on, and the command that renders them."""
+"""The camera world as a component: approaches for scoring, scenes for training, and their rendering."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ TRAINING_WEATHERS = ("clear", "rain", "fog")
 
 @dataclass(frozen=True, kw_only=True)
 class StopSignApproach(CameraWorld):
-    """An approach to a stop sign at three places, the sun behind the ego, beside it and behind the sign.
+    """An approach to a stop sign at three places: the sun behind the ego, beside it, and behind the sign.
 
     Args:
-        bank: folder of the rendered frames; empty for those that ship with the project.
+        bank: folder of the rendered frames; empty for the shipped frames.
     """
 
     axes: ClassVar[Axes] = AXES
@@ -44,7 +44,7 @@ class StopSignApproach(CameraWorld):
 
     @property
     def folder(self) -> Path:
-        """Where the frames are."""
+        """Folder of the frames."""
         return Path(self.bank).expanduser() if self.bank else bank.SHIPPED
 
     def training_scenes(self) -> BankScenes:
@@ -61,17 +61,15 @@ class StopSignApproach(CameraWorld):
             if (pose.lanes, pose.density) == (cell.lanes, cell.density)
         ]
         if not frames:
-            raise UserError(
-                f"there are no frames of {location} with {cell} in {self.folder}; `bench render` makes them"
-            )
+            raise UserError(f"no frames of {location} with {cell} in {self.folder}; `bench render` makes them")
         scenes = BankScenes(frames, [cell.weather] * len(frames))
         return Approach(seed=seed, location=location, scenes=scenes)
 
     def render(self, out: Path | None, progress: Progress) -> list[Path]:
-        """Trace what is not traced yet, and write the bank.
+        """Trace the missing poses, and write the bank.
 
         Args:
-            out: folder of the bank; None is the one that ships with the project.
+            out: folder of the bank; None for the shipped bank.
             progress: called with the share done.
 
         Raises:

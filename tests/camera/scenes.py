@@ -1,4 +1,4 @@
-"""A frame that is made here and now, without a path tracer: enough to test what happens to it afterwards."""
+"""Synthetic traced frames, made without a path tracer, for tests of the later steps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from envs.weather import WEATHERS
 
 
 def lit(pose: Pose, level: float = 0.6) -> Traced:
-    """A grey street under even light, with nothing before the sign."""
+    """A grey street in even light, with nothing in front of the sign."""
     camera = pose.camera
     x0, y0, x1, y1 = sign.box(sign_x(pose.lanes), camera)
     left, right = (int(np.clip(x, 0, camera.width)) for x in (x0 - 3, x1 + 4))

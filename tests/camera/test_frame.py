@@ -49,7 +49,7 @@ def test_the_patch_covers_its_share_of_the_sign_and_nothing_else() -> None:
 
 
 def test_the_picture_is_differentiable_to_the_patch() -> None:
-    """Against a central difference, in the linear part of the tone curve's range."""
+    """Compared with a central difference, in the linear part of the tone curve."""
     plain = scenes()
     patch = torch.full((1, 3, 8, 8), 0.5, requires_grad=True)
     weights = torch.randn(3, 384, 1248, generator=torch.Generator().manual_seed(0))
@@ -124,7 +124,7 @@ def test_a_bank_that_is_not_there_or_cut_short_is_one_line(tmp_path: Path) -> No
     with pytest.raises(UserError, match="bench render"):
         bank.read(tmp_path, "sun-beside", "fog")
     bank.path_of(tmp_path, "sun-beside", "fog").write_bytes(b"\x10\0\0\0\0\0\0\0{}")
-    with pytest.raises(UserError, match="cannot be read"):
+    with pytest.raises(UserError, match="cannot read the frames"):
         bank.read(tmp_path, "sun-beside", "fog")
 
 

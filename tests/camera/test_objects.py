@@ -1,4 +1,4 @@
-"""What there is to find in a frame of the camera world."""
+"""Labels of the frames of the camera world."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from envs.camera.street.layout import sign_x
 from tests.camera.scenes import scenes
 
 
-def test_every_training_view_holds_its_sign_and_other_things_beside() -> None:
+def test_every_training_view_has_its_sign_and_other_objects() -> None:
     named: set[str] = set()
     for pose in training():
         found = dict(reversed(objects(pose)))
@@ -27,14 +27,14 @@ def test_every_training_view_holds_its_sign_and_other_things_beside() -> None:
     assert named == set(NAMES)
 
 
-def test_a_hidden_sign_is_not_there_to_be_found() -> None:
-    """By traffic, or because the ego is so near that it is outside the picture."""
+def test_a_hidden_sign_has_no_label() -> None:
+    """Hidden by traffic, or outside the image because the ego is near."""
     hidden = [pose for pose in scored() if pose.lighting == "sun" and STOP_SIGN not in dict(objects(pose))]
     assert {pose.distance > 12 for pose in hidden} == {True, False}
     assert len(hidden) < 30
 
 
-def test_scenes_hand_them_on() -> None:
+def test_scenes_have_the_labels_of_their_frames() -> None:
     street = scenes("fog")
     found = street.objects(9)
     assert found.names[0] in NAMES

@@ -1,4 +1,4 @@
-"""The path tracer: what is composited is what it would have traced."""
+"""The path tracer: a composite is equal to a direct render."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LANES = 3
 
 @pytest.fixture(scope="module", autouse=True)
 def scalar() -> None:
-    """The variant that every machine has."""
+    """The Mitsuba variant that every machine has."""
     render.variant.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MITSUBA_VARIANT", "scalar_rgb")
@@ -30,8 +30,8 @@ def scalar() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lighting", ["sun", "overcast"])
-def test_a_composite_is_what_a_direct_render_shows(lighting: str) -> None:
-    """A chessboard of black and white on the sign: the texture that tells most."""
+def test_a_composite_is_equal_to_a_direct_render(lighting: str) -> None:
+    """With a black and white chessboard on the sign, the most demanding texture."""
     place = layout.LOCATIONS["sun-behind-ego"]
     parts = layout.street(place, lanes=LANES, density=1.0, distance=9.0, lights=False)
     lit = light("sun" if lighting == "sun" else "overcast", place.sun_azimuth_deg)

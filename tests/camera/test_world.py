@@ -1,4 +1,4 @@
-"""The frames that ship: every approach of the grid, by day and by night, at places that no patch was crafted on."""
+"""The shipped frames: every approach of the grid, by day and by night, at places where no patch is crafted."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WORLD = StopSignApproach()
 
 
 @pytest.mark.parametrize("weather", WEATHERS)
-def test_every_approach_is_there(weather: str) -> None:
+def test_every_approach_ships(weather: str) -> None:
     scored = {name for name, place in LOCATIONS.items() if not place.training}
     for lanes in poses.LANES:
         for density in poses.DENSITIES:
@@ -28,11 +28,11 @@ def test_every_approach_is_there(weather: str) -> None:
                 assert (approach.scenes.visible > 0).sum() >= 6
 
 
-def test_no_scored_place_is_for_crafting() -> None:
+def test_training_scenes_have_no_scored_place() -> None:
     assert all(LOCATIONS[pose.location].training for pose in WORLD.training_scenes().poses)
 
 
-def test_all_of_it_is_under_80_mb() -> None:
+def test_all_frames_are_under_80_mb() -> None:
     assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 80e6
 
 

@@ -1,1 +1,1 @@
-"""The procedural street: meshes, textures and light for the path tracer, all from a seed, with no outside asset."""
+"""The procedural street: meshes, textures and light for the path tracer, all from a seed, without external assets."""

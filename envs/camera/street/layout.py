@@ -1,6 +1,6 @@
-"""Where everything stands: the road, the places it leads through, and the traffic on it.
+"""Layout of the street: the road, its surroundings, and the traffic.
 
-Coordinates are those of `envs.camera.camera`: the sign's face at y = 0, the middle of the ego's lane at x = 0.
+Coordinates as in `envs.camera.camera`: the face of the sign at y = 0, the middle of the ego's lane at x = 0.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from envs.camera.street.vehicles import LENGTH, PAINTS, Model, Part, vehicle
 
 LANE_M = 2.75
 LANES_TO_THE_LEFT = 2
-"""Of the ego's: it keeps to the third lane from the left, so every lane more puts the sign a lane further away."""
+"""Lanes to the left of the ego, which keeps to the third lane; each additional lane puts the sign one lane further away."""
 LEFT_EDGE = -LANE_M * (LANES_TO_THE_LEFT + 0.5)
 """x of the left edge of the road in m."""
 VERGE_M = 1.1
-"""From the kerb to the middle of the sign."""
+"""Distance from the kerb to the middle of the sign."""
 DISTANCES = tuple(float(distance) for distance in np.linspace(30.0, 8.0, 10))
-"""Of the frames of an approach before the sign, in m."""
+"""Distances of the frames of an approach to the sign, in m."""
 MOST_HIDDEN = 4
-"""Frames of an approach in which the traffic may hide the sign."""
+"""Largest number of frames of an approach in which traffic may hide the sign."""
 CROSSING = (2.5, 11.5)
-"""The road that the sign gives way to, along y."""
+"""Range along y of the crossing road, to which the sign gives way."""
 _NEAR, _FAR = -80.0, 260.0
 
 Surrounding = Literal["avenue", "town", "outskirts"]
@@ -45,11 +45,11 @@ class Location:
     """A place with a stop sign.
 
     Args:
-        name: how tables call it.
-        surrounding: what stands beside the road.
-        sun_azimuth_deg: from the direction of driving, clockwise; 180 is behind the ego and shines on the sign.
-        seed: of everything in it.
-        training: whether attacks and defences may look at it; scores come from the others.
+        name: name in tables.
+        surrounding: kind of surroundings beside the road.
+        sun_azimuth_deg: clockwise from the driving direction; at 180 the sun is behind the ego and shines on the sign.
+        seed: seed of everything at this place.
+        training: whether attacks and defences may use it; scores come from the other places.
     """
 
     name: str
@@ -83,13 +83,13 @@ def sign_x(lanes: int) -> float:
 
 
 def street(location: Location, *, lanes: int, density: float, distance: float, lights: bool) -> list[Part]:
-    """Everything but the sign's face, as meshes of one material each.
+    """Everything except the face of the sign, as meshes of one material each.
 
     Args:
         location: the place.
-        lanes: of the road, 3 to 5.
-        density: traffic density factor: at 1 a lane has a vehicle every 36 m.
-        distance: of the ego before the sign in m; the traffic is where it has got to by then.
+        lanes: number of lanes, 3 to 5.
+        density: traffic density factor; at 1 a lane has a vehicle every 36 m.
+        distance: distance of the ego to the sign in m; sets the positions of the traffic.
         lights: whether tail lights are on.
     """
     parts = list(_standing(location, lanes))
@@ -102,14 +102,14 @@ def street(location: Location, *, lanes: int, density: float, distance: float, l
 
 @lru_cache(maxsize=4)
 def _standing(location: Location, lanes: int) -> tuple[Part, ...]:
-    """What is the same in every frame of an approach."""
+    """The parts that are the same in every frame of an approach."""
     parts = _ground(location, lanes) + _post(lanes) + _beside(location, lanes) + _lamp_posts()
     return tuple(_merged(parts + _other_signs(location, lanes)))
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A vehicle when the ego is at the first of `DISTANCES`: its middle in m, its speed in m/s, a number in `PAINTS`."""
+    """A vehicle when the ego is at `DISTANCES[0]`: its middle in m, its speed in m/s, its index in `PAINTS`."""
 
     model: Model
     x: float
@@ -124,9 +124,9 @@ class Placed:
 
 @cache
 def traffic(location: Location, lanes: int, density: float) -> tuple[Placed, ...]:
-    """The vehicles around the ego: the first draw that hides the sign in some frames of the approach at most.
+    """The vehicles around the ego: the first draw that hides the sign in at most `MOST_HIDDEN` frames of the approach.
 
-    Where there are lanes between the ego and the sign and the traffic is dense, it hides it in one frame at least.
+    In dense traffic with lanes between the ego and the sign, it hides the sign in at least one frame.
     """
     least = 1 if lanes > LANES_TO_THE_LEFT + 1 and density > 1 else 0
     for attempt in itertools.count():
@@ -137,7 +137,7 @@ def traffic(location: Location, lanes: int, density: float) -> tuple[Placed, ...
 
 
 def _drawn(rng: Rng, lanes: int, density: float) -> tuple[Placed, ...]:
-    """Vehicles in every lane. Those to the ego's right slow down for the crossing or wait there, so that it comes past them."""
+    """Vehicles in every lane. Those to the right of the ego slow down or wait at the crossing, so the ego passes them."""
     models = get_args(Model)
     placed = []
     for lane in range(lanes):
@@ -154,7 +154,7 @@ def _drawn(rng: Rng, lanes: int, density: float) -> tuple[Placed, ...]:
 
 
 def _hidden(placed: tuple[Placed, ...], lanes: int, distance: float) -> bool:
-    """Whether vehicles hide more than half of the sign, which may be outside the picture beside that."""
+    """Whether vehicles hide more than half of the part of the sign that is inside the image."""
     camera, x = Camera(y=-distance), sign_x(lanes)
     alone = occlusion.visible(camera, x, ())
     seen = occlusion.visible(camera, x, [(each.model, each.x, each.later(distance)) for each in placed])
@@ -162,7 +162,7 @@ def _hidden(placed: tuple[Placed, ...], lanes: int, distance: float) -> bool:
 
 
 def _merged(parts: list[Part]) -> list[Part]:
-    """One mesh a material: fewer shapes load and trace faster."""
+    """One mesh a material, because fewer shapes load and trace faster."""
     groups: dict[tuple[object, ...], tuple[Material, list[Mesh]]] = {}
     for mesh, material in parts:
         key = (material.kind, material.colour, id(material.texture))
@@ -218,7 +218,7 @@ def _post(lanes: int) -> list[Part]:
 
 
 def _lamp_posts() -> list[Part]:
-    """Beside the left kerb, every 34 m."""
+    """Lamp posts beside the left kerb, every 34 m."""
     x = LAMPS_X
     posts = [rod((x, y, 0), (x, y, LAMP_HEIGHT_M), 0.09, 0.05) for y in LAMPS_Y]
     arms = [rod((x, y, LAMP_HEIGHT_M), (x + 2.2, y, LAMP_HEIGHT_M + 0.2), 0.04) for y in LAMPS_Y]
@@ -228,7 +228,7 @@ def _lamp_posts() -> list[Part]:
 
 @dataclass(frozen=True)
 class OtherSign:
-    """A sign that is no stop sign: its kind, and where its middle is in m."""
+    """A sign other than a stop sign: its kind, and the position of its middle in m."""
 
     kind: SignKind
     x: float
@@ -237,7 +237,7 @@ class OtherSign:
 
 
 def other_signs(location: Location, lanes: int) -> list[OtherSign]:
-    """A speed limit, a warning or a direction each, two beside the road ahead and one behind on its other side."""
+    """Three signs (speed limit, warning or direction): two on the right beyond the sign, one on the left before it."""
     rng = np.random.default_rng([location.seed, 3])
     left, right = LEFT_EDGE - VERGE_M, right_edge(lanes) + VERGE_M
     places = ((right, rng.uniform(24, 30)), (right, rng.uniform(48, 60)), (left, rng.uniform(-16, -10)))
@@ -265,7 +265,7 @@ def _other_signs(location: Location, lanes: int) -> list[Part]:
 
 
 def _polygon(x: float, y: float, z: float, radius: float, sides: int) -> Mesh:
-    """A regular polygon that faces -y and stands on a corner if it has four."""
+    """A regular polygon that faces -y; with four sides it stands on a corner."""
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     rim = np.stack([x + radius * np.cos(angle), np.full(sides, y), z + radius * np.sin(angle)], 1)
     return join([quad([(x, y, z), rim[i], rim[(i + 1) % sides], rim[(i + 1) % sides]]) for i in range(sides)])
@@ -277,7 +277,7 @@ LAMPS_Y = (-48.0, -14.0, 20.0, 54.0, 88.0)
 
 
 def lamp_heads() -> list[tuple[float, float, float]]:
-    """Where the street lamps shine from."""
+    """Positions of the light sources of the street lamps."""
     x = LAMPS_X + 1.95
     return [(x, y, LAMP_HEIGHT_M + 0.1) for y in LAMPS_Y]
 
@@ -333,7 +333,7 @@ def _trees(rng: Rng, places: list[tuple[float, float]], heights: tuple[float, fl
 
 
 def _houses(rng: Rng, x: float, side: int) -> list[Part]:
-    """A closed row of fronts along the road, with a gap for the crossing."""
+    """A closed row of house fronts along the road, with a gap for the crossing."""
     parts: list[Part] = []
     for y0, y1 in ((-70, -36), (-36, CROSSING[0] - 3), (CROSSING[1] + 3, 42), (42, 84), (84, 150)):
         deep, height = rng.uniform(11, 15), rng.uniform(9, 16)

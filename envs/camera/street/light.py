@@ -14,28 +14,28 @@ from envs.weather import Weather
 HEADLIGHTS_X = (-0.62, 0.62)
 HEADLIGHT_HEIGHT_M = 0.68
 HEADLIGHT_AHEAD_M = 1.6
-"""Of the camera."""
+"""How far the headlights are ahead of the camera."""
 BEAM_FIELD_DEG = 90.0
 """Horizontal field of the low beam's pattern."""
 BEAM_PEAK_CD = 20_000.0
 """Brightest direction of a low beam (a usual figure for halogen and LED alike)."""
 LAMP_CD = 1_000.0
-"""Of a street lamp, downwards."""
+"""Intensity of a street lamp, downwards."""
 
 
 Lighting = Literal["sun", "overcast", "night"]
-"""What a pose is traced under; the weathers of a grid share these."""
+"""The light that a pose is traced in; several weathers share one."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """What lights a scene.
+    """The light of a scene.
 
     Args:
-        sun: [3] unit vector towards the sun, which brings its own sky; or None.
-        sky: [H, W, 3] radiance of the sky by elevation (first row: zenith) and azimuth, where there is no sun.
+        sun: unit vector [3] towards the sun, which has its own sky; or None.
+        sky: radiance of the sky without a sun, [H, W, 3], by elevation (first row: zenith) and azimuth.
         headlights: whether the ego's low beams and the street lamps are on.
-        wet: whether the road is.
+        wet: whether the road is wet.
     """
 
     sun: NDArray[np.float64] | None = None
@@ -45,7 +45,7 @@ class Light:
 
 
 def lighting(weather: Weather) -> Lighting:
-    """What a weather is traced under: night with the sun below the horizon, an overcast sky in rain and in fog."""
+    """The lighting of a weather: night if the sun is below the horizon, overcast in rain and in fog, else sun."""
     if weather.sun_elevation_deg < 0:
         return "night"
     dull = weather.precipitation_mm_h > 0 or weather.visibility_m < 1000
@@ -64,7 +64,7 @@ def light(kind: Lighting, sun_azimuth_deg: float, sun_elevation_deg: float = 45.
 
 
 def overcast(tint: tuple[float, float, float], height: int = 128) -> NDArray[np.float32]:
-    """[height, 2 * height, 3] radiance of the CIE standard overcast sky, (1 + 2 sin elevation) / 3, with some cloud in it."""
+    """Radiance [height, 2 * height, 3] of the CIE standard overcast sky, (1 + 2 sin elevation) / 3, with some clouds."""
     up = np.cos((np.arange(height) + 0.5) / height * np.pi)
     level = np.where(up > 0, (1 + 2 * up) / 3, 0.12)
     clouds = 0.75 + 0.5 * noise(2 * height, np.random.default_rng(3), 5, 3)[:height]
@@ -72,11 +72,11 @@ def overcast(tint: tuple[float, float, float], height: int = 128) -> NDArray[np.
 
 
 def low_beam(width: int = 512, height: int = 160) -> NDArray[np.float32]:
-    """[height, width] of a low beam on a plane in front of it, 1 at its peak; first row up, `BEAM_FIELD_DEG` wide.
+    """Pattern [height, width] of a low beam on a plane in front of it, 1 at its peak; first row up, `BEAM_FIELD_DEG` wide.
 
-    A hot spot just under the horizon, a cut-off that rises by 15 degrees to the right (UN Regulation 112), a wide and weak
-    foreground, so that the road near the car is not brighter than the road ahead, and a little stray light above, by which
-    overhead signs are seen.
+    It has a hot spot just below the horizon, a cut-off that rises by 15 degrees to the right (UN Regulation 112), a wide and weak
+    foreground, so that the road near the car is not brighter than the road ahead, and some stray light above the cut-off, which
+    makes overhead signs visible.
     """
     half = np.tan(np.deg2rad(BEAM_FIELD_DEG / 2))
     x = ((np.arange(width) + 0.5) / width * 2 - 1) * half

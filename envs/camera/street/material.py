@@ -1,4 +1,4 @@
-"""What a surface is made of, without a word of the renderer."""
+"""Materials of surfaces, independent of the renderer."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Material:
     """A surface.
 
     Args:
-        kind: how it reflects; `paving` and `road` darken and shine when wet, `lamp` glows.
+        kind: how it reflects; `paving` and `road` are darker and glossier when wet, `lamp` emits light.
         colour: linear reflectance, or radiance of a `lamp`.
-        texture: linear reflectance instead of `colour`.
+        texture: linear reflectance; replaces `colour`.
     """
 
     kind: Kind

@@ -1,4 +1,4 @@
-"""Triangle meshes with texture coordinates, and the few shapes that a street is made of."""
+"""Triangle meshes with texture coordinates, and the basic shapes of the street."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Mesh:
-    """Vertices [N, 3] in m, triangles [M, 3] of vertex numbers, texture coordinates [N, 2]."""
+    """Vertices [N, 3] in m, triangles [M, 3] of vertex indices, texture coordinates [N, 2]."""
 
     vertices: NDArray[np.float32]
     triangles: NDArray[np.uint32]
     uv: NDArray[np.float32]
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Mesh:
-        """The same, somewhere else."""
+        """The mesh translated by x, y, z in m."""
         return Mesh(self.vertices + np.array([x, y, z], np.float32), self.triangles, self.uv)
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh of several."""
+    """Join several meshes into one."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     triangles = [mesh.triangles + np.uint32(start) for mesh, start in zip(meshes, starts, strict=True)]
     return Mesh(
@@ -36,7 +36,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def quad(corners: ArrayLike, uv: ArrayLike = ((0, 0), (1, 0), (1, 1), (0, 1))) -> Mesh:
-    """Four corners [4, 3], in order."""
+    """A quadrilateral with corners [4, 3], in order."""
     triangles = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
     return Mesh(np.asarray(corners, np.float32), triangles, np.asarray(uv, np.float32))
 
@@ -61,7 +61,7 @@ def block(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, tile
 
 
 def sweep(rings: NDArray[np.floating]) -> Mesh:
-    """A closed skin through rings [K, N, 3] of points, with its two ends filled."""
+    """A closed surface through rings [K, N, 3] of points, with both ends filled."""
     count, around = rings.shape[:2]
     ends = [rings[0].mean(0), rings[-1].mean(0)]
     vertices = np.concatenate([rings.reshape(-1, 3), ends])

@@ -1,4 +1,4 @@
-"""How much of the sign the traffic hides, from outlines alone: enough to lay out a street, not to score a frame."""
+"""How much of the sign the traffic hides, estimated from outlines: for the layout of a street, not for scores."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from envs.camera.camera import Array, Camera
 from envs.camera.street.vehicles import PAINTS, Model, vehicle
 
 FINE = 4
-"""Samples along a pixel's side."""
+"""Samples along the side of a pixel."""
 
 
 def visible(camera: Camera, sign_x: float, vehicles: Iterable[tuple[Model, float, float]]) -> float:
-    """Share of the sign that is in the picture and behind no vehicle, in [0, 1].
+    """Share of the sign that is inside the image and not hidden by a vehicle, in [0, 1].
 
     Args:
-        camera: where it is seen from.
-        sign_x: where the sign stands, in m.
+        camera: camera of the view.
+        sign_x: x of the sign in m.
         vehicles: model, x and y of the middle in m.
     """
     outline = camera.project(sign.corners(sign_x))
@@ -49,7 +49,7 @@ def visible(camera: Camera, sign_x: float, vehicles: Iterable[tuple[Model, float
 
 @cache
 def _points(model: Model) -> Array:
-    """[8, 3] corners of the box around a vehicle at the origin, in m."""
+    """Corners [8, 3] in m of the box around a vehicle at the origin."""
     points = np.concatenate([mesh.vertices for mesh, _ in vehicle(model, PAINTS[0])])
     low, high = points.min(0), points.max(0)
     return np.array(list(itertools.product(*zip(low, high, strict=True))), float)

@@ -1,7 +1,7 @@
-"""One pose, path-traced with Mitsuba 3 (Jakob et al. 2022): the light that reaches the camera, and how much of it a sign adds.
+"""Path-traces a pose with Mitsuba 3 (Jakob et al. 2022): the light at the camera, and the part that the sign adds.
 
-A matt sign's light is linear in its texture, L = B + G * texture: B is the picture with a black sign, G what a white one adds.
-So a pose is traced once, and any texture is put on the sign afterwards.
+The light of a matt sign is linear in its texture, L = B + G * texture: B is the image with a black sign, G the light that a white
+sign adds. So a pose is traced once, and any texture is put on the sign afterwards.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from envs.camera.street.textures import noise
 from envs.camera.street.vehicles import Part
 
 SAMPLES, GUIDE_SAMPLES, SIGN_SAMPLES = 8, 4, 64
-"""Paths a pixel of the picture, of the denoiser's guides, and of the sign's crop."""
+"""Paths a pixel for the image, for the guides of the denoiser, and for the crop of the sign."""
 BOUNCES = 5
 MARGIN = 3
-"""Pixels around the sign that belong to its crop."""
+"""Margin of the crop around the sign in pixels."""
 RETROREFLECTION = ((0.2, 250.0), (0.5, 95.0), (1.0, 18.0), (2.0, 5.5), (4.0, 1.6), (8.0, 0.6))
-"""White sheeting of ASTM D4956 type III by observation angle in degrees, in cd/lx/m2; beyond 0.5 degrees extrapolated."""
+"""Retroreflection in cd/lx/m2 by observation angle in degrees, for white ASTM D4956 type III; extrapolated beyond 0.5 degrees."""
 
 
 @dataclass(frozen=True)
 class Traced:
-    """What the path tracer leaves of a pose, in linear light.
+    """A path-traced pose, in linear light.
 
     Args:
-        black: [H, W, 3] with a black sign.
-        crop: x0, y0, x1, y1 around the sign in pixels, within the picture; empty if it is outside.
-        gain: [h, w, 3] what a white sign adds on the crop.
-        coverage: [h, w] share of each pixel of the crop that is sign and not hidden by what stands before it.
-        depth: [H, W] along the line of sight in m; inf is the sky.
+        black: light with a black sign, [H, W, 3].
+        crop: x0, y0, x1, y1 around the sign in pixels, inside the image; empty if the sign is outside.
+        gain: light that a white sign adds on the crop, [h, w, 3].
+        coverage: share of each pixel of the crop that shows the sign, [h, w].
+        depth: depth along the line of sight in m, [H, W]; inf is the sky.
     """
 
     black: NDArray[np.float32]
@@ -56,13 +56,13 @@ class Traced:
 
 @cache
 def variant() -> str:
-    """The Mitsuba variant in use: MITSUBA_VARIANT, or `llvm_ad_rgb` where LLVM can be loaded, or `scalar_rgb`.
+    """The Mitsuba variant: MITSUBA_VARIANT, else `llvm_ad_rgb` if LLVM can be loaded, else `scalar_rgb`.
 
-    Results are equal across processes and thread counts for one variant, and differ in noise between two.
+    One variant gives equal results in any process with any number of threads. Two variants differ in noise.
     """
     wanted = os.environ.get("MITSUBA_VARIANT")
     if not wanted:
-        # Some LLVM versions abort the whole process, so another one tries it first.
+        # Some LLVM versions abort the process, so a separate process tries first.
         probe = "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.load_dict(mi.cornell_box())"
         works = subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0
         wanted = "llvm_ad_rgb" if works else "scalar_rgb"
@@ -73,11 +73,11 @@ def trace(parts: list[Part], light: Light, camera: Camera, sign_x: float, seed: 
     """Trace a pose.
 
     Args:
-        parts: everything but the sign's face.
-        light: of the weather.
-        camera: where it is seen from.
-        sign_x: where the sign stands.
-        seed: of the sampler.
+        parts: everything except the face of the sign.
+        light: light of the weather.
+        camera: camera of the view.
+        sign_x: x of the sign in m.
+        seed: seed of the sampler.
     """
     mi = _mitsuba()
     scene = _scene(parts, light, camera, sign_x)
@@ -114,7 +114,7 @@ def trace(parts: list[Part], light: Light, camera: Camera, sign_x: float, seed: 
 
 
 def _crop(camera: Camera, sign_x: float) -> tuple[int, int, int, int]:
-    """The sign's box with a margin, cut to the picture."""
+    """The box of the sign with a margin, clipped to the image."""
     x0, y0, x1, y1 = sign.box(sign_x, camera)
     left, top = max(0, int(x0) - MARGIN), max(0, int(y0) - MARGIN)
     right, bottom = min(camera.width, int(x1) + MARGIN + 1), min(camera.height, int(y1) + MARGIN + 1)
@@ -122,7 +122,7 @@ def _crop(camera: Camera, sign_x: float) -> tuple[int, int, int, int]:
 
 
 def _retroreflected(camera: Camera, sign_x: float) -> NDArray[np.float32]:
-    """[3] radiance that white sheeting throws back of the headlights."""
+    """Radiance [3] of the headlights that white sheeting retroreflects."""
     middle = np.array([sign_x, 0.0, sign.HEIGHT_M])
     beam = lights.low_beam()
     total = 0.0
@@ -133,7 +133,7 @@ def _retroreflected(camera: Camera, sign_x: float) -> NDArray[np.float32]:
         column = int((ray[0] / ray[1] / half + 1) / 2 * beam.shape[1])
         row = int((1 - ray[2] / ray[1] / half * beam.shape[1] / beam.shape[0]) / 2 * beam.shape[0])
         if not (0 <= row < beam.shape[0] and 0 <= column < beam.shape[1]):
-            continue  # beside the beam
+            continue  # outside the beam
         lux = lights.BEAM_PEAK_CD * beam[row, column] * ray[1] / np.linalg.norm(ray) ** 3
         cosine = ray @ line / np.linalg.norm(ray) / np.linalg.norm(line)
         angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
@@ -143,14 +143,14 @@ def _retroreflected(camera: Camera, sign_x: float) -> NDArray[np.float32]:
 
 
 def _lamp(camera: Camera, x: float) -> Array:
-    """[3] where the headlight at `x` of the car's middle is."""
+    """Position [3] of the headlight at `x` from the middle of the car."""
     return camera.position + np.array([x, lights.HEADLIGHT_AHEAD_M, lights.HEADLIGHT_HEIGHT_M - camera.z])
 
 
 def _denoised(
     picture: NDArray[np.float32], albedo: NDArray[np.float32], normal: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Intel's Open Image Denoise, guided by albedo and normals."""
+    """Denoise with Intel's Open Image Denoise, guided by albedo and normals."""
     import pyoidn
 
     guides = {"albedo": np.ascontiguousarray(np.clip(albedo, 0, 1)), "normal": np.ascontiguousarray(normal)}
@@ -171,7 +171,7 @@ def _rgb(colour: Any) -> dict[str, Any]:
 
 
 def _bitmap(texture: NDArray[np.float32]) -> dict[str, Any]:
-    # A texture's first row is its top, and v points up.
+    # The first row of a texture is its top, but v points up.
     data = np.ascontiguousarray(texture[::-1] if texture.ndim == 3 else texture[::-1, :, None], np.float32)
     return {"type": "bitmap", "data": _mitsuba().TensorXf(data), "raw": True}
 
@@ -184,7 +184,7 @@ def _reflectance(material: Material, factor: float = 1.0) -> dict[str, Any]:
 
 @cache
 def _puddles() -> NDArray[np.float32]:
-    """Roughness of a wet road: films of water among damp asphalt."""
+    """Roughness of a wet road: films of water on damp asphalt."""
     share = np.clip((noise(1024, np.random.default_rng(5), 5, 6) - 0.42) * 4, 0, 1)
     return (0.07 + 0.33 * share).astype(np.float32)
 
@@ -243,7 +243,7 @@ def _shape(
 
 
 def _face(x: float) -> Mesh:
-    """The sign's face, with its texture's coordinates."""
+    """The face of the sign with its texture coordinates."""
     corners = sign.corners(x)
     fan = [[0, i, i + 1] for i in range(1, 7)]
     uv = (corners[:, ::2] - (x, sign.HEIGHT_M)) / sign.SIZE_M + 0.5
@@ -296,10 +296,10 @@ def _scene(parts: list[Part], light: Light, camera: Camera, sign_x: float) -> di
 
 @cache
 def _clear_sky(sun: tuple[float, float, float]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Radiance [H, W, 3] of a clear sky, as `Light.sky`, and irradiance [3] of its sun.
+    """Radiance [H, W, 3] of a clear sky, laid out as `Light.sky`, and irradiance [3] of its sun.
 
-    Mitsuba's own model of both (Hosek and Wilkie 2012, 2013) costs more a sample than all the rest of the scene; as a map and
-    a parallel beam they cost next to nothing.
+    Mitsuba's model of both (Hosek and Wilkie 2012, 2013) costs more per sample than the rest of the scene; as a map and a
+    parallel beam they cost almost nothing.
     """
     height = 128
     polar, azimuth = np.meshgrid(
@@ -307,7 +307,7 @@ def _clear_sky(sun: tuple[float, float, float]) -> tuple[NDArray[np.float32], ND
     )
     directions = np.stack([np.sin(polar) * np.sin(azimuth), np.sin(polar) * np.cos(azimuth), np.cos(polar)], -1)
     sky = _radiance({"sun_scale": 0.0}, sun, directions.reshape(-1, 3)).reshape(height, 2 * height, 3)
-    # Below the horizon the model is black; the far ground is not.
+    # The model is black below the horizon, but the distant ground is not.
     sky[height // 2 :] = 0.3 * sky[height // 2 - 1].mean(0)
     disc = _radiance({"sky_scale": 0.0}, sun, np.array([sun]))[0]
     limb_darkening = 0.8
@@ -315,7 +315,7 @@ def _clear_sky(sun: tuple[float, float, float]) -> tuple[NDArray[np.float32], ND
 
 
 def _radiance(scales: dict[str, float], sun: tuple[float, float, float], towards: NDArray[np.float64]) -> Array:
-    """[N, 3] what the sun and sky send from the directions [N, 3]."""
+    """Radiance [N, 3] of sun and sky from the directions [N, 3]."""
     mi = _mitsuba()
     emitter = mi.load_dict(
         {"type": "sunsky", "sun_direction": list(sun), "turbidity": 3.0, "albedo": 0.2, "sun_aperture": 0.533} | scales
@@ -340,7 +340,7 @@ def _headlights(camera: Camera) -> dict[str, Any]:
         found[f"headlight{number}"] = {
             "type": "projector",
             "irradiance": _bitmap(lights.low_beam()[::-1]),
-            # The projector's scale is pi times the intensity along its axis.
+            # The scale of the projector times pi is the intensity along its axis.
             "scale": lights.BEAM_PEAK_CD / np.pi,
             "fov": lights.BEAM_FIELD_DEG,
             "to_world": mi.ScalarTransform4f().look_at(

@@ -1,4 +1,4 @@
-"""Surfaces painted from a seed: linear reflectances, [H, W, 3] in [0, 1]."""
+"""Procedural textures from a seed: linear reflectances [H, W, 3] in [0, 1]."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ Colour = tuple[float, float, float]
 
 
 def noise(side: int, rng: Rng, octaves: int = 6, cells: int = 4, persistence: float = 0.55) -> NDArray[np.float32]:
-    """[side, side] value noise in [0, 1]: octaves of smoothed random grids, each `persistence` times as strong."""
+    """Value noise [side, side] in [0, 1]: octaves of smoothed random grids, with weights falling by `persistence`."""
     total, weight = np.zeros((side, side), np.float32), 1.0
     for octave in range(octaves):
         grid = min(cells * 2**octave, side)
         layer = rng.random((grid, grid)).astype(np.float32)
-        # The border is repeated so that the texture tiles.
+        # The border is repeated so that the texture can be tiled.
         layer = np.pad(layer, 2, mode="wrap")
         wide = round(side * (grid + 4) / grid)
         edge = round(2 * side / grid)
@@ -33,7 +33,7 @@ def between(share: NDArray[np.floating], low: Colour, high: Colour) -> Texture:
 
 
 def asphalt(rng: Rng, side: int = 2048) -> Texture:
-    """Worn asphalt for 16 m: stones, stains, tyre tracks and a few sealed cracks."""
+    """16 m of worn asphalt: stones, stains, tyre tracks and a few sealed cracks."""
     stones = cv2.GaussianBlur(rng.normal(size=(side, side)).astype(np.float32), (0, 0), 0.9) * 1.5
     share = 0.32 + 0.3 * (noise(side, rng, 5, 6) - 0.5) + 0.13 * stones
     surface = between(np.clip(share, 0, 1), (0.045, 0.045, 0.047), (0.2, 0.195, 0.19))
@@ -48,7 +48,7 @@ def asphalt(rng: Rng, side: int = 2048) -> Texture:
 
 
 def grass(rng: Rng, side: int = 1024) -> Texture:
-    """Mown grass for 5 m."""
+    """5 m of mown grass."""
     surface = between(noise(side, rng, 7, 4, 0.7), (0.03, 0.055, 0.015), (0.13, 0.19, 0.05))
     starts = rng.integers(0, side, (24_000, 2))
     ends = starts + rng.normal(0, 5, (24_000, 2)).astype(int)
@@ -66,14 +66,14 @@ def concrete(rng: Rng, side: int = 512) -> Texture:
 
 
 def leaves(rng: Rng, base: Colour) -> Texture:
-    """A palette that leaf quads take their colour from."""
+    """A palette of colours for leaf quads."""
     return (np.asarray(base) * rng.uniform(0.6, 1.5, (16, 16, 1)) + rng.uniform(0, 0.012, (16, 16, 3))).astype(
         np.float32
     )
 
 
 def facade(rng: Rng, kind: str, side: int = 1024, storeys: int = 4, columns: int = 5) -> Texture:
-    """A house front of `storeys` by `columns` windows, `brick` or `plaster`; its first row is the top."""
+    """A house front of `brick` or `plaster` with `storeys` by `columns` windows; the first row is the top."""
     if kind == "brick":
         surface = between(noise(side, rng, 6, 6), (0.2, 0.075, 0.05), (0.34, 0.15, 0.1))
         _bricks(surface, rng)

@@ -1,4 +1,4 @@
-"""Cars, vans and lorries as lofted bodies. Each stands at the origin with its rear towards -y."""
+"""Cars, vans and lorries as lofted bodies, at the origin with the rear towards -y."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ PAINTS = (
     (0.04, 0.12, 0.08),
     (0.35, 0.3, 0.22),
 )
-"""Linear reflectances."""
+"""Paint colours as linear reflectances."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Stations along a body from rear to front: y in m, lower and upper edge in m, half width in m there."""
+    """Cross sections of a vehicle from rear to front: y, lower edge, upper edge and half width, in m."""
 
     body: tuple[tuple[float, float, float, float], ...]
     cabin: tuple[tuple[float, float, float, float], ...] = ()
@@ -92,9 +92,9 @@ def vehicle(model: Model, paint: tuple[float, float, float], *, lights: bool = F
     """The parts of a vehicle.
 
     Args:
-        model: its kind.
+        model: kind of vehicle.
         paint: linear reflectance.
-        lights: whether its tail lights are on.
+        lights: whether the tail lights are on.
     """
     shape = SHAPES[model]
     coat = Material("paint", paint)
@@ -118,12 +118,12 @@ def vehicle(model: Model, paint: tuple[float, float, float], *, lights: bool = F
 
 
 def _loft(stations: tuple[tuple[float, float, float, float], ...], around: int = 32, rings: int = 40) -> Mesh:
-    """A smooth skin of rounded rectangles through the stations."""
+    """A smooth surface of rounded rectangles through the stations."""
     given = np.array(stations)
     between = np.interp(np.linspace(0, len(given) - 1, rings), np.arange(len(given)), given[:, 0])
     lengthwise = PchipInterpolator(given[:, 0], given[:, 1:])(between)
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
-    # A superellipse: square enough for a car, without an edge.
+    # A superellipse: nearly a rectangle, but without edges.
     cos, sin = np.cos(angle), np.sin(angle)
     across, up = np.sign(cos) * np.abs(cos) ** 0.45, np.sign(sin) * np.abs(sin) ** 0.45
     skin = [
@@ -134,7 +134,7 @@ def _loft(stations: tuple[tuple[float, float, float, float], ...], around: int =
 
 
 def _roof(shape: Shape) -> Mesh:
-    """The painted panel over the glass: the top of the cabin between its middle stations, a little higher."""
+    """The painted roof above the glass: slightly above the cabin between its middle stations."""
     (y0, _, z0, w0), (y1, _, z1, w1) = shape.cabin[1:3]
     stations = (
         (y0 - 0.1, z0 - 0.07, z0 + 0.0, 0.86 * w0),
