@@ -1,4 +1,4 @@
-"""Which tracks a component serves, read from its source: listing components imports none of them."""
+"""Reads from the source of a component which tracks it works on, without importing it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bench.plugins.registry import GROUPS, Kind
 
 
 def names(kind: Kind, track: str) -> list[str]:
-    """The components of a kind that serve a track."""
+    """The components of a kind that work on a track."""
     return [
         name
         for name, claims in registry.entries(GROUPS[kind]).items()
@@ -22,9 +22,9 @@ def names(kind: Kind, track: str) -> list[str]:
 
 
 def tracks_of(target: str) -> list[str]:
-    """The tracks of the class that an entry point names, `module:Class`; empty where the source does not say.
+    """The tracks of the class `module:Class` of an entry point; empty if the source does not tell.
 
-    They are every `track: ... = "..."` in the body of the class or of a base of it, as far as those can be followed by name.
+    They are the values of `track: ... = "..."` in the bodies of the class and its bases, where these can be followed by name.
     """
     module, _, name = target.partition(":")
     waiting, seen, found = [(module, name)], set(), set()
@@ -52,7 +52,7 @@ def tracks_of(target: str) -> list[str]:
 
 @cache
 def _top_level(module: str) -> tuple[dict[str, ast.ClassDef], dict[str, tuple[str, str]]]:
-    """The classes of a module, and the module and name behind each name it imports."""
+    """The classes of a module, and the origin (module, name) of each name that it imports."""
     path = file_of(module)
     if path is None or path.suffix != ".py":
         return {}, {}
