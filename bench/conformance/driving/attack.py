@@ -72,7 +72,7 @@ class AttackSuite(Suite):
             answer, _ = self._answer(self._victim(action_type), self._observations()[:0])
             require(
                 answer.shape[0] == 0,
-                f"{self._method} returned {answer.shape[0]} observations for an empty batch: if not len(observation): return observation",
+                f"{self._method} returned {answer.shape[0]} for an empty batch: if not len(observation): return observation",
             )
 
     def neighbours_do_not_matter(self) -> None:
