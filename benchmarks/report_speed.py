@@ -1,10 +1,9 @@
-"""`bench report html=PAGE` on a folder of a million episode records: wall time, memory and the size of the page.
+"""Measures `bench report html=PAGE` on a million episode records: wall time, memory and size of the page.
 
     python benchmarks/report_speed.py                    # a thousand files of a thousand records
-    python benchmarks/report_speed.py --units 1          # as `bench run` leaves them: ten thousand files, one a unit
+    python benchmarks/report_speed.py --units 1          # as `bench run` writes them: ten thousand files, one per unit
 
-The records are made up in the shape of real ones: what was measured is drawn at random,
-and what produced it is as long as in a real record.
+The records are synthetic: measurements are random, and provenance texts are as long as in real records.
 """
 
 from __future__ import annotations
@@ -24,10 +23,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bench.records.store import FOLDER, SCHEMA
+from bench.plugins.fingerprint import canonical
+from bench.plugins.track import track
+from bench.records.schema import schema
+from bench.records.store import FOLDER
+from bench.scenarios import Cell
 from envs.highway.axes import STANDARD_V1
+from envs.highway.world import HighwayWorld
 
 SEEDS, EPISODES, ATTACKS = 3, 100, 8
+SCHEMA, WORLD = schema(track("driving")), HighwayWorld()
 POLICY = {f"parameter_{number}": 0.125 for number in range(15)}
 MEASURE = """
 import resource, subprocess, sys, time
@@ -38,9 +43,8 @@ print(code, time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_
 """
 
 
-def unit(number: int, defense: str, attack: str, seed: int, cell: object, rng: np.random.Generator) -> pa.Table:
+def unit(number: int, defense: str, attack: str, seed: int, cell: Cell, rng: np.random.Generator) -> pa.Table:
     """The records of one unit of work."""
-    lanes, density, weather = (getattr(cell, name) for name in ("lanes", "density", "weather"))
     clean = attack == "none"
     digest = hashlib.sha256(str(number).encode()).hexdigest()
     constants = {
@@ -53,7 +57,7 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: object, rng: n
         "victim": "dqn",
         "victim_params": json.dumps(POLICY),
         "world": "highway",
-        "world_params": '{"backend":"batched","max_steps":450,"observed_vehicles":5}',
+        "world_params": canonical(WORLD),
         "action_type": "discrete",
         "sees": True,
         "training_seed": seed,
@@ -62,9 +66,8 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: object, rng: n
         "threat_access": "oblivious" if clean else "gradients",
         "threat_queries": 0 if clean else 1000,
         "grid": "standard-v1",
-        "lanes": lanes,
-        "density": density,
-        "weather": weather,
+        "cell": json.dumps(dict(cell), separators=(",", ":")),
+        "world_facts": json.dumps(WORLD.facts.written(), separators=(",", ":")),
         "attack_shipped_by": "cavbench 0.1.0",
         "weights_sha256": hashlib.sha256(f"{defense}{seed}".encode()).hexdigest(),
         "code_digest": hashlib.sha256(attack.encode()).hexdigest(),
@@ -86,14 +89,14 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: object, rng: n
 
 
 def write(out: Path, episodes: int, units: int) -> int:
-    """Write records and return the number of files; `units` of work a file."""
+    """Write records, `units` of work per file, and return the number of files."""
     folder = out / FOLDER
     folder.mkdir(parents=True)
     rng = np.random.default_rng(0)
     attacks = ["none", *(f"attack_{number}" for number in range(ATTACKS))]
-    every = itertools.product(range(episodes // EPISODES), attacks, range(SEEDS), STANDARD_V1.cells())
+    combinations = itertools.product(range(episodes // EPISODES), attacks, range(SEEDS), STANDARD_V1.cells())
     waiting, files = [], 0
-    for number, (place, attack, seed, cell) in enumerate(itertools.islice(every, episodes // EPISODES)):
+    for number, (place, attack, seed, cell) in enumerate(itertools.islice(combinations, episodes // EPISODES)):
         waiting.append(unit(number, f"defense_{place}", attack, seed, cell, rng))
         if len(waiting) == units:
             pq.write_table(pa.concat_tables(waiting), folder / f"{number:06d}.parquet", compression="zstd")
@@ -102,23 +105,21 @@ def write(out: Path, episodes: int, units: int) -> int:
 
 
 def main() -> None:
-    """Print one line of figures."""
-    parser = argparse.ArgumentParser(description="How long `bench report html=PAGE` takes on a million records.")
+    """Write the records, measure the report and print the results."""
+    parser = argparse.ArgumentParser(description="Measure `bench report html=PAGE` on a million records.")
     parser.add_argument("--episodes", type=int, default=1_000_000)
-    parser.add_argument("--units", type=int, default=10, help="units of work (of 100 episodes) a file")
-    words = parser.parse_args()
+    parser.add_argument("--units", type=int, default=10, help="units of work (100 episodes each) per file")
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         out, page = Path(folder) / "results", Path(folder) / "leaderboard.html"
         start = time.perf_counter()
-        files = write(out, words.episodes, words.units)
-        print(f"{words.episodes} records in {files} files, written in {time.perf_counter() - start:.0f} s")
+        files = write(out, arguments.episodes, arguments.units)
+        print(f"{arguments.episodes} records in {files} files, written in {time.perf_counter() - start:.0f} s")
         command = [sys.executable, "-c", MEASURE, f"out={out}", f"html={page}"]
         code, wall, cpu, memory = map(float, subprocess.run(command, capture_output=True, text=True).stdout.split())
         if code:
             sys.exit("bench report failed")
-        print(
-            f"page in {wall:.1f} s ({cpu:.1f} s of processor time), {memory:.2f} GB, {page.stat().st_size / 1e6:.2f} MB"
-        )
+        print(f"page in {wall:.1f} s ({cpu:.1f} s of CPU time), {memory:.2f} GB, {page.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":
