@@ -48,7 +48,7 @@ def test_what_the_access_forbids_is_refused(access: Access, allowed: int) -> Non
         if number < allowed:
             ask(pictures(1))
         else:
-            with pytest.raises(UserError, match=f"declares that it needs '{access}' only"):
+            with pytest.raises(UserError, match=f"declares only '{access}'"):
                 ask(pictures(1))
     assert door.spent == allowed
 
