@@ -111,9 +111,9 @@ class Suite(ABC):
         return f" ({Path(file).name}, line {lines[-1]})" if file and lines else ""
 
 
-def require(held: object, complaint: str) -> None:
-    """Raise BrokenRuleError with the complaint unless `held` is true."""
-    if not held:
+def require(condition: object, complaint: str) -> None:
+    """Raise BrokenRuleError with the complaint unless `condition` is true."""
+    if not condition:
         raise BrokenRuleError(complaint)
 
 

@@ -43,10 +43,10 @@ def tracks_of(target: str) -> list[str]:
                     found.add(track)
         for base in classes[name].bases:
             match base:
-                case ast.Name(id=own):
-                    waiting.append((module, own))
-                case ast.Attribute(value=ast.Name(id=parent), attr=own):
-                    waiting.append((".".join(filter(None, imported.get(parent, (parent, "")))), own))
+                case ast.Name(id=parent_class):
+                    waiting.append((module, parent_class))
+                case ast.Attribute(value=ast.Name(id=parent), attr=parent_class):
+                    waiting.append((".".join(filter(None, imported.get(parent, (parent, "")))), parent_class))
     return sorted(found)
 
 

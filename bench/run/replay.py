@@ -59,7 +59,7 @@ def find(records: pa.Table, where: Mapping[str, str]) -> dict[str, Any]:
         if not left.num_rows:
             values = sorted(set(column.drop_null().to_pylist()))
             shown = ", ".join(map(str, values[:12])) + (f", … {values[-1]}" if len(values) > 12 else "")
-            raise UserError(f"no record has {name}={value}; there are {shown}")
+            raise UserError(f"no record has {name}={value}; known values: {shown}")
         records = left
     return records.slice(0, 1).to_pylist()[0]
 

@@ -141,9 +141,9 @@ class Episodes:
         return Episodes.arrange(table)
 
 
-def _places(own: Sequence[object], wanted: Collection[object] | None) -> list[int]:
+def _places(values: Sequence[object], wanted: Collection[object] | None) -> list[int]:
     kept = None if wanted is None else set(wanted)
-    return [place for place, value in enumerate(own) if kept is None or value in kept]
+    return [place for place, value in enumerate(values) if kept is None or value in kept]
 
 
 def _distinct(column: pa.ChunkedArray) -> tuple[list[Any], NDArray[np.int64]]:

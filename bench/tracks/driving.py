@@ -85,7 +85,8 @@ class DrivingTrack(Track):
     )
     legend: ClassVar[str] = (
         "safe progress: 0 if the car crashes or leaves the road, otherwise its mean progress. success: share of steps in which "
-        "the attack changed the decision. TTC: time to collision with the car ahead."
+        "the attack changed the decision. TTC: time to collision with the car ahead. best blind: the best policy that "
+        "ignores its input."
     )
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
         BEST_BLIND: Baseline(title="best blind policy", heading="best\nblind", spare=0),

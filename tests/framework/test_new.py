@@ -78,7 +78,7 @@ def test_an_existing_folder_is_not_overwritten(bench: Bench, tmp_path: Path) -> 
         (("atack", "my_attack"), "unknown kind 'atack'; did you mean 'attack'?"),
         (("world", "my_world"), "unknown kind 'world'; known: attack, defense, victim"),
         (("attack", "my_attack", "track=street"), "unknown track 'street'; known: detection, driving"),
-        (("attack", "my_attack", "trak=driving"), "unknown word 'trak=driving'"),
+        (("attack", "my_attack", "trak=driving"), "unknown option 'trak=driving'"),
         (("attack", "my_attack", "out=/proc/none/here"), "cannot be written"),
     ],
 )

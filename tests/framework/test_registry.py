@@ -58,7 +58,7 @@ BROKEN = {
         "from bench.driving.contracts import DrivingAttack\n"
         "class Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
     ),
-    "takes steps by position": (
+    "has the positional parameters steps": (
         "from dataclasses import dataclass\nfrom bench.driving.contracts import DrivingAttack\n"
         "@dataclass(frozen=True)\nclass Plugin(DrivingAttack):\n    steps: int = 1\n    def perturb(self, o, oracle): ...\n"
     ),

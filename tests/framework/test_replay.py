@@ -61,7 +61,7 @@ def test_view_lists_recordings_and_records_other_episodes(bench: Bench, folder: 
     assert "Replayed bit for bit" in made.out
     listed = bench("view", str(folder))
     assert "has 2 recordings" in listed.out
-    assert_one_line(bench("view", str(folder), "lanes=5"), "no record has lanes=5; there are 3")
+    assert_one_line(bench("view", str(folder), "lanes=5"), "no record has lanes=5; known values: 3")
     assert_one_line(bench("view", str(folder), "lane=3"), "unknown column 'lane'; did you mean 'lanes'?")
     assert_one_line(bench("view", str(folder), "seed=first"), "cannot read seed=first: the column holds int64")
     assert_one_line(bench("view", "none", "--out", str(folder)), "has no recordings; record an episode")
