@@ -66,7 +66,7 @@ CANNOT_BE_LOADED = {
     ),
     "a check that fails itself": (
         f"{HEAD}{GOOD}    def __post_init__(self):\n        [][0]\n",
-        "attack 'wrong' cannot be made: IndexError: list index out of range",
+        "attack 'wrong' cannot be created: IndexError: list index out of range",
     ),
     "a default that is refused": (
         f"{HEAD}{GOOD}    def __post_init__(self):\n        raise ValueError('speed must be above 0')\n",
@@ -107,15 +107,15 @@ FAILS_AT_WORK = {
     ("attack=crooked", "attack.rule=shape"): "Crooked.perturb returned shape (2, 2, 2), not (2, 2, 3)",
     ("attack=crooked", "attack.rule=nothing"): "Crooked.perturb returned a NoneType, not (2, 2, 3)",
     ("attack=crooked", "attack.rule=nan"): "Crooked.perturb returned numbers that are NaN or infinite",
-    ("attack=crooked", "attack.rule=raise"): "ZeroDivisionError: at a loss (--debug shows where)",
+    ("attack=crooked", "attack.rule=raise"): "ZeroDivisionError: at a loss (--debug shows the traceback)",
     ("attack=crooked", "attack.rule=access"): "the attack used access 'gradients', but declares only 'scores'",
     (
         "attack=crooked",
         "attack.rule=greedy",
         "threat.queries=2",
     ): "asked for 3 queries in a step, the threat model allows 2",
-    ("attack=crooked", "threat.access=oblivious"): "attack 'crooked' needs access 'scores', the threat model allows",
-    ("victim=bad", "victim.rule=nothing"): "none + bad(rule=nothing) is a NoneType where a Policy is needed",
+    ("attack=crooked", "threat.access=oblivious"): "attack 'crooked' needs access 'scores', but the threat model allows",
+    ("victim=bad", "victim.rule=nothing"): "none + bad(rule=nothing) loads a NoneType, but a Policy is needed",
     ("victim=bad", "victim.rule=raise"): "none + bad(rule=raise) cannot be loaded: ZeroDivisionError: at a loss",
 }
 

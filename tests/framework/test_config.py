@@ -113,7 +113,7 @@ BAD = {
     "seeds=-1": "seeds must be distinct whole numbers of at least 0, got -1",
     "record=101": "record must be between 0 and the 100 episodes, got 101",
     "attack=zo attack=pgd": "attack is given twice",
-    "attack=": "attack has no value",
+    "attack=": "attack has an empty value",
     "zo": "cannot read 'zo': write key=value",
     "+attack=zo": "cannot read '+attack=zo': write key=value",
 }

@@ -71,7 +71,7 @@ def test_the_victim_determines_the_track_and_the_track_the_defaults() -> None:
 
 BAD = {
     "attack=noise victim=red world=red_street": "attack 'noise' does not fit victim 'red' of the detection track; fitting:",
-    "attack=paint victim=toy world=toy": "attack 'paint' does not fit victim 'toy' of the driving track; fitting: art, noise",
+    "attack=paint victim=toy world=toy": "attack 'paint' does not fit victim 'toy' of the driving track; fitting: art, bias, noise",
     "victim=red world=highway": "world 'highway' does not fit victim 'red' of the detection track; fitting: ",
     "victim=toy,red": "victims 'toy' (driving) and 'red' (detection) belong to different tracks",
     "victim=red world=red_street threat.norm=linf": "unknown threat.norm 'linf'; known: patch",

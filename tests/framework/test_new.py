@@ -70,7 +70,7 @@ def test_an_existing_folder_is_not_overwritten(bench: Bench, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (("attack", "zo"), "attack 'zo' is shipped by cavbench"),
+        (("attack", "zo"), "attack 'zo' is already shipped by cavbench"),
         (("attack", "MyAttack"), "'MyAttack' is not a valid name for an attack: write lower-case words joined by _"),
         (("attack", "my-attack"), "'my-attack' is not a valid name for an attack"),
         (("defense", "class"), "'class' is not a valid name for a defence"),
