@@ -1,11 +1,11 @@
-"""cavbench by the name that pip knows: `import cavbench` fails in one line if a user's file shadows one of its packages."""
+"""The module `cavbench`: importing it fails with one line if a user's file shadows one of its packages."""
 
 from __future__ import annotations
 
 import runpy
 from pathlib import Path
 
-# Loaded from its file: a user's own `bench.py` may be what Python finds as `bench`.
+# Loaded from its file, because Python may find a user's `bench.py` as `bench`.
 runpy.run_path(str(Path(__file__).with_name("bench") / "shadow.py"))["check"]("bench")
 
 from bench import __version__  # noqa: E402

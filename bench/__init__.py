@@ -1,4 +1,4 @@
-"""cavbench: how much does this attack hurt this defence of an automated vehicle?"""
+"""cavbench: a benchmark for the adversarial robustness of driving policies and object detectors."""
 
 from bench import shadow
 

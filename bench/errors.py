@@ -1,12 +1,12 @@
-"""The one exception that the command line turns into one clear line and a non-zero exit."""
+"""The exception that the command line prints as one line, with a non-zero exit code."""
 
 from __future__ import annotations
 
 
 class UserError(Exception):
-    """Bad input: the message says in one line what was wrong, what is allowed and, where it helps, what to type instead."""
+    """Bad input. The message is one line: what was wrong, what is allowed and, if it helps, what to type instead."""
 
 
 def reason(error: BaseException) -> str:
-    """Kind and first line of an exception: why something failed, in one line."""
+    """The type and the first line of an exception: why something failed, in one line."""
     return f"{type(error).__name__}: {error}".splitlines()[0]

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, whenever the process is killed."""
+"""Atomic file writes: a file appears whole or not at all, even if the process is killed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 @contextmanager
 def whole(path: Path) -> Iterator[BinaryIO]:
-    """A binary file to write `path` with: written aside, synced, and renamed at the end; not at all if the block raises."""
+    """Open a binary file that becomes `path`: a temporary file, synced and renamed at the end, deleted if the block raises."""
     handle, aside = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-", suffix=".tmp")
     try:
         with os.fdopen(handle, "wb") as file:

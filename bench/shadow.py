@@ -1,4 +1,4 @@
-"""Python takes the first module of a name on its path: says when a user's file or folder comes before cavbench's."""
+"""Reports when a user's file or folder shadows a package of cavbench on the import path."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def check(*packages: str) -> None:
     """Make sure that Python finds cavbench's own packages.
 
     Args:
-        packages: their names; without any, those beside `bench`.
+        packages: names of the packages; by default those installed beside `bench`.
 
     Raises:
-        ImportError: with one line, if another file or folder comes first on the import path.
-        SystemExit: with that line on standard error and exit code 2, in the command `bench` and in `python -m bench`.
+        ImportError: if another file or folder comes first on the import path; the message is one line.
+        SystemExit: instead, in the command `bench` and in `python -m bench`: the line on standard error and exit code 2.
     """
     for name in packages or PACKAGES:
         if line := _shadowed(name, ROOT):
@@ -30,13 +30,13 @@ def check(*packages: str) -> None:
 
 
 def explanation(module: str, distribution: str) -> str:
-    """What comes before a module that a distribution ships, in one line; empty if nothing does.
+    """Say in one line what shadows a module of a distribution; empty if nothing does.
 
     Args:
-        module: of an entry point.
-        distribution: name of the pip package.
+        module: module of an entry point.
+        distribution: name of the pip package that ships it.
     """
-    from importlib import metadata  # 40 ms, which `import bench` does not need
+    from importlib import metadata  # takes 40 ms, which `import bench` can do without
 
     name = module.partition(".")[0]
     if name in PACKAGES and distribution == "cavbench":
@@ -49,12 +49,12 @@ def explanation(module: str, distribution: str) -> str:
 
 def _shadowed(name: str, root: str, owner: str = "cavbench") -> str:
     candidates = (os.path.join(root, name, "__init__.py"), os.path.join(root, f"{name}.py"))
-    own = {os.path.realpath(path) for path in candidates if os.path.isfile(path)}
+    expected = {os.path.realpath(path) for path in candidates if os.path.isfile(path)}
     try:
         found = find_spec(name)
-    except ValueError:  # a module made by hand has no spec
+    except ValueError:  # a module created by hand has no spec
         return ""
-    if not own or found is None or not found.origin or os.path.realpath(found.origin) in own:
+    if not expected or found is None or not found.origin or os.path.realpath(found.origin) in expected:
         return ""
     path = found.origin.removesuffix(f"{os.sep}__init__.py")
     return f"{path} shadows {name!r} of {owner}: rename it, or start Python in another folder"

@@ -1,13 +1,12 @@
-"""How many times faster than highway-env the driving world is, per CPU second of one thread.
+"""Measures how much faster than highway-env the driving world is, per CPU second of one thread:
 
     python benchmarks/highway_speed.py [--rounds 9] [--steps 50] [--vehicles 20 50] [--batch 64 1024]
 
-One run, interleaved: every round drives highway-env, the engine and the TorchRL environment through the same stretch of
-episodes, so that whatever else the machine does meets all three. 3 lanes, density 1, 15 Hz; highway-env's own IDM
-driver steers the ego in all three, which keeps it in the traffic: a braking ego would soon be alone, a random one
-would crash.
-Compilation is not counted. A TorchRL step is `step_and_maybe_reset`, which also prepares the next step's tensordict and
-restarts finished episodes, as a collector does.
+Every round drives highway-env, the engine and the TorchRL environment through the same part of the episodes, so that other load
+on the machine affects all three. 3 lanes, density 1, 15 Hz. highway-env's IDM driver drives the ego in all three and keeps it
+in traffic: an ego that only brakes would soon be alone, a random one would crash.
+Compilation is not counted. A TorchRL step is `step_and_maybe_reset`, which also prepares the tensordict of the next step and
+resets finished episodes, as a collector does.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ ENGINE_GOAL, ENVIRONMENT_GOAL = 700, 500
 
 @dataclass
 class Contender:
-    """One way to drive: `drive(steps)` drives and says how many episode steps that were."""
+    """One of the compared simulators: `drive(steps)` returns the number of episode steps that it drove."""
 
     drive: Callable[[int], int]
     done: int = 0
@@ -48,7 +47,7 @@ class Contender:
     rounds: list[float] = field(default_factory=list)
 
     def measure(self, steps: int) -> None:
-        """Drive on for some steps, on the CPU's clock."""
+        """Drive some steps and add their CPU time."""
         start = time.process_time()
         done = self.drive(steps)
         seconds = time.process_time() - start
@@ -63,7 +62,7 @@ class Contender:
 
 
 def highway_env(vehicles: int) -> Contender:
-    """The real thing, one episode."""
+    """highway-env itself, one episode."""
     env = SensedHighwayEnv(HighwayConfig(cells=(CELL,), vehicles=vehicles, driver="idm"), CELL)
     env.start(int(SeedBlock.TUNE))
 
@@ -76,7 +75,7 @@ def highway_env(vehicles: int) -> Contender:
 
 
 def engine(vehicles: int, batch: int) -> Contender:
-    """The compiled engine alone."""
+    """The compiled engine without TorchRL."""
     simulator = HighwayEngine(HighwayConfig(cells=(CELL,) * batch, vehicles=vehicles, driver="idm", max_steps=10**9))
     simulator.reset(np.arange(batch), int(SeedBlock.TUNE) + np.arange(batch))
     action = np.full(batch, IDLE)
@@ -91,7 +90,7 @@ def engine(vehicles: int, batch: int) -> Contender:
 
 
 def environment(vehicles: int, batch: int) -> Contender:
-    """The TorchRL environment around it."""
+    """The TorchRL environment of the engine."""
     env = BatchedHighway(HighwayConfig(cells=(CELL,) * batch, vehicles=vehicles, driver="idm"))
     seeds = int(SeedBlock.TUNE) + torch.arange(batch)
     state = env.reset(TensorDict({"seed": seeds}, batch_size=[batch]))
@@ -108,7 +107,7 @@ def environment(vehicles: int, batch: int) -> Contender:
 
 
 def compare(vehicles: int, batches: tuple[int, ...], rounds: int, steps: int) -> list[list[str]]:
-    """Rows of the table for one number of vehicles."""
+    """The rows of the table for one number of vehicles."""
     farama = highway_env(vehicles)
     pairs = [(batch, engine(vehicles, batch), environment(vehicles, batch)) for batch in batches]
     for contender in (farama, *(c for _, *both in pairs for c in both)):
@@ -133,18 +132,20 @@ def compare(vehicles: int, batches: tuple[int, ...], rounds: int, steps: int) ->
 
 
 def ratio(ours: Contender, farama: Contender, goal: int) -> tuple[str, str]:
-    """How many times as fast (green where the goal is met), and the least and greatest of the rounds."""
+    """The ratio of the rates (green if it reaches the goal), and its range over the rounds."""
     value = ours.rate / farama.rate
-    each = [a / b for a, b in zip(ours.rounds, farama.rounds, strict=True)]
+    ratios = [a / b for a, b in zip(ours.rounds, farama.rounds, strict=True)]
     colour = "green" if value >= goal else "red"
-    return f"[{colour}]{value:,.0f} x[/{colour}]", f"{min(each):,.0f}-{max(each):,.0f}"
+    return f"[{colour}]{value:,.0f} x[/{colour}]", f"{min(ratios):,.0f}-{max(ratios):,.0f}"
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=9, help="rounds a configuration (9 rounds of 50 are one episode)")
-    parser.add_argument("--steps", type=int, default=50, help="steps of each contender in a round")
+    parser.add_argument(
+        "--rounds", type=int, default=9, help="rounds per configuration (9 rounds of 50 steps are one episode)"
+    )
+    parser.add_argument("--steps", type=int, default=50, help="steps of each simulator per round")
     parser.add_argument("--vehicles", type=int, nargs="+", default=[20, 50])
     parser.add_argument("--batch", type=int, nargs="+", default=[64, 1024])
     arguments = parser.parse_args()
@@ -158,7 +159,7 @@ def main() -> None:
     for vehicles in arguments.vehicles:
         for row in compare(vehicles, tuple(arguments.batch), arguments.rounds, arguments.steps):
             table.add_row(*row)
-    # Piped output has no width of its own; the table needs more than the usual 80 columns.
+    # Piped output has no width; the table needs more than the default of 80 columns.
     Console(width=max(Console().width, 100)).print(table)
 
 

@@ -1,10 +1,10 @@
-"""What crafting a patch costs beside the detector's own passes, and how long scoring one takes. One command:
+"""Measures the time of crafting a patch, compared with the detector's passes alone, and of scoring a patch:
 
     python benchmarks/patch_speed.py [--bank FOLDER] [--rounds 10] [--steps 4]
 
-Steps of `eot` at its defaults and as many forward and backward passes of the detector alone take turns, in one process and
-one thread; so do rendering the frames of an approach, and rendering and looking at them. Medians over the rounds, for a machine
-that does other things too; of "times", the median of what each round says.
+Alternates steps of `eot` at its defaults with as many forward and backward passes of the detector alone, in one process and one
+thread; likewise rendering the frames of an approach with rendering and detecting. Prints medians over the rounds, because the
+machine may be busy; "times" is the median of the ratios of the rounds.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ CLOCKS = ("processor", "wall")
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--bank", default="", help="folder of rendered frames (default: those that ship)")
+    parser.add_argument("--bank", default="", help="folder of rendered frames (default: the shipped ones)")
     parser.add_argument("--rounds", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=4, help="of the attack in a round")
-    words = parser.parse_args()
+    parser.add_argument("--steps", type=int, default=4, help="steps of the attack per round")
+    arguments = parser.parse_args()
     settle()
     torch.manual_seed(0)
-    world, detector = StopSignApproach(bank=words.bank), YOLOv3Tiny().load(0, StopSignApproach().facts)
+    world, detector = StopSignApproach(bank=arguments.bank), YOLOv3Tiny().load(0, StopSignApproach().facts)
     try:
-        craft(detector, world.training_scenes(), words.rounds, words.steps)
-        score(detector, world, words.rounds)
+        craft(detector, world.training_scenes(), arguments.rounds, arguments.steps)
+        score(detector, world, arguments.rounds)
     except UserError as error:
         raise SystemExit(str(error)) from None
 
 
 def craft(detector: Detector, scenes: Scenes, rounds: int, steps: int) -> None:
-    """Print what a step of `eot` costs, with its share of the first look at every frame."""
+    """Print the time of a step of `eot`, including its share of the first rendering of all frames."""
     attack, generator = EOT(steps=steps), torch.Generator().manual_seed(0)
     pictures = torch.rand(attack.batch, 3, attack.window, attack.window, generator=generator)
     label = detector.index(STOP_SIGN)
@@ -59,53 +59,53 @@ def craft(detector: Detector, scenes: Scenes, rounds: int, steps: int) -> None:
     def step() -> None:
         attack.craft(PatchOracle(detector, THREAT, attack.access, generator), scenes, lambda share, text: None)
 
-    def first_look() -> None:
+    def first_rendering() -> None:
         for frame in torch.arange(len(scenes)).split(1):
             scenes.render(frame, None, THREAT.budget)
 
-    first = seconds(first_look) / EOT.steps
+    first = seconds(first_rendering) / EOT.steps
     alone, whole = turns(passes, step, rounds=rounds) / steps
     whole += first[:, None]
     print(f"a step of eot: yolov3_tiny, batch {attack.batch}, windows of {attack.window} x {attack.window}, one thread")
     for clock, name in enumerate(CLOCKS):
-        each, times = np.median((alone[clock], whole[clock]), 1) * 1000, np.median(whole[clock] / alone[clock])
-        print(f"  {name:<9}  detector {each[0]:5.0f} ms   step {each[1]:5.0f} ms   {times:.2f} times (goal: 1.3)")
+        medians, times = np.median((alone[clock], whole[clock]), 1) * 1000, np.median(whole[clock] / alone[clock])
+        print(f"  {name:<9}  detector {medians[0]:5.0f} ms   step {medians[1]:5.0f} ms   {times:.2f} times (goal: 1.3)")
 
 
 def score(detector: Detector, world: StopSignApproach, rounds: int) -> None:
-    """Print what a frame of an approach costs, and what that makes for the standard grid."""
+    """Print the time of one frame of an approach, and of the standard grid."""
     texels = torch.rand(3, EOT.texels, EOT.texels)
 
     def scenes() -> Scenes:
         return world.approaches(GRID.cells()[0], GRID.seeds()[:1])[0].scenes
 
-    every = torch.arange(len(scenes()))
+    frames = torch.arange(len(scenes()))
     with torch.no_grad():
         rendering, looking = turns(
-            lambda: scenes().render(every, texels.unsqueeze(0), THREAT.budget),
+            lambda: scenes().render(frames, texels.unsqueeze(0), THREAT.budget),
             lambda: look(detector, scenes(), texels, THREAT.budget),
             rounds=rounds,
-        ) / len(every)
+        ) / len(frames)
     height, width = scenes().size
-    frames = len(GRID.cells()) * len(GRID.seeds()) * len(every)
-    print(f"scoring a texture: yolov3_tiny, batch {len(every)}, pictures of {width} x {height}, one thread")
+    total = len(GRID.cells()) * len(GRID.seeds()) * len(frames)
+    print(f"scoring a patch: yolov3_tiny, batch {len(frames)}, images of {width} x {height}, one thread")
     for clock, name in enumerate(CLOCKS):
         rendered, seen = np.median((rendering[clock], looking[clock]), 1)
         print(
             f"  {name:<9}  rendering {rendered * 1000:4.0f} ms   with the detector {seen * 1000:4.0f} ms a frame, "
             f"{1 / seen:.1f} frames a second"
         )
-        whole = frames * seen / WORKERS
-        print(f"             {GRID.name}: {frames} frames, {WORKERS} workers, {whole:.0f} s (goal: 180 s)")
+        whole = total * seen / WORKERS
+        print(f"             {GRID.name}: {total} frames, {WORKERS} workers, {whole:.0f} s (goal: 180 s)")
 
 
 def turns(*works: Callable[[], object], rounds: int) -> np.ndarray:
-    """[works, 2, rounds] seconds of each work, of the processor and on the wall, in turns; after one round to warm up."""
+    """[works, 2, rounds] CPU and wall seconds of each work, alternating, after one round to warm up."""
     return np.array([[seconds(work) for work in works] for _ in range(rounds + 1)][1:]).transpose(1, 2, 0)
 
 
 def seconds(work: Callable[[], object]) -> np.ndarray:
-    """[2] of the processor and on the wall."""
+    """[2] CPU and wall seconds of a work."""
     start = np.array([time.process_time(), time.perf_counter()])
     work()
     return np.array([time.process_time(), time.perf_counter()]) - start

@@ -1,10 +1,9 @@
-"""`bench report html=PAGE` on a folder of a million episode records: wall time, memory and the size of the page.
+"""Measures `bench report html=PAGE` on a million episode records: wall time, memory and size of the page.
 
     python benchmarks/report_speed.py                    # a thousand files of a thousand records
-    python benchmarks/report_speed.py --units 1          # as `bench run` leaves them: ten thousand files, one a unit
+    python benchmarks/report_speed.py --units 1          # as `bench run` writes them: ten thousand files, one per unit
 
-The records are made up in the shape of real ones: what was measured is drawn at random,
-and what produced it is as long as in a real record.
+The records are synthetic: measurements are random, and provenance texts are as long as in real records.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: Cell, rng: np.
         "victim": "dqn",
         "victim_params": json.dumps(POLICY),
         "world": "highway",
-        "world_params": '{"backend":"batched","max_steps":450,"observed_vehicles":5}',
+        "world_params": canonical(WORLD),
         "action_type": "discrete",
         "sees": True,
         "training_seed": seed,
@@ -91,14 +90,14 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: Cell, rng: np.
 
 
 def write(out: Path, episodes: int, units: int) -> int:
-    """Write records and return the number of files; `units` of work a file."""
+    """Write records, `units` of work per file, and return the number of files."""
     folder = out / FOLDER
     folder.mkdir(parents=True)
     rng = np.random.default_rng(0)
     attacks = ["none", *(f"attack_{number}" for number in range(ATTACKS))]
-    every = itertools.product(range(episodes // EPISODES), attacks, range(SEEDS), STANDARD_V1.cells())
+    combinations = itertools.product(range(episodes // EPISODES), attacks, range(SEEDS), STANDARD_V1.cells())
     waiting, files = [], 0
-    for number, (place, attack, seed, cell) in enumerate(itertools.islice(every, episodes // EPISODES)):
+    for number, (place, attack, seed, cell) in enumerate(itertools.islice(combinations, episodes // EPISODES)):
         waiting.append(unit(number, f"defense_{place}", attack, seed, cell, rng))
         if len(waiting) == units:
             pq.write_table(pa.concat_tables(waiting), folder / f"{number:06d}.parquet", compression="zstd")
@@ -107,23 +106,21 @@ def write(out: Path, episodes: int, units: int) -> int:
 
 
 def main() -> None:
-    """Print one line of figures."""
-    parser = argparse.ArgumentParser(description="How long `bench report html=PAGE` takes on a million records.")
+    """Write the records, measure the report and print the results."""
+    parser = argparse.ArgumentParser(description="Measure `bench report html=PAGE` on a million records.")
     parser.add_argument("--episodes", type=int, default=1_000_000)
-    parser.add_argument("--units", type=int, default=10, help="units of work (of 100 episodes) a file")
-    words = parser.parse_args()
+    parser.add_argument("--units", type=int, default=10, help="units of work (100 episodes each) per file")
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         out, page = Path(folder) / "results", Path(folder) / "leaderboard.html"
         start = time.perf_counter()
-        files = write(out, words.episodes, words.units)
-        print(f"{words.episodes} records in {files} files, written in {time.perf_counter() - start:.0f} s")
+        files = write(out, arguments.episodes, arguments.units)
+        print(f"{arguments.episodes} records in {files} files, written in {time.perf_counter() - start:.0f} s")
         command = [sys.executable, "-c", MEASURE, f"out={out}", f"html={page}"]
         code, wall, cpu, memory = map(float, subprocess.run(command, capture_output=True, text=True).stdout.split())
         if code:
             sys.exit("bench report failed")
-        print(
-            f"page in {wall:.1f} s ({cpu:.1f} s of processor time), {memory:.2f} GB, {page.stat().st_size / 1e6:.2f} MB"
-        )
+        print(f"page in {wall:.1f} s ({cpu:.1f} s of CPU time), {memory:.2f} GB, {page.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

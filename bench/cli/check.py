@@ -1,4 +1,4 @@
-"""`bench check`: carries out the checks of a component, and prints a line each."""
+"""`bench check`: runs the checks of a component, and prints one line for each."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from bench.conformance.check import Outcome
 
 TRIED_WITH = ("victim", "world")
-"""Keys that choose what a component is tried together with."""
+"""Keys that choose the victim and the world to check a component with."""
 MARKS = {"pass": ("✓", "green"), "fail": ("✗ fix", "bold red"), "skip": ("– skipped", "dim")}
 
 
 def print_checks(name: str, words: Sequence[str], console: Console) -> int:
-    """Carry out the checks of every component of this name, print them, and return 1 if any failed, else 0.
+    """Run the checks of every component of this name, print them, and return 1 if any failed, otherwise 0.
 
     Raises:
-        UserError: if no component has the name, its plug-in is broken, or a word cannot be read.
+        UserError: if no component has the name, its plug-in is broken, or an option cannot be parsed.
     """
     from bench.conformance import examine
     from bench.run.process import settle
@@ -40,14 +40,14 @@ def print_checks(name: str, words: Sequence[str], console: Console) -> int:
     failed = False
     for kind in kinds:
         console.print(heading(kind, name))
-        own = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{kind}.")}
+        values = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{kind}.")}
         with console.status("checking"):
             tried_with = {key: given.get(key, "") for key in TRIED_WITH}
-            outcomes = list(examine(kind, name, own, **tried_with))
+            outcomes = list(examine(kind, name, values, **tried_with))
         console.print(_table(outcomes))
         counts = Counter(outcome.status for outcome in outcomes)
-        told = f"{counts['pass']} passed, {counts['fail']} to fix, {counts['skip']} skipped\n"
-        console.print(Text(told, style="bold red" if counts["fail"] else "green"))
+        summary = f"{counts['pass']} passed, {counts['fail']} to fix, {counts['skip']} skipped\n"
+        console.print(Text(summary, style="bold red" if counts["fail"] else "green"))
         failed = failed or counts["fail"] > 0
     return int(failed)
 
@@ -68,7 +68,7 @@ def _read(word: str) -> tuple[str, str]:
     key, equals, value = word.partition("=")
     if not (equals and value and (key in TRIED_WITH or "." in key)):
         raise UserError(
-            f"cannot read {word!r}: write attack.steps=50 for a parameter, victim=NAME for the victim that a defence is tried "
-            "on, or world=NAME for the world that it is tried in"
+            f"cannot read {word!r}: write, for instance, attack.steps=50 to set a parameter, victim=NAME to choose the victim of "
+            "a defence, or world=NAME to choose the world"
         )
     return key, value

@@ -1,4 +1,4 @@
-"""`bench fetch`: the published files there are, and fetching them."""
+"""`bench fetch`: lists and downloads published files."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from bench.victims import fetch
 
 
 def print_downloads(console: Console) -> None:
-    """Every file with its size, licence and origin, and whether it is in the cache."""
+    """Print every file with its size, licence and source, and whether it is in the cache."""
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for column in ("name", "size", "licence", "here", "from"):
+    for column in ("name", "size", "licence", "cached", "source"):
         table.add_column(column, overflow="fold")
     for name, download in fetch.DOWNLOADS.items():
-        here = "yes" if fetch.cached(name) else "no"
+        cached = "yes" if fetch.cached(name) else "no"
         size = f"{download.size / 1e6:.1f} MB"
-        table.add_row(Text(name, style="bold"), size, download.licence, here, Text(download.source))
+        table.add_row(Text(name, style="bold"), size, download.licence, cached, Text(download.source))
     console.print(table)
-    console.print(Text(f"\n`bench fetch NAME` fetches one into {fetch.cache()}.", style="dim"), soft_wrap=True)
+    console.print(Text(f"\n`bench fetch NAME` downloads a file to {fetch.cache()}.", style="dim"), soft_wrap=True)
 
 
 def print_fetched(names: Sequence[str], console: Console) -> None:
-    """Fetch files, and say where they are.
+    """Download files, and print their paths.
 
     Raises:
-        UserError: if one is unknown (then nothing is fetched) or cannot be fetched.
+        UserError: if a name is unknown (nothing is downloaded then), or a download fails.
     """
     show_downloads()
     for name in names:

@@ -1,4 +1,4 @@
-"""`bench list`: the names of all components, and the page of one."""
+"""`bench list`: prints the names of all components, or the description of one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bench.plugins.sources import tracks_of
 
 
 def print_names(console: Console) -> None:
-    """Every component by kind, with its tracks and the package that ships it. Imports none of them."""
+    """Print every component by kind, with its tracks and the package that ships it, without importing it."""
     table = Table(box=None, pad_edge=False, header_style="dim")
     for column in ("kind", "name", "track", "shipped by"):
         table.add_column(column)
@@ -28,14 +28,14 @@ def print_names(console: Console) -> None:
             served = ", ".join(tracks_of(claims[0].target)) or "?"
             table.add_row(kind if number == 0 else "", Text(name, style="bold"), served, shipped_by)
     console.print(table)
-    console.print("\n`bench list NAME` says what one does and what its parameters are.", style="dim", highlight=False)
+    console.print("\n`bench list NAME` describes a component and its parameters.", style="dim", highlight=False)
 
 
 def print_component(name: str, console: Console) -> None:
-    """Print the page of every component of this name: description, track, parameters, and the package that ships it.
+    """Describe every component of this name: what it does, track, parameters, and the package that ships it.
 
     Raises:
-        UserError: if no component has the name, or if its plug-in is broken.
+        UserError: if no component has the name, or its plug-in is broken.
     """
     for number, kind in enumerate(registry.kinds_of(name)):
         if number:
@@ -81,23 +81,21 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
 
 
 def _print_choices(name: str, choices: Mapping[str, str], console: Console) -> None:
-    """The components of an adapter."""
+    """Print the choices of an adapter."""
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
     for choice, word in choices.items():
         table.add_row(Text(f"{name}:{choice}", style="bold"), word)
     console.print(table)
     example = f"{name}:{next(iter(choices))}"
-    console.print(
-        f"\n`bench list {example}` says what one does and what its parameters are.", style="dim", highlight=False
-    )
+    console.print(f"\n`bench list {example}` describes one and its parameters.", style="dim", highlight=False)
 
 
 def fits(kind: Kind, component: type[Any]) -> str:
-    """Its track; of an attack the access and actions it needs, of a black box the most it answers."""
+    """Its tracks, the access and actions that an attack needs, and the access that a black-box victim supports."""
     tracks = component.tracks()
-    track = "Track: every one." if tracks == (ANY_TRACK,) else f"Track: {' and '.join(tracks)}."
+    track = "Track: all." if tracks == (ANY_TRACK,) else f"Track: {' and '.join(tracks)}."
     if kind == "victim" and component.answers != "gradients":
-        return f"{track} Answers {component.answers} at most: attacks that need gradients are refused."
+        return f"{track} Supports access {component.answers} at most: attacks that need more are refused."
     if kind != "attack":
         return track
     types = getattr(component, "action_types", ())
@@ -106,16 +104,16 @@ def fits(kind: Kind, component: type[Any]) -> str:
 
 
 def _paragraphs(text: str) -> list[str]:
-    """The paragraphs of a docstring, each on one line unless it is indented (an example)."""
-    found = []
+    """The paragraphs of a docstring, each joined to one line unless it is indented (an example)."""
+    paragraphs = []
     for paragraph in text.split("\n\n"):
         indented = any(line.startswith(" ") for line in paragraph.splitlines())
-        found.append(paragraph if indented else " ".join(paragraph.split()))
-    return [paragraph for paragraph in found if paragraph.strip()]
+        paragraphs.append(paragraph if indented else " ".join(paragraph.split()))
+    return [paragraph for paragraph in paragraphs if paragraph.strip()]
 
 
 def _with_code(text: str) -> Text:
-    """Text in which `backticked` words have a style of their own."""
+    """Text with `backticked` words highlighted."""
     rendered = Text()
     for number, piece in enumerate(re.split(r"`([^`]+)`", text)):
         rendered.append(piece, style="cyan" if number % 2 else "")

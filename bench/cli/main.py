@@ -1,6 +1,6 @@
-"""The command line: `bench run | train | list | new | check | show | view | report | fetch`.
+"""The command line: `bench run | train | list | new | check | render | show | view | report | fetch`.
 
-Commands import what they need when they are called, so that `bench list` and `--help` do not wait for torch.
+A command imports what it needs when it is called, so that `bench list` and `--help` do not import torch.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Words = Annotated[
     typer.Argument(
         metavar="KEY=VALUE...",
         help="Comma lists sweep: attack=zo,noise defense=advtrain victim=dqn attack.steps=50 threat.budget=0.1,0.2. "
-        "seeds and the axes of the world choose from its grid: seeds=0,1 lanes=3,4 weather=clear,rain episodes=20.",
+        "Training seeds and axes select a part of the grid: seeds=0,1 lanes=3,4 weather=clear,rain episodes=20.",
     ),
 ]
 
@@ -38,15 +38,15 @@ Words = Annotated[
 def bench() -> None:
     """A benchmark for the adversarial robustness of driving policies and object detectors.
 
-    With --debug anywhere on the line, or BENCH_DEBUG=1, an error shows its traceback.
+    With --debug, or BENCH_DEBUG=1 in the environment, errors show their traceback.
     """
 
 
 @app.command("list")
 def list_components(
-    name: Annotated[str, typer.Argument(help="One component: what it does and its parameters.")] = "",
+    name: Annotated[str, typer.Argument(help="A component to describe, with its parameters.")] = "",
 ) -> None:
-    """List the attacks, defences, victims and worlds that are installed."""
+    """List the installed attacks, defences, victims and worlds, or describe one."""
     from bench.cli import listing as cli_list
 
     cli_list.print_component(name, Console()) if name else cli_list.print_names(Console())
@@ -55,13 +55,13 @@ def list_components(
 @app.command()
 def new(
     kind: Annotated[str, typer.Argument(help="attack, defense or victim.")],
-    name: Annotated[str, typer.Argument(help="What the command line shall call it, for instance my_attack.")],
+    name: Annotated[str, typer.Argument(help="Its name on the command line, for instance my_attack.")],
     words: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[track=…] [out=…]", help="track=detection; out=FOLDER for the package."),
+        typer.Argument(metavar="[track=…] [out=…]", help="track=detection for a detector; out=FOLDER for the package."),
     ] = None,
 ) -> None:
-    """Write a small plug-in package that installs, works and passes its test, to begin with.
+    """Create a plug-in package: a small component that works and passes its tests, to start from.
 
     For instance: bench new attack my_attack, or bench new defense my_defense track=detection
     """
@@ -72,13 +72,13 @@ def new(
 
 @app.command()
 def check(
-    name: Annotated[str, typer.Argument(help="A component, built in or a plug-in's.")],
+    name: Annotated[str, typer.Argument(help="A component, built-in or from a plug-in.")],
     words: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[KEY=VALUE]...", help="Its parameters; victim=NAME and world=NAME to try it with."),
+        typer.Argument(metavar="[KEY=VALUE]...", help="Its parameters; victim=NAME and world=NAME to check it with."),
     ] = None,
 ) -> None:
-    """Check that a component keeps the rules of the benchmark, and say what to fix.
+    """Check that a component follows the rules of the benchmark, and print what to fix.
 
     For instance: bench check my_attack attack.strength=2
     """
@@ -89,7 +89,7 @@ def check(
 
 @app.command(cls=AxesHelp)
 def run(words: Words = None) -> None:
-    """Score attacks on defended victims over a grid of scenarios; the same command again continues a run that was ended.
+    """Score attacks on defended victims over a grid of scenarios. Run the same command again to continue an interrupted run.
 
     For instance: bench run attack=zo defense=advtrain
     """
@@ -100,7 +100,7 @@ def run(words: Words = None) -> None:
 
 @app.command()
 def train(words: Words = None) -> None:
-    """Train a victim, or harden it with a defence, and save it to the zoo.
+    """Train a victim, with or without a defence, and save it to the zoo.
 
     For instance: bench train victim=dqn seeds=0,1,2, or bench train defense=advtrain defense.skip=0.3 victim=dqn
     """
@@ -112,13 +112,13 @@ def train(words: Words = None) -> None:
 @app.command()
 def render(
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the frames; by default those that bench run uses.")
+        Path | None, typer.Option(help="Folder for the frames; by default the one that bench run reads.")
     ] = None,
     world: Annotated[str, typer.Option(help="The camera world.")] = "camera",
 ) -> None:
-    """Render the frames of a camera world; hours of work, that goes on where it was broken off.
+    """Render the frames of a camera world. This takes hours; run the same command again to continue.
 
-    It needs the renderer: pip install 'cavbench[render]'. The frames of the standard grid ship with the project.
+    It needs the renderer: pip install 'cavbench[render]'. The frames of the standard grid ship with cavbench.
     """
     from bench.cli import render as cli_render
 
@@ -127,10 +127,10 @@ def render(
 
 @app.command()
 def show(
-    run: Annotated[str, typer.Argument(help="A results folder, or the name of a pair in it.")] = "results",
+    run: Annotated[str, typer.Argument(help="A results folder, or the name of a pair.")] = "results",
     out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
 ) -> None:
-    """Show a run: its configuration, what produced it, its table and its recordings."""
+    """Show a run: its configuration, provenance, table and recordings."""
     from bench.cli import show as cli_show
 
     cli_show.print_run(run, out, Console(), _print_report)
@@ -138,13 +138,11 @@ def show(
 
 @app.command()
 def view(
-    run: Annotated[str, typer.Argument(help="A recording (.rrd), a results folder, or the name of a pair in it.")],
-    where: Annotated[
-        list[str] | None, typer.Argument(metavar="COLUMN=VALUE...", help="Which record to replay.")
-    ] = None,
+    run: Annotated[str, typer.Argument(help="A recording (.rrd), a results folder, or the name of a pair.")],
+    where: Annotated[list[str] | None, typer.Argument(metavar="COLUMN=VALUE...", help="The record to replay.")] = None,
     out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
 ) -> None:
-    """Open a recording in the rerun viewer; with COLUMN=VALUE, drive that episode again and record it first.
+    """Open a recording in the rerun viewer; with COLUMN=VALUE, replay and record that episode first.
 
     For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017
     """
@@ -155,10 +153,12 @@ def view(
 
 @app.command()
 def report(words: Words = None) -> None:
-    """Print a report on all records of a results folder: bench report NAME out=FOLDER, for instance thesis.
+    """Print a report on all records of a results folder.
 
-    With html=PAGE it writes the leaderboards as one HTML file that opens from disk, with JSON and CSV beside it. Without a folder
-    and without out=, a report sees no records; it may have published ones of its own.
+    For instance: bench report thesis out=results
+
+    With html=PAGE, write the leaderboards as one HTML file, with JSON and CSV files next to it. Without out=, the folder is
+    results; if it does not exist, a report shows the published records that it ships, if any.
     """
     from bench.cli import report as cli_report
 
@@ -167,11 +167,11 @@ def report(words: Words = None) -> None:
 
 @app.command()
 def fetch(
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="What to fetch.")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Files to download.")] = None,
 ) -> None:
-    """Fetch published weights into the cache, or list what there is.
+    """Download published weights to the cache, or list them.
 
-    What is needed is fetched when it is first needed; this is for a machine that will be without a network later.
+    Other commands download what they need; use this before you work without a network.
     """
     from bench.cli import fetch as cli_fetch
 
@@ -186,7 +186,7 @@ def _print_report(track: Track, records: pa.Table) -> None:
 
 
 def main() -> None:
-    """Run the command line. Bad input ends in one line on standard error and exit code 2."""
+    """Run the command line. Bad input prints one line on standard error and exits with code 2."""
     debug = "--debug" in sys.argv or bool(os.environ.get("BENCH_DEBUG"))
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     try:
@@ -196,11 +196,11 @@ def main() -> None:
             raise
         reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
         sys.exit(_complain(reason))
-    # What nobody foresaw is mostly in a plug-in; its author is told how to see where.
+    # Unexpected errors are mostly in plug-ins: tell their authors how to see the traceback.
     except Exception as error:
         if debug:
             raise
-        sys.exit(_complain(f"{type(error).__name__}: {error} (--debug shows where)"))
+        sys.exit(_complain(f"{type(error).__name__}: {error} (--debug shows the traceback)"))
     sys.exit(status or 0)
 
 

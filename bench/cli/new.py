@@ -1,4 +1,4 @@
-"""`bench new`: writes a plug-in package that works, and says what to type next."""
+"""`bench new`: creates a plug-in package that works, and prints the next commands."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ KEYS = ("track", "out")
 
 
 def print_new(kind: str, name: str, words: Sequence[str], console: Console) -> None:
-    """Write the package and say what is next.
+    """Write the package and print the next commands.
 
     Raises:
-        UserError: if a word cannot be read or the package not be written.
+        UserError: if an option cannot be parsed, or the package cannot be written.
     """
     given: dict[str, str] = {}
     for word in words:
         key, equals, value = word.partition("=")
         if key not in KEYS or not (equals and value):
-            raise UserError(registry.unknown(f"word {word!r}", key, [f"{known}=…" for known in KEYS]))
+            raise UserError(registry.unknown(f"option {word!r}", key, [f"{known}=…" for known in KEYS]))
         given[key] = value
     track, out = given.get("track") or scaffold.default_track(), given.get("out")
     folder = scaffold.write(kind, name, track=track, folder=Path(out).expanduser() if out else None)
-    console.print(Text(f"{folder} is written. Next, in the environment that cavbench is in:"), soft_wrap=True)
+    console.print(Text(f"Created {folder}. Next, in the environment of cavbench:"), soft_wrap=True)
     lines = {
-        f"pip install -e '{folder}[test]'": "bench finds it from now on, also after you edit it",
-        f"bench check {name}": "does it keep the rules?",
-        f"python -m pytest {folder}": "its own test",
-        scaffold.first_run(kind, name, track): "a first score, on a part of the grid",
+        f"pip install -e '{folder}[test]'": "installs it; your later edits take effect at once",
+        f"bench check {name}": "checks that it follows the rules",
+        f"python -m pytest {folder}": "runs its tests",
+        scaffold.first_run(kind, name, track): "scores it on a part of the grid",
     }
     for command, meaning in lines.items():
         console.print(Text.assemble("\n    ", (command, "bold"), "\n    ", (meaning, "dim")), soft_wrap=True)

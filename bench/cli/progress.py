@@ -1,4 +1,4 @@
-"""What the terminal shows while work goes on, and of a component: bars and tables on rich consoles."""
+"""Progress of runs, trainings and downloads: bars on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 
 class RunProgress:
-    """The progress of a run (`bench.run.runner.RunWatcher`): a bar on a terminal, a line a finished unit elsewhere.
+    """Shows the progress of a run (`bench.run.runner.RunWatcher`): a bar on a terminal, one line per finished unit elsewhere.
 
     Args:
-        console: where it is drawn; standard error, so that tables can be piped.
+        console: console to draw on; standard error, so that tables can be piped.
     """
 
     def __init__(self, console: Console) -> None:
@@ -54,7 +54,7 @@ class RunProgress:
         self.total, self.done = episodes, finished
         self.task = self.bar.add_task("", total=episodes, completed=finished)
         if finished:
-            self.console.print(f"{finished} of {episodes} episodes were there already", style="dim", highlight=False)
+            self.console.print(f"{finished} of {episodes} episodes are already done", style="dim", highlight=False)
 
     def working(self, works: Sequence[Unit | Preparation]) -> None:
         self.working_on = {str(work): self.working_on.get(str(work), "") for work in works}
@@ -65,7 +65,7 @@ class RunProgress:
         self._describe()
 
     def finished(self, work: Unit | Preparation, wall_s: float) -> None:
-        # What was prepared is no episode: it is counted with those that use it.
+        # Only units have episodes; a preparation has none.
         self.done += len(work.seeds) if hasattr(work, "grid") else 0
         if self.task is not None:
             self.bar.update(self.task, completed=self.done)
@@ -83,7 +83,7 @@ class RunProgress:
 
 
 class TrainingProgress:
-    """The progress of one training (`bench.plugins.contracts.Progress`): a bar on a terminal, a line every tenth elsewhere."""
+    """Shows the progress of a training (`bench.plugins.contracts.Progress`): a bar on a terminal, a line every 10 % elsewhere."""
 
     def __init__(self, console: Console, label: str) -> None:
         self.console = console
@@ -113,7 +113,7 @@ class TrainingProgress:
 
 
 class DownloadProgress:
-    """The progress of one download, called with the bytes that came and those there are: a bar on a terminal, else a line."""
+    """Shows the progress of a download, called with the bytes received and in total: a bar on a terminal, one line elsewhere."""
 
     def __init__(self, console: Console, label: str) -> None:
         self.console = console
@@ -139,7 +139,7 @@ class DownloadProgress:
 
 
 def show_downloads() -> None:
-    """Show a bar on standard error for whatever is downloaded from now on."""
+    """Show the progress of all later downloads on standard error."""
     from bench.victims import fetch
 
     fetch.tell(lambda name: DownloadProgress(Console(stderr=True), name))

@@ -1,4 +1,4 @@
-"""`bench render`: the frames of a camera world."""
+"""`bench render`: renders the frames of a camera world."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from bench.run.config import component
 
 
 def render(world: str, out: Path | None, console: Console) -> None:
-    """Render what is not rendered yet, and say where it is.
+    """Render the missing frames, and print where they are.
 
     Args:
         world: name of the world.
-        out: folder for the frames; None for the world's own.
-        console: where to print.
+        out: folder for the frames; None for the default of the world.
+        console: console to print to.
 
     Raises:
-        UserError: if the world has nothing to render, or the renderer is not installed.
+        UserError: if the world has no frames to render, or the renderer is not installed.
     """
-    found = component("world", world, {})
-    make = getattr(found, "render", None)
+    make = getattr(component("world", world, {}), "render", None)
     if make is None:
-        raise UserError(f"world {world!r} has no camera to render for")
+        raise UserError(f"world {world!r} has no frames to render; choose a camera world")
     with TrainingProgress(Console(stderr=True), f"render {world}") as progress:
         try:
             files = make(out, progress)

@@ -1,4 +1,4 @@
-"""`bench report`: prints a report on a results folder, or writes its leaderboards as a page."""
+"""`bench report`: prints a report on a results folder, or writes its leaderboards as an HTML page."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def print_report(words: Sequence[str], console: Console) -> None:
     """Print a report, or write a page.
 
     Args:
-        words: the name of a report (default `run`), `out=FOLDER` and `html=PAGE`.
-        console: where to print.
+        words: options: the name of a report (default `run`), `out=FOLDER` and `html=PAGE`.
+        console: console to print to.
 
     Raises:
-        UserError: if the words are none of these, or there are no records.
+        UserError: if an option is unknown, or there are no records.
     """
     values: dict[str, str] = {}
     names = []
@@ -38,17 +38,17 @@ def print_report(words: Sequence[str], console: Console) -> None:
     if len(names) > 1:
         raise UserError(_TAKES)
     out = Path(values.get("out", "results")).expanduser()
-    unasked = "out" not in values and not out.exists()
+    no_folder = "out" not in values and not out.exists()
     if "html" in values:
         page = registry.resolve(PAGES, names[0] if names else "leaderboard", "page")
-        page(None if unasked else out, Path(values["html"]).expanduser(), console)
+        page(None if no_folder else out, Path(values["html"]).expanduser(), console)
         return
     name = names[0] if names else "run"
     function = registry.resolve(registry.REPORTS, name, "report")
-    function({} if name != "run" and unasked else reading.read_all(out), console)
+    function({} if name != "run" and no_folder else reading.read_all(out), console)
 
 
 _TAKES = (
-    "bench report takes one report, one out=folder and one html=page, for instance: bench report thesis out=results, "
+    "bench report takes at most one NAME, one out=FOLDER and one html=PAGE, for instance: bench report thesis out=results, "
     "or bench report out=results html=leaderboard.html"
 )

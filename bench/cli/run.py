@@ -1,4 +1,4 @@
-"""`bench run`: scores pairs on a grid, and prints their table."""
+"""`bench run`: scores pairs on a grid, and prints a table."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from bench.run.config import run_config
 
 
 def run(words: Sequence[str], console: Console, report: Callable[[Track, pa.Table], None]) -> None:
-    """Drive what is not driven yet, and print the table of the run.
+    """Carry out the unfinished part of a run, and print its table.
 
     Args:
         words: the options.
-        console: where to print.
+        console: console to print to.
         report: prints the table of a track, from records.
 
     Raises:
-        UserError: for an option that cannot be read, a component that fails, or Ctrl-C.
+        UserError: if an option cannot be parsed or a component fails, or after Ctrl-C.
     """
     show_downloads()
     config = run_config(words)
@@ -34,7 +34,10 @@ def run(words: Sequence[str], console: Console, report: Callable[[Track, pa.Tabl
             units = runner.run(config, progress)
         except KeyboardInterrupt:
             kept = f"{progress.done} of {progress.total} episodes are kept"
-            raise UserError(f"interrupted; {kept}, and the same command goes on from there") from None
-    own = track_of(config.pairs[0])
-    report(own, reading.read(config.out, units, track=own))
-    console.print(Text(f"Records in {config.out}: `bench show {config.out}` says what made them."), soft_wrap=True)
+            raise UserError(f"interrupted; {kept}: run the same command again to continue") from None
+    track = track_of(config.pairs[0])
+    report(track, reading.read(config.out, units, track=track))
+    console.print(
+        Text(f"Records in {config.out}: `bench show {config.out}` shows their configuration and provenance."),
+        soft_wrap=True,
+    )

@@ -1,4 +1,4 @@
-"""`bench show`: what a results folder holds, what made it, and its recordings."""
+"""`bench show`: shows the configuration, provenance, table and recordings of a results folder or a pair."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ Report = Callable[[Track, pa.Table], None]
 
 
 def print_run(run: str, out: Path, console: Console, report: Report) -> None:
-    """Print the configuration and the provenance of every pair of a run, its table and its recordings.
+    """Print the configuration and provenance of the pairs of a run, its table and its recordings.
 
     Args:
         run: a results folder, or the beginning of the name of a pair in `out`.
         out: results folder.
-        console: where to print.
+        console: console to print to.
         report: prints the table of a track, from records.
 
     Raises:
-        UserError: if there is no such run.
+        UserError: if there is no such folder or pair.
     """
     folder, pair = located(run, out)
     name = None
@@ -48,33 +48,37 @@ def print_run(run: str, out: Path, console: Console, report: Report) -> None:
 
 
 def located(run: str, out: Path) -> tuple[Path, str]:
-    """The results folder and the beginning of a pair's name; the name is empty if `run` is a folder.
+    """The results folder and the beginning of a pair's name, which is empty if `run` is a folder.
 
     Raises:
-        UserError: if `run` can only be a path, and nothing is there.
+        UserError: if `run` is a path that does not exist.
     """
     if Path(run).is_dir():
         return Path(run), ""
     if "/" in run:
-        raise UserError(f"there is nothing at {run}")
+        raise UserError(f"the folder {run} does not exist")
     return out, run
 
 
 def records_of(folder: Path, pair: str = "") -> list[tuple[Track, pa.Table]]:
-    """The records of each track in a folder; where a pair's name begins with `pair`, those of its track alone."""
-    found = [(track(name), records) for name, records in reading.read_all(folder).items()]
-    with_it = [one for one in found if pc.any(pc.starts_with(one[1]["pair"], pair)).as_py()]
-    return with_it[:1] if pair and with_it else found
+    """The records of each track in a folder; only those of the pair's track if a pair's name begins with `pair`."""
+    every = [(track(name), records) for name, records in reading.read_all(folder).items()]
+    with_pair = [one for one in every if pc.any(pc.starts_with(one[1]["pair"], pair)).as_py()]
+    return with_pair[:1] if pair and with_pair else every
 
 
 def pair_named(beginning: str, records: pa.Table) -> str:
-    """The one pair whose name begins so."""
+    """The name of the only pair whose name begins so.
+
+    Raises:
+        UserError: if there is no such pair, or more than one.
+    """
     known = sorted(set(records["pair"].to_pylist()))
     found = [name for name in known if name.startswith(beginning)]
     if len(found) == 1:
         return found[0]
     if found:
-        raise UserError(f"{beginning!r} is the beginning of {len(found)} pairs: {', '.join(found)}")
+        raise UserError(f"{beginning!r} fits {len(found)} pairs: {', '.join(found)}; write more of the name")
     raise UserError(registry.unknown(f"pair {beginning!r}", beginning, known))
 
 
@@ -83,18 +87,18 @@ def _with_controls(pairs: pa.Table, records: pa.Table, own: Track) -> pa.Table:
     identity = [
         field.name for field in IDENTITY if field.name not in ("unit", "pair", "cell", "seed", "training_seed", "grid")
     ]
-    mine = pairs.slice(0, 1).to_pylist()[0]
+    pair = pairs.slice(0, 1).to_pylist()[0]
     same = [name for name in identity if name.startswith(("defense", "victim", "world"))]
-    kept = {str(mine["pair"])}
+    kept = {str(pair["pair"])}
     for other in records.group_by([*identity, "pair"]).aggregate([]).to_pylist():
-        control = other["attack"] == "none" and all(other[name] == mine[name] for name in same)
-        if control or own.baseline_of(other, mine):
+        control = other["attack"] == "none" and all(other[name] == pair[name] for name in same)
+        if control or own.baseline_of(other, pair):
             kept.add(str(other["pair"]))
     return records.filter(pc.field("pair").isin(sorted(kept)))
 
 
 def _print_facts(records: pa.Table, console: Console) -> None:
-    """The pairs of some records, their configuration and their provenance; what differs between them has several lines."""
+    """Print the pairs of some records with their configuration and provenance, one line for each distinct value."""
     for name in pc.unique(records["pair"]).to_pylist():
         console.print(Text(name, style="bold"))
     facts = Table.grid(padding=(0, 2, 0, 0))
@@ -114,8 +118,8 @@ def _print_facts(records: pa.Table, console: Console) -> None:
     facts.add_row("machine", _each(records, ("machine",), str))
     units = records.group_by("unit").aggregate([("wall_s", "max")])
     facts.add_row(
-        "made",
-        f"by {pc.max(records['created_at']).as_py():%Y-%m-%d %H:%M} UTC: {records.num_rows} episodes, "
+        "finished",
+        f"{pc.max(records['created_at']).as_py():%Y-%m-%d %H:%M} UTC: {records.num_rows} episodes, "
         f"{units.num_rows} units of work, {pc.sum(units['wall_s_max']).as_py():.0f} s",
     )
     console.print(facts, highlight=False)
@@ -123,7 +127,7 @@ def _print_facts(records: pa.Table, console: Console) -> None:
 
 
 def _axes(column: pa.ChunkedArray) -> str:
-    """The values that there are on each axis."""
+    """The distinct values on each axis."""
     found: dict[str, dict[Value, None]] = {}
     for cell in pc.unique(column).to_pylist():
         for name, value in json.loads(cell).items():
@@ -132,7 +136,7 @@ def _axes(column: pa.ChunkedArray) -> str:
 
 
 def _each(records: pa.Table, names: tuple[str, ...], describe: Callable[..., str]) -> Text:
-    """A line for every different combination of values in these columns."""
+    """One line for each distinct combination of values in these columns."""
     rows = records.select(names).group_by(list(names)).aggregate([]).to_pylist()
     return Text("\n".join(sorted(describe(*(row[name] for name in names)) for row in rows)))
 
@@ -152,4 +156,5 @@ def _listed(column: pa.ChunkedArray, digits: int | None = None) -> str:
 
 
 def recordings(folder: Path, pair: str | None) -> list[Path]:
+    """The recordings of a pair, or of all pairs."""
     return sorted((folder / "recordings").glob(f"{pair or '*'}/*.rrd"))

@@ -1,4 +1,4 @@
-"""`bench train`: train a victim, or harden it with a defence, and save every seed to the zoo."""
+"""`bench train`: trains a victim, with or without a defence, and saves every training seed to the zoo."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from bench.victims import zoo
 
 
 def train(words: Sequence[str], console: Console) -> None:
-    """Train what the options ask for, one training seed after the other, and say where it is and how to use it.
+    """Train every requested training seed, and print where it is saved and how to use it.
 
     Raises:
-        UserError: if an option is wrong, there is nothing to train, or the zoo cannot be written.
+        UserError: if an option is invalid, there is nothing to train, or the zoo cannot be written.
     """
     settle()
     config = train_config(words)
-    hardens = config.defense.name != "none"
-    if not hardens and not config.victim.component.learns:
+    defends = config.defense.name != "none"
+    if not defends and not config.victim.component.learns:
         raise UserError(f"there is nothing to train: {config.victim.name} does not learn")
-    trained = config.defense if hardens else config.victim
+    trained = config.defense if defends else config.victim
     component = _placed(trained, config.world.component)
-    parts = (config.victim.component, component) if hardens else (component,)
+    parts = (config.victim.component, component) if defends else (component,)
     try:
         recipe = zoo.Recipe.of(*parts)
     except NotImplementedError as error:
@@ -43,17 +43,17 @@ def train(words: Sequence[str], console: Console) -> None:
     for seed in config.seeds:
         start = time.perf_counter()
         with TrainingProgress(Console(stderr=True), f"{recipe.name}, seed {seed}") as progress:
-            made = _trained(config, component, hardens, seed, progress)
+            made = _trained(config, component, defends, seed, progress)
         path = zoo.save(made.network, recipe, seed=seed, world=config.world.component, card=made.card, root=config.out)
         seconds = time.perf_counter() - start
-        said = f"{recipe.name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"
-        console.print(Text(said), soft_wrap=True)
+        line = f"{recipe.name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"
+        console.print(Text(line), soft_wrap=True)
     console.print(Text(f"To use it: {recipe.use}"), soft_wrap=True)
 
 
-def _trained(config: TrainConfig, component: Any, hardens: bool, seed: int, progress: TrainingProgress) -> Trained[Any]:
+def _trained(config: TrainConfig, component: Any, defends: bool, seed: int, progress: TrainingProgress) -> Trained[Any]:
     victim, world = config.victim.component, config.world.component
-    if not hardens:
+    if not defends:
         return component.train(world, seed=seed, progress=progress)
     made = component.train(victim, world, seed=seed, progress=progress)
     if made is None:
@@ -62,24 +62,24 @@ def _trained(config: TrainConfig, component: Any, hardens: bool, seed: int, prog
 
 
 def _placed(trained: Chosen[Any], world: World) -> Any:
-    """The component that is trained, saying the world it is trained in.
+    """The component to train, with its parameter `trained_in` set to the world of the training.
 
     Raises:
-        UserError: if it says another one, or has no parameter to say it.
+        UserError: if `trained_in` is already another world, or the component needs it but does not have it.
     """
     where = zoo.trained_in(world, default=track(world.tracks()[0]).world)
-    said = getattr(trained.component, "trained_in", "")
-    if said not in ("", where):
+    given = getattr(trained.component, "trained_in", "")
+    if given not in ("", where):
         raise UserError(
-            f"{trained.kind}.trained_in={said} does not name the world of this training, "
-            f"{where or 'the default'}; leave it out, it is set by world=NAME and world.PARAMETER=VALUE"
+            f"{trained.kind}.trained_in={given} is not the world of this training, {where or 'the default'}: leave it out; "
+            "world=NAME and world.PARAMETER=VALUE set it"
         )
     if "trained_in" in {field.name for field in fields(trained.component)}:
         return replace(trained.component, trained_in=where)
     if where:
         raise UserError(
-            f"{trained.kind} {trained.name!r} cannot be trained in {where!r}: it has no parameter trained_in, so it could "
-            "not be told from one that was trained in the default world"
+            f"{trained.kind} {trained.name!r} cannot be trained in {where!r}: it has no parameter trained_in that "
+            "would distinguish it from one trained in the default world"
         )
     return trained.component
 
@@ -89,5 +89,5 @@ def _check_writable(root: Path) -> None:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(
-            f"the zoo {root} cannot be written: {error.strerror or error}; out= names another folder"
+            f"the zoo {root} cannot be written: {error.strerror or error}; choose another folder with out="
         ) from None

@@ -1,4 +1,4 @@
-"""`bench view`: opens a recording, or makes one of any record by driving its episode again."""
+"""`bench view`: opens a recording, or replays and records the episode of any record."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from bench.scenarios.axes import written
 
 
 def open_recording(run: str, where: Sequence[str], out: Path, console: Console) -> None:
-    """Open a recording in the rerun viewer, or say how to where there is no display.
+    """Open a recording in the rerun viewer; without a display, print the command that opens it.
 
     Args:
-        run: a recording; or a results folder or the beginning of a pair's name, whose recordings are listed.
-        where: `column=value` words; the first record that has these values is replayed and recorded.
-        out: results folder to look for a pair in.
-        console: where to print.
+        run: a recording, a results folder, or the beginning of a pair's name; several recordings are listed.
+        where: `column=value` options; the first matching record is replayed and recorded.
+        out: results folder of the pair.
+        console: console to print to.
 
     Raises:
         UserError: if there is no such recording or record.
@@ -41,14 +41,20 @@ def open_recording(run: str, where: Sequence[str], out: Path, console: Console) 
     if path.suffix != ".rrd":
         raise UserError(f"{path} is not a recording (.rrd)")
     if not _has_display():
-        console.print(Text(f"There is no display here. Where there is one: rerun {path.resolve()}"), soft_wrap=True)
+        console.print(
+            Text(f"No display found. On a machine with a display, run: rerun {path.resolve()}"), soft_wrap=True
+        )
         return
     subprocess.Popen([sys.executable, "-m", "rerun", str(path)], start_new_session=True)
     console.print(Text(f"opened {path} in the rerun viewer"), soft_wrap=True)
 
 
 def _listed(folder: Path, beginning: str, console: Console) -> Path | None:
-    """The only recording there is; if there are more, they are listed."""
+    """The only recording; None after listing several.
+
+    Raises:
+        UserError: if there is no recording.
+    """
     (_, records), *_ = records_of(folder, beginning)
     pair = pair_named(beginning, records) if beginning else None
     found = recordings(folder, pair)
@@ -56,11 +62,11 @@ def _listed(folder: Path, beginning: str, console: Console) -> Path | None:
         return found[0]
     what = f"{pair or folder} has {len(found) or 'no'} recordings"
     if not found:
-        raise UserError(f"{what}; name an episode to make one, for instance: {_example(folder, pair, records)}")
+        raise UserError(f"{what}; record an episode, for instance: {_example(folder, pair, records)}")
     console.print(Text(f"{what}:"))
     for path in found:
         console.print(Text(f"  bench view {path}"), soft_wrap=True)
-    console.print(Text(f"Any other episode is driven again: {_example(folder, pair, records)}"), soft_wrap=True)
+    console.print(Text(f"Replay any other episode, for instance: {_example(folder, pair, records)}"), soft_wrap=True)
     return None
 
 
@@ -80,7 +86,7 @@ def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Conso
     record = find(records, words)
     made = replay(folder, record)
     if made.differences:
-        cause = f"changed since: {made.changed}" if made.changed else "nothing is known to have changed since"
+        cause = f"changed since: {made.changed}" if made.changed else "no known change since"
         differing = ", ".join(made.differences)
         console.print(Text(f"The replay differs from the record in {differing} ({cause}).", style="yellow"))
     else:

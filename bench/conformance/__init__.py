@@ -1,4 +1,4 @@
-"""The rules that every component keeps, as checks: `bench check NAME`, and `complaints` for a plug-in's own tests."""
+"""Checks of the rules for components: `bench check NAME`, and `complaints` for the tests of plug-ins."""
 
 from bench.conformance.suites import complaints, examine
 

@@ -1,4 +1,4 @@
-"""What a check is, how it ends, and how a suite of them is carried out."""
+"""Checks, their outcomes, and suites of checks."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from bench.plugins.registry import Kind
 
 Status = Literal["pass", "fail", "skip"]
 Check = Callable[[], str | None]
-"""Returns a remark beside that it passed, or nothing."""
+"""Returns a remark or None if the check passes; raises otherwise."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a check ended.
+    """The outcome of a check.
 
     Args:
-        check: its name.
-        status: pass, fail, or skip where it does not apply.
+        check: name of the check.
+        status: pass, fail, or skip if it does not apply.
         text: one line: what to fix, why it does not apply, or a remark.
     """
 
@@ -35,7 +35,7 @@ class Outcome:
 
 
 class BrokenRuleError(Exception):
-    """A rule is broken; the message says in one line which rule and what to do."""
+    """A rule is broken; the message says in one line which one, and what to fix."""
 
 
 class NotApplicableError(Exception):
@@ -44,14 +44,14 @@ class NotApplicableError(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """A component that is checked, with what it is tried together with.
+    """A component to check, with the world and the victim to check it with.
 
     Args:
         kind: attack, defense, victim or world.
-        name: it is registered by.
-        component: as it would be used in a run.
-        world: that attacks, victims and defences are tried in; None for a world, and for checks that need none.
-        victim: that a defence is tried on; of a victim, the victim itself; None for the others.
+        name: registered name.
+        component: the instance to check.
+        world: world to check in; None if a world is checked, and for checks that need none.
+        victim: victim of a defence, or the checked victim itself; None for attacks and worlds.
     """
 
     kind: Kind
@@ -61,25 +61,25 @@ class Subject:
     victim: Any = None
 
     def load(self) -> Any:
-        """The network of training seed 0 that a victim or a defence loads, made anew.
+        """Load the network of training seed 0 of a victim or a defence.
 
         Raises:
-            UserError: if it is not there.
+            UserError: if it does not exist.
         """
         if self.kind == "victim":
             return self.component.load(0, self.world.facts)
         return self.component.load(self.victim, 0, self.world.facts)
 
     def load_victim(self) -> Any:
-        """The network of the victim without the defence, made anew."""
+        """Load the network of the victim without the defence."""
         return self.victim.load(0, self.world.facts)
 
 
 class Suite(ABC):
-    """Some checks of a component.
+    """A group of checks for a component.
 
     Args:
-        subject: what is checked.
+        subject: the component to check.
     """
 
     component: Any
@@ -92,7 +92,7 @@ class Suite(ABC):
         """The checks by name, in order."""
 
     def outcomes(self) -> Iterator[Outcome]:
-        """Carry out every check."""
+        """Run every check."""
         for name, check in self.checks().items():
             try:
                 yield Outcome(name, "pass", check() or "")
@@ -100,20 +100,20 @@ class Suite(ABC):
                 yield Outcome(name, "fail", one_line(failure))
             except NotApplicableError as reason:
                 yield Outcome(name, "skip", one_line(reason))
-            # Third-party code may fail in any way; its author is told how and where.
+            # Third-party code may raise anything: tell its author what, and where.
             except Exception as error:
                 yield Outcome(name, "fail", f"{type(error).__name__}: {one_line(error)}{self._place(error)}")
 
     def _place(self, error: Exception) -> str:
-        """The line of the component's own file at which it happened; empty if it happened elsewhere."""
-        own = inspect.getsourcefile(type(self.component))
-        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
-        return f" ({Path(own).name}, line {lines[-1]})" if own and lines else ""
+        """The line of the component's file that raised the error; empty if the error is from another file."""
+        file = inspect.getsourcefile(type(self.component))
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+        return f" ({Path(file).name}, line {lines[-1]})" if file and lines else ""
 
 
-def require(held: object, complaint: str) -> None:
-    """Raise BrokenRuleError with the complaint unless the rule is held."""
-    if not held:
+def require(condition: object, complaint: str) -> None:
+    """Raise BrokenRuleError with the complaint unless `condition` is true."""
+    if not condition:
         raise BrokenRuleError(complaint)
 
 
@@ -124,7 +124,7 @@ def one_line(error: Exception) -> str:
 
 @contextmanager
 def refusals_are_broken_rules() -> Iterator[None]:
-    """Turn a UserError, by which the framework refuses what a component did, into a broken rule with the same message."""
+    """Convert a UserError, with which the framework refuses what a component did, to a BrokenRuleError."""
     try:
         yield
     except UserError as error:

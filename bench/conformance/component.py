@@ -1,4 +1,4 @@
-"""The rules for every component: it is documented, can be set on the command line, and survives pickling."""
+"""Rules for all components: they are documented, can be set on the command line, and survive pickling."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bench.plugins.parameters import description, parameters
 
 
 class ComponentSuite(Suite):
-    """Of any kind and track."""
+    """Checks of a component of any kind and track."""
 
     def checks(self) -> Mapping[str, Check]:
         return {
@@ -25,14 +25,14 @@ class ComponentSuite(Suite):
         }
 
     def documented(self) -> None:
-        """`bench list NAME` shows its docstrings."""
+        """It has the docstrings that `bench list NAME` shows."""
         kind = type(self.component)
-        require(description(kind), f"{kind.__name__} has no docstring: say what it does in a sentence")
+        require(description(kind), f"{kind.__name__} has no docstring: describe it in one sentence")
         silent = [parameter.name for parameter in parameters(kind).values() if not parameter.meaning]
-        require(not silent, f"say in the docstring's `Args:` what these mean: {', '.join(silent)}")
+        require(not silent, f"describe these parameters in the docstring's `Args:`: {', '.join(silent)}")
 
     def set_by_words(self) -> str:
-        """Every parameter can be written on the command line and comes back as it was."""
+        """Every parameter can be written on the command line, and is parsed to the same value."""
         owned = parameters(type(self.component))
         written = {name: text for name in owned if (text := _text(getattr(self.component, name))) is not None}
         try:
@@ -44,31 +44,34 @@ class ComponentSuite(Suite):
             value, wanted = getattr(made, name), getattr(self.component, name)
             require(
                 type(value) is type(wanted) and value == wanted,
-                f"{self.subject.kind}.{name}={text} is read as {value!r}: its type annotation does not fit its value {wanted!r}",
+                f"{self.subject.kind}.{name}={text} is parsed as {value!r}: its annotation does not fit its value {wanted!r}",
             )
         return f"{len(written)} of {len(owned)} parameters" if len(written) < len(owned) else ""
 
     def picklable(self) -> None:
-        """Worker processes get it pickled."""
+        """It survives pickling, by which worker processes receive it."""
         try:
             copy = pickle.loads(pickle.dumps(self.component))
         except (pickle.PicklingError, TypeError, AttributeError) as error:
-            require(False, f"keep plain values in its fields, and make the rest where it is used: {one_line(error)}")
-        require(copy == self.component, "a pickled copy is not equal: give its fields types that compare by value")
+            require(
+                False,
+                f"keep only plain values in its fields, and create other objects where they are used: {one_line(error)}",
+            )
+        require(copy == self.component, "a pickled copy is not equal: use field types that compare by value")
         require(
             canonical(copy) == canonical(self.component),
-            "a pickled copy has another fingerprint: a field is written with its address in memory",
+            "a pickled copy has another fingerprint: the text of a field contains its memory address",
         )
 
     def versioned(self) -> str:
-        """Records name the package and its version."""
+        """Its package has a version, which records name."""
         shipped_by = registry.find(registry.GROUPS[self.subject.kind], self.subject.name, self.subject.kind).shipped_by
         require("unknown" not in shipped_by, "its package has no version: install it with pip")
-        return f"records say {shipped_by}"
+        return f"records name {shipped_by}"
 
 
 def _text(value: object) -> str | None:
-    """A value as it is written on the command line; None for those that cannot be."""
+    """A value as written on the command line; None if it cannot be written."""
     match value:
         case bool():
             return str(value).lower()

@@ -1,4 +1,4 @@
-"""What `bench check` and `bench new` know of a track: its kit, found by the entry point `cavbench.kits`."""
+"""Kits: what `bench check` and `bench new` need of a track, found by the entry point `cavbench.kits`."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from bench.plugins.registry import Kind
 
 KITS = "cavbench.kits"
 Suites = Callable[[Subject], Iterable[Suite]]
-"""Makes the suites that a component has to pass; it may raise `NotApplicableError`."""
+"""Creates the suites for a component; may raise `NotApplicableError`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """What the author of a new component types first.
+    """First commands for the author of a new component.
 
     Args:
-        run: the command that scores it on a small part of the grid; `{name}` stands for its name.
-        setting: one of its parameters with another value than the default.
+        run: command that scores it on a small part of the grid; `{name}` stands for its name.
+        setting: one of its parameters with a value other than the default.
     """
 
     run: str
@@ -33,9 +33,9 @@ class Kit:
     """The suites and the templates of a track. Importing it must be quick: no torch.
 
     Args:
-        suites: by kind of component.
-        starts: by kind of which there is a template.
-        package: whose folder `templates` has KIND.py.tmpl and test_KIND.py.tmpl for each of them.
+        suites: suites by kind of component.
+        starts: first commands by kind; each of these kinds has a template.
+        package: package whose folder `templates` contains KIND.py.tmpl and test_KIND.py.tmpl for these kinds.
     """
 
     suites: Mapping[Kind, Suites]
@@ -49,10 +49,10 @@ def kits() -> list[str]:
 
 
 def kit(track: str) -> Kit | None:
-    """The kit of a track; None where it has none.
+    """The kit of a track; None if it has none.
 
     Raises:
-        UserError: if two packages ship one, it cannot be imported, or its entry point names something else.
+        UserError: if two packages ship one, it cannot be imported, or it is not a `Kit`.
     """
     if track not in kits():
         return None

@@ -1,4 +1,4 @@
-"""The rules for whatever a victim or a defence loads, drivers and detectors alike."""
+"""Rules for the networks of victims and defences, both policies and detectors."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from bench.plugins.fingerprint import state_digest
 
 
 def check_frozen(network: nn.Module, noun: str) -> None:
-    """Eval mode, and no gradients on weights."""
+    """Require eval mode and weights without gradients."""
     require(not network.training, f"it is in training mode: load must return {noun}.eval()")
     require(
         not any(weight.requires_grad for weight in network.parameters()),
-        f"its weights take gradients: load must return {noun}.requires_grad_(False)",
+        f"its weights require gradients: load must return {noun}.requires_grad_(False)",
     )
 
 
 def check_white_box(victim: Victim) -> None:
-    """Skip where the victim says that it has no gradients."""
+    """Skip a check of gradients if the victim declares that it has none."""
     if victim.answers != "gradients":
-        raise NotApplicableError(f"it answers {victim.answers} at most: gradient attacks are refused")
+        raise NotApplicableError(f"it supports access {victim.answers} at most: gradient attacks are refused")
 
 
 def check_gradient(gradient: Tensor) -> None:
-    """A way back that leads somewhere."""
-    require(bool(gradient.isfinite().all()), "its gradient is NaN or infinite somewhere")
+    """Require a finite, non-zero gradient."""
+    require(bool(gradient.isfinite().all()), "its gradient contains NaN or infinity")
     require(
         bool(gradient.any()),
-        "its gradient is 0 everywhere, a wall that proves nothing: let it pass straight through (Athalye et al. 2018)",
+        "its gradient is 0 everywhere, which hides weaknesses: use a straight-through gradient (Athalye et al. 2018)",
     )
 
 
 @contextmanager
-def unchanged(network: nn.Module, own: Callable[[], nn.Module]) -> Iterator[None]:
-    """What is done in the block changes no weights of the network, nor of the victim's `own`, loaded anew."""
-    before = state_digest(network), state_digest(own())
+def unchanged(network: nn.Module, load_victim: Callable[[], nn.Module]) -> Iterator[None]:
+    """Require that the block changes neither the weights of the network nor those that `load_victim` loads."""
+    before = state_digest(network), state_digest(load_victim())
     yield
-    require(state_digest(network) == before[0], "its weights changed while it was asked")
-    require(state_digest(own()) == before[1], "loading it changed the victim's own weights")
+    require(state_digest(network) == before[0], "its weights changed when it was queried")
+    require(state_digest(load_victim()) == before[1], "loading it changed the weights of the victim")

@@ -1,4 +1,4 @@
-"""Random states that a result must not hang on."""
+"""Random generators that results must not depend on."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ import numpy as np
 
 
 def stir_others(seed: int) -> None:
-    """Set the generators that no run seeds: NumPy's and Python's."""
+    """Seed the global generators of NumPy and Python, which no run seeds."""
     np.random.seed(seed)  # noqa: NPY002
     random.seed(seed)

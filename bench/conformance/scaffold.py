@@ -1,4 +1,4 @@
-"""Writes a plug-in package to begin with: an entry point, a small component that works, a test that passes."""
+"""Creates a plug-in package: an entry point, a small component that works, and tests that pass."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOUNS = {"attack": "an attack", "defense": "a defence", "victim": "a victim"}
 
 
 def default_track() -> str:
-    """The track of the victim that a run attacks when it is not told otherwise."""
+    """The track of the default victim of a run."""
     entry = registry.find(registry.GROUPS["victim"], DEFAULTS["victim"], "victim")
     return sources.tracks_of(entry.target)[0]
 
@@ -30,7 +30,7 @@ def first_run(kind: str, name: str, track: str) -> str:
     """The command that scores a new component on a small part of the grid.
 
     Raises:
-        UserError: if the kind or the track is unknown, or the track has no template of the kind.
+        UserError: if the kind or the track is unknown, or the track has no template for the kind.
     """
     return _kit(kind, track).starts[cast(Kind, kind)].run.format(name=name)
 
@@ -40,12 +40,12 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
 
     Args:
         kind: attack, defense or victim.
-        name: what the command line shall call it.
-        track: one that has templates.
-        folder: must be empty or not there yet; by default `cavbench-NAME` in the current one.
+        name: name on the command line.
+        track: a track with templates.
+        folder: a folder that is empty or does not exist; by default `cavbench-NAME` in the current folder.
 
     Raises:
-        UserError: if the name cannot be used, there is no template, or the folder is not empty.
+        UserError: if the name is not allowed, there is no template, or the folder is not empty or cannot be written.
     """
     kit = _kit(kind, track)
     _check_name(kind, name)
@@ -53,7 +53,7 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
     module = f"cavbench_{name}"
     folder = folder or Path(distribution)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder} is there already and not empty; nothing was written: say out=another-folder")
+        raise UserError(f"{folder} exists and is not empty; nothing was written: choose another folder with out=")
     article, noun = NOUNS[kind].split()
     values = {
         "kind": kind,
@@ -79,12 +79,12 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
             text = Template(template.read_text(encoding="utf-8")).substitute(values)
             (folder / path).write_text(text, encoding="utf-8")
     except OSError as error:
-        raise UserError(f"{folder} cannot be written: {error.strerror}; say out=another-folder") from error
+        raise UserError(f"{folder} cannot be written: {error.strerror}; choose another folder with out=") from error
     return folder
 
 
 def _kit(kind: str, track: str) -> Kit:
-    """The kit of a track, with a template of the kind; UserError if there is none."""
+    """The kit of a track with a template for the kind; UserError if there is none."""
     if kind not in get_args(NewKind):
         raise UserError(registry.unknown(f"kind {kind!r}", kind, get_args(NewKind)))
     known = registry.entries(registry.TRACKS)
@@ -99,12 +99,12 @@ def _kit(kind: str, track: str) -> Kit:
 
 
 def _check_name(kind: str, name: str) -> None:
-    """Raise UserError unless a new component may have the name."""
+    """Raise UserError unless the name is valid and not taken."""
     if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or keyword.iskeyword(name) or len(name) > 40:
         raise UserError(
-            f"{name!r} is no name for {NOUNS[kind]}: write lower-case words joined by _, at most 40 characters, "
+            f"{name!r} is not a valid name for {NOUNS[kind]}: write lower-case words joined by _, at most 40 characters, "
             "for instance my_attack"
         )
     claims = registry.entries(f"cavbench.{kind}s").get(name)
     if claims:
-        raise UserError(f"{kind} {name!r} is shipped by {claims[0].shipped_by} already; choose another name")
+        raise UserError(f"{kind} {name!r} is already shipped by {claims[0].shipped_by}; choose another name")

@@ -1,4 +1,4 @@
-"""Which suites a component has to pass, and their outcomes."""
+"""Selects and runs the suites of a component."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from bench.plugins.track import track
 def examine(
     kind: Kind, name: str, values: Mapping[str, str] | None = None, *, victim: str = "", world: str = ""
 ) -> Iterator[Outcome]:
-    """The outcome of every check of a component, in order, as they come.
+    """Run every check of a component, and yield the outcomes in order.
 
     Args:
         kind: attack, defense, victim or world.
-        name: it is registered by.
+        name: registered name.
         values: its parameters, as on the command line.
-        victim: that a defence is tried on; empty for the first that it can be loaded for.
-        world: that attacks, victims and defences are tried in; empty for the default world of the track.
+        victim: name of the victim for a defence; empty for the first that it can be loaded for.
+        world: name of the world to check in; empty for the default world of the track.
 
     Raises:
         UserError: if the plug-in is broken, or a parameter is not allowed.
@@ -47,11 +47,11 @@ def examine(
 
 
 def complaints(kind: Kind, name: str, **values: str) -> list[str]:
-    """What a plug-in has to fix, a line each; its own tests assert that there is nothing.
+    """What to fix in a component, one line each; the tests of a plug-in assert that the list is empty.
 
     Args:
         kind: attack, defense, victim or world.
-        name: it is registered by: the package must be installed.
+        name: registered name; the package must be installed.
         values: its parameters, as on the command line.
 
     Raises:
@@ -62,13 +62,13 @@ def complaints(kind: Kind, name: str, **values: str) -> list[str]:
 
 
 def _behaviour(subject: Subject, track_name: str, victim: str, world: str) -> Iterator[Outcome]:
-    """The outcomes of the suites of a track."""
+    """Run the suites of a track."""
     try:
         suites = list(_suites(subject, track_name, victim, world))
     except NotApplicableError as reason:
         yield Outcome("behaviour", "skip", one_line(reason))
         return
-    # Third-party code may fail in any way, while it is loaded too.
+    # Loading third-party code may raise anything.
     except Exception as error:
         yield Outcome("behaviour", "fail", f"{type(error).__name__}: {one_line(error)}")
         return
@@ -77,14 +77,16 @@ def _behaviour(subject: Subject, track_name: str, victim: str, world: str) -> It
 
 
 def _suites(subject: Subject, track_name: str, victim: str, world: str) -> Iterator[Suite]:
-    """The suites that the kit of a track has for a component, which is loaded first if it has to be."""
+    """The suites of a track's kit for a component; victims and defences are loaded first."""
     kit = kits.kit(track_name)
     if kit is None or subject.kind not in kit.suites:
-        raise NotApplicableError(f"the track {track_name!r} has no checks of its own for it (entry point {kits.KITS})")
+        raise NotApplicableError(
+            f"the track {track_name!r} has no checks for this kind of component (entry point {kits.KITS})"
+        )
     if subject.kind != "world":
         tried_in = choose("world", world or track(track_name).world).component
         if not tried_in.serves(track_name):
-            raise NotApplicableError(f"world {world!r} is of another track")
+            raise NotApplicableError(f"world {world!r} belongs to another track")
         subject = replace(subject, world=tried_in)
     if subject.kind == "victim":
         subject = replace(subject, victim=subject.component)
@@ -95,7 +97,7 @@ def _suites(subject: Subject, track_name: str, victim: str, world: str) -> Itera
 
 
 def _require_loadable(subject: Subject) -> None:
-    """Raise NotApplicableError where there is nothing to load yet: a victim that nobody has trained."""
+    """Raise NotApplicableError if a victim cannot be loaded, for instance because it is not trained yet."""
     try:
         subject.load()
     except UserError as error:
@@ -103,22 +105,22 @@ def _require_loadable(subject: Subject) -> None:
 
 
 def _with_victim(subject: Subject, name: str, track_name: str) -> Subject:
-    """The defence with the victim it is tried on: the one that is named, or the first that it can be loaded for."""
+    """The subject with a victim for the defence: the named one, or the first that the defence can be loaded for."""
     reasons = []
     for victim in [choose("victim", name).component] if name else _victims(track_name):
         if not victim.serves(track_name):
-            raise NotApplicableError(f"victim {name!r} is of another track")
+            raise NotApplicableError(f"victim {name!r} belongs to another track")
         tried = replace(subject, victim=victim)
         try:
             tried.load()
             return tried
         except UserError as error:
             reasons.append(one_line(error))
-    raise NotApplicableError(f"it can be loaded for no victim: {reasons[0] if reasons else 'none is installed'}")
+    raise NotApplicableError(f"it cannot be loaded for any victim: {reasons[0] if reasons else 'none is installed'}")
 
 
 def _victims(track_name: str) -> Iterator[Any]:
-    """The victims of a track that use their input and have a default for every parameter."""
+    """The victims of a track that use their input and need no parameters."""
     for name in sources.names("victim", track_name):
         try:
             victim = choose("victim", name).component

@@ -1,4 +1,4 @@
-"""A victim at the wheel: observations to scores, scores to an action, and what it remembers from one step to the next."""
+"""Driving policies: a map from observations to scores and from scores to actions, with an optional state per episode."""
 
 from __future__ import annotations
 
@@ -12,61 +12,60 @@ from torch import Tensor, nn
 from bench.driving.features import ActionType, Driver
 
 State: TypeAlias = TensorDictBase | None
-"""What is remembered of B episodes, a TensorDict of batch size [B]; None where nothing is."""
+"""The state of B episodes: a TensorDict of batch size [B]; None for stateless policies and attacks."""
 
 
 class Policy(nn.Module, ABC):
-    """A victim at the wheel: a differentiable map from observations to scores, and from scores to an action.
+    """A driving policy: a differentiable map from observations to scores, and from scores to an action.
 
-    One without a memory writes `forward` and nothing else, as any torch network does. One that remembers writes `initial`,
-    `scores` and `advance`: the run keeps its state, and asking for scores changes nothing, however often and for whichever
-    episodes an attack asks.
+    A stateless policy implements only `forward`, like any torch network. A policy with a state implements `initial`, `scores`
+    and `advance`. The run keeps the state; `scores` does not change it, so an attack may query any episodes any number of times.
     """
 
     action_type: ActionType
     driver: Driver = "agent"
     weights_sha256: str = ""
-    """Hash of the weights file it was loaded from; empty where there is none."""
+    """Hash of the policy's weights file; empty if there is none."""
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The scores of a policy without a memory (see `scores`).
+        """The scores of a stateless policy (see `scores`).
 
         Args:
             observation: float [..., V, F].
         """
-        raise NotImplementedError(f"{type(self).__name__} has neither forward nor scores")
+        raise NotImplementedError(f"{type(self).__name__} implements neither forward nor scores")
 
     def initial(self, episodes: Tensor) -> State:
-        """What is remembered before the first step.
+        """The state before the first step.
 
         Args:
-            episodes: int64 [B], a number that identifies each episode; a policy that draws seeds its generators with it.
+            episodes: int64 [B], a number that identifies each episode; a randomised policy seeds its generators with it.
         """
         return None
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
-        """What a score-based attacker reads: Q-values [..., A] (discrete) or the action itself [..., 2] (continuous).
+        """The output that score-based attacks read: Q-values [..., A] (discrete) or the action itself [..., 2] (continuous).
 
         A pure function: the same observation and state give the same scores.
 
         Args:
             observation: float [..., V, F].
-            state: of the same episodes, of batch size [...]; None for a policy without a memory.
+            state: the state of the same episodes, batch size [...]; None for a stateless policy.
         """
         return self(observation)
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
-        """What is remembered after a step.
+        """The state after a step.
 
         Args:
-            observation: what was shown, [B, V, F].
-            action: what was done, int64 [B] or float [B, 2].
-            state: before the step.
+            observation: the observation that the policy received, [B, V, F].
+            action: the action taken, int64 [B] or float [B, 2].
+            state: the state before the step.
         """
         return state
 
     def choose(self, scores: Tensor) -> Tensor:
-        """The action that goes with scores: int64 [...] (discrete, the greedy one) or float [..., 2] in [-1, 1] (continuous)."""
+        """The action for given scores: the greedy one, int64 [...] (discrete), or float [..., 2] in [-1, 1] (continuous)."""
         return scores.argmax(-1) if self.action_type == "discrete" else scores
 
     def decide(self, observation: Tensor, state: State = None) -> Tensor:
@@ -83,10 +82,10 @@ class Policy(nn.Module, ABC):
 
 
 class PolicyWrapper(Policy):
-    """A policy in front of another one, as defences are: everything passes through but what is overridden.
+    """A policy that wraps another one, for defences: every method that is not overridden calls the wrapped policy.
 
     Args:
-        policy: the other one, `self.policy`. What it remembers is the state, unless `initial` and `advance` are overridden.
+        policy: the wrapped policy, `self.policy`. Its state is the state, unless `initial` and `advance` are overridden.
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -111,7 +110,7 @@ class PolicyWrapper(Policy):
 
 
 def rows_of(state: State, rows: Tensor) -> State:
-    """The state of some episodes, int64 [R] or bool [B]."""
+    """The state of the episodes `rows`, int64 [R] or bool [B]."""
     return None if state is None else state[rows]
 
 

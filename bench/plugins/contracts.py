@@ -1,10 +1,10 @@
-"""What every plug-in is, whatever its track: World, Victim, Attack, Defense, and the threat model between them.
+"""Base classes of all plug-ins, of any track: World, Victim, Attack, Defense and ThreatModel.
 
-A component is a frozen, keyword-only dataclass: its fields are its parameters, so that `attack.steps=50` on the command line,
-the record of a run and the constructor are the same thing. Ranges stand in the annotations (`bench.plugins.ranges`).
+A component is a frozen, keyword-only dataclass. Its fields are its parameters: they have the same names in the constructor, on
+the command line (`attack.steps=50`) and in records. Their annotations give the allowed ranges (`bench.plugins.ranges`).
 
-A track is a kind of victim (`bench.plugins.track`). The base classes of the driving track are in `bench.driving`, those of the
-detection track in `bench.detection`; a component that derives from both serves both.
+A track is a kind of victim (`bench.plugins.track`). Its base classes are in `bench.driving` and `bench.detection`; a component
+that derives from both works on both tracks.
 """
 
 from __future__ import annotations
@@ -23,51 +23,51 @@ if TYPE_CHECKING:
     from torch import nn
 
 ANY_TRACK = "any"
-"""The track of a component that serves every one, as `none` does."""
+"""The track of a component that works on all of them, such as `none`."""
 Access = Literal["oblivious", "decisions", "scores", "gradients"]
-"""What an attacker may ask of the victim, in rising order."""
+"""What an attacker may ask of the victim, from the least access to the most."""
 Progress = Callable[[float, str], None]
-"""Called with the share done in [0, 1] and a short text; the command line draws the bar."""
+"""Called with the share done in [0, 1] and a short text; the command line draws a progress bar."""
 Network = TypeVar("Network", bound="nn.Module")
 
 
 class Component(ABC):
-    """What has a name on the command line."""
+    """Anything that is chosen by name on the command line."""
 
     track: ClassVar[str]
-    """Name of the track, set by the base classes of a track, and by them only."""
+    """Name of the track. Only the base classes of a track set it."""
     training: ClassVar[int] = 1
-    """Version of what it trains, if it does; raised when a change of the code changes the weights that it makes."""
+    """Version of its training. Raise it when a change of the code changes the trained weights."""
     libraries: ClassVar[tuple[str, ...]] = ()
-    """Distributions that compute for it: records name their versions, beside those of torch and the rest."""
+    """Distributions that it computes with: records list their versions, besides torch and the other common libraries."""
 
     def __post_init__(self) -> None:
-        """Check the fields against their annotations; a component that checks more calls this first."""
+        """Check the fields against their annotations; a component with more checks calls this first."""
         ranges.check(self)
 
     @classmethod
     def choices(cls) -> Mapping[str, str]:
-        """Of an adapter to a library: what can be said after its name, `NAME:CHOICE`, and a word on each; else empty."""
+        """For an adapter to a library, the choices of `NAME:CHOICE`, each with a short description; otherwise empty."""
         return {}
 
     @classmethod
     def chosen(cls, choice: str) -> type[Component]:
-        """The component that `NAME:CHOICE` is, for every one of the `choices`.
+        """The component class of `NAME:CHOICE`, where CHOICE is one of `choices`.
 
         Raises:
-            UserError: if the library is not installed, saying which command installs it.
+            UserError: if the library is not installed; the message names the command that installs it.
         """
-        raise NotImplementedError(f"{cls.__name__} leaves no choice")
+        raise NotImplementedError(f"{cls.__name__} has no choices")
 
     @classmethod
     def tracks(cls) -> tuple[str, ...]:
-        """The names of the tracks whose base classes it derives from; `any` for one that serves all."""
-        own = dict.fromkeys(base.__dict__["track"] for base in cls.__mro__ if "track" in base.__dict__)
-        return tuple(sorted(own, reverse=True))
+        """Names of the tracks whose base classes it derives from; `any` if it works on all."""
+        names = dict.fromkeys(base.__dict__["track"] for base in cls.__mro__ if "track" in base.__dict__)
+        return tuple(sorted(names, reverse=True))
 
     @classmethod
     def missing(cls) -> list[str]:
-        """The methods that it must have and does not implement."""
+        """The required methods that it does not implement."""
         return sorted(getattr(cls, "__abstractmethods__", ()))
 
     @classmethod
@@ -78,13 +78,13 @@ class Component(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What a victim or a defence may know of its world, and a report needs: the published facts, never the hidden state.
+    """What victims, defences and reports may know of a world: published facts, never the hidden state.
 
     Args:
-        axes: what the cells of the world differ in.
-        decision_hz: decisions a second; 0 where nothing is decided step by step.
-        max_steps: decisions of an episode that runs to its end; 0 where there are none.
-        actions: names of the discrete actions, by number; empty where there are none.
+        axes: the axes of the world's cells.
+        decision_hz: decisions per second; 0 if nothing is decided step by step.
+        max_steps: decisions in a full episode; 0 if there are none.
+        actions: names of the discrete actions, by number; empty if there are none.
     """
 
     axes: Axes
@@ -93,50 +93,50 @@ class Facts:
     actions: tuple[str, ...] = ()
 
     def written(self) -> dict[str, Any]:
-        """As plain JSON values, for records: a report needs no plug-in to read them."""
+        """The facts as plain JSON values for records, so that a report needs no plug-in to read them."""
         values = {name: value for name, value in vars(self).items() if name != "axes"}
         return values | {"axes": [_without_defaults(axis) for axis in self.axes.values()]}
 
 
 def _without_defaults(value: Any) -> dict[str, Any]:
     defaults = {name: field.default for name, field in type(value).__dataclass_fields__.items()}
-    return {name: found for name, found in asdict(value).items() if found != defaults[name]}
+    return {name: given for name, given in asdict(value).items() if given != defaults[name]}
 
 
 class World(Component):
-    """Where victims are put to the test: it makes what the cells of a grid stand for."""
+    """Where victims are tested: it creates the scenarios of a grid's cells."""
 
     axes: ClassVar[Axes]
-    """What its cells differ in."""
+    """The axes of its cells."""
     grid: ClassVar[str]
-    """Name of the grid that a run drives when it is not told otherwise, an entry of `cavbench.grids`."""
+    """Name of the default grid of a run, an entry of `cavbench.grids`."""
 
     @property
     def facts(self) -> Facts:
-        """What victims, defences and reports may know of it."""
+        """What victims, defences and reports may know of this world."""
         return Facts(axes=self.axes)
 
 
 class Victim(Component):
-    """What is attacked: how to load it and, if it learns, how to train it."""
+    """What is attacked. It can be loaded and, if it learns, trained."""
 
     network: ClassVar[type[Any]]
-    """What victims of the track load, and defences make of them; set by the track's base class."""
+    """The class of the networks that victims and defences of the track load; set by the track's base class."""
     threat: ClassVar[type[ThreatModel]]
     """The class of the track's threat models; set by its base class."""
     learns: ClassVar[bool] = False
     sees: ClassVar[bool] = True
-    """False for one that ignores what it is shown: no attack and no weather can touch it."""
+    """False if it ignores its input, so that neither attacks nor weather can affect it."""
     answers: ClassVar[Access] = "gradients"
-    """The most that it can be asked: `scores` for one that computes outside of torch, and so has no gradient."""
+    """The highest access that it supports: `scores` if it computes outside of torch and has no gradient."""
 
     @property
     def seeded(self) -> bool:
-        """Whether `load` gives another network for another training seed."""
+        """Whether `load` depends on the training seed."""
         return self.learns
 
     def zoo_name(self) -> str:
-        """The name of this victim's entries in the zoo, and the beginning of the name of what defences make of it."""
+        """The name of its entries in the zoo; the names of its defended versions begin with it."""
         raise NotImplementedError(f"{type(self).__name__} does not learn")
 
     @abstractmethod
@@ -145,10 +145,10 @@ class Victim(Component):
 
         Args:
             seed: training seed.
-            facts: of the world it is going to be used in, in the class of its track.
+            facts: facts of the world that it will be used in, in the class of its track.
 
         Raises:
-            UserError: if it is not there, saying which command makes it.
+            UserError: if it does not exist yet; the message names the command that makes it.
         """
 
 
@@ -156,12 +156,12 @@ class Attack(Component):
     """Changes what the victim sees, within a threat model."""
 
     access: ClassVar[Access]
-    """The least access it needs: oblivious, decisions, scores or gradients."""
+    """The access that it needs: oblivious, decisions, scores or gradients."""
     seeded: ClassVar[bool] = False
-    """Whether it makes something once for every training seed, as a patch is crafted."""
+    """Whether it prepares something once for each training seed, such as a patch."""
 
     def misfit(self, victim: Any) -> str:
-        """Why it cannot attack a victim of its track, as the end of a sentence; empty if it can."""
+        """Why it cannot attack a victim of its track, as the end of a sentence; empty if it can attack it."""
         return ""
 
 
@@ -169,33 +169,33 @@ class Defense(Component):
     """Protects a victim: at training time, at run time, or both."""
 
     def train(self, victim: Any, world: Any, *, seed: int, progress: Progress) -> Trained[Any] | None:
-        """Train the hardened network of training seed `seed`; None where there is nothing to train."""
+        """Train the defended network of training seed `seed`; None if there is nothing to train."""
         return None
 
     @property
     def trains(self) -> bool:
-        """Whether what it makes of a victim depends on a training seed."""
+        """Whether the defended victim depends on a training seed."""
         return type(self).train is not Defense.train
 
     def zoo_name(self, victim: Any) -> str:
-        """The name of the zoo entries that hold what `train` made of `victim`."""
+        """The name of the zoo entries that `train` made from `victim`."""
         raise NotImplementedError(f"{type(self).__name__} trains nothing")
 
     @abstractmethod
     def load(self, victim: Any, seed: int, facts: Any) -> nn.Module:
-        """The defended network, ready for use: from the zoo, wrapped, or both.
+        """Load the defended network, ready for use: from the zoo, wrapped, or both.
 
         Args:
-            victim: what is protected.
+            victim: the victim to protect.
             seed: training seed.
-            facts: of the world it is going to be used in, in the class of the track: what features measure and in what units,
-                how often is decided, what actions mean.
+            facts: facts of the world that it will be used in, in the class of the track: features with units, decision rate,
+                meaning of the actions.
         """
 
 
 @dataclass(frozen=True)
 class Trained(Generic[Network]):
-    """What a training leaves: the network, and what its card says of the training."""
+    """The result of a training: the network, and what its card says about the training."""
 
     network: Network
     card: Mapping[str, object]
@@ -203,13 +203,13 @@ class Trained(Generic[Network]):
 
 @dataclass(frozen=True, kw_only=True)
 class ThreatModel:
-    """What an attacker may do. Enforced, never trusted.
+    """What an attacker may do. The framework enforces it.
 
     Args:
-        norm: names the set of changes it may choose from.
-        budget: size of that set.
-        access: the most an attack may use; attacks that need more are refused.
-        queries: most evaluations of the victim.
+        norm: name of the perturbation set.
+        budget: size of the perturbation set.
+        access: the highest access allowed; attacks that need more are refused.
+        queries: maximum number of evaluations of the victim.
     """
 
     norm: str
@@ -225,28 +225,28 @@ class ThreatModel:
 
     @classmethod
     def of_nobody(cls) -> Self:
-        """The threat model of every clean run, so that runs under different threats share it."""
+        """The threat model of all clean runs, so that runs under different threat models share them."""
         return cls(budget=0.0, access="oblivious", queries=0)  # type: ignore[call-arg]
 
     def allows(self, access: Access) -> bool:
-        """Whether an attack that needs `access` fits this threat model."""
+        """Whether this threat model allows an attack that needs `access`."""
         return permits(self.access, access)
 
 
 def permits(allowed: Access, access: Access) -> bool:
-    """Whether who may use `allowed` may use `access`."""
+    """Whether the access level `allowed` includes `access`."""
     return get_args(Access).index(access) <= get_args(Access).index(allowed)
 
 
 def permit(asked: Access, declared: Access) -> None:
-    """Refuse an attack that asks for more than it declares that it needs.
+    """Refuse an attack that uses more access than it declares.
 
     Raises:
-        UserError: if it does.
+        UserError: if `asked` is above `declared`.
     """
     if not permits(declared, asked):
-        raise UserError(f"the attack asked for {asked!r}, but declares that it needs {declared!r} only")
+        raise UserError(f"the attack used access {asked!r}, but declares only {declared!r}: declare access={asked!r}")
 
 
 class QueryBudgetError(UserError):
-    """An attack asked for more queries than its threat model allows."""
+    """An attack exceeded the query budget of its threat model."""

@@ -1,4 +1,4 @@
-"""What a result depends on, as hashes: configurations, source code, library versions."""
+"""Hashes of everything that a result depends on: configuration, source code, library versions."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ BESIDE_THE_RESULT = frozenset(
         "tracks",
     ]
 )
-"""Rooms of `bench` that choose, store or show results: editing them outdates no record."""
+"""Packages and modules of `bench` that choose, store or show results: editing them outdates no record."""
 
 
 def canonical(value: Any) -> str:
-    """The one JSON text of a value: sorted keys, no spaces; dataclasses and mappings as objects, the rest by str()."""
+    """The canonical JSON of a value: sorted keys, no spaces; dataclasses and mappings as objects, anything else by str()."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     return json.dumps(value, sort_keys=True, separators=(",", ":"), default=_plain)
@@ -53,13 +53,13 @@ def digest(value: Any) -> str:
 
 @cache
 def code_digest(modules: tuple[str, ...]) -> str:
-    """sha256 over the names and the code of `sources(modules)`: comments, docstrings and layout do not count."""
+    """sha256 of the names and the code of `sources(modules)`, without comments, docstrings and layout."""
     return digest({name: _code(path) for name, path in sources(modules).items()})
 
 
 @cache
 def _code(path: Path) -> str:
-    """sha256 of what a file does: its syntax tree without docstrings."""
+    """sha256 of the syntax tree of a file, without docstrings."""
     tree = ast.parse(path.read_bytes())
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
@@ -68,15 +68,15 @@ def _code(path: Path) -> str:
 
 
 def _is_text(node: ast.stmt) -> bool:
-    """Whether a statement is a docstring, of a definition or below an attribute."""
+    """Whether a statement is a docstring of a definition or of an attribute."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
 def sources(modules: Iterable[str]) -> dict[str, Path]:
-    """The files that modules are made of: their own and those they import, anywhere in their code and at any remove.
+    """The source files of modules and of everything they import, directly or indirectly, anywhere in their code.
 
-    Imports are followed within the modules' own top-level packages and `bench`, without those `BESIDE_THE_RESULT`; other
-    packages count by their version.
+    Imports are followed within the modules' top-level packages and `bench`, except `BESIDE_THE_RESULT`; of other packages only
+    the version counts.
     """
     waiting = list(modules)
     packages = {"bench", *(name.partition(".")[0] for name in waiting)}
@@ -95,7 +95,7 @@ def sources(modules: Iterable[str]) -> dict[str, Path]:
 
 
 def file_of(module: str) -> Path | None:
-    """Where a module's code is, without importing it or its parents; None where there is no such module."""
+    """The file of a module, found without importing it or its parents; None if there is no such module."""
     top, *inner = module.split(".")
     spec = importlib.util.find_spec(top)
     if spec is None:
@@ -111,7 +111,7 @@ def file_of(module: str) -> Path | None:
 
 
 def _imports(module: str, path: Path) -> Iterator[str]:
-    """Every name that the import statements of a module mention, whether it is a module's or not."""
+    """Every name in the import statements of a module, whether it names a module or not."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
@@ -133,13 +133,13 @@ def state_digest(network: Any) -> str:
 
 @cache
 def libraries(more: tuple[str, ...] = ()) -> dict[str, str]:
-    """Versions of Python and of the libraries that compute results, and of `more` distributions."""
+    """Versions of Python, of the libraries that compute results, and of `more` distributions."""
     return {"python": platform.python_version(), **{name: metadata.version(name) for name in (*LIBRARIES, *more)}}
 
 
 @cache
 def machine() -> str:
-    """System, processor and cores, as far as Python knows them."""
+    """System, processor and number of cores, as far as Python knows them."""
     return f"{platform.system()} {platform.machine()} {_processor()}, {os.cpu_count()} cores"
 
 

@@ -1,7 +1,7 @@
-"""Options like `attack=zo,noise attack.steps=50 lanes=3,4`, read and type-checked by hydra's compose API.
+"""Command-line options such as `attack=zo,noise attack.steps=50 lanes=3,4`, parsed and type-checked by hydra's compose API.
 
-Comma lists of seeds and of the axes of a world (lanes, weather) select; every other comma list sweeps. A component's parameter is
-given to those of the chosen components that have it.
+Comma lists of seeds and of the axes of a world (lanes, weather) select values; all other comma lists sweep. A parameter is
+passed to those of the chosen components that have it.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ DEFAULTS: dict[Kind, str] = {"attack": "none", "defense": "none", "victim": "dqn
 
 
 class Options:
-    """The options as given: the values of each key, in hydra's override grammar.
+    """The given options: the values of each key, in hydra's override grammar.
 
     Args:
-        words: `key=value` each.
-        kinds: of components that may be chosen.
+        words: options, each `key=value`.
+        kinds: kinds of components that may be chosen.
         settings: dataclass of the other keys.
-        axes: names of the axes that may be chosen from, of any world.
+        axes: names of the axes of all worlds.
     """
 
     def __init__(
@@ -52,13 +52,13 @@ class Options:
     ) -> None:
         self.kinds, self.axes = tuple(kinds), tuple(axes)
         self.schema = settings
-        # A path is taken as it is: hydra's grammar gives meaning to many of the characters one may hold.
+        # Paths bypass hydra: its grammar gives a meaning to many characters that occur in them.
         self.out = [word.partition("=")[2] for word in words if word.startswith("out=")]
         self.values: dict[str, tuple[str, ...]] = {}
         for override in _parsed([word for word in words if not word.startswith("out=")]):
             key = override.key_or_group
             if key in self.values or len(self.out) > 1:
-                raise UserError(f"{key} is given twice; write its values with commas: {key}=a,b")
+                raise UserError(f"{key} is given twice; separate its values with commas: {key}=a,b")
             self._check_key(key)
             self.values[key] = _elements(override)
 
@@ -70,7 +70,7 @@ class Options:
             raise UserError(registry.unknown(f"key {key!r}", key, known))
 
     def settings(self) -> dict[str, Any]:
-        """The values of the keys that choose no component."""
+        """The values of the keys that choose neither a component nor a cell."""
         store = ConfigStore.instance()
         store.store(name="settings", node=self.schema)
         lists = {item.name for item in fields(self.schema) if "list" in str(item.type)}
@@ -87,10 +87,10 @@ class Options:
         return {str(key): value for key, value in found.items()} | ({"out": self.out[0]} if self.out else {})
 
     def cell_values(self, axes: Axes) -> dict[str, tuple[Value, ...]]:
-        """The values on the axes of the world that is driven in, as far as they are given.
+        """The given values on the axes of the world of the run.
 
         Raises:
-            UserError: if the world has no such axis, or if a value is not allowed.
+            UserError: if the world does not have the axis, or a value is not allowed.
         """
         given = [key for key in self.values if key in self.axes]
         if strange := [key for key in given if key not in axes]:
@@ -99,21 +99,21 @@ class Options:
 
     @cached_property
     def track(self) -> str:
-        """Name of the track of the victims asked for.
+        """Name of the track of the chosen victims.
 
         Raises:
-            UserError: if they are not all of one.
+            UserError: if they belong to several tracks.
         """
         found = {chosen.component.tracks()[0]: chosen.name for chosen in self.chosen("victim")}
         if len(found) > 1:
             victims = " and ".join(f"{name!r} ({track})" for track, name in found.items())
             raise UserError(
-                f"victims {victims} are of different tracks: run one after the other, with the same out= if you like"
+                f"victims {victims} belong to different tracks: start one run for each; both may use the same out="
             )
         return next(iter(found))
 
     def chosen(self, kind: Kind) -> list[Chosen[Any]]:
-        """Every component of a kind that is asked for, with every combination of its parameters' values."""
+        """The chosen components of a kind, with every combination of their parameter values."""
         names = self.values.get(kind) or (track(self.track).world if kind == "world" else DEFAULTS[kind],)
         # Hydra's grammar escapes the colon of NAME:CHOICE.
         names = tuple(name.replace("\\:", ":") for name in names)
@@ -136,7 +136,7 @@ class Options:
         return list(found.values())
 
     def threats(self) -> list[ThreatModel]:
-        """Every combination of the threat model's values."""
+        """The threat models: every combination of the given values."""
         model = self.chosen("victim")[0].component.threat
         owned = parameters(model)
         keys = [key for key in self.values if key.startswith("threat.")]
@@ -152,10 +152,10 @@ class Options:
 
 
 def configured(kind: Kind, name: str, values: Mapping[str, str]) -> Chosen[Any]:
-    """A component by name, its parameters read as on the command line.
+    """A component by name, with parameters parsed as on the command line.
 
     Raises:
-        UserError: for anything that cannot be read or is not allowed, in one line.
+        UserError: if a value cannot be parsed or is not allowed.
     """
     owned = parameters(registry.load(kind, name))
     for key in values:
@@ -165,16 +165,16 @@ def configured(kind: Kind, name: str, values: Mapping[str, str]) -> Chosen[Any]:
 
 
 def parameter_words(text: str) -> dict[str, str]:
-    """Parameters in one value, as `attack_params` of adversarial training has them: "steps=3 restarts=2".
+    """Parameters in one text, as in `attack_params` of adversarial training: "steps=3 restarts=2".
 
     Raises:
-        UserError: if a word is not of that kind.
+        UserError: if a part is not `name=value`.
     """
     found = {}
     for word in text.split():
         name, equals, value = word.partition("=")
         if not equals:
-            raise UserError(f"attack_params takes words like steps=3, got {word!r}")
+            raise UserError(f'attack_params takes name=value pairs, for instance "steps=3 restarts=2", got {word!r}')
         found[name] = value
     return found
 
@@ -189,7 +189,7 @@ def _parsed(words: Sequence[str]) -> list[Override]:
         try:
             (override,) = parser.parse_overrides([word])
         except HydraException:
-            # Not a value of hydra's grammar, so a plain text.
+            # The value is outside of hydra's grammar: quote it as plain text.
             escaped = value.replace("\\", "\\\\").replace('"', '\\"')
             (override,) = parser.parse_overrides([f'{key}="{escaped}"'])
         overrides.append(override)
@@ -200,12 +200,12 @@ def _elements(override: Override) -> tuple[str, ...]:
     swept = override.is_sweep_override()
     values = list(override.sweep_string_iterator()) if swept else [override.get_value_element_as_str()]
     if "" in values:
-        raise UserError(f"{override.key_or_group} has no value; write {override.key_or_group}=value")
+        raise UserError(f"{override.key_or_group} has an empty value; write {override.key_or_group}=value")
     return tuple(dict.fromkeys(values))
 
 
 def _listed(values: Sequence[str]) -> Sequence[str]:
-    """The values of `key=a,b`, and of `key=[a,b]` too."""
+    """The values of `key=a,b` or `key=[a,b]`."""
     if len(values) == 1 and values[0].startswith("[") and values[0].endswith("]"):
         return [value.strip() for value in values[0][1:-1].split(",")]
     return values
@@ -233,7 +233,7 @@ def _composed(overrides: list[str], config_name: str | None = None) -> DictConfi
 
 
 def _schema(owned: dict[str, Parameter]) -> type[Any]:
-    """A structured config of a component's parameters, with types that OmegaConf knows."""
+    """A structured config of a component's parameters, with types that OmegaConf supports."""
     made: list[tuple[str, Any, Any]] = []
     for parameter in owned.values():
         value = parameter.default
@@ -255,7 +255,7 @@ def _omegaconf_type(hint: Any) -> Any:
 
 
 def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping[str, str]) -> dict[str, Any]:
-    """Values in hydra's grammar as constructor arguments: typed, checked against the choices, tuples for lists."""
+    """Constructor arguments from values in hydra's grammar: typed, checked against the choices, lists as tuples."""
     given_names = {key.partition(".")[0] for key in given}
     if missing := [f"{kind}.{key}=…" for key, p in owned.items() if p.required and key not in given_names]:
         raise UserError(f"{kind} {name!r} needs {', '.join(missing)}")

@@ -1,4 +1,4 @@
-"""Components by name, and the pair: an attack on a defended victim in a world, under a threat model."""
+"""Components chosen by name, and pairs: an attack on a defended victim in a world, under a threat model."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ C = TypeVar("C", Attack, Defense, Victim, World)
 
 @dataclass(frozen=True, kw_only=True)
 class Chosen(Generic[C]):
-    """A component with the name it was registered by.
+    """A component with its registered name.
 
     Args:
         kind: attack, defense, victim or world.
-        name: of the entry point.
+        name: name of the entry point.
         component: the instance; its fields are its parameters.
     """
 
@@ -31,54 +31,54 @@ class Chosen(Generic[C]):
 
     @property
     def params(self) -> str:
-        """Its parameters as canonical JSON."""
+        """The parameters as canonical JSON."""
         return canonical(self.component)
 
     def __str__(self) -> str:
-        """The name, with the parameters that are not the default: `pgd(steps=20)`."""
-        own = {p.name: (getattr(self.component, p.name), p) for p in parameters(type(self.component)).values()}
-        changed = [f"{name}={value}" for name, (value, p) in own.items() if p.required or value != p.default]
+        """The name, with the parameters that differ from their defaults: `pgd(steps=20)`."""
+        values = {p.name: (getattr(self.component, p.name), p) for p in parameters(type(self.component)).values()}
+        changed = [f"{name}={value}" for name, (value, p) in values.items() if p.required or value != p.default]
         return f"{self.name}({', '.join(changed)})" if changed else self.name
 
 
 def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
-    """A component by name, with these parameters and the defaults of the others.
+    """A component by name, with these parameters; the others keep their defaults.
 
     Raises:
-        UserError: if the name is unknown, the plug-in broken or a value not allowed.
+        UserError: if the name is unknown, the plug-in is broken, or a value is not allowed.
     """
     component = registry.load(kind, name)
     try:
         return Chosen(kind=kind, name=name, component=component(**params))
     except (ValueError, TypeError) as error:
         raise UserError(f"{kind} {name!r}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
-    # A plug-in's own checks may fail in any other way.
+    # The checks of a plug-in may raise anything else.
     except Exception as error:
-        raise UserError(f"{kind} {name!r} cannot be made: {reason(error)} (--debug shows where)") from error
+        raise UserError(f"{kind} {name!r} cannot be created: {reason(error)} (--debug shows the traceback)") from error
 
 
 def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:
-    """Refuse components that are not of the victim's track.
+    """Refuse components that do not work on the victim's track.
 
     Raises:
-        UserError: naming the first that is not, and what fits.
+        UserError: names the first such component, and those that fit.
     """
     track = victim.component.tracks()[0]
     for part in parts:
         if not part.component.serves(track):
             fitting = ", ".join(sources.names(part.kind, track)) or "none is installed"
             raise UserError(
-                f"{part.kind} {part.name!r} does not fit victim {victim.name!r} of the {track} track; what fits: {fitting}"
+                f"{part.kind} {part.name!r} does not fit victim {victim.name!r} of the {track} track; fitting: {fitting}"
             )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pair:
-    """An attack on a defended victim in a world, under a threat model: what a grid is driven with.
+    """An attack on a defended victim in a world, under a threat model: what a run evaluates on a grid.
 
     Raises:
-        UserError: if a part is of another track than the victim, or if the attack does not fit the victim or needs more than
-            the threat model allows.
+        UserError: if a component does not work on the victim's track, or if the attack does not fit the victim or needs more
+            access than the threat model allows.
     """
 
     attack: Chosen[Attack]
@@ -91,18 +91,18 @@ class Pair:
         attack, victim = self.attack.component, self.victim.component
         check_track(self.victim, self.attack, self.defense, self.world)
         if not isinstance(self.threat, victim.threat):
-            raise UserError(f"a {type(self.threat).__name__} is no threat model of the {self.track} track")
+            raise UserError(f"{type(self.threat).__name__} is not a threat model of the {self.track} track")
         if not self.is_clean and (why := attack.misfit(victim) or ("" if victim.sees else "which ignores its input")):
             raise UserError(f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}, {why}")
         if not permits(victim.answers, attack.access):
             raise UserError(
-                f"attack {self.attack.name!r} needs access {attack.access!r}, victim {self.victim.name!r} answers "
-                f"{victim.answers!r} at most: it is a black box"
+                f"attack {self.attack.name!r} needs access {attack.access!r}, but victim {self.victim.name!r} is a black box "
+                f"that supports {victim.answers!r} at most"
             )
         if not self.threat.allows(attack.access):
             raise UserError(
-                f"attack {self.attack.name!r} needs access {attack.access!r}, the threat model allows "
-                f"{self.threat.access!r} at most; say threat.access={attack.access} to allow it"
+                f"attack {self.attack.name!r} needs access {attack.access!r}, but the threat model allows "
+                f"{self.threat.access!r} at most; allow it with threat.access={attack.access}"
             )
 
     @property
@@ -117,12 +117,12 @@ class Pair:
 
     @property
     def is_seeded(self) -> bool:
-        """Whether training seeds make a difference: to the victim, its defence, or what the attack prepares."""
+        """Whether the victim, its defence or the attack's preparation depends on the training seed."""
         return self.victim.component.seeded or self.defense.component.trains or self.attack.component.seeded
 
     @property
     def is_clean(self) -> bool:
-        """Whether nothing stands between the world and the victim."""
+        """Whether there is no attack."""
         return self.attack.name == "none"
 
     @property
@@ -133,12 +133,12 @@ class Pair:
 
     @property
     def id(self) -> str:
-        """A short name for files and tables: the names and eight digits of the hash of the identity."""
+        """A short name for files and tables: the component names and eight digits of the identity's hash."""
         names = f"{self.attack.name}-{self.defense.name}-{self.victim.name}".replace(":", "-")
         return f"{names}-{digest(self.identity)[:8]}"
 
     def clean(self) -> Pair:
-        """The same victim and defence without the attack: the control of every attacked pair."""
+        """The same victim and defence without the attack: the clean control."""
         return replace(self, attack=choose("attack", "none"), threat=type(self.threat).of_nobody())
 
     def load(self, training_seed: int) -> Any:
@@ -147,24 +147,24 @@ class Pair:
         return self.defense.component.load(self.victim.component, training_seed, facts)
 
     def weights_sha256(self, training_seed: int) -> str:
-        """The hash that the defended network carries of its weights or, where it carries none, the hash of what it has.
+        """The network's own `weights_sha256`; if it has none, the hash of its state.
 
         Raises:
-            UserError: if it cannot be loaded, or is no network of the track.
+            UserError: if it cannot be loaded, or is not a network of the track.
         """
         try:
             network = self.load(training_seed)
         except UserError:
             raise
-        # Third-party code may fail in any way; the person at the terminal is told which component did.
+        # Third-party code may raise anything: name the component that failed.
         except Exception as error:
             raise UserError(
-                f"{self.defense} + {self.victim} cannot be loaded: {reason(error)} (--debug shows where)"
+                f"{self.defense} + {self.victim} cannot be loaded: {reason(error)} (--debug shows the traceback)"
             ) from error
         wanted = self.victim.component.network
         if not isinstance(network, wanted):
             raise UserError(
-                f"{self.defense} + {self.victim} is a {type(network).__name__} where a {wanted.__name__} is needed"
+                f"{self.defense} + {self.victim} loads a {type(network).__name__}, but a {wanted.__name__} is needed"
             )
         carried = str(getattr(network, "weights_sha256", ""))
         return carried if carried or not network.state_dict() else state_digest(network)

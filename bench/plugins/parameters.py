@@ -1,4 +1,4 @@
-"""A component's parameters: its dataclass fields with their types, choices, and the meaning in its docstring."""
+"""The parameters of a component: its dataclass fields with types, choices, and meanings from its docstring."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Parameter:
     """One parameter of a component.
 
     Args:
-        name: of the dataclass field.
+        name: name of the dataclass field.
         hint: its type.
-        default: None where `required`.
+        default: default value; None if `required`.
         required: whether it must be given.
-        meaning: what the class docstring's Args say of it; empty if nothing.
-        allowed: its choices or its range in words; empty if its type says all.
+        meaning: description in the Args of the class docstring; empty if there is none.
+        allowed: choices or range as text; empty if only the type restricts it.
     """
 
     name: str
@@ -35,20 +35,20 @@ class Parameter:
 
     @property
     def choices(self) -> tuple[Any, ...]:
-        """What is allowed, where the type is a Literal; empty otherwise."""
+        """The allowed values of a Literal type; empty for other types."""
         hints = (self.hint, *get_args(self.hint)) if get_origin(self.hint) in (Union, types.UnionType) else (self.hint,)
         return tuple(choice for hint in hints if get_origin(hint) is Literal for choice in get_args(hint))
 
     @property
     def default_text(self) -> str:
-        """The default as it is shown, or that there is none."""
+        """The default as text, or "required"."""
         if self.required:
             return "required"
         return str(self.default).lower() if isinstance(self.default, bool) else str(self.default)
 
     @property
     def type_name(self) -> str:
-        """The type as an author writes it."""
+        """The type as written in the source."""
         if self.choices:
             return type(self.choices[0]).__name__
         return self.hint.__name__ if isinstance(self.hint, type) and not get_args(self.hint) else str(self.hint)
@@ -62,7 +62,7 @@ def parameters(component: type) -> dict[str, Parameter]:
     """
     try:
         hints, annotated = (typing.get_type_hints(component, include_extras=extras) for extras in (False, True))
-    # An annotation is evaluated, and may be any expression.
+    # Annotations are evaluated, and may be any expression.
     except Exception as error:
         raise UserError(f"the parameters of {component.__qualname__} cannot be read: {error}") from error
     meanings: dict[str, str] = {}
@@ -83,7 +83,7 @@ def parameters(component: type) -> dict[str, Parameter]:
 
 
 def description(component: type) -> str:
-    """The class docstring without its Args; empty if it has none of its own."""
+    """The class docstring without its Args; empty if the class itself has none."""
     return re.sub(r"\n*Args:\n(?:[ \t]+.*\n?|\n(?=[ \t]))*", "\n", _docstring(component)).strip()
 
 
@@ -94,13 +94,13 @@ def _default(field: Field[Any]) -> Any:
 
 
 def _docstring(component: type) -> str:
-    own = component.__dict__.get("__doc__") or ""
-    # dataclass() writes the signature where an author wrote nothing.
-    return "" if own.startswith(f"{component.__name__}(") else inspect.cleandoc(own)
+    text = component.__dict__.get("__doc__") or ""
+    # dataclass() sets the signature as the docstring of a class without one.
+    return "" if text.startswith(f"{component.__name__}(") else inspect.cleandoc(text)
 
 
 def _meanings(component: type) -> dict[str, str]:
-    """The Args of a Google-style docstring: `name: meaning` or `name, name: meaning`, continued by deeper lines."""
+    """The Args of a Google-style docstring: `name: meaning` or `name, name: meaning`, continued on indented lines."""
     _, _, section = _docstring(component).partition("Args:\n")
     found: dict[str, str] = {}
     current: list[str] = []

@@ -1,6 +1,6 @@
-"""What values a parameter may have, from its annotation: `Annotated[float, Interval(gt=0, le=1)]`, `Literal["a", "b"]`.
+"""Allowed values of parameters, from their annotations: `Annotated[float, Interval(gt=0, le=1)]`, `Literal["a", "b"]`.
 
-The markers are those of the annotated-types package: Ge, Gt, Le, Lt, Interval.
+The markers Ge, Gt, Le, Lt and Interval are from the annotated-types package.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ Natural = Annotated[int, Ge(0)]
 
 
 def check(instance: Any) -> None:
-    """Refuse a dataclass instance with a field whose value is not allowed by its annotation.
+    """Check the fields of a dataclass instance against their annotations.
 
     Raises:
-        ValueError: in one line: which field, what is allowed, what it is.
+        ValueError: names in one line the field, what is allowed, and its value.
     """
     kind: Any = type(instance)
     for name, hint in _hints(kind).items():
@@ -41,7 +41,7 @@ def check(instance: Any) -> None:
 
 
 def words(hint: Any) -> str:
-    """What is allowed: "between 0 and 1", "above 0", "one of a, b"; empty where everything of the type is."""
+    """The allowed values as text: "between 0 and 1", "above 0", "one of a, b"; empty if only the type restricts them."""
     choices = [str(choice) for part in _parts(hint) if get_origin(part) is Literal for choice in get_args(part)]
     if choices:
         return f"one of {', '.join(choices)}"
@@ -59,13 +59,13 @@ def words(hint: Any) -> str:
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
-    """The annotations of the fields that restrict their values."""
+    """The annotations that restrict the values of their fields."""
     hints = typing.get_type_hints(kind, include_extras=True)
     return {name: hints[name] for name in getattr(kind, "__dataclass_fields__", {}) if words(hints[name])}
 
 
 def _parts(hint: Any) -> Iterator[Any]:
-    """The alternatives of a union, without the markers; a type that is none is its only one."""
+    """The alternatives of a union, or the type itself, without the markers."""
     if get_origin(hint) is Annotated:
         yield from _parts(get_args(hint)[0])
     elif get_origin(hint) in (Union, types.UnionType):
@@ -76,7 +76,7 @@ def _parts(hint: Any) -> Iterator[Any]:
 
 
 def _bounds(hint: Any) -> Iterator[Bound]:
-    """The bounds of an annotation, or of one of a union's alternatives."""
+    """The bounds of an annotation, also within a union."""
     if get_origin(hint) in (Union, types.UnionType):
         for part in get_args(hint):
             yield from _bounds(part)

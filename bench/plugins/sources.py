@@ -1,4 +1,4 @@
-"""Which tracks a component serves, read from its source: listing components imports none of them."""
+"""Reads from the source of a component which tracks it works on, without importing it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bench.plugins.registry import GROUPS, Kind
 
 
 def names(kind: Kind, track: str) -> list[str]:
-    """The components of a kind that serve a track."""
+    """The components of a kind that work on a track."""
     return [
         name
         for name, claims in registry.entries(GROUPS[kind]).items()
@@ -22,9 +22,9 @@ def names(kind: Kind, track: str) -> list[str]:
 
 
 def tracks_of(target: str) -> list[str]:
-    """The tracks of the class that an entry point names, `module:Class`; empty where the source does not say.
+    """The tracks of the class `module:Class` of an entry point; empty if the source does not tell.
 
-    They are every `track: ... = "..."` in the body of the class or of a base of it, as far as those can be followed by name.
+    They are the values of `track: ... = "..."` in the bodies of the class and its bases, where these can be followed by name.
     """
     module, _, name = target.partition(":")
     waiting, seen, found = [(module, name)], set(), set()
@@ -43,16 +43,16 @@ def tracks_of(target: str) -> list[str]:
                     found.add(track)
         for base in classes[name].bases:
             match base:
-                case ast.Name(id=own):
-                    waiting.append((module, own))
-                case ast.Attribute(value=ast.Name(id=parent), attr=own):
-                    waiting.append((".".join(filter(None, imported.get(parent, (parent, "")))), own))
+                case ast.Name(id=parent_class):
+                    waiting.append((module, parent_class))
+                case ast.Attribute(value=ast.Name(id=parent), attr=parent_class):
+                    waiting.append((".".join(filter(None, imported.get(parent, (parent, "")))), parent_class))
     return sorted(found)
 
 
 @cache
 def _top_level(module: str) -> tuple[dict[str, ast.ClassDef], dict[str, tuple[str, str]]]:
-    """The classes of a module, and the module and name behind each name it imports."""
+    """The classes of a module, and the origin (module, name) of each name that it imports."""
     path = file_of(module)
     if path is None or path.suffix != ".py":
         return {}, {}

@@ -1,7 +1,7 @@
-"""What a track is: all that the framework has to know of a kind of victim, in one object.
+"""A track: everything that the framework needs to know about a kind of victim, in one object.
 
-A track is found by its entry point, `cavbench.tracks`. Nothing else in the framework knows one by name: command line, runner,
-records and reports ask the object. Importing a track's module must be quick (no torch): imports stand in its methods.
+Tracks are found by their entry points, `cavbench.tracks`. Command line, runner, records and reports ask the object; none of them
+knows a track by name. Importing a track's module must be quick: put imports of torch into the methods.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ class Job:
 
     Args:
         pair: attack, defence, victim, world, threat model.
-        training_seed: of the victim; of what is prepared too.
-        attack_seed: of the attack's random generator.
-        cell: where.
+        training_seed: seed of the victim and of the artefact.
+        attack_seed: seed of the attack's random generator.
+        cell: cell of the grid.
         seeds: the scenario seed of each episode.
-        artefact: fingerprint of what was prepared for it; empty for nothing.
+        artefact: fingerprint of the artefact that was prepared for it; empty if there is none.
     """
 
     pair: Pair
@@ -50,11 +50,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Driven:
-    """What a job made.
+    """The result of a job.
 
     Args:
-        columns: a column [B] a measurement of the track, with `seed`.
-        traces: what recordings of some episodes are made of, by scenario seed; only the track knows what is in one.
+        columns: one column [B] for each measurement of the track, and `seed`.
+        traces: by scenario seed, the data for recordings of some episodes, in a format of the track.
     """
 
     columns: Columns
@@ -63,20 +63,20 @@ class Driven:
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """A column of reports: how the values of a measurement over many episodes become one number.
+    """A column of reports: how a measurement is aggregated over episodes.
 
     Args:
-        column: of the records.
-        heading: at most two lines; `{max_steps}` and other facts of the world are filled in.
+        column: column of the records.
+        heading: at most two lines; may contain facts of the world, such as `{max_steps}`.
         how: `iqm`: interquartile mean over runs and cells with a bootstrap interval; `mean`; `median`; `rate`: share of the
-            episodes for which a flag is set, with a Wilson interval; `step mean`: mean over all steps, of a column that holds the
-            mean of each episode.
-        unit: `share` is written as a percentage.
-        digits: behind the point.
-        of_attack: whether it describes the attack, and nothing where there is none.
+            episodes for which a flag is set, with a Wilson interval; `step mean`: mean over all steps, from a column of
+            episode means.
+        unit: `share` is shown as a percentage.
+        digits: decimal places.
+        of_attack: whether it describes the attack; it is empty for clean runs.
         with_interval: whether the overview shows its interval.
-        tables: which tables have it: `overview` (a row an attack), `cells` (a row a cell), or `both`.
-        spare: columns are left out of a narrow terminal from the highest number down; 0 stays.
+        tables: tables that show it: `overview` (one row per attack), `cells` (one row per cell), or `both`.
+        spare: a narrow terminal drops the columns with the highest numbers first; 0 is never dropped.
     """
 
     column: str
@@ -92,11 +92,11 @@ class Measure:
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:
-    """What reports call a baseline (`Track.baseline_of`).
+    """The names of a baseline (`Track.baseline_of`) in reports.
 
     Args:
-        title: in a row or a sentence.
-        heading: of its column, at most two lines.
+        title: name in a row or a sentence.
+        heading: heading of its column, at most two lines.
         spare: as in `Measure`.
     """
 
@@ -107,15 +107,15 @@ class Baseline:
 
 @dataclass(frozen=True, kw_only=True)
 class Contrast:
-    """The baseline that scores under attack are compared with, scenario by scenario, and who has to do better than it.
+    """The baseline that scores under attack are compared with, scenario by scenario.
 
     Args:
-        side: `victim`: the victim under attack must score above a baseline that ignores its input. `attack`: the score must fall
-            below that under a baseline attack, which knows nothing of the victim.
-        baseline: its name; empty for the one with the lowest score of those that were driven.
-        title: of the baseline in a sentence, with its article.
-        heading: of the column of differences, at most two lines.
-        short: of a column of marks, at most two lines.
+        side: who must beat the baseline. `victim`: the victim under attack must score above an input-independent policy.
+            `attack`: the score must fall below the score under a baseline attack that is not optimised against the victim.
+        baseline: its name; empty for the baseline with the lowest score.
+        title: its name in a sentence, with article.
+        heading: heading of the column of differences, at most two lines.
+        short: heading of a column of marks, at most two lines.
     """
 
     side: Literal["victim", "attack"]
@@ -126,112 +126,112 @@ class Contrast:
 
 
 class Track(ABC):
-    """A kind of victim, with everything that is special about it."""
+    """A kind of victim, with everything that is specific to it."""
 
     name: ClassVar[str]
-    """As in the `track` of its base classes."""
+    """Its name, equal to `track` of its base classes."""
     world: ClassVar[str]
-    """Name of the world that a run uses when it is not told otherwise."""
+    """Name of the default world of a run."""
     victim: ClassVar[str] = ""
-    """Name of a victim to show in examples; empty for none."""
+    """Name of a victim for examples; empty for none."""
     episode: ClassVar[tuple[str, str]] = ("scenario", "scenarios")
-    """What an episode is called: one, and several."""
+    """The word for an episode: singular and plural."""
     run: ClassVar[str] = "training seed"
-    """What tells the runs of a pair apart."""
+    """The word for what distinguishes the runs of a pair."""
     artefact: ClassVar[tuple[str, str] | None] = None
-    """What is prepared once for a pair and training seed, before its cells are driven: one, and several.
+    """The word for what is prepared once per pair and training seed, before its cells are driven: singular and plural.
 
-    Records have a column named after one of them, with its fingerprint; they are kept in a folder named after several.
+    The singular names the column of records that holds its fingerprint, the plural the folder of its files.
     """
 
     unrepeatable: ClassVar[tuple[str, ...]] = ()
-    """Measurements that no replay can repeat: wall times, and names that change with the code."""
+    """Measurements that a replay cannot reproduce: wall times, and fingerprints that change with the code."""
     measurements: ClassVar[tuple[pa.Field, ...]]
-    """The columns of its records, beside those that every track has (`bench.records.schema`)."""
+    """The columns of its records, in addition to those of all tracks (`bench.records.schema`)."""
     probes: ClassVar[tuple[pa.Field, ...]] = ()
-    """More of them, that may be null: what the flags of a leaderboard are measured by."""
+    """Further columns, which may be null, for the flags of a leaderboard."""
     facts_of_v1: ClassVar[Mapping[str, object]] = {}
-    """What its world was when records did not say (version 1); empty for a track that is younger."""
+    """Facts of its world for records of format 1, which do not contain them; empty for a newer track."""
     metric: ClassVar[str]
-    """The measurement it is ranked by, in [0, 1], more is better for the victim."""
+    """The ranking metric: a measurement in [0, 1], higher is better for the victim."""
     metric_title: ClassVar[str]
-    """What reports call it."""
+    """Name of the metric in reports."""
     failure: ClassVar[str] = ""
-    """The measurement, a flag, that is the worst that can happen to the victim: a crash, a sign that is run."""
+    """The boolean measurement of the worst failure: a crash, or running the sign; empty for none."""
     measures: ClassVar[tuple[Measure, ...]] = ()
-    """The columns of its reports, beside the metric."""
+    """The columns of its reports, in addition to the metric."""
     legend: ClassVar[str] = ""
-    """What a reader of its tables has to know."""
+    """Explains the columns of its tables."""
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {}
-    """What reports call its baselines (`baseline_of`), in their order."""
+    """The names of its baselines (`baseline_of`) in reports, in order."""
     contrast: ClassVar[Contrast | None] = None
-    """The baseline that a pair under attack is compared with; None where there is none."""
+    """The baseline that attacked pairs are compared with; None for none."""
     place: ClassVar[str] = ""
-    """The measurement that names where an episode takes place; tables of a pair have a row for each. Empty for none."""
+    """The measurement that names the location of an episode; tables of a pair have one row per location. Empty for none."""
     queries: ClassVar[str] = "queries"
-    """The measurement that counts what an attack asked the victim."""
+    """The measurement that counts the queries of an attack."""
     queries_title: ClassVar[str] = "queries"
-    """What reports call it, for instance queries a step."""
+    """Its name in reports, for instance "queries a step"."""
     gradients: ClassVar[str] = "gradient_queries"
-    """The measurement, or probe, that counts the gradients among them."""
+    """The measurement or probe that counts the gradients of an attack."""
     excess: ClassVar[str] = ""
-    """The measurement of how far an attack's answers were outside its perturbation set; empty for none."""
+    """The measurement of how far an attack left its perturbation set before projection; empty for none."""
     step_ms: ClassVar[str] = ""
-    """The measurement of an attack's wall time a decision, in milliseconds; empty for none."""
+    """The measurement of an attack's wall time per decision in milliseconds; empty for none."""
     enough_episodes: ClassVar[int] = 20
-    """Scenarios a cell below which a leaderboard flags a score."""
+    """A leaderboard flags scores with fewer scenarios per cell."""
     other_input: ClassVar[str] = "another input"
-    """What the probe `same_answer` shows the victim instead of its input."""
+    """The input that the probe `same_answer` substitutes."""
     many_draws: ClassVar[str] = ""
-    """Why every attack sees many draws of a random victim, as a sentence; empty where it has to ask again to see them."""
+    """Why every attack sees many draws of a random victim, as a sentence; empty if it must repeat queries to see them."""
 
     work: ClassVar[str]
-    """The module that computes its records: its source, with all it imports, is what they outdate with."""
+    """The module that computes its records; a change of its source, or of what it imports, outdates them."""
     preparation: ClassVar[str] = ""
-    """The module that makes its artefacts."""
+    """The module that computes its artefacts; empty if it has none."""
 
     def baselines(self, pair: Pair) -> Iterator[Pair]:
-        """The pairs that a pair is compared with, and which every run drives beside it."""
+        """The baseline pairs that a pair is compared with; every run also drives these."""
         yield from ()
 
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
-        """The name under which records are a baseline for others; empty if they are none. A baseline is one for itself too.
+        """The name of the baseline that records are for other records, themselves included; empty if they are not one.
 
         Args:
-            other: the identity columns of a record of what may be a baseline.
-            own: those of what is compared.
+            other: identity columns of the possible baseline.
+            own: identity columns of the records to compare with it.
         """
         return ""
 
     def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
-        """What a perturbation budget allows, in words.
+        """Describe what a perturbation budget allows.
 
         Args:
-            norm: of the threat model.
-            budget: of the threat model.
-            facts: of the world, as records have them (`world_facts`).
+            norm: norm of the threat model.
+            budget: budget of the threat model.
+            facts: facts of the world, as in records (`world_facts`).
         """
         return f"a perturbation of at most {budget:g}"
 
     def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
-        """What an attack did or cost, each as a word and a sentence.
+        """Describe what an attack did or cost, each as a keyword and a sentence.
 
         Args:
-            column: gives the values of a measurement in all its episodes.
+            column: returns the values of a measurement in all its episodes.
         """
         yield from ()
 
     def identity(self, pair: Pair) -> Mapping[str, object]:
-        """The columns of a record's identity that only this track fills: `action_type`."""
+        """The identity columns of records that depend on the track: `action_type`."""
         return {"action_type": ""}
 
     def prepare(self, job: Job, made_by: str, progress: Progress) -> bytes:
-        """Make the `artefact` of a job's pair and training seed: the content of a safetensors file.
+        """Make the `artefact` of a pair and training seed: the content of a safetensors file.
 
         Args:
-            job: whose pair it is of; its cell and scenario seeds do not matter.
-            made_by: canonical JSON of what decides it, to be kept in the file.
-            progress: told how far it is.
+            job: the job that needs it; its cell and scenario seeds do not matter.
+            made_by: canonical JSON of everything that determines it, to be stored in the file.
+            progress: called with the progress.
 
         Raises:
             UserError: if it cannot be made.
@@ -240,22 +240,22 @@ class Track(ABC):
 
     @abstractmethod
     def drive(self, job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
-        """Do the work of a job.
+        """Carry out a job.
 
         Args:
-            job: what to do.
-            artefact: what `prepare` made; None where there is nothing to prepare.
-            traced: scenario seeds of the episodes that a recording is wanted of.
+            job: the job.
+            artefact: the result of `prepare`; None if nothing is prepared.
+            traced: scenario seeds of the episodes to record.
         """
 
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         """Write the recording of an episode.
 
         Args:
-            job: that it is of.
-            trace: what `drive` kept of it.
+            job: job of the episode.
+            trace: its trace from `drive`.
             meta: the identity columns of its record.
-            path: of the `.rrd` file, in a folder that exists.
+            path: path of the `.rrd` file, in an existing folder.
         """
         raise NotImplementedError(f"the {self.name} track makes no recordings")
 
@@ -265,16 +265,16 @@ def track(name: str) -> Track:
     """The track of this name.
 
     Raises:
-        UserError: if there is none, or if what its entry point names is no track.
+        UserError: if there is no such track, or its entry point is not a track.
     """
-    found = registry.resolve(registry.TRACKS, name, "track")
-    if not (isinstance(found, type) and issubclass(found, Track)):
+    kind = registry.resolve(registry.TRACKS, name, "track")
+    if not (isinstance(kind, type) and issubclass(kind, Track)):
         raise UserError(f"track {name!r} is not a subclass of bench.plugins.track.Track")
-    return found()
+    return kind()
 
 
 def tracks() -> list[Track]:
-    """Every track that is installed, by name."""
+    """All installed tracks, by name."""
     return [track(name) for name in registry.entries(registry.TRACKS)]
 
 

@@ -1,6 +1,6 @@
-"""Which track and which version of the format a file of records is of, and how older ones are read.
+"""Identifies the track and the format version of a file of records, and reads older versions.
 
-Version 1 had a column each for lanes, density and weather, and said nothing of its world; its first files had no probes either.
+Version 1 had one column each for lanes, density and weather, and no facts of the world; its first files had no probes either.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CELL_OF_V1 = "to_json({'lanes': lanes, 'density': density, 'weather': weather}):
 
 @cache
 def generations(track: Track) -> tuple[pa.Schema, ...]:
-    """The columns of a track's records, those of today first."""
+    """The schemas of a track's records, the current one first."""
     today = schema(track)
     if not track.facts_of_v1:
         return (today,)
@@ -37,34 +37,38 @@ def generations(track: Track) -> tuple[pa.Schema, ...]:
 
 
 def selection(track: Track, columns: pa.Schema) -> str:
-    """What to select, as SQL, from files of a generation to have the columns of today."""
-    there = set(columns.names)
+    """The SQL select list that converts files of a generation to the current schema."""
+    present = set(columns.names)
     facts = json.dumps(track.facts_of_v1, separators=(",", ":")).replace("'", "''")
     older = {"cell": f'{CELL_OF_V1} as "cell"', "world_facts": f"'{facts}' as \"world_facts\""}
     missing = {name: f'null::double as "{name}"' for name in (field.name for field in track.probes)} | older
-    return ", ".join(f'"{name}"' if name in there else missing[name] for name in schema(track).names)
+    return ", ".join(f'"{name}"' if name in present else missing[name] for name in schema(track).names)
 
 
 def check(path: Path, *, thoroughly: bool = False) -> tuple[Track, pa.Schema]:
-    """The track and the generation of a file of records, by its columns, or by reading it all.
+    """The track and the generation of a file of records, from its columns.
+
+    Args:
+        path: the file.
+        thoroughly: whether to read the whole file.
 
     Raises:
-        UserError: if it is truncated or foreign.
+        UserError: if the file is missing, truncated, or not a file of records.
     """
     try:
         found = pq.read_table(path).schema if thoroughly else pq.read_schema(path)
     except (pa.ArrowException, OSError) as error:
-        reason = "not there" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
-        raise UserError(f"the record {path} is {reason}; delete it and run again to make it anew") from None
+        reason = "missing" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
+        raise UserError(f"the record {path} is {reason}; delete it and run again to recreate it") from None
     for track in tracks():
         for generation in generations(track):
             if found.equals(generation):
                 return track, generation
-    raise UserError(f"the record {path} has other columns than this version writes; use another folder with out=")
+    raise UserError(f"the record {path} has columns that this version does not write; use another folder with out=")
 
 
 def glance(path: Path) -> tuple[Track, pa.Schema]:
-    """The same by the names in the footer alone, ten times as fast; a file that seems foreign is looked at in full."""
+    """As `check`, but only from the names in the footer, ten times as fast; falls back to `check`."""
     footer = _footer(path)
     for track in tracks():
         for generation in generations(track):
@@ -81,7 +85,7 @@ def _encoded(generation: pa.Schema) -> tuple[bytes, ...]:
 
 
 def _footer(path: Path) -> bytes:
-    """The end of a Parquet file, where its columns are named."""
+    """The footer of a Parquet file, which names its columns; empty if it cannot be read."""
     try:
         with path.open("rb") as file:
             file.seek(-8, os.SEEK_END)

@@ -1,4 +1,4 @@
-"""Reads the records of a results folder: the newest of everything, or those of some units."""
+"""Reads the records of a results folder: the newest of all units, or those of some units."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from bench.records.store import FOLDER, path_of
 
 
 def read_all(out: Path) -> dict[str, pa.Table]:
-    """The newest records of each track that a results folder has records of.
+    """The newest records of each track in a results folder.
 
     Raises:
-        UserError: if there are no records, or if a file is truncated or foreign.
+        UserError: as `read`.
     """
-    there = {check(path)[0].name for path in _paths(out)}
-    return {track.name: read(out, track=track) for track in of.tracks() if track.name in there}
+    present = {check(path)[0].name for path in _paths(out)}
+    return {track.name: read(out, track=track) for track in of.tracks() if track.name in present}
 
 
 def read(out: Path, units: Collection[str] | None = None, *, track: Track) -> pa.Table:
@@ -36,12 +36,12 @@ def read(out: Path, units: Collection[str] | None = None, *, track: Track) -> pa
 
     Args:
         out: results folder.
-        track: whose records; those of the other are left alone.
-        units: fingerprints of the units to read. None reads the newest result of everything that is there: of each pair
-            and training seed only what the newest code and weights made, and of a scenario driven twice the last one.
+        track: track to read; records of other tracks are skipped.
+        units: fingerprints of the units to read. None reads the newest results: for each pair and training seed only those of
+            the newest code and weights, and for a scenario that was driven twice only the last.
 
     Raises:
-        UserError: if there are no records, or if a file is truncated or foreign, or has values that cannot be.
+        UserError: if there are no records, or a file is truncated, foreign, or has invalid values.
     """
     paths = _paths(out) if units is None else [path_of(out, unit) for unit in sorted(set(units))]
     known = [(path, generation) for path in paths for found, generation in [check(path)] if found.name == track.name]
@@ -61,39 +61,39 @@ def _paths(out: Path) -> list[Path]:
 
 
 def _valid(records: pa.Table, out: Path, track: Track) -> pa.Table:
-    """Records as they are; refused, and their file named, if a value cannot be."""
-    if found := validity.complaint(records, schema(track)):
-        row, why = found
+    """The records, unchanged; UserError with the name of the file if a value is invalid."""
+    if problem := validity.complaint(records, schema(track)):
+        row, why = problem
         path = path_of(out, records["unit"][row].as_py())
         named = f"the record {path}" if path.exists() else f"a record in {out} (unit {path.stem})"
-        raise UserError(f"{named} cannot be right: {why}; delete it and run again to make it anew")
+        raise UserError(f"{named} is invalid: {why}; delete it and run again to recreate it")
     return records
 
 
 def read_compact(out: Path, measurements: Collection[str]) -> dict[str, pa.Table]:
-    """The newest records of each track as `read` would choose them, small enough for a million: for leaderboards.
+    """The newest records of each track, as in `read_all`, in a compact form for leaderboards of a million records.
 
-    Text columns are dictionaries. Of the measurements only those asked for are there, and the probes.
+    Text columns are dictionary-encoded. Only the given measurements, and the probes, are read.
 
     Args:
         out: results folder.
-        measurements: names of columns that hold no lists, of any track.
+        measurements: names of columns of any track, without lists.
 
     Raises:
-        UserError: if there are no records, or if a file is truncated or foreign, or has values that cannot be.
+        UserError: if there are no records, or a file is truncated, foreign, or has invalid values.
     """
     known: dict[str, list[tuple[Path, pa.Schema]]] = {}
     for path in _paths(out):
         track, generation = glance(path)
         known.setdefault(track.name, []).append((path, generation))
-    there = [track for track in of.tracks() if track.name in known]
-    return {track.name: _read_compact(out, known[track.name], track, measurements) for track in there}
+    present = [track for track in of.tracks() if track.name in known]
+    return {track.name: _read_compact(out, known[track.name], track, measurements) for track in present}
 
 
 def _read_compact(
     out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track, measurements: Collection[str]
 ) -> pa.Table:
-    """A row a unit, as what its episodes share is most of a record, with its episodes as lists; these are laid out then."""
+    """Read one row per unit, with its episodes as lists, then expand the lists: most of a record is shared by its unit."""
     shared = [field.name for field in (*IDENTITY, *PROVENANCE) if field.name not in ("unit", "seed")]
     wanted = [field.name for field in track.measurements if field.name in measurements]
     wanted += [field.name for field in track.probes]
@@ -112,7 +112,7 @@ def _read_compact(
 
 
 def _laid_out(column: pa.Array, rows: NDArray[np.int64]) -> pa.Array:
-    """A column of units as one of their episodes: lists are unpacked, text becomes a dictionary."""
+    """Expand a column of units to one of episodes: lists are flattened, text is dictionary-encoded."""
     if pa.types.is_list(column.type):
         return column.flatten()
     if pa.types.is_string(column.type):
@@ -123,7 +123,7 @@ def _laid_out(column: pa.Array, rows: NDArray[np.int64]) -> pa.Array:
 
 @contextmanager
 def _records(out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track) -> Iterator[duckdb.DuckDBPyConnection]:
-    """A connection whose view `records` is what is in files of one track; a file that cannot be read is named."""
+    """A connection with the view `records` of the files of one track; UserError with the name of an unreadable file."""
     by_columns: dict[pa.Schema, list[str]] = {}
     for path, generation in known:
         by_columns.setdefault(generation, []).append("'" + str(path).replace("'", "''") + "'")
@@ -141,7 +141,7 @@ def _records(out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track) -
         raise UserError(f"the records in {out} cannot be read: {str(error).splitlines()[0]}") from error
 
 
-_NOTHING = "there are no records in {out}; `bench run out={out}` makes some"
+_NOTHING = "there are no records in {out}; create some with `bench run out={out}`"
 _NEWEST = """
     qualify (code_digest, weights_sha256) = first_value((code_digest, weights_sha256)) over (
         partition by pair, training_seed order by created_at desc, unit)
@@ -152,6 +152,6 @@ _NEWEST_UNITS = """
     qualify (code_digest, weights_sha256) = first_value((code_digest, weights_sha256)) over (
         partition by pair, training_seed order by created_at desc, unit)
 """
-"""The same of units; of a scenario that two of them drove, the reader keeps the last."""
+"""The same for units; if two of them drove a scenario, the caller keeps the last."""
 _UNIT_ORDER = " order by pair, training_seed, cell, created_at"
 _ORDER = " order by pair, training_seed, cell, seed"

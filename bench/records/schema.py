@@ -1,4 +1,4 @@
-"""The columns of episode records: what every track has, and those of one track. One row is an episode."""
+"""The columns of episode records: those of all tracks and those of one track. One row is one episode."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import pyarrow as pa
 from bench.plugins.track import Track
 
 VERSION = "2"
-"""Of the format: 1 had a column for lanes, density and weather each, 2 has `cell` and `world_facts`."""
+"""Version of the format. 1 had the columns lanes, density and weather; 2 has `cell` and `world_facts`."""
 TEXT, FLOAT, INT = pa.string(), pa.float64(), pa.int64()
 
 
 def field(name: str, kind: pa.DataType, meaning: str, unit: str = "", *, nullable: bool = False) -> pa.Field:
-    """A column, with its unit and meaning. A share says "0 to 1" in its unit, and is checked to be one."""
+    """A column with its unit and meaning. If the unit contains "0 to 1", values are checked against that range."""
     return pa.field(name, kind, nullable=nullable, metadata={"unit": unit, "meaning": meaning})
 
 
 IDENTITY: tuple[pa.Field, ...] = (
-    field("unit", TEXT, "fingerprint of the unit of work: sha256 of everything that decides the result"),
+    field("unit", TEXT, "fingerprint of the unit of work: sha256 of everything that determines the result"),
     field("pair", TEXT, "the attack, defence, victim, world and threat model: names and a short hash"),
     field("attack", TEXT, "name"),
     field("attack_params", TEXT, "canonical JSON"),
@@ -27,76 +27,80 @@ IDENTITY: tuple[pa.Field, ...] = (
     field("victim_params", TEXT, "canonical JSON"),
     field("world", TEXT, "name"),
     field("world_params", TEXT, "canonical JSON"),
-    field("action_type", TEXT, "of the driving track: discrete or continuous; else empty"),
-    field("sees", pa.bool_(), "false for victims that ignore their input; perceptual axes are at their first value"),
-    field("training_seed", INT, "of the victim and of what the attack prepares; 0 where it changes nothing"),
-    field("threat_norm", TEXT, "perturbation set; a clean run has budget 0"),
-    field("threat_budget", FLOAT, "size of the perturbation set", "share or normalised, by the norm"),
-    field("threat_access", TEXT, "the most the attacker may ask"),
-    field("threat_queries", INT, "most queries: of a step, or of a patch", "queries"),
+    field("action_type", TEXT, "driving track: discrete or continuous; otherwise empty"),
+    field("sees", pa.bool_(), "false if the victim ignores its input; perceptual axes are then at their first value"),
+    field("training_seed", INT, "of the victim and of the attack's preparation; 0 if neither depends on it"),
+    field("threat_norm", TEXT, "name of the perturbation set; a clean run has budget 0"),
+    field("threat_budget", FLOAT, "size of the perturbation set", "share or normalised, depending on the norm"),
+    field("threat_access", TEXT, "highest access allowed to the attacker"),
+    field("threat_queries", INT, "query budget of a step or of a patch", "queries"),
     field("grid", TEXT, "name of the grid"),
     field("cell", TEXT, "JSON: the value on each axis of the world"),
     field("world_facts", TEXT, "JSON: axes, decision rate, episode length and actions of the world"),
     field("seed", INT, "scenario seed of the episode"),
 )
-"""What was driven."""
+"""What was evaluated."""
 
 PROVENANCE: tuple[pa.Field, ...] = (
     field("attack_shipped_by", TEXT, "distribution and version"),
     field("defense_shipped_by", TEXT, "distribution and version"),
     field("victim_shipped_by", TEXT, "distribution and version"),
     field("world_shipped_by", TEXT, "distribution and version"),
-    field("weights_sha256", TEXT, "of the policy's weights; empty where it has none"),
-    field("code_digest", TEXT, "sha256 of the source of the packages that computed it"),
+    field("weights_sha256", TEXT, "of the victim's weights; empty if it has none"),
+    field("code_digest", TEXT, "sha256 of the source code that computed it"),
     field(
         "libraries",
         TEXT,
-        "JSON: versions of python, torch and others that compute, and of a component's own libraries",
+        "JSON: versions of Python, torch, other computing libraries and the libraries of components",
     ),
     field("machine", TEXT, "system, processor and number of cores"),
-    field("created_at", pa.timestamp("us", tz="UTC"), "when the unit was finished"),
-    field("wall_s", FLOAT, "wall time of the unit, all its episodes", "s"),
+    field("created_at", pa.timestamp("us", tz="UTC"), "time when the unit was finished"),
+    field("wall_s", FLOAT, "wall time of the unit with all its episodes", "s"),
 )
-"""What produced it, where and when."""
+"""What produced the record, where and when."""
 
 
 def schema(track: Track) -> pa.Schema:
-    """The columns of a record of a track; each field's metadata says its unit and its meaning."""
+    """The schema of a track's records; the metadata of each field holds its unit and its meaning."""
     columns = (*IDENTITY, *track.measurements, *PROVENANCE, *track.probes)
     return pa.schema(columns, metadata={"cavbench": VERSION, "track": track.name})
 
 
 PROBES: tuple[pa.Field, ...] = (
     field(
-        "gradient_queries", FLOAT, "gradients the attack took: a step, mean; or of a patch", "gradients", nullable=True
+        "gradient_queries",
+        FLOAT,
+        "gradients that the attack took: mean per step, or per patch",
+        "gradients",
+        nullable=True,
     ),
     field(
         "zero_gradients",
         FLOAT,
-        "of the gradients the attack took, those that were 0 everywhere",
+        "gradients of the attack that were 0 everywhere",
         "share, 0 to 1",
         nullable=True,
     ),
     field(
         "redrawn",
         FLOAT,
-        "probes on which the victim, asked the same twice, scored it otherwise: it draws",
+        "probes on which the victim gave different scores to the same input: it is random",
         "share, 0 to 1",
         nullable=True,
     ),
     field(
         "same_answer",
         FLOAT,
-        "probes on which another episode's observation (a grey picture) got the same scores",
+        "probes on which another episode's observation (a grey image) got the same scores",
         "share, 0 to 1",
         nullable=True,
     ),
     field(
         "draws",
         FLOAT,
-        "how often the attack asked about each observation, where the victim draws",
+        "queries of the attack per observation, if the victim is random",
         "queries",
         nullable=True,
     ),
 )
-"""What the flags of a leaderboard are measured by; null where nothing was measured. A track that measures them names them."""
+"""Columns for the flags of a leaderboard; null if not measured. A track that measures them lists them in `probes`."""

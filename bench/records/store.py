@@ -1,6 +1,6 @@
-"""Episode records: an append-only Parquet data set, one file a finished unit of work, one row an episode.
+"""Episode records: an append-only Parquet data set with one file per finished unit of work and one row per episode.
 
-A file appears whole or not at all, so a killed run leaves only finished units behind.
+Files are written atomically, so a killed run leaves only finished units.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ FOLDER = "episodes"
 
 
 def prepare(out: Path) -> None:
-    """Make the results folder, or refuse it before any work is done.
+    """Create the results folder and check that it is writable, before any work is done.
 
     Raises:
-        UserError: if nothing can be written there.
+        UserError: if the folder cannot be written.
     """
     try:
         (out / FOLDER).mkdir(parents=True, exist_ok=True)
@@ -37,24 +37,28 @@ def prepare(out: Path) -> None:
 
 
 def path_of(out: Path, unit: str) -> Path:
-    """Where the records of a unit are, by its fingerprint."""
+    """The file of a unit's records, by its fingerprint."""
     return out / FOLDER / f"{unit}.parquet"
 
 
 def finished(out: Path, units: Iterable[str]) -> set[str]:
-    """The fingerprints among `units` whose records are there.
+    """The fingerprints among `units` that have records.
 
     Raises:
         UserError: if one of the files is truncated or foreign.
     """
-    there = {unit for unit in units if path_of(out, unit).exists()}
-    for unit in sorted(there):
+    done = {unit for unit in units if path_of(out, unit).exists()}
+    for unit in sorted(done):
         check(path_of(out, unit))
-    return there
+    return done
 
 
 def write(out: Path, records: pa.Table) -> Path:
-    """Write the records of one unit and return the file; it appears whole or not at all."""
+    """Write the records of one unit atomically, and return the file.
+
+    Raises:
+        UserError: if it cannot be written.
+    """
     path = path_of(out, records["unit"][0].as_py())
     try:
         with files.whole(path) as file:
@@ -65,12 +69,12 @@ def write(out: Path, records: pa.Table) -> Path:
 
 
 def table(constants: Mapping[str, object], measured: Columns, *, track: Track) -> pa.Table:
-    """The records of a unit, one row an episode.
+    """The records of a unit, one row per episode.
 
     Args:
-        constants: what every row says (`bench.run.unit.Unit.constants`).
-        measured: a column [B] a measurement, [B, n] where it is a list; with `seed`.
-        track: whose records they are.
+        constants: values that all rows share (`bench.run.unit.Unit.constants`).
+        measured: one column for each measurement, and `seed`: [B], or [B, n] for lists.
+        track: track of the records.
     """
     rows = len(measured["seed"])
     columns = []

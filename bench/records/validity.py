@@ -1,4 +1,4 @@
-"""What the values of a record may be: shares from 0 to 1, and the cells, access levels and JSON that this version can read."""
+"""Checks the values of records: shares are in [0, 1]; cells, access levels and JSON can be read."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ JSON = ("attack_params", "defense_params", "victim_params", "world_params", "lib
 
 
 def complaint(records: pa.Table, schema: pa.Schema) -> tuple[int, str] | None:
-    """The first row whose values cannot be, and why; None if all can.
+    """The first row with an invalid value, and why it is invalid; None if all rows are valid.
 
     Args:
-        records: columns of `bench.records.schema`; text may be dictionaries.
-        schema: theirs; a column may be missing.
+        records: columns of `bench.records.schema`; text may be dictionary-encoded.
+        schema: schema of the records, which may lack some of its columns.
     """
-    found = [*_out_of_range(records, schema), *_unreadable(records)]
-    return min(found, default=None)
+    problems = [*_out_of_range(records, schema), *_unreadable(records)]
+    return min(problems, default=None)
 
 
 def _out_of_range(records: pa.Table, schema: pa.Schema) -> Iterator[tuple[int, str]]:
-    """Of shares and confidences: numbers whose unit says "0 to 1"."""
+    """Problems of shares and confidences: numbers whose unit ends with "0 to 1"."""
     for field in schema:
         share = field.type == pa.float64() and field.metadata[b"unit"].endswith(b"0 to 1")
         if not share or field.name not in records.column_names:
@@ -42,7 +42,7 @@ def _out_of_range(records: pa.Table, schema: pa.Schema) -> Iterator[tuple[int, s
 
 
 def _unreadable(records: pa.Table) -> Iterator[tuple[int, str]]:
-    """Of texts and cells, each distinct value once."""
+    """Problems of texts and cells; each distinct value is checked once."""
     yield from _refused(records, ("cell", "world_facts"), _cell)
     yield from _refused(records, ("threat_access",), _access)
     for name in JSON:
@@ -50,7 +50,7 @@ def _unreadable(records: pa.Table) -> Iterator[tuple[int, str]]:
 
 
 def _refused(records: pa.Table, names: Sequence[str], check: Callable[..., object]) -> Iterator[tuple[int, str]]:
-    """The first row of every distinct value of these columns that a check refuses with a ValueError."""
+    """The first row of each distinct combination of values in these columns for which `check` raises ValueError."""
     codes = np.zeros(records.num_rows, np.int64)
     for name in names:
         encoded = records[name].combine_chunks()
@@ -68,10 +68,10 @@ def _refused(records: pa.Table, names: Sequence[str], check: Callable[..., objec
 
 
 def _cell(cell: str, facts: str) -> None:
-    values, said = json.loads(cell), json.loads(facts)
-    if not (isinstance(values, dict) and isinstance(said, dict) and isinstance(said.get("axes"), list)):
-        raise ValueError("not a cell of a world that says its axes")
-    Axes.read(said["axes"]).cell(**values)
+    values, world = json.loads(cell), json.loads(facts)
+    if not (isinstance(values, dict) and isinstance(world, dict) and isinstance(world.get("axes"), list)):
+        raise ValueError("not a cell, or world_facts has no axes")
+    Axes.read(world["axes"]).cell(**values)
 
 
 def _access(name: str) -> None:

@@ -1,4 +1,4 @@
-"""What was prepared, in a results folder: a file each, whole or not there, found by its fingerprint."""
+"""The artefacts in a results folder: one file per preparation, written atomically, named by its fingerprint."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from bench.run.unit import Preparation
 
 
 def path_of(out: Path, preparation: Preparation) -> Path:
-    """Where the artefact of a preparation is."""
+    """The file of a preparation's artefact."""
     artefact = preparation.track.artefact
     assert artefact
     return out / artefact[1] / f"{preparation.fingerprint}.safetensors"
 
 
 def write(out: Path, preparation: Preparation, content: bytes) -> Path:
-    """Write an artefact and return its file; it appears whole or not at all.
+    """Write an artefact atomically, and return its file.
 
     Raises:
         UserError: if it cannot be written.
@@ -36,9 +36,9 @@ def read(path: Path) -> bytes:
     """The content of an artefact.
 
     Raises:
-        UserError: if it is not there.
+        UserError: if it is missing.
     """
     try:
         return path.read_bytes()
     except OSError:
-        raise UserError(f"{path} is not there; the same run again makes it") from None
+        raise UserError(f"{path} is missing; run the same command again to create it") from None

@@ -1,4 +1,4 @@
-"""What a run is, in frozen and typed configurations, made from `key=value` words."""
+"""Typed, frozen configurations of runs and trainings, from `key=value` options."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class RunConfig:
     """A run: every pair on every cell of the grid with every training seed.
 
     Args:
-        pairs: what is run.
-        grid: the cells and the scenario seeds.
-        seeds: training seeds of the victims; of detectors also the seeds of the patches.
-        executor: the back end that carries out the work, a name in `bench.run.executors.EXECUTORS`.
-        workers: worker processes; results do not depend on their number.
+        pairs: pairs to evaluate.
+        grid: cells and scenario seeds.
+        seeds: training seeds of the victims, and seeds of the patches.
+        executor: back end that carries out the work, a name in `bench.run.executors.EXECUTORS`.
+        workers: number of worker processes; results do not depend on it.
         out: results folder.
-        record: episodes to record of every cell of each pair; None records one, of the first cell.
-        reference: whether the reference drivers, or the reference patches, are run too.
+        record: episodes to record in every cell of each pair; None records one episode of the first cell.
+        reference: whether to run the baselines of the pairs, too.
 
     Raises:
         ValueError: if a number is out of range.
@@ -58,14 +58,14 @@ class RunConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """A training: one policy a training seed.
+    """A training: one network per training seed.
 
     Args:
-        victim: what is trained.
-        defense: how it is hardened; `none` trains the victim itself.
-        world: where it practises.
+        victim: victim to train.
+        defense: defence to train it with; `none` trains the victim itself.
+        world: world to train in.
         seeds: training seeds.
-        out: the zoo to save to; None is the user's own.
+        out: zoo to save to; None for the user's zoo.
     """
 
     victim: Chosen[Any]
@@ -80,19 +80,21 @@ class TrainConfig:
 
 
 def check_seeds(seeds: tuple[int, ...]) -> None:
-    """Raise ValueError unless there is at least one training seed, none negative and none twice."""
+    """Raise ValueError unless there is at least one training seed, and all are distinct and not negative."""
     if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
-        raise ValueError(f"seeds must be different numbers of at least 0, got {','.join(map(str, seeds)) or 'none'}")
+        raise ValueError(
+            f"seeds must be distinct whole numbers of at least 0, got {','.join(map(str, seeds)) or 'none'}"
+        )
 
 
 def cores() -> int:
-    """Cores this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass
 class RunOptions:
-    """The options of `bench run` that choose no component and no cell, with their types and defaults."""
+    """The options of `bench run` that choose neither a component nor a cell, with types and defaults."""
 
     grid: str | None = None
     episodes: int | None = None
@@ -106,17 +108,17 @@ class RunOptions:
 
 @dataclass
 class TrainOptions:
-    """The options of `bench train` that choose no component."""
+    """The options of `bench train` that do not choose a component, with types and defaults."""
 
     seeds: list[int] = field(default_factory=lambda: [0])
     out: str | None = None
 
 
 def run_config(words: Sequence[str]) -> RunConfig:
-    """The configuration of `bench run WORDS`.
+    """The configuration of `bench run` with these options.
 
     Raises:
-        UserError: for anything that cannot be read or is not allowed, in one line.
+        UserError: if an option cannot be parsed or is not allowed.
     """
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     given = Options(words, kinds=KINDS, settings=RunOptions, axes=list(axes))
@@ -143,41 +145,41 @@ def run_config(words: Sequence[str]) -> RunConfig:
 
 
 def _grid(given: Options, name: str | None) -> Grid:
-    """The grid of this name, or the world's own.
+    """The grid of this name, or the default grid of the world.
 
     Raises:
-        UserError: if there is none of this name, or if it is of another world.
+        UserError: if the world has no such grid, or several worlds are chosen.
     """
     worlds = {world.name: world.component for world in given.chosen("world")}
     if len(worlds) > 1:
-        raise UserError(f"one run drives one world, got {' and '.join(worlds)}: run one after the other")
-    ((own, world),) = worlds.items()
-    known = [grid.name for grid in registry.grids(own)]
+        raise UserError(f"a run uses one world, got {' and '.join(worlds)}: start one run for each")
+    ((world_name, world),) = worlds.items()
+    known = [grid.name for grid in registry.grids(world_name)]
     wanted = name or world.grid
     if wanted not in known:
         if wanted in registry.entries(registry.GRIDS):
-            registry.grid(wanted)  # says why, if it is broken
-        raise UserError(registry.unknown(f"grid {wanted!r} of the world {own!r}", wanted, known))
+            registry.grid(wanted)  # raises the reason if the grid is broken
+        raise UserError(registry.unknown(f"grid {wanted!r} of the world {world_name!r}", wanted, known))
     return registry.grid(wanted)
 
 
 def train_config(words: Sequence[str]) -> TrainConfig:
-    """The configuration of `bench train WORDS`; `seed` is another word for `seeds`.
+    """The configuration of `bench train` with these options; `seed` is an alias of `seeds`.
 
     Raises:
-        UserError: for anything that cannot be read or is not allowed, in one line.
+        UserError: if an option cannot be parsed or is not allowed.
     """
     words = [f"seeds={word.removeprefix('seed=')}" if word.startswith("seed=") else word for word in words]
     given = Options(words, kinds=("defense", "victim", "world"), settings=TrainOptions)
     settings = given.settings()
     one: dict[Kind, Chosen[Any]] = {}
     for kind in given.kinds:
-        found = given.chosen(kind)
-        if len(found) > 1:
+        choices = given.chosen(kind)
+        if len(choices) > 1:
             raise UserError(
-                f"bench train trains one policy a seed, not {len(found)}: give one {kind} and one set of parameters"
+                f"bench train trains one network per seed, not {len(choices)}: give one {kind} and one set of parameters"
             )
-        one[kind] = found[0]
+        one[kind] = choices[0]
     with _one_line():
         return TrainConfig(
             victim=one["victim"],
@@ -189,10 +191,10 @@ def train_config(words: Sequence[str]) -> TrainConfig:
 
 
 def component(kind: Kind, name: str, values: Mapping[str, str]) -> Any:
-    """A component by name, its parameters read as on the command line: `component("attack", "pgd", {"steps": "3"})`.
+    """A component by name, with parameters parsed as on the command line: `component("attack", "pgd", {"steps": "3"})`.
 
     Raises:
-        UserError: for anything that cannot be read or is not allowed, in one line.
+        UserError: if a value cannot be parsed or is not allowed.
     """
     return configured(kind, name, values).component
 

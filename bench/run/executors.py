@@ -1,4 +1,4 @@
-"""Back ends that carry out tasks: `map(tasks)` yields every outcome as it comes, in any order."""
+"""Back ends that carry out tasks: `map(tasks)` yields each outcome as soon as it is finished, in any order."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from bench.run.unit import Preparation, Unit
 from bench.run.work import Outcome, Task, Tell, perform
 
 NEWS_S = 1.0
-"""Seconds between two looks at how far the tasks are."""
+"""Seconds between two updates of the tasks' progress."""
 Finished = tuple[Task, Outcome]
 
 
 class Watcher(Protocol):
-    """Told how work goes; the command line draws its progress bar from it."""
+    """Receives the progress of the work; the command line draws a progress bar."""
 
     def working(self, works: Sequence[Unit | Preparation]) -> None:
-        """These are being worked on now."""
+        """Called with the work in progress."""
 
     def preparing(self, work: str, share: float, text: str) -> None:
-        """How far a preparation is, in [0, 1], in the attack's own words."""
+        """Called with the share of a preparation done in [0, 1], and a text of the attack."""
 
 
 class Executor(Protocol):
-    """A back end."""
+    """A back end that carries out tasks."""
 
     def map(self, tasks: Sequence[Task], watcher: Watcher) -> Generator[Finished, None, None]:
-        """Carry out every task, and yield each with its outcome when it is finished.
+        """Carry out all tasks, and yield each with its outcome as soon as it is finished.
 
-        Closing the generator ends what is in flight.
+        Closing the generator stops the tasks in progress.
 
         Raises:
-            UserError: if a task fails, or its worker dies.
+            UserError: if a task fails or a worker dies.
         """
         ...
 
@@ -60,7 +60,7 @@ class ProcessExecutor:
     """Carries out the tasks in worker processes of this machine.
 
     Args:
-        workers: how many.
+        workers: number of worker processes.
     """
 
     def __init__(self, workers: int) -> None:
@@ -79,7 +79,7 @@ class ProcessExecutor:
         except BrokenProcessPool:
             raise UserError(
                 "a worker process died (killed, or out of memory); "
-                "what was finished is kept, and the same command goes on from there"
+                "finished units are kept: run the same command again to continue"
             ) from None
         except BaseException:
             for process in set(multiprocessing.active_children()) - others:
@@ -96,7 +96,7 @@ def _pooled(
     watcher: Watcher,
     news: SimpleQueue[tuple[str, float, str]],
 ) -> Iterator[Finished]:
-    """Keep every worker busy and no task waiting in the pool, so that what is in flight is what is worked on."""
+    """Submit only as many tasks as there are workers, so that all submitted tasks are in progress."""
     waiting = list(reversed(tasks))
     running: dict[Future[Outcome], Task] = {}
     while waiting or running:
@@ -125,11 +125,11 @@ def executor(name: str, workers: int, tasks: int) -> Executor:
 
 
 _tell: Tell
-"""Of a worker process: where it tells how far its work is."""
+"""In a worker process, reports the progress of its work."""
 
 
 def _begin_work(news: SimpleQueue[tuple[str, float, str]]) -> None:
-    """Set up a worker process: one thread, deaf to Ctrl-C (the parent ends it), and gone when the parent is gone."""
+    """Set up a worker process: one thread, ignores Ctrl-C (the parent stops it), exits when the parent is gone."""
     global _tell
 
     def tell(work: str, share: float, text: str) -> None:

@@ -1,4 +1,4 @@
-"""A run as units of work: every pair, its clean control and its baselines, on every cell of the grid."""
+"""Splits a run into units of work: each pair, its clean control and its baselines, on every cell of the grid."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bench.scenarios import Axes, Cell
 
 
 def plan(config: RunConfig) -> list[Unit]:
-    """Every unit of a run, each once: the pairs, their clean controls and, if asked for, their baselines.
+    """The distinct units of a run: of the pairs, their clean controls and, if `reference`, their baselines.
 
-    Loads every victim once, so that one that is missing is refused before any work.
+    Loads every victim once, so that a missing one is reported before any work is done.
 
     Raises:
-        UserError: if one cannot be loaded.
+        UserError: if a victim cannot be loaded.
     """
     clean = [pair.clean() for pair in config.pairs]
     baselines = [other for pair in config.pairs for other in track_of(pair).baselines(pair)] if config.reference else []
@@ -44,7 +44,7 @@ def plan(config: RunConfig) -> list[Unit]:
 
 
 def _cells(pair: Pair, cells: Iterable[Cell], axes: Axes) -> list[Cell]:
-    """The cells to drive; perceptual axes make no difference to a victim that ignores its input."""
+    """The cells to drive; for a victim that ignores its input, without duplicates along perceptual axes."""
     if pair.victim.component.sees:
         return list(cells)
     return list(dict.fromkeys(axes.unperceived(cell) for cell in cells))

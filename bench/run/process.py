@@ -1,4 +1,4 @@
-"""How a process of the benchmark uses the machine: one thread, and memory that is kept instead of given back."""
+"""Sets up a process of the benchmark: one thread, and freed memory is kept."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 def settle() -> None:
     """Prepare this process for many small forward passes.
 
-    Torch gets one thread: work is spread over processes, and a pool of threads for networks this small costs more than it
-    gives. The C library keeps freed memory: it otherwise hands every intermediate tensor back to the kernel and faults it in
-    again, which halves the rate of a forward pass on a thousand observations.
+    Torch gets one thread: work is distributed over processes, and threads slow down networks this small. The C library keeps
+    freed memory: otherwise it returns every intermediate tensor to the kernel and faults it in again, which halves the speed
+    of a forward pass on a thousand observations.
     """
     import torch
 

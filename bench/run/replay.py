@@ -1,4 +1,4 @@
-"""Drives a recorded episode again, from its record alone, to look at it: bit for bit the same on the same kind of machine."""
+"""Replays an episode from its record alone and records it: bit for bit the same on the same type of machine."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from bench.scenarios import Cell
 
 @dataclass(frozen=True)
 class Replay:
-    """What a replay made.
+    """The result of a replay.
 
     Args:
-        path: of the recording.
-        changed: what has changed since the record was made (code, libraries, weights), in words; empty if nothing.
-        differences: the measurements that came out otherwise than in the record.
+        path: path of the recording.
+        changed: names of what has changed since the record (weights, code, libraries, machine); empty if nothing has.
+        differences: the measurements that differ from the record.
     """
 
     path: Path
@@ -41,10 +41,10 @@ class Replay:
 
 
 def find(records: pa.Table, where: Mapping[str, str]) -> dict[str, Any]:
-    """The first record with these values in its columns or on the axes of its cell, as {"lanes": "3", "seed": "1000017"}.
+    """The first record with these values in its columns or on the axes of its cell: {"lanes": "3", "seed": "1000017"}.
 
     Raises:
-        UserError: if a column is unknown or no record fits.
+        UserError: if a column is unknown or no record matches.
     """
     for name, value in where.items():
         column = records[name] if name in records.column_names else _on_axis(records, name)
@@ -59,7 +59,7 @@ def find(records: pa.Table, where: Mapping[str, str]) -> dict[str, Any]:
         if not left.num_rows:
             values = sorted(set(column.drop_null().to_pylist()))
             shown = ", ".join(map(str, values[:12])) + (f", … {values[-1]}" if len(values) > 12 else "")
-            raise UserError(f"no record has {name}={value}; there are {shown}")
+            raise UserError(f"no record has {name}={value}; known values: {shown}")
         records = left
     return records.slice(0, 1).to_pylist()[0]
 
@@ -69,7 +69,7 @@ def _axes(records: pa.Table) -> list[str]:
 
 
 def _on_axis(records: pa.Table, name: str) -> pa.ChunkedArray | None:
-    """The values of an axis; None where no cell has it."""
+    """The values on an axis; None if no cell has it."""
     if name not in _axes(records):
         return None
     encoded = records["cell"].combine_chunks().dictionary_encode()
@@ -78,14 +78,14 @@ def _on_axis(records: pa.Table, name: str) -> pa.ChunkedArray | None:
 
 
 def replay(out: Path, record: Mapping[str, Any]) -> Replay:
-    """Drive the unit of a record again and save the recording of its episode.
+    """Repeat the unit of a record and save the recording of its episode.
 
     Args:
         out: results folder.
-        record: one row of it.
+        record: one of its records.
 
     Raises:
-        UserError: if a component or the policy is not there any more.
+        UserError: if a component, the weights or the artefact is missing.
     """
     unit, before = _unit(out, record)
     noun, folder = unit.track.artefact or ("", "")
@@ -107,10 +107,10 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
 
 
 def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
-    """The unit of a record, and all its records."""
+    """The unit of a record, and all records of that unit."""
     victim = _chosen("victim", record)
-    own = track(victim.component.tracks()[0])
-    before = reading.read(out, [record["unit"]], track=own).sort_by("seed")
+    track_of_victim = track(victim.component.tracks()[0])
+    before = reading.read(out, [record["unit"]], track=track_of_victim).sort_by("seed")
     seeds = before["seed"].to_pylist()
     pair = Pair(
         attack=_chosen("attack", record),
@@ -140,7 +140,7 @@ def _chosen(kind: registry.Kind, record: Mapping[str, Any]) -> Chosen[Any]:
 
 
 def _equal(before: pa.ChunkedArray, after: pa.ChunkedArray) -> bool:
-    """The same values to the last bit, NaN equal to NaN."""
+    """Whether all values are equal to the last bit; NaN equals NaN."""
     left, right = before.to_pylist(), after.to_pylist()
     return all(
         a == b or (isinstance(a, float) and np.isnan(a) and np.isnan(b)) for a, b in zip(left, right, strict=True)

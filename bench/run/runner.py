@@ -1,7 +1,7 @@
-"""Carries out a run: hands its units of work to an executor, and keeps what comes back as files.
+"""Carries out a run: passes its units of work to an executor, and writes the outcomes to files.
 
-What a unit needs before (a patch) is prepared first, and kept as a file for it. A unit is a pure function of its configuration:
-results do not depend on the executor, the number of workers or the order of work.
+Preparations (patches) are made first and kept as files for their units. A unit is a pure function of its configuration: results
+do not depend on the executor, the number of workers or the order of work.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from bench.scenarios.axes import written
 
 
 class RunWatcher(Watcher, Protocol):
-    """Told how a run goes."""
+    """Receives the progress of a run."""
 
     def begin(self, *, episodes: int, finished: int) -> None:
-        """The run has `episodes` in all, of which `finished` were there already."""
+        """The run has `episodes` in total, of which `finished` already have records."""
 
     def finished(self, work: Unit | Preparation, wall_s: float) -> None:
-        """One more unit, or preparation, is written; it took `wall_s` seconds."""
+        """A unit or preparation is finished and written; it took `wall_s` seconds."""
 
     def warn(self, line: str) -> None:
-        """Something went wrong that does not touch the records."""
+        """Something went wrong that does not affect the records."""
 
 
 def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
-    """Do what is not done yet, and return the fingerprints of all units of the run.
+    """Carry out the unfinished units of a run, and return the fingerprints of all its units.
 
     Raises:
-        UserError: if the results folder cannot be written, a policy is missing, a component fails or a worker dies;
-            what was finished until then is kept.
+        UserError: if the results folder cannot be written, weights are missing, a component fails or a worker dies; finished
+            units are kept.
     """
     units = {unit.fingerprint: unit for unit in plan(config)}
     store.prepare(config.out)
@@ -70,7 +70,7 @@ def _carry_out(
     back_end: Executor,
     watcher: RunWatcher,
 ) -> None:
-    """Hand the works to the executor, and write what each has made as soon as it comes."""
+    """Pass work to the executor, and write each outcome as soon as it is finished."""
     read = cache(artefacts.read)
     tasks = [_task(work, out, recorded, read) for work in works]
     with closing(back_end.map(tasks, watcher)) as finished:
@@ -91,7 +91,7 @@ def _task(
 
 
 def _keep(task: Task, outcome: Outcome, out: Path) -> None:
-    """Write all that a task made; the records last, as they say that it is finished."""
+    """Write the outcome of a task: the records last, because they mark it as finished."""
     if isinstance(task.work, Preparation):
         assert outcome.artefact is not None
         artefacts.write(out, task.work, outcome.artefact)
@@ -103,35 +103,35 @@ def _keep(task: Task, outcome: Outcome, out: Path) -> None:
 
 
 def keep_recording(path: Path, content: bytes) -> None:
-    """Write a recording; it appears whole or not at all."""
+    """Write a recording atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with files.whole(path) as file:
         file.write(content)
 
 
 def recording_path(out: Path, unit: Unit, seed: int) -> Path:
-    """Where the recording of an episode is."""
+    """The file of an episode's recording."""
     cell = "-".join(f"{name}-{written(value)}" for name, value in unit.cell.items())
     return out / "recordings" / unit.pair.id / f"{cell}-{seed}.rrd"
 
 
 def _recorded(config: RunConfig, units: Iterable[Unit]) -> dict[str, Sequence[int]]:
-    """The scenario seeds to record of each unit: of the pairs asked for, with one training seed."""
-    asked = {pair.id for pair in config.pairs}
-    first: dict[str, Unit] = {}
+    """The scenario seeds to record, by fingerprint of the unit: of the requested pairs, with their first training seed."""
+    requested = {pair.id for pair in config.pairs}
+    first_units: dict[str, Unit] = {}
     for unit in units:
-        first.setdefault(unit.pair.id, unit)
-    found: dict[str, Sequence[int]] = {}
+        first_units.setdefault(unit.pair.id, unit)
+    recorded: dict[str, Sequence[int]] = {}
     for unit in units:
-        own = first[unit.pair.id]
-        wanted = unit.pair.id in asked and unit.training_seed == own.training_seed
-        if wanted and (config.record is not None or unit is own):
+        first = first_units[unit.pair.id]
+        wanted = unit.pair.id in requested and unit.training_seed == first.training_seed
+        if wanted and (config.record is not None or unit is first):
             count = 1 if config.record is None else config.record
-            found[unit.fingerprint] = unit.seeds[:count]
-    return found
+            recorded[unit.fingerprint] = unit.seeds[:count]
+    return recorded
 
 
 def _longest_first(unit: Unit) -> tuple[object, ...]:
-    """Attacked units before clean ones, and what has the highest values on its axes first: no long one is left for the end."""
+    """Sort key: attacked units first, then those with the highest values on their axes, so that no long unit comes last."""
     numbers = [-value for value in unit.cell.values() if not isinstance(value, str)]
     return (unit.pair.is_clean, *reversed(numbers))

@@ -1,4 +1,4 @@
-"""The units of work, pure functions of their configuration: a pair on every scenario seed of a cell, and what it needs before."""
+"""Units of work, pure functions of their configuration: a pair on every scenario seed of a cell, and its preparation."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from bench.scenarios import Cell
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What units of both kinds have.
+    """The common part of units and preparations.
 
     Args:
         pair: attack, defence, victim, world, threat model.
-        training_seed: of the victim; of what is prepared too.
-        weights_sha256: of the victim's weights.
+        training_seed: seed of the victim and of the preparation.
+        weights_sha256: hash of the defended victim's weights.
         cell: one value on each axis of the world.
         seeds: the scenario seed of each episode.
     """
@@ -34,7 +34,7 @@ class Work:
 
     @property
     def track(self) -> Track:
-        """The pair's."""
+        """The track of the pair."""
         return track_of(self.pair)
 
     @property
@@ -44,22 +44,22 @@ class Work:
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Modules that are hashed into the code digest, with what they import."""
+        """Modules hashed into the code digest, with their imports."""
         return (self.module, *sorted(type(part.component).__module__ for part in self.pair.parts))
 
     @property
     def code_digest(self) -> str:
-        """Of the source that computes it: the track's and its components', with what they import."""
+        """Hash of the source code that computes it: the track's and the components' modules, with their imports."""
         return code_digest(self.modules)
 
     @property
     def libraries(self) -> dict[str, str]:
-        """Versions of what computes it beside that source."""
+        """Versions of the libraries that it is computed with."""
         return libraries(tuple(sorted({name for part in self.pair.parts for name in part.component.libraries})))
 
     @property
     def attack_seed(self) -> int:
-        """Of the attack's random generator."""
+        """Seed of the attack's random generator."""
         raise NotImplementedError
 
     @property
@@ -81,7 +81,7 @@ class Work:
 
     @property
     def origin(self) -> dict[str, object]:
-        """What decides the result."""
+        """Everything that determines the result."""
         return {
             "pair": self.pair.identity,
             "training_seed": self.training_seed,
@@ -95,9 +95,9 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation(Work):
-    """What an attack makes once for a defended victim, before any cell is driven: a patch, for instance.
+    """What an attack prepares once for a defended victim, before any cell is driven: for instance a patch.
 
-    Its cell and seeds are those of the unit it is made for; they change nothing.
+    Its cell and seeds are those of the unit that needs it; the result does not depend on them.
     """
 
     @property
@@ -106,12 +106,12 @@ class Preparation(Work):
 
     @cached_property
     def fingerprint(self) -> str:
-        """sha256 of everything that decides it."""
+        """sha256 of everything that determines it."""
         return digest(self.origin)
 
     @property
     def attack_seed(self) -> int:
-        """The same for every pair."""
+        """Seed of the attack's random generator; the same for every pair."""
         assert self.track.artefact
         return int(digest([self.track.artefact[0], self.training_seed])[:15], 16)
 
@@ -130,12 +130,12 @@ class Unit(Work):
 
     @property
     def attack_seed(self) -> int:
-        """The same for every pair and every order of work."""
+        """Seed of the attack's random generator; the same for every pair and order of work."""
         return int(digest([canonical(self.cell), self.training_seed])[:15], 16)
 
     @cached_property
     def preparation(self) -> Preparation | None:
-        """What must be there before; None where there is nothing to prepare."""
+        """The preparation that it needs; None if it needs none."""
         if not self.track.artefact or self.pair.is_clean:
             return None
         return Preparation(
@@ -152,21 +152,21 @@ class Unit(Work):
 
     @cached_property
     def fingerprint(self) -> str:
-        """sha256 of everything that decides the result."""
+        """sha256 of everything that determines the result."""
         before = {"artefact": self.artefact} if self.artefact else {}
         scenarios = {"cell": canonical(self.cell), "seeds": [self.seeds.start, self.seeds.stop]}
         return digest(self.origin | scenarios | before)
 
     @property
     def grid(self) -> str:
-        """The named grid of its world that has this cell and these seeds; `custom` if none has."""
-        own = registry.grids(self.pair.world.name)
-        return next((grid.name for grid in own if self.cell in grid.cells() and self.seeds == grid.seeds()), "custom")
+        """Name of the grid of its world with this cell and these seeds; `custom` if there is none."""
+        grids = registry.grids(self.pair.world.name)
+        return next((grid.name for grid in grids if self.cell in grid.cells() and self.seeds == grid.seeds()), "custom")
 
     def constants(self, wall_s: float) -> dict[str, object]:
-        """What every record of the unit says: the columns IDENTITY (but `seed`) and PROVENANCE of `bench.records.schema`.
+        """The columns that all records of the unit share: IDENTITY (without `seed`) and PROVENANCE of `bench.records.schema`.
 
-        Called where the work was done: machine, code and libraries are those of that place.
+        Call it in the process that did the work: it reads machine, code and libraries there.
         """
         pair, threat = self.pair, self.pair.threat
         return {

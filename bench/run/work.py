@@ -1,4 +1,4 @@
-"""Carries out one piece of work. All that it made comes back in its outcome, so that no shared disk is needed."""
+"""Carries out one task. The outcome contains all results, so that no shared disk is needed."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from bench.records.store import table
 from bench.run.unit import Preparation, Unit
 
 Tell = Callable[[str, float, str], None]
-"""Told of which work how far it is, in [0, 1], in a few words."""
+"""Called with the name of the work, the share done in [0, 1], and a short text."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A piece of work, with all that it needs.
+    """A piece of work with everything that it needs.
 
     Args:
-        work: what to do.
-        artefact: the file of the unit's preparation; None where it has none.
+        work: the unit or preparation.
+        artefact: content of the file of the unit's preparation; None if it has none.
         recorded: scenario seeds of the episodes to record.
     """
 
@@ -37,14 +37,14 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What a task made.
+    """The results of a task.
 
     Args:
-        wall_s: seconds that it took.
-        records: of a unit, with their provenance; None of a preparation.
-        artefact: the file of a preparation; None of a unit.
-        recordings: the `.rrd` files of a unit, by scenario seed.
-        warnings: what went wrong that does not touch the records.
+        wall_s: wall time in seconds.
+        records: records of a unit, with their provenance; None for a preparation.
+        artefact: content of the file of a preparation; None for a unit.
+        recordings: contents of the `.rrd` files of a unit, by scenario seed.
+        warnings: problems that do not affect the records.
     """
 
     wall_s: float
@@ -58,16 +58,16 @@ def perform(task: Task, tell: Tell) -> Outcome:
     """Carry out a task.
 
     Raises:
-        UserError: if a component fails, in one line that names the work.
+        UserError: if a component fails; the message names the work.
     """
     work = task.work
     try:
         return _prepared(work, tell) if isinstance(work, Preparation) else _driven(work, task)
     except UserError as error:
         raise UserError(f"{work}: {error}") from error
-    # Third-party code may fail in any way; the person at the terminal is told which component did.
+    # Third-party code may raise anything: name the component that failed.
     except Exception as error:
-        raise UserError(f"{work} failed: {reason(error)} (--debug shows where)") from error
+        raise UserError(f"{work} failed: {reason(error)} (--debug shows the traceback)") from error
 
 
 def _prepared(work: Preparation, tell: Tell) -> Outcome:
@@ -89,7 +89,7 @@ def _driven(unit: Unit, task: Task) -> Outcome:
 def _recordings(
     unit: Unit, traces: Mapping[int, object], constants: Mapping[str, object]
 ) -> tuple[dict[int, bytes], tuple[str, ...]]:
-    """The recordings of a unit, and why one failed: the records are the result, and a view of them must not lose them."""
+    """The recordings of a unit, and why one failed: a failed recording must not lose the records."""
     found: dict[int, bytes] = {}
     with tempfile.TemporaryDirectory(prefix="cavbench-") as folder:
         for seed, trace in traces.items():

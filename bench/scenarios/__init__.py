@@ -1,4 +1,4 @@
-"""What is driven: the axes of a world, the cells they span, named grids of cells, and the blocks of scenario seeds."""
+"""Scenarios: the axes of a world, the cells they span, named grids of cells, and blocks of scenario seeds."""
 
 from bench.scenarios.axes import Axes, Axis, Cell, Value
 from bench.scenarios.grid import Grid, SeedBlock

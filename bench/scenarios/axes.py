@@ -1,4 +1,4 @@
-"""The axes of a world, and the cell: one value on each of them."""
+"""The axes of a world, and cells: one value on each axis."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ KINDS: dict[str, type] = {"int": int, "float": float, "str": str}
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """One thing in which the cells of a world differ: the number of lanes, the density of traffic, the weather.
+    """One dimension of a world's cells, such as the number of lanes, the density of traffic or the weather.
 
     Args:
-        name: as on the command line and in records, for instance `lanes`; a Python identifier.
+        name: name on the command line and in records, for instance `lanes`; a Python identifier.
         kind: type of its values.
-        meaning: what it is, in a few words.
-        unit: of its values; empty for names and counts.
-        low, high: smallest and largest value of a number.
-        above: a number must be larger than this.
-        choices: the values there are; of names, in the order of tables. Empty: any within the bounds.
-        default: value of a cell that does not say; None where every cell must.
-        perceptual: whether it changes what is observed and nothing else, as fog does: a driver that ignores its observation is
-            driven at the first value only.
+        meaning: short description.
+        unit: unit of its values; empty for names and counts.
+        low, high: smallest and largest allowed number.
+        above: exclusive lower bound of a number.
+        choices: allowed values, for names in the order of tables. Empty: any value within the bounds.
+        default: value of cells that leave it out; None if every cell must give one.
+        perceptual: whether it changes only what is observed, as fog does. Input-independent policies are driven at its first
+            value only.
     """
 
     name: str
@@ -40,10 +40,10 @@ class Axis:
     perceptual: bool = False
 
     def checked(self, value: Value) -> Value:
-        """The value in the axis' own type.
+        """Convert a value to the type of the axis.
 
         Raises:
-            ValueError: in one line, if it is not allowed.
+            ValueError: in one line, if the value is not allowed.
         """
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if self.kind == "str":
@@ -56,10 +56,10 @@ class Axis:
         return found
 
     def read(self, text: str) -> Value:
-        """A value as it is written on the command line.
+        """Parse a value from the command line.
 
         Raises:
-            ValueError: in one line, if it cannot be read or is not allowed.
+            ValueError: in one line, if the value cannot be parsed or is not allowed.
         """
         try:
             return self.checked(KINDS[self.kind](text))
@@ -68,7 +68,7 @@ class Axis:
 
     @property
     def allowed(self) -> str:
-        """The values there may be, in words."""
+        """The allowed values as text."""
         if self.choices:
             return f"one of {', '.join(map(written, self.choices))}"
         noun = {"int": "a whole number", "float": "a number", "str": "a name"}[self.kind]
@@ -85,14 +85,14 @@ class Axis:
         return isinstance(value, str) or (self.low <= value <= self.high and value > self.above)
 
     def place(self, value: Value) -> tuple[float, str]:
-        """What values are sorted by: numbers by size, names in the order of `choices`."""
+        """Sort key of a value: numbers by size, names in the order of `choices`."""
         if isinstance(value, str):
             return (self.choices.index(value) if value in self.choices else len(self.choices), value)
         return (float(value), "")
 
 
 class Cell(Mapping[str, Value]):
-    """One square of a grid: a value on each axis of a world, without a seed. `cell.lanes` is `cell["lanes"]`."""
+    """One cell of a grid: a value on each axis of a world, without a seed. `cell.lanes` is `cell["lanes"]`."""
 
     __slots__ = ("_hash", "_values")
     _values: dict[str, Value]
@@ -118,7 +118,7 @@ class Cell(Mapping[str, Value]):
             raise AttributeError(f"the cell {self} has no axis {name!r}") from None
 
     def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError("a cell cannot be changed: make another one with `replaced`")
+        raise AttributeError("a cell is immutable: create another one with `replaced`")
 
     def __eq__(self, other: object) -> bool:
         # Reports compare hundreds of thousands of cells; what `Mapping` does takes twenty times as long.
@@ -168,21 +168,21 @@ class Axes(Mapping[str, Axis]):
 
     @classmethod
     def read(cls, written: Sequence[Mapping[str, Any]]) -> Axes:
-        """The axes that records speak of (`bench.plugins.contracts.Facts.written`).
+        """The axes in records (`bench.plugins.contracts.Facts.written`).
 
         Raises:
-            ValueError: if they are none.
+            ValueError: if `written` does not describe axes.
         """
         try:
             return cls(tuple(Axis(**{**axis, "choices": tuple(axis.get("choices", ()))}) for axis in written))
         except TypeError as error:
-            raise ValueError(f"no axes: {error}") from None
+            raise ValueError(f"not axes: {error}") from None
 
     def cell(self, **values: Value) -> Cell:
-        """A cell with a checked value on every axis, the default where none is given.
+        """A cell with a checked value on every axis; missing values take the default.
 
         Raises:
-            ValueError: in one line, if a value is missing, not allowed, or of an axis that the world does not have.
+            ValueError: in one line, if an axis is unknown, or a value is missing or not allowed.
         """
         if unknown := [name for name in values if name not in self]:
             raise ValueError(f"unknown axis {unknown[0]!r}; known: {', '.join(self)}")
@@ -190,21 +190,21 @@ class Axes(Mapping[str, Axis]):
         for axis in self.axes:
             value = values.get(axis.name, axis.default)
             if value is None:
-                raise ValueError(f"a cell needs a value of {axis.name}: {axis.allowed}")
+                raise ValueError(f"a cell needs a value for {axis.name}: {axis.allowed}")
             found[axis.name] = axis.checked(value)
         return Cell(**found)
 
     def unperceived(self, cell: Cell) -> Cell:
-        """The cell with every perceptual axis at its first value: what a driver that ignores its observation is driven in."""
+        """The cell with every perceptual axis at its first value, in which input-independent policies are driven."""
         first = {axis.name: axis.choices[0] for axis in self.axes if axis.perceptual and axis.choices}
         return cell.replaced(**first)
 
     def place(self, cell: Cell) -> tuple[tuple[float, str], ...]:
-        """What cells are sorted by: the perceptual axes first, so that tables group by weather."""
+        """Sort key of a cell: perceptual axes first, so that tables are grouped by weather."""
         ordered = sorted(self.axes, key=lambda axis: not axis.perceptual)
         return tuple(axis.place(cell[axis.name]) for axis in ordered)
 
 
 def written(value: Value) -> str:
-    """A value as tables and commands show it."""
+    """A value as text, for tables and commands."""
     return value if isinstance(value, str) else f"{value:g}"

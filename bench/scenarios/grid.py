@@ -1,4 +1,4 @@
-"""Named, versioned grids of scenarios, and the blocks that scenario seeds are taken from."""
+"""Named, versioned grids of scenarios, and blocks of scenario seeds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.scenarios.axes import Axes, Cell, Value
 
 
 class SeedBlock(IntEnum):
-    """Where each use of scenario seeds begins. Seeds that select or tune are never the seeds that are reported."""
+    """First scenario seed of each use. Seeds for selection or tuning are never reported."""
 
     REPORT = 1_000_000
     SELECT = 2_000_000
@@ -21,18 +21,18 @@ class SeedBlock(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """A named, versioned list of scenarios in a world: every combination of values, with `episodes` seeds a cell.
+    """A named, versioned set of scenarios in a world: all combinations of values, with `episodes` seeds per cell.
 
     Args:
-        name: as on the command line, for instance `standard-v1`; `custom` for one that was put together there.
-        world: name of the world that it is of.
-        axes: of that world.
-        values: of each axis, at least one.
-        episodes: scenario seeds a cell.
-        first_seed: the first of them.
+        name: name on the command line, for instance `standard-v1`; `custom` for one composed there.
+        world: name of its world.
+        axes: axes of that world.
+        values: at least one value for each axis.
+        episodes: scenario seeds per cell.
+        first_seed: first scenario seed.
 
     Raises:
-        ValueError: in one line, if a value is not allowed or missing.
+        ValueError: in one line, if a value is missing or not allowed.
     """
 
     name: str
@@ -47,11 +47,11 @@ class Grid:
             raise ValueError(f"episodes must be between 1 and 1000000, got {self.episodes}")
         for name in self.axes:
             if not self.values.get(name):
-                raise ValueError(f"a grid needs at least one value of {name}")
+                raise ValueError(f"a grid needs at least one value for {name}")
         self.cells()
 
     def cells(self) -> tuple[Cell, ...]:
-        """The cells of the grid in the order of tables, each once."""
+        """The distinct cells of the grid, in the order of tables."""
         combined = itertools.product(*(self.values[name] for name in self.axes))
         cells = {self.axes.cell(**dict(zip(self.axes, values, strict=True))) for values in combined}
         return tuple(sorted(cells, key=self.axes.place))
@@ -61,7 +61,7 @@ class Grid:
         return range(self.first_seed, self.first_seed + self.episodes)
 
     def with_(self, *, episodes: int | None = None, **values: Sequence[Value]) -> Grid:
-        """The grid with other values or another number of episodes; its name then says that it is none of the named ones."""
+        """The grid with other values or another number of episodes; if anything changes, its name becomes `custom`."""
         wanted = self.episodes if episodes is None else episodes
         changed = replace(self, values={**self.values, **values}, episodes=wanted)
         same = changed.episodes == self.episodes and changed.cells() == self.cells()

@@ -1,8 +1,8 @@
-"""The episodes of a pair in order, and what they say with intervals, a cell or a grid at a time.
+"""Arranges the episodes of a pair and computes estimates with intervals, for one cell or a whole grid.
 
-Records come as a `pyarrow.Table`, one row an episode (columns: `bench.records.schema`). `Episodes.arrange` puts the
-rows of one pair in order, training seeds x cells x scenario seeds; `measured` makes them one number; `difference` compares
-two sets scenario by scenario. The statistics are those of `bench.statistics.estimates`.
+Records come as a `pyarrow.Table`, one row per episode (columns: `bench.records.schema`). `Episodes.arrange` sorts the rows of one
+pair by training seed, cell and scenario seed; `measured` aggregates them; `difference` compares two sets scenario by scenario.
+The statistics are in `bench.statistics.estimates`.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from bench.statistics.estimates import Array, Interval, interval, wilson
 
 @dataclass(frozen=True)
 class Episodes:
-    """The episodes of one pair: every run has every cell, every cell every scenario seed.
+    """The episodes of one pair: every run has every cell, and every cell every scenario seed.
 
     Args:
         table: the records, sorted by run, cell, scenario seed; [R * C * E] rows.
         runs: training seeds [R].
         cells: [C], in the order of tables (`Axes.place`).
-        axes: that the cells differ in.
-        seeds: scenario seeds [E], rising.
-        left_out: records given to `arrange` that were not used, because their cell or seed is missing from another run.
+        axes: axes of the cells.
+        seeds: scenario seeds [E], ascending.
+        left_out: number of records that `arrange` dropped because another run lacks their cell or seed.
     """
 
     table: pa.Table
@@ -44,10 +44,10 @@ class Episodes:
 
     @classmethod
     def arrange(cls, records: pa.Table) -> Episodes:
-        """Sort the records of one pair; keep the cells that every run has and the seeds that all those cells have.
+        """Sort the records of one pair. Keep the cells that every run has, and the seeds that all these cells have.
 
         Raises:
-            ValueError: if there is no record, if a scenario is there twice, or if nothing is common to all runs.
+            ValueError: if there are no records, a scenario occurs twice, or the runs have nothing in common.
         """
         if not records.num_rows:
             raise ValueError("no records to measure")
@@ -59,7 +59,7 @@ class Episodes:
         place[run, cell, seed] = np.arange(records.num_rows)
         driven = place >= 0
         if driven.sum() < records.num_rows:
-            raise ValueError("a scenario is there twice: these are the records of more than one pair")
+            raise ValueError("a scenario occurs twice: these are records of more than one pair")
         every_run: NDArray[np.bool_] = np.asarray(driven.any(2).all(0))
         if not every_run.any():
             raise ValueError("the training seeds have no cell in common")
@@ -79,11 +79,11 @@ class Episodes:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """R runs, C cells, E episodes a run and cell."""
+        """(R, C, E): runs, cells, episodes per run and cell."""
         return len(self.runs), len(self.cells), len(self.seeds)
 
     def column(self, name: str) -> Array:
-        """[R, C, E] a measurement as float64."""
+        """A measurement [R, C, E] as float64."""
         values = self.table[name].to_numpy(zero_copy_only=False)
         return np.asarray(values, dtype=np.float64).reshape(self.shape)
 
@@ -94,7 +94,7 @@ class Episodes:
         cells: Collection[Cell] | None = None,
         seeds: Collection[int] | None = None,
     ) -> Episodes:
-        """The part with these runs, cells and scenario seeds; None keeps all.
+        """The episodes of these runs, cells and scenario seeds; None keeps all.
 
         Raises:
             ValueError: if nothing is left.
@@ -115,26 +115,26 @@ class Episodes:
         )
 
     def standing_for(self, runs: Sequence[int], cells: Sequence[Cell]) -> Episodes:
-        """The episodes of a victim that neither learns nor sees, under the names of other runs and cells.
+        """Relabel the episodes of an input-independent victim that does not learn with other runs and cells.
 
         Args:
-            runs: training seeds, each given the episodes of the first run.
-            cells: each driven itself, or with its perceptual axes at their first value, which stands for all of theirs.
+            runs: training seeds; each gets the episodes of the first run.
+            cells: each must have been driven, either itself or with its perceptual axes at their first value.
 
         Raises:
-            ValueError: if a cell was driven in neither way.
+            ValueError: if a cell was driven in neither form.
         """
         stand_ins = [cell if cell in self.cells else self.axes.unperceived(cell) for cell in cells]
         missing = [str(cell) for cell, stand_in in zip(cells, stand_ins, strict=True) if stand_in not in self.cells]
         if missing:
             raise ValueError(f"never driven: {'; '.join(missing)}")
-        each = len(self.seeds)
+        count = len(self.seeds)
         first_run = np.arange(self.table.num_rows).reshape(self.shape)[0]
         rows = np.concatenate([first_run[self.cells.index(stand_in)] for stand_in in stand_ins])
         table = self.table.take(pa.array(np.tile(rows, len(runs))))
         labels = {
-            "training_seed": np.repeat(runs, len(cells) * each),
-            "cell": np.tile(np.repeat([as_text(cell) for cell in cells], each), len(runs)),
+            "training_seed": np.repeat(runs, len(cells) * count),
+            "cell": np.tile(np.repeat([as_text(cell) for cell in cells], count), len(runs)),
         }
         for name, values in labels.items():
             field = table.schema.field(name)
@@ -142,21 +142,21 @@ class Episodes:
         return Episodes.arrange(table)
 
 
-def _places(own: Sequence[object], wanted: Collection[object] | None) -> list[int]:
+def _places(values: Sequence[object], wanted: Collection[object] | None) -> list[int]:
     kept = None if wanted is None else set(wanted)
-    return [place for place, value in enumerate(own) if kept is None or value in kept]
+    return [place for place, value in enumerate(values) if kept is None or value in kept]
 
 
 def _distinct(column: pa.ChunkedArray) -> tuple[list[Any], NDArray[np.int64]]:
-    """The values of a column, rising, and the place of each record's among them."""
+    """The distinct values of a column, ascending, and the index of each record's value among them."""
     encoded = column.combine_chunks()
     encoded = encoded if pa.types.is_dictionary(encoded.type) else encoded.dictionary_encode()
     values, codes = encoded.dictionary.to_pylist(), encoded.indices.to_numpy()
-    there = np.flatnonzero(np.bincount(codes, minlength=len(values))).tolist()
-    rising = sorted(there, key=lambda code: values[code])
+    used = np.flatnonzero(np.bincount(codes, minlength=len(values))).tolist()
+    ascending = sorted(used, key=lambda code: values[code])
     place = np.zeros(len(values), np.int64)
-    place[rising] = np.arange(len(rising))
-    return [values[code] for code in rising], place[codes]
+    place[ascending] = np.arange(len(ascending))
+    return [values[code] for code in ascending], place[codes]
 
 
 def axes_of(records: pa.Table) -> Axes:
@@ -175,12 +175,12 @@ def _read_cell(text: str) -> Cell:
 
 
 def as_text(cell: Cell) -> str:
-    """A cell as records have it."""
+    """A cell as JSON, as in records."""
     return json.dumps(dict(cell), separators=(",", ":"))
 
 
 def _cells(records: pa.Table, axes: Axes) -> tuple[list[Cell], NDArray[np.int64]]:
-    """The cells of some records in the order of tables, and the place of each record's."""
+    """The cells of some records in the order of tables, and the index of each record's cell among them."""
     texts, code = _distinct(records["cell"])
     cells = [_read_cell(text) for text in texts]
     order = sorted(range(len(cells)), key=lambda place: axes.place(cells[place]))
@@ -190,7 +190,7 @@ def _cells(records: pa.Table, axes: Axes) -> tuple[list[Cell], NDArray[np.int64]
 
 
 def shared(first: Episodes, second: Episodes) -> tuple[Episodes, Episodes]:
-    """Both, reduced to the runs, cells and scenario seeds that both have.
+    """Reduce both to the runs, cells and scenario seeds that they have in common.
 
     Raises:
         ValueError: if they have nothing in common.
@@ -202,10 +202,10 @@ def shared(first: Episodes, second: Episodes) -> tuple[Episodes, Episodes]:
 
 
 def difference(treated: Episodes, control: Episodes, name: str) -> Interval:
-    """Interquartile mean of `treated` - `control`, paired: same training seed, cell and scenario seed.
+    """Interquartile mean of `treated` - `control`, paired by training seed, cell and scenario seed.
 
     Raises:
-        ValueError: if runs, cells or scenario seeds differ: that would mix the traffic into the effect.
+        ValueError: if runs, cells or scenario seeds differ: the difference would then include that of the traffic.
     """
     if (treated.runs, treated.cells, treated.seeds) != (control.runs, control.cells, control.seeds):
         raise ValueError("not paired: the two sides differ in training seeds, cells or scenario seeds (see `shared`)")
@@ -213,26 +213,26 @@ def difference(treated: Episodes, control: Episodes, name: str) -> Interval:
 
 
 def measured(episodes: Episodes, measure: Measure) -> Interval:
-    """The number that a measure is of some episodes; its bounds are NaN where it has no interval."""
+    """Aggregate some episodes by a measure; the bounds are NaN if it has no interval."""
     if measure.how == "rate":
         return rate(episodes, measure.column)
     if measure.how == "step mean":
-        found = step_mean(episodes, measure.column)
+        value = step_mean(episodes, measure.column)
     elif measure.how == "median":
-        found = float(np.median(episodes.column(measure.column)))
+        value = float(np.median(episodes.column(measure.column)))
     elif measure.how == "mean":
-        found = float(episodes.column(measure.column).mean())
+        value = float(episodes.column(measure.column).mean())
     else:
         scores = episodes.column(measure.column)
         return unit_interval(scores) if measure.unit == "share" else interval(scores)
-    return Interval(found, np.nan, np.nan)
+    return Interval(value, np.nan, np.nan)
 
 
 def unit_interval(scores: Array) -> Interval:
     """`interval` for scores [R, C, E] in [0, 1].
 
-    Where every score is 0, or every score is 1, a bootstrap has nothing to vary; there the interval is Wilson's,
-    which is conservative for any variable in [0, 1].
+    If all scores are 0, or all are 1, a bootstrap interval has no width; the interval is then Wilson's, which is conservative for
+    any variable in [0, 1].
     """
     estimate = interval(scores)
     if np.all(scores == scores.flat[0]) and scores.flat[0] in (0.0, 1.0):
@@ -241,12 +241,12 @@ def unit_interval(scores: Array) -> Interval:
 
 
 def rate(episodes: Episodes, name: str) -> Interval:
-    """The share of episodes, all runs and cells pooled, for which a boolean column is set, with its Wilson interval."""
+    """The share of episodes with a boolean column set, over all runs and cells, with its Wilson interval."""
     values = episodes.column(name)
     return wilson(float(values.sum()), values.size)
 
 
 def step_mean(episodes: Episodes, name: str) -> float:
-    """Mean over all driven steps of a column that holds a mean a step."""
+    """Mean over all steps of a column of means over the steps of an episode."""
     steps = episodes.column("steps")
     return float((episodes.column(name) * steps).sum() / max(float(steps.sum()), 1.0))

@@ -1,10 +1,10 @@
 """Estimates with intervals: interquartile mean and stratified bootstrap, Wilson rates, paired differences.
 
-Pure functions on arrays; what the arrays mean is said in `bench.statistics.episodes`. The aggregate is rliable's interquartile
-mean and the resampling is that of its `StratifiedBootstrap` (Agarwal et al. 2021, "Deep RL at the edge of the
-statistical precipice"), drawn in one vectorised pass from a generator of our own: rliable 1.2 draws from numpy's
-global one, whatever seed it is given. `iqm` and `wilson` are scipy's `trim_mean` and `binomtest(...).proportion_ci` to the last
-digit that a table shows (a test compares them), without the 0.8 s that importing `scipy.stats` takes, and 6 and 100 times faster.
+Pure functions on arrays; `bench.statistics.episodes` says what the arrays mean. Interquartile mean and resampling are those of
+rliable and its `StratifiedBootstrap` (Agarwal et al. 2021, "Deep RL at the edge of the statistical precipice"). The resampling is
+one vectorised pass with its own generator, because rliable 1.2 ignores its seed and uses numpy's global generator. `iqm` and
+`wilson` equal scipy's `trim_mean` and `binomtest(...).proportion_ci` to the last digit of a table (a test compares them), but
+are 6 and 100 times faster and need no `scipy.stats`, which takes 0.8 s to import.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 REPLICATES = 2000
-"""Bootstrap draws: another generator seed then moves the ends of an interval by about 2 % of its width."""
+"""Bootstrap draws. With 2000, another generator seed moves the bounds of an interval by about 2 % of its width."""
 CONFIDENCE = 0.95
 _TAILS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate and its interval, in the unit of what was measured; the bounds are NaN where nothing can be said."""
+    """An estimate with its 95 % confidence interval, in the unit of the measurement; the bounds are NaN if there is none."""
 
     estimate: float
     low: float
@@ -38,9 +38,9 @@ class Interval:
 
 
 def iqm(scores: Array, axis: int | None = None) -> Array:
-    """Interquartile mean along `axis` (all of them by default): the mean without the lowest and the highest quarter.
+    """Interquartile mean along `axis` (default: all): the mean without the lowest and the highest quarter.
 
-    The definition of `rliable.metrics.aggregate_iqm`; with fewer than four values it is the mean.
+    Defined as `rliable.metrics.aggregate_iqm`; of fewer than four values it is the mean.
     """
     count = scores.size if axis is None else scores.shape[axis]
     if count < 4:
@@ -53,13 +53,13 @@ def iqm(scores: Array, axis: int | None = None) -> Array:
 def interval(scores: Array, *, seed: int = 0, replicates: int = REPLICATES) -> Interval:
     """Interquartile mean over runs and tasks, with a 95 % percentile interval from a stratified bootstrap.
 
-    With two or more runs, runs are drawn with replacement within each task. One run cannot say how training seeds
-    differ; there the episodes are drawn with replacement within each task, and the interval speaks of that one run.
+    With two or more runs, runs are drawn with replacement within each task. With one run, episodes are drawn with replacement
+    within each task; the interval then does not include the variation between training seeds.
 
     Args:
         scores: [R, C, E], R runs (training seeds) x C tasks (cells) x E episodes (scenario seeds), finite.
-        seed: of the bootstrap's own generator.
-        replicates: bootstrap draws.
+        seed: seed of the bootstrap's generator.
+        replicates: number of bootstrap draws.
 
     Raises:
         ValueError: if `scores` is not three-dimensional, is empty, or holds a value that is not finite.
@@ -79,12 +79,12 @@ def interval(scores: Array, *, seed: int = 0, replicates: int = REPLICATES) -> I
 
 
 def task_intervals(scores: Array, *, seed: int = 0, replicates: int = REPLICATES) -> list[Interval]:
-    """`interval` of each task by itself, all in one pass.
+    """`interval` for each task separately, in one pass.
 
     Args:
-        scores: [R, C, E], as there.
-        seed: of the bootstrap's own generator.
-        replicates: bootstrap draws.
+        scores: [R, C, E], as in `interval`.
+        seed: seed of the bootstrap's generator.
+        replicates: number of bootstrap draws.
     """
     _check(scores)
     runs, tasks, _ = scores.shape
@@ -94,26 +94,24 @@ def task_intervals(scores: Array, *, seed: int = 0, replicates: int = REPLICATES
     means = scores.mean(2)
     estimates, (low, high) = iqm(means, 0), np.quantile(iqm(means[drawn], 1), _TAILS, axis=0)
     bounds = np.minimum(low, estimates), np.maximum(high, estimates)
-    return [Interval(*map(float, each)) for each in zip(estimates, *bounds, strict=True)]
+    return [Interval(*map(float, values)) for values in zip(estimates, *bounds, strict=True)]
 
 
 @cache
 def _drawn(runs: int, tasks: int, seed: int, replicates: int) -> NDArray[np.int64]:
-    """[replicates, R, C] the flat places in [R, C] of the runs that are drawn in each task."""
+    """[replicates, R, C] flat indices into [R, C] of the runs drawn for each task."""
     drawn = np.random.default_rng(seed).integers(runs, size=(replicates, runs, tasks))
     return drawn * tasks + np.arange(tasks)
 
 
 def _episode_means(values: Array, generator: np.random.Generator, replicates: int) -> Array:
-    """[replicates] means of `values` [E] drawn with replacement."""
+    """[replicates] means of samples of `values` [E], drawn with replacement."""
     drawn = generator.integers(len(values), size=(replicates, len(values)))
     return np.asarray(values[drawn].mean(1))
 
 
 def _percentiles(estimate: float, draws: Array) -> Interval:
-    """The percentile interval; widened to hold the estimate, which a skewed bootstrap of a trimmed mean can miss by a
-    hair.
-    """
+    """The percentile interval, widened to include the estimate, which the bootstrap of a trimmed mean can just miss."""
     low, high = np.quantile(draws, _TAILS)
     return Interval(estimate, min(float(low), estimate), max(float(high), estimate))
 

@@ -1,1 +1,1 @@
-"""The tracks that ship with the benchmark, found by their entry points like any other."""
+"""The tracks that ship with cavbench, found by their entry points like all others."""

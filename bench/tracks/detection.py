@@ -1,4 +1,4 @@
-"""The detection track: a detector that looks for a stop sign, which a patch on the sign hides."""
+"""The detection track: detectors of a stop sign, attacked by a patch on the sign."""
 
 from __future__ import annotations
 
@@ -18,33 +18,40 @@ from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
 from bench.records.schema import FLOAT, PROBES, TEXT, field
 
 REFERENCE_PATCHES = ("noise_patch", "grey_patch")
-"""Patches that know nothing of the detector: what part of an attack is only that the sign is covered."""
+"""Baseline patches, not optimised against the detector: they measure the effect of covering the sign."""
 
 MEASUREMENTS: tuple[pa.Field, ...] = (
     field("location", TEXT, "of the approach"),
     field(
         "confidence_mean",
         FLOAT,
-        "in the sign at its true place, mean over the frames; 0 in a frame that misses it",
+        "confidence in the sign at its true position, mean over the frames; 0 in a frame that misses it",
         "0 to 1",
     ),
-    field("confidence_median", FLOAT, "the same, median over the frames", "0 to 1"),
+    field("confidence_median", FLOAT, "as confidence_mean, but the median over the frames", "0 to 1"),
     field("detection_rate", FLOAT, "frames with a confidence above 0.25", "share, 0 to 1"),
-    field("first_seen_m", FLOAT, "distance at which it is first detected; 0 if it never is", "m"),
-    field("confirmed_m", FLOAT, "distance at which it is detected in 3 of the last 5 frames; 0 if it never is", "m"),
-    field("overrun_m", FLOAT, "how far beyond the line the car stops; 0 if before it", "m"),
-    field("ran", pa.bool_(), "the car never braked for the sign, or stopped more than 1 m beyond the line"),
-    field("visible_share", FLOAT, "of the sign, mean over the frames: in the picture and not hidden", "share, 0 to 1"),
-    field("false_alarms", FLOAT, "stop signs detected where there is none, mean over the frames", "detections"),
-    field("queries", FLOAT, "pictures the detector was asked about to craft the patch", "pictures"),
-    field("gradients", FLOAT, "pictures whose gradient was taken to craft the patch", "pictures"),
+    field("first_seen_m", FLOAT, "distance at which the sign is first detected; 0 if never", "m"),
+    field(
+        "confirmed_m", FLOAT, "distance at which the sign is first detected in 3 of the last 5 frames; 0 if never", "m"
+    ),
+    field("overrun_m", FLOAT, "how far beyond the stop line the car stops; 0 if before it", "m"),
+    field("ran", pa.bool_(), "whether the car never brakes for the sign, or stops more than 1 m beyond the line"),
+    field(
+        "visible_share",
+        FLOAT,
+        "share of the sign inside the image and not occluded, mean over the frames",
+        "share, 0 to 1",
+    ),
+    field("false_alarms", FLOAT, "stop signs detected where there is none, mean per frame", "detections"),
+    field("queries", FLOAT, "images that the detector was queried with to craft the patch", "images"),
+    field("gradients", FLOAT, "images whose gradient was taken to craft the patch", "images"),
     field("crafting_s", FLOAT, "wall time of crafting the patch", "s"),
-    field("excess", FLOAT, "farthest the attack's own texels were outside [0, 1]", "texel value"),
-    field("patch", TEXT, "fingerprint of the patch, patches/<this>.safetensors; empty where there is none"),
-    field("patch_sha256", TEXT, "of its texels; empty where it leaves the sign alone"),
-    field("frame_distance_m", pa.list_(FLOAT), "of each frame, from the camera to the sign", "m"),
-    field("frame_confidence", pa.list_(FLOAT), "of each frame, in the sign at its true place", "0 to 1"),
-    field("frame_visible", pa.list_(FLOAT), "of each frame, share of the sign to be seen", "share, 0 to 1"),
+    field("excess", FLOAT, "largest distance of the attack's texels outside [0, 1], before clipping", "texel value"),
+    field("patch", TEXT, "fingerprint of the patch, patches/<fingerprint>.safetensors; empty if there is none"),
+    field("patch_sha256", TEXT, "of its texels; empty if the attack makes no patch"),
+    field("frame_distance_m", pa.list_(FLOAT), "of each frame: distance from the camera to the sign", "m"),
+    field("frame_confidence", pa.list_(FLOAT), "of each frame: confidence in the sign at its true position", "0 to 1"),
+    field("frame_visible", pa.list_(FLOAT), "of each frame: visible share of the sign", "share, 0 to 1"),
 )
 
 
@@ -75,9 +82,9 @@ class DetectionTrack(Track):
         Measure(column="crafting_s", heading="craft\ns", of_attack=True, tables="overview", spare=4),
     )
     legend: ClassVar[str] = (
-        "confidence: in the stop sign at its true place, mean over an approach, 0 in a frame that misses it. frames seen: "
-        "confidence above 0.25. runs the sign: the car, at 10 m/s, never brakes or stops more than 1 m beyond the line. false "
-        "alarms: a frame."
+        "confidence: in the stop sign at its true position, mean over an approach, 0 in a frame that misses it. frames seen: "
+        "share with confidence above 0.25. runs the sign: the car, at 10 m/s, never brakes, or stops more than 1 m beyond the "
+        "line. false alarms: per frame."
     )
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
         "noise_patch": Baseline(title="noise patch", heading="\nnoise", spare=1),
@@ -92,7 +99,7 @@ class DetectionTrack(Track):
     excess: ClassVar[str] = "excess"
     enough_episodes: ClassVar[int] = 3
     other_input: ClassVar[str] = "a grey image"
-    many_draws: ClassVar[str] = "It draws, and a patch is crafted on many images, each a draw of its own."
+    many_draws: ClassVar[str] = "The victim is random, and a patch is crafted on many images, each with its own draw."
     facts_of_v1: ClassVar[Mapping[str, object]] = {
         "decision_hz": 0,
         "max_steps": 0,
@@ -115,7 +122,7 @@ class DetectionTrack(Track):
     preparation: ClassVar[str] = "bench.detection.crafting"
 
     def baselines(self, pair: Pair) -> Iterator[Pair]:
-        """The patches that know nothing, of the same size, on the same defended detector."""
+        """The baseline patches, of the same size, on the same defended detector."""
         installed = registry.names("attack") if not pair.is_clean else []
         for name in REFERENCE_PATCHES:
             if name in installed and name != pair.attack.name:
@@ -131,7 +138,7 @@ class DetectionTrack(Track):
 
     def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
         images, seconds = (float(column(name).mean()) for name in ("queries", "crafting_s"))
-        yield "crafted", f"from {images:.0f} images in {seconds:.0f} s, a patch, on average"
+        yield "crafted", f"from {images:.0f} images in {seconds:.0f} s per patch, on average"
 
     def prepare(self, job: Job, made_by: str, progress: Progress) -> bytes:
         from bench.detection.crafting import prepare

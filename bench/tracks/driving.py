@@ -1,4 +1,4 @@
-"""The driving track: a policy at the wheel, whose observations are attacked at every step."""
+"""The driving track: driving policies whose observations are attacked at every step."""
 
 from __future__ import annotations
 
@@ -21,36 +21,48 @@ if TYPE_CHECKING:
 BEST_BLIND, IDM, RANDOM = "best blind", "idm", "random"
 
 MEASUREMENTS: tuple[pa.Field, ...] = (
-    field("steps", pa.int32(), "decisions driven until the episode ended", "steps"),
+    field("steps", pa.int32(), "decisions until the episode ended", "steps"),
     field("return", FLOAT, "reward of the world, summed over the episode", "reward"),
     field(
         "safe_progress",
         FLOAT,
-        "0 if crashed or off the road, else mean progress over the steps of a whole episode",
+        "0 if the ego crashed or left the road, otherwise mean progress over the steps of a full episode",
         "share, 0 to 1",
     ),
     field("crashed", pa.bool_(), "the ego hit another vehicle"),
     field("offroad", pa.bool_(), "the ego left the road"),
     field("distance_m", FLOAT, "driven along the road", "m"),
-    field("min_ttc_s", FLOAT, "smallest time to collision with the car ahead; inf if there was none", "s"),
+    field("min_ttc_s", FLOAT, "smallest time to collision with the car ahead; inf if there is none", "s"),
     field("mean_speed", FLOAT, "mean over the steps", "m/s"),
-    field("queries", FLOAT, "victim evaluations a step, mean", "queries"),
-    field("queries_median", FLOAT, "victim evaluations a step, median", "queries"),
-    field("queries_max", FLOAT, "victim evaluations a step, largest", "queries"),
+    field("queries", FLOAT, "victim evaluations per step, mean", "queries"),
+    field("queries_median", FLOAT, "victim evaluations per step, median", "queries"),
+    field("queries_max", FLOAT, "victim evaluations per step, maximum", "queries"),
     field("changed", FLOAT, "steps on which the attack changed the decision", "share, 0 to 1"),
     field("linf", FLOAT, "largest deviation of a step, mean over the steps", "normalised, 2 is the full range"),
     field("linf_max", FLOAT, "largest deviation of the episode", "normalised, 2 is the full range"),
     field("l2", FLOAT, "L2 norm of a step's deviation, mean over the steps", "normalised"),
     field("linf_m", FLOAT, "largest deviation of a position in a step, mean over the steps", "m"),
     field("linf_mps", FLOAT, "largest deviation of a velocity in a step, mean over the steps", "m/s"),
-    field("excess_max", FLOAT, "farthest the attack's answer was outside its set, before projection", "normalised"),
-    field("attack_ms", FLOAT, "the attack's wall time a step and episode (its batch's time shared out)", "ms"),
-    field("action_counts", pa.list_(pa.int32()), "times each discrete action was taken; empty for continuous ones"),
+    field(
+        "excess_max",
+        FLOAT,
+        "largest distance of the attack's answer outside its perturbation set, before projection",
+        "normalised",
+    ),
+    field(
+        "attack_ms",
+        FLOAT,
+        "wall time of the attack per step and episode (the time of a batch, divided by its episodes)",
+        "ms",
+    ),
+    field(
+        "action_counts", pa.list_(pa.int32()), "how often each discrete action was taken; empty for continuous actions"
+    ),
 )
 
 
 class DrivingTrack(Track):
-    """Lane-changing policies on a road, attacked through what they measure, ranked by `safe_progress`."""
+    """Driving policies on a road, attacked through their observations, ranked by `safe_progress`."""
 
     name: ClassVar[str] = "driving"
     world: ClassVar[str] = "highway"
@@ -72,8 +84,9 @@ class DrivingTrack(Track):
         Measure(column="attack_ms", heading="ms\n/ step", how="step mean", digits=1, of_attack=True, spare=3),
     )
     legend: ClassVar[str] = (
-        "safe progress: 0 if the episode crashes or leaves the road, else its mean progress. success: share of steps whose "
-        "decision the attack changed. TTC: time to collision with the car ahead."
+        "safe progress: 0 if the car crashes or leaves the road, otherwise its mean progress. success: share of steps in which "
+        "the attack changed the decision. TTC: time to collision with the car ahead. best blind: the best policy that "
+        "ignores its input."
     )
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
         BEST_BLIND: Baseline(title="best blind policy", heading="best\nblind", spare=0),
@@ -117,13 +130,13 @@ class DrivingTrack(Track):
     work: ClassVar[str] = "bench.driving.drive"
 
     def baselines(self, pair: Pair) -> Iterator[Pair]:
-        """Drivers that ignore their input: those of the pair's action type that its world has, and the IDM driver."""
+        """Input-independent policies with the pair's action type, and the IDM driver if the world has one."""
         victim, world = _parts(pair)
         facts, action_type = world.facts, victim.action_type
-        words = [("blind", {"policy": policy}) for policy in facts.blind_policies(action_type)]
-        words += [("random", {"actions": action_type})]
-        words += [(IDM, {})] if IDM in facts.drivers else []
-        for name, params in words:
+        drivers = [("blind", {"policy": policy}) for policy in facts.blind_policies(action_type)]
+        drivers += [("random", {"actions": action_type})]
+        drivers += [(IDM, {})] if IDM in facts.drivers else []
+        for name, params in drivers:
             none = {"attack": choose("attack", "none"), "defense": choose("defense", "none")}
             yield replace(pair, **none, victim=choose("victim", name, **params), threat=type(pair.threat).of_nobody())
 
@@ -140,22 +153,22 @@ class DrivingTrack(Track):
         return BEST_BLIND if other["victim"] == "blind" else str(other["victim"])
 
     def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
-        off = f"{100 * budget:g} % of itself" if norm == "relative" else f"{budget:g} on the [-1, 1] scale"
+        deviation = f"{100 * budget:g} % of itself" if norm == "relative" else f"{budget:g} on the [-1, 1] scale"
         features = facts.get("features", {})
         floors = features.get("floors", ()) if norm == "relative" else ()
-        least = [
+        minima = [
             f"{name} {floor * budget / 0.1:g} {unit}"
             for name, floor, unit in zip(features.get("names", ()), floors, features.get("units", ()), strict=False)
         ]
-        by_floor = f", or by its floor ({', '.join(least)})" if least else ""
-        return f"each measured value may be off by {off}{by_floor}; presence cannot be forged"
+        by_floor = f", or by its floor ({', '.join(minima)})" if minima else ""
+        return f"each measured value may be off by {deviation}{by_floor}; presence cannot be forged"
 
     def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
         steps = column("steps")
         metres, speed = (
             f"{(column(name) * steps).sum() / max(float(steps.sum()), 1.0):.2f}" for name in ("linf_m", "linf_mps")
         )
-        yield "moved", f"{metres} m and {speed} m/s, the largest deviation of a step, on average"
+        yield "moved", f"{metres} m and {speed} m/s: largest deviation per step, on average"
 
     def identity(self, pair: Pair) -> Mapping[str, object]:
         return {"action_type": _parts(pair)[0].action_type}

@@ -1,4 +1,4 @@
-"""Defences that do not defend: one ignores its input, two have no gradient, one is random."""
+"""Defences that do not defend: one hides the input, two have no gradient, one is random."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Deaf(DrivingDefense):
 
 @dataclass(frozen=True, kw_only=True)
 class Stepped(DrivingDefense):
-    """Rounds what the victim sees: its gradient is zero."""
+    """Rounds the observation, so that the gradient is zero."""
 
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
         return _Stepped(victim.load(seed, facts))
@@ -49,7 +49,7 @@ class Stepped(DrivingDefense):
 
 @dataclass(frozen=True, kw_only=True)
 class Detached(DrivingDefense):
-    """Cuts the gradient off."""
+    """Detaches the gradient."""
 
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
         return _Detached(victim.load(seed, facts))

@@ -1,4 +1,4 @@
-"""A policy, an attack and a defence that each break one rule about what they remember; they break none with rule `none`."""
+"""A policy, an attack and a defence that break a given rule for memories; with `none` they break no rule."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bench.plugins.contracts import Access
 
 
 class _Mean(Policy):
-    """Its scores depend on the mean of what it was shown before."""
+    """Its scores depend on a running mean of earlier observations."""
 
     action_type: ActionType = "discrete"
 
@@ -103,7 +103,7 @@ class Forgetful(DrivingVictim):
 
 @dataclass(frozen=True, kw_only=True)
 class Grudge(DrivingAttack):
-    """Holds the offset of the first step.
+    """Keeps the perturbation of the first step.
 
     Args:
         rule: that it breaks.
@@ -166,7 +166,7 @@ class _Losing(Policy):
 
 @dataclass(frozen=True, kw_only=True)
 class Losing(DrivingDefense):
-    """Passes the victim's memory on, or does not.
+    """Passes the victim's memory on, depending on the rule.
 
     Args:
         rule: that it breaks.

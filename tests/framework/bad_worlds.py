@@ -16,7 +16,7 @@ from bench.scenarios import Axes, Axis, Cell, Grid
 
 
 def axes(**changes: Any) -> Axes:
-    """One axis, `gap`, with some values of it changed."""
+    """One axis, `gap`, with some fields changed."""
     return Axes((Axis(**{"name": "gap", "kind": "int", "meaning": "to the car ahead", "unit": "m"} | changes),))
 
 
@@ -44,14 +44,14 @@ GRIDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Bad(ToyWorld):
-    """One axis, and a rule that is broken."""
+    """A world with one axis; its subclasses break one rule each."""
 
     axes: ClassVar[Axes] = PLAIN
 
 
 @dataclass(frozen=True, kw_only=True)
 class Nameless(Bad):
-    """The name of its axis has a space."""
+    """The name of its axis contains a space."""
 
     axes: ClassVar[Axes] = NAMELESS
     grid: ClassVar[str] = "nameless-v1"
@@ -59,7 +59,7 @@ class Nameless(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class Taken(Bad):
-    """Its axis is called as an option of a run."""
+    """Its axis has the name of an option of a run."""
 
     axes: ClassVar[Axes] = TAKEN
     grid: ClassVar[str] = "taken-v1"
@@ -75,7 +75,7 @@ class Silent(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class Defaulted(Bad):
-    """The default of its axis is out of the bounds."""
+    """The default of its axis is out of bounds."""
 
     axes: ClassVar[Axes] = DEFAULTED
     grid: ClassVar[str] = "defaulted-v1"
@@ -83,14 +83,14 @@ class Defaulted(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class Gridless(Bad):
-    """Its grid is not there."""
+    """Its grid does not exist."""
 
     grid: ClassVar[str] = "gridless-v1"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Borrowing(Bad):
-    """Its grid is of another world."""
+    """Its grid belongs to another world."""
 
     grid: ClassVar[str] = "standard-v1"
 
@@ -104,7 +104,7 @@ class Otheraxes(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class Lying(Bad):
-    """Its facts tell of other axes."""
+    """Its facts have other axes."""
 
     grid: ClassVar[str] = "lying-v1"
 
@@ -115,7 +115,7 @@ class Lying(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class General(Bad):
-    """Its facts are not those of its track."""
+    """Its facts are not of the class of its track."""
 
     grid: ClassVar[str] = "general-v1"
 
@@ -142,7 +142,7 @@ class Unwritten(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class Timeless(Bad):
-    """It never decides."""
+    """Its decision rate is 0."""
 
     grid: ClassVar[str] = "timeless-v1"
 
@@ -153,7 +153,7 @@ class Timeless(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class Miscounted(Bad):
-    """It names three actions and takes five."""
+    """It names three actions, but accepts five."""
 
     grid: ClassVar[str] = "miscounted-v1"
     actions: ClassVar[tuple[str, ...]] = ("LEFT", "STRAIGHT", "RIGHT")
@@ -164,7 +164,7 @@ class Miscounted(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class Driverless(Bad):
-    """It names a driver that it cannot make."""
+    """It names a driver that it cannot create."""
 
     grid: ClassVar[str] = "driverless-v1"
     drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm")
@@ -177,7 +177,7 @@ class Driverless(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class Choosy(Bad):
-    """It cannot start one of the cells of its own grid."""
+    """It cannot start one of the cells of its grid."""
 
     grid: ClassVar[str] = "choosy-v1"
 
@@ -189,11 +189,11 @@ class Choosy(Bad):
 
 @dataclass(frozen=True, kw_only=True)
 class Refusing(Bad):
-    """It takes no continuous actions, which it may."""
+    """It refuses continuous actions, which is allowed."""
 
     grid: ClassVar[str] = "refusing-v1"
 
     def make(self, cells: Sequence[Cell], *, action_type: ActionType = "discrete", **kwargs: Any) -> EnvBase:
         if action_type == "continuous":
-            raise UserError("nobody steers here")
+            raise UserError("this world has no steering")
         return super().make(cells, action_type=action_type, **kwargs)

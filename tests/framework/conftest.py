@@ -21,7 +21,7 @@ BENCH = (sys.executable, "-m", "bench")
 
 @pytest.fixture(scope="session")
 def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Where the toy distribution is installed; it is on the import path of this process."""
+    """The folder of the toy distribution, on the import path of this process."""
     folder = tmp_path_factory.mktemp("site")
     install_toy(folder)
     sys.path.insert(0, str(folder))
@@ -33,7 +33,7 @@ def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture
 def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder on the import path of this process for distributions of the test's own."""
+    """A folder on the import path of this process, for the distributions of a test."""
     folder = tmp_path / "plugins"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))
@@ -44,7 +44,7 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class Said:
-    """What a command printed and how it ended."""
+    """The output and the exit code of a command."""
 
     code: int
     out: str
@@ -71,16 +71,16 @@ def bench(toy_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
 
 def import_path(*folders: Path) -> str:
-    """PYTHONPATH of a process: these folders, then what this process was given."""
+    """PYTHONPATH of a process: these folders, then the PYTHONPATH of this process."""
     return os.pathsep.join(filter(None, [*map(str, folders), os.environ.get("PYTHONPATH", "")]))
 
 
 def started(folder: Path, *words: str) -> subprocess.Popen[str]:
-    """The command line as a process of its own, with the plug-ins of `folder`."""
+    """Start the command line in a new process, with the plug-ins of `folder`."""
     environment = os.environ | {"PYTHONPATH": import_path(folder), "OMP_NUM_THREADS": "1", "COLUMNS": "160"}
 
     def hear() -> None:
-        """A shell's background job, which these tests may be, is deaf to Ctrl-C and so are its children."""
+        """Accept Ctrl-C, which a shell's background job, such as these tests, and its children ignore."""
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     return subprocess.Popen(
@@ -89,7 +89,7 @@ def started(folder: Path, *words: str) -> subprocess.Popen[str]:
 
 
 def ran(folder: Path, *words: str) -> Said:
-    """The command line as a process of its own, to its end."""
+    """Run the command line in a new process, to its end."""
     process = started(folder, *words)
     out, err = process.communicate(timeout=300)
     return Said(process.returncode, out, err)

@@ -1,4 +1,4 @@
-"""Makes pip distributions in a folder, as installed: modules and the metadata that entry points are read from."""
+"""Creates installed pip distributions in a folder: modules, and metadata with entry points."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TOY_POINTS = {
 def install(
     folder: Path, name: str, points: Mapping[str, Mapping[str, str]], modules: Mapping[str, str], version: str = "1.0"
 ) -> None:
-    """Write a distribution to `folder`, which is found once the folder is on the import path."""
+    """Write a distribution to `folder`, which must be on the import path."""
     info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
@@ -47,7 +47,7 @@ def install(
 
 
 def pip_install(folder: Path, *packages: Path) -> None:
-    """Let pip install packages to `folder`, outside of the environment of the tests and without a network."""
+    """Install packages to `folder` with pip, outside of the environment of the tests and without a network."""
     pip = (
         sys.executable,
         "-m",
@@ -64,6 +64,6 @@ def pip_install(folder: Path, *packages: Path) -> None:
 
 
 def install_toy(folder: Path) -> None:
-    """The plug-ins of `toy.py` and `toy_camera.py`, as the distribution cavbench-toy 1.0."""
+    """Install the plug-ins of `toy.py` and `toy_camera.py` as the distribution cavbench-toy 1.0."""
     modules = {"toy_plugin": TOY.read_text(), "toy_camera_plugin": TOY_CAMERA.read_text()}
     install(folder, "cavbench-toy", TOY_POINTS, modules)

@@ -22,7 +22,7 @@ WORDS = ("victim=toy", "world=toy", "lanes=3,4", "density=1", "weather=clear", "
 
 @pytest.fixture
 def rows(plugins: Path, bench: Callable[..., Said], tmp_path: Path) -> dict[str, Row]:
-    """The leaderboard of the bad defences and of none, by defence."""
+    """The rows of a leaderboard of the bad defences and of `none`, by defence."""
     code = Path(__file__).with_name("bad_defenses.py").read_text()
     points = {"cavbench.defenses": {name: f"bad_defenses_plugin:{name.capitalize()}" for name in BAD}}
     install(plugins, "cavbench-bad", points, {"bad_defenses_plugin": code})

@@ -1,4 +1,4 @@
-"""Every kind of bad plug-in ends a command in one line that names it, and breaks no other component."""
+"""A command with a bad plug-in ends with one line that names it; other components are not affected."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CANNOT_BE_LOADED = {
         "from bench.driving.contracts import DrivingDefense\nclass Plugin(DrivingDefense): ...\n",
         "is not a subclass of bench.plugins.contracts.Attack",
     ),
-    "no track": (f"{HEAD}{GOOD}".replace("(DrivingAttack)", "(Attack)"), "is of no track"),
+    "no track": (f"{HEAD}{GOOD}".replace("(DrivingAttack)", "(Attack)"), "belongs to no track"),
     "an abstract method": (f"{HEAD}{GOOD}".replace("def perturb", "def disturb"), "does not implement perturb or step"),
     "no dataclass": (
         f"{HEAD}{GOOD}".replace("@dataclass(frozen=True, kw_only=True)", ""),
@@ -50,9 +50,12 @@ CANNOT_BE_LOADED = {
     "a mutable dataclass": (f"{HEAD}{GOOD}".replace("frozen=True, ", ""), "is not a frozen dataclass"),
     "no access": (
         f"{HEAD}{GOOD}".replace('    access: ClassVar[Access] = "oblivious"\n', ""),
-        "must say what it needs: access: ClassVar[Access] = one of oblivious, decisions, scores, gradients",
+        "must declare the access it needs: access: ClassVar[Access] = one of oblivious, decisions, scores, gradients",
     ),
-    "an access that there is not": (f"{HEAD}{GOOD}".replace("oblivious", "everything"), "must say what it needs"),
+    "an access that there is not": (
+        f"{HEAD}{GOOD}".replace("oblivious", "everything"),
+        "must declare the access it needs",
+    ),
     "a type that is not there": (
         f"from __future__ import annotations\n{HEAD}{GOOD}    speed: Metres = 1\n",
         "the parameters of Plugin cannot be read: name 'Metres' is not defined",
@@ -63,7 +66,7 @@ CANNOT_BE_LOADED = {
     ),
     "a check that fails itself": (
         f"{HEAD}{GOOD}    def __post_init__(self):\n        [][0]\n",
-        "attack 'wrong' cannot be made: IndexError: list index out of range",
+        "attack 'wrong' cannot be created: IndexError: list index out of range",
     ),
     "a default that is refused": (
         f"{HEAD}{GOOD}    def __post_init__(self):\n        raise ValueError('speed must be above 0')\n",
@@ -73,7 +76,7 @@ CANNOT_BE_LOADED = {
 
 
 @pytest.mark.parametrize("what", CANNOT_BE_LOADED)
-def test_a_plugin_that_cannot_be_loaded_is_named_and_breaks_no_other(
+def test_a_plugin_that_cannot_be_loaded_is_reported_and_breaks_no_other(
     bench: Bench, plugins: Path, tmp_path: Path, what: str
 ) -> None:
     source, part = CANNOT_BE_LOADED[what]
@@ -87,7 +90,7 @@ def test_a_plugin_that_cannot_be_loaded_is_named_and_breaks_no_other(
     assert bench("list", "noise").code == 0
 
 
-def test_a_name_that_is_taken_is_named_with_both_packages(bench: Bench, plugins: Path, tmp_path: Path) -> None:
+def test_a_name_shipped_by_two_packages_is_reported_with_both(bench: Bench, plugins: Path, tmp_path: Path) -> None:
     install(plugins, "rival", {"cavbench.attacks": {"noise": "rival:Plugin"}}, {"rival": HEAD + GOOD})
     for command in (
         ("run", "attack=noise", "victim=toy", *TOY, f"out={tmp_path}"),
@@ -104,21 +107,24 @@ FAILS_AT_WORK = {
     ("attack=crooked", "attack.rule=shape"): "Crooked.perturb returned shape (2, 2, 2), not (2, 2, 3)",
     ("attack=crooked", "attack.rule=nothing"): "Crooked.perturb returned a NoneType, not (2, 2, 3)",
     ("attack=crooked", "attack.rule=nan"): "Crooked.perturb returned numbers that are NaN or infinite",
-    ("attack=crooked", "attack.rule=raise"): "ZeroDivisionError: at a loss (--debug shows where)",
-    ("attack=crooked", "attack.rule=access"): "the attack asked for 'gradients', but declares that it needs 'scores'",
+    ("attack=crooked", "attack.rule=raise"): "ZeroDivisionError: at a loss (--debug shows the traceback)",
+    ("attack=crooked", "attack.rule=access"): "the attack used access 'gradients', but declares only 'scores'",
     (
         "attack=crooked",
         "attack.rule=greedy",
         "threat.queries=2",
     ): "asked for 3 queries in a step, the threat model allows 2",
-    ("attack=crooked", "threat.access=oblivious"): "attack 'crooked' needs access 'scores', the threat model allows",
-    ("victim=bad", "victim.rule=nothing"): "none + bad(rule=nothing) is a NoneType where a Policy is needed",
+    (
+        "attack=crooked",
+        "threat.access=oblivious",
+    ): "attack 'crooked' needs access 'scores', but the threat model allows",
+    ("victim=bad", "victim.rule=nothing"): "none + bad(rule=nothing) loads a NoneType, but a Policy is needed",
     ("victim=bad", "victim.rule=raise"): "none + bad(rule=raise) cannot be loaded: ZeroDivisionError: at a loss",
 }
 
 
 @pytest.mark.parametrize("words", FAILS_AT_WORK, ids=" ".join)
-def test_a_plugin_that_fails_at_work_is_named_and_the_records_of_others_are_kept(
+def test_a_plugin_that_fails_in_a_run_is_reported_and_other_records_are_kept(
     bench: Bench, plugins: Path, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
     install(plugins, "crooked-pack", POINTS, {"crooked": CROOKED})

@@ -1,4 +1,4 @@
-"""`bench check`: every built-in component passes, and every broken rule is found by the check that is for it."""
+"""`bench check`: every built-in component passes, and every broken rule is found by its check."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from tests.framework.test_cli import assert_one_line
 
 Bench = Callable[..., Said]
 FROM_FILES = {"sb3", "torch", "onnx"}
-"""Victims that are nothing without a file of the user's: checked with one in `tests/victims/test_from_file.py`."""
+"""Victims that need a file of the user: `tests/victims/test_from_file.py` checks them."""
 ADAPTERS = {"art"}
-"""Nothing without a choice: checked with some in `tests/attacks/test_art.py`."""
+"""Adapters, which need a choice: `tests/attacks/test_art.py` checks some."""
 QUICK = {"noise", "noise_patch", "grey_patch", "blind", "random", "idm"}
 BUILT_IN: list[tuple[Kind, str]] = [
     (kind, name)
@@ -252,13 +252,13 @@ RULES: list[tuple[Kind, str, str, str, str]] = [
     ("attack", "crooked", "type", "shape, type and device", "perturb returned torch.float32 on cpu for torch.float64"),
     ("attack", "crooked", "nothing", "shape, type and device", "perturb returned a NoneType, not a tensor"),
     ("attack", "crooked", "graph", "shape, type and device", "return answer.detach()"),
-    ("attack", "crooked", "nan", "finite numbers", "numbers of the answer are NaN or infinite"),
+    ("attack", "crooked", "nan", "finite numbers", "values of the answer are NaN or infinite"),
     ("attack", "crooked", "empty", "empty batch", "IndexError"),
-    ("attack", "crooked", "batch", "batching", "an episode's answer changes with the other episodes of the batch"),
+    ("attack", "crooked", "batch", "batching", "the answer for an episode depends on the others of its batch"),
     ("attack", "crooked", "global", "determinism", "draw with generator=oracle.generator"),
     ("attack", "crooked", "numpy", "determinism", "draw with generator=oracle.generator"),
-    ("attack", "crooked", "memory", "determinism", "keep nothing on the object"),
-    ("attack", "crooked", "widen", "threat model", "the attack must not change oracle.radius or its set"),
+    ("attack", "crooked", "memory", "determinism", "store nothing on the object"),
+    ("attack", "crooked", "widen", "threat model", "the attack must not change oracle.radius"),
     (
         "attack",
         "crooked",
@@ -271,7 +271,7 @@ RULES: list[tuple[Kind, str, str, str, str]] = [
         "crooked",
         "access",
         "shape, type and device",
-        "asked for 'gradients', but declares that it needs 'scores'",
+        "used access 'gradients', but declares only 'scores'",
     ),
     ("attack", "crooked", "weights", "victim left alone", "the victim's weights changed"),
     ("attack", "crooked", "mode", "victim left alone", "the victim's mode or gradients changed"),
@@ -294,17 +294,17 @@ RULES: list[tuple[Kind, str, str, str, str]] = [
         "bad",
         "action type",
         "ready to drive",
-        "the policy's action_type is 'discrete', the victim's 'continuous'",
+        "the policy's action_type is 'discrete', but the victim's is 'continuous'",
     ),
     ("victim", "bad", "shape", "shape and type", "keep all dimensions but the last two"),
     ("victim", "bad", "nan", "shape and type", "some scores are NaN or infinite"),
     ("victim", "bad", "float", "decisions", "discrete actions are int64"),
-    ("victim", "bad", "batch", "batching", "the scores of an episode change with the others"),
-    ("victim", "bad", "random", "determinism", "two loads with the same seed score differently"),
+    ("victim", "bad", "batch", "batching", "the scores of an episode depend on the others"),
+    ("victim", "bad", "random", "determinism", "two loads with the same seed give different scores"),
     ("victim", "bad", "blind", "sees", "set sees = False"),
     ("victim", "bad", "masked", "gradient", "its gradient is 0 everywhere"),
     ("victim", "bad", "no graph", "gradient", "its scores have no graph"),
-    ("victim", "bad", "learns", "weights left alone", "its weights changed while it was asked"),
+    ("victim", "bad", "learns", "weights left alone", "its weights changed when it was queried"),
 ]
 
 
@@ -315,9 +315,7 @@ def crooked(plugins: Path) -> None:
 
 @pytest.mark.usefixtures("crooked")
 @pytest.mark.parametrize(("kind", "name", "rule", "check", "part"), RULES, ids=[f"{r[1]}-{r[2]}" for r in RULES])
-def test_a_broken_rule_is_found_and_what_to_fix_is_said(
-    kind: Kind, name: str, rule: str, check: str, part: str
-) -> None:
+def test_a_broken_rule_is_reported_with_its_fix(kind: Kind, name: str, rule: str, check: str, part: str) -> None:
     found = failures(kind, name, rule=rule)
     assert part in found[check]
     assert "\n" not in found[check]
@@ -325,27 +323,27 @@ def test_a_broken_rule_is_found_and_what_to_fix_is_said(
 
 @pytest.mark.usefixtures("crooked")
 @pytest.mark.parametrize(("kind", "name"), [("attack", "crooked"), ("attack", "bad_patch"), ("victim", "bad")])
-def test_what_breaks_no_rule_passes(kind: Kind, name: str) -> None:
+def test_a_component_that_breaks_no_rule_passes(kind: Kind, name: str) -> None:
     assert failures(kind, name) == {}
 
 
 @pytest.mark.usefixtures("crooked")
-def test_what_every_component_needs_is_looked_at() -> None:
+def test_rules_for_all_components_are_checked() -> None:
     assert "Undocumented has no docstring" in failures("attack", "undocumented")["docs"]
     unwritten = failures("attack", "unwritten")
     assert "the parameters of attack 'unwritten' cannot be set on the command line" in unwritten["command line"]
-    assert "keep plain values in its fields" in unwritten["worker processes"]
+    assert "keep only plain values in its fields" in unwritten["worker processes"]
 
 
 @pytest.mark.usefixtures("crooked")
-def test_an_answer_outside_the_set_is_projected_and_said_so() -> None:
+def test_an_answer_outside_the_set_is_projected_with_a_remark() -> None:
     outcomes = {outcome.check: outcome for outcome in examine("attack", "crooked", {"rule": "outside"})}
     assert outcomes["threat model"].status == "pass"
-    assert "outside, projected by the oracle" in outcomes["threat model"].text
+    assert "outside the set, projected by the oracle" in outcomes["threat model"].text
 
 
 @pytest.mark.usefixtures("crooked")
-def test_the_table_says_what_to_fix_and_the_exit_status_says_it_too(bench: Bench) -> None:
+def test_check_prints_what_to_fix_and_exits_with_1(bench: Bench) -> None:
     good, bad = bench("check", "crooked"), bench("check", "crooked", "attack.rule=shape")
     assert good.code == 0
     assert "0 to fix" in good.out
@@ -365,13 +363,13 @@ def test_the_table_says_what_to_fix_and_the_exit_status_says_it_too(bench: Bench
         (("pgd", "attack.steps=0"), "steps must be at least 1, got 0"),
     ],
 )
-def test_bad_words_of_a_check_are_refused_in_one_line(bench: Bench, words: tuple[str, ...], part: str) -> None:
+def test_bad_options_of_check_are_refused_in_one_line(bench: Bench, words: tuple[str, ...], part: str) -> None:
     assert_one_line(bench("check", *words), part)
 
 
 @pytest.mark.usefixtures("crooked")
-def test_a_defence_is_tried_on_the_victim_that_is_named() -> None:
+def test_a_defence_is_checked_on_the_given_victim() -> None:
     outcomes: list[Any] = list(examine("defense", "none", victim="bad"))
     skipped = [outcome for outcome in outcomes if outcome.check == "detection: behaviour"]
-    assert "victim 'bad' is of another track" in skipped[0].text
+    assert "victim 'bad' belongs to another track" in skipped[0].text
     assert all(outcome.status != "fail" for outcome in outcomes)

@@ -1,4 +1,4 @@
-"""`bench check` of worlds: any axes and any number of actions pass, and what a run could not use is found."""
+"""`bench check` of worlds: any axes and any number of actions pass; worlds that a run cannot use fail."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ POINTS = {
     },
 }
 RULES = {
-    "nameless": ("axes", "the axis 'the gap' cannot be typed as NAME=VALUE"),
+    "nameless": ("axes", "the axis 'the gap' cannot be written as NAME=VALUE"),
     "taken": ("axes", "the axis 'seeds' has the name of an option of `bench run`: rename it"),
-    "silent": ("axes", "the axis 'gap' has no meaning: say in a few words what it is"),
+    "silent": ("axes", "the axis 'gap' has no meaning: add a short description"),
     "defaulted": ("axes", "the axis 'gap' does not allow its own value"),
-    "gridless": ("grids", "give its grid an entry point in cavbench.grids"),
-    "borrowing": ("grids", "the grid 'standard-v1' is of the world 'highway'"),
-    "otheraxes": ("grids", "give both the same Axes object"),
-    "lying": ("facts", "facts.axes are not the world's axes"),
+    "gridless": ("grids", "register its grid as an entry point in cavbench.grids"),
+    "borrowing": ("grids", "the grid 'standard-v1' belongs to the world 'highway'"),
+    "otheraxes": ("grids", "use the same Axes object for both"),
+    "lying": ("facts", "facts.axes differ from the world's axes"),
     "general": ("features", "facts is a Facts, not a bench.driving.DrivingFacts"),
-    "unwritten": ("facts", "facts.written() must hold plain JSON values"),
+    "unwritten": ("facts", "facts.written() must contain plain JSON values"),
     "timeless": ("decisions", "decision_hz must be above 0, got 0.0"),
-    "miscounted": ("decisions", "the action_spec of the environment has 5 actions, facts.actions names 3"),
+    "miscounted": ("decisions", "the environment's action_spec has 5 actions, but facts.actions has 3"),
     "driverless": ("drivers", "KeyError: 'idm'"),
     "choosy": ("cells", "ValueError: the gap is too large"),
 }
@@ -59,7 +59,7 @@ def bad_worlds(plugins: Path, toy_folder: Path) -> None:
 
 @pytest.mark.usefixtures("bad_worlds")
 @pytest.mark.parametrize("world", RULES)
-def test_a_broken_rule_is_found_and_what_to_do_is_said(world: str) -> None:
+def test_a_broken_rule_is_reported_with_its_fix(world: str) -> None:
     check, part = RULES[world]
     failed = {outcome.check: outcome.text for outcome in examine("world", world) if outcome.status == "fail"}
     assert part in failed[check]
@@ -70,7 +70,7 @@ def test_a_broken_rule_is_found_and_what_to_do_is_said(world: str) -> None:
 def test_a_world_may_refuse_continuous_actions() -> None:
     outcomes = {outcome.check: outcome for outcome in examine("world", "refusing")}
     assert {outcome.status for outcome in outcomes.values()} == {"pass"}
-    assert outcomes["actions"].text == "continuous actions are refused: nobody steers here"
+    assert outcomes["actions"].text == "continuous actions are refused: this world has no steering"
 
 
 @pytest.mark.usefixtures("toy_folder")
@@ -80,7 +80,7 @@ def test_a_world_with_axes_and_actions_of_its_own_passes(world: str) -> None:
 
 
 @pytest.mark.usefixtures("toy_folder")
-def test_a_victim_is_tried_in_the_world_that_is_named(bench: Bench) -> None:
+def test_a_victim_is_checked_in_the_given_world(bench: Bench) -> None:
     assert bench("check", "toy", "world=bend").code == 0
     blind = {outcome.check: outcome for outcome in examine("victim", "blind", {"policy": "straight"}, world="bend")}
     assert blind["shape and type"].status == "pass"
@@ -98,6 +98,6 @@ def test_a_track_without_checks_of_its_own_has_those_of_every_component(plugins:
         outcomes = {outcome.check: outcome for outcome in examine(kind, name)}  # type: ignore[arg-type]
         assert outcomes["docs"].status == "pass"
         assert outcomes["behaviour"].status == "skip"
-        assert "the track 'listening' has no checks of its own" in outcomes["behaviour"].text
+        assert "the track 'listening' has no checks for this kind of component" in outcomes["behaviour"].text
     assert outcomes["grids"].text == "melodies-v1; melodies-v1 has 2 cells"
     track.cache_clear()

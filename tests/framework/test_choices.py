@@ -1,4 +1,4 @@
-"""NAME:CHOICE: a plug-in that is an adapter to many, of which the command line names one."""
+"""NAME:CHOICE: adapters, plug-ins with many components, of which the command line chooses one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bench.driving import DrivingAttack
 
 @dataclass(frozen=True, kw_only=True)
 class Shelf(DrivingAttack):
-    """Everything that is on the shelf.
+    """An adapter to two components.
 
     Args:
         strength: how far, as a share of the radius.
@@ -97,7 +97,7 @@ def test_a_choice_is_a_component_with_parameters_of_its_own(bench: Callable[...,
 
 
 @pytest.mark.usefixtures("shelf")
-def test_what_there_is_to_choose_is_listed(bench: Callable[..., Said]) -> None:
+def test_list_prints_the_choices_of_an_adapter(bench: Callable[..., Said]) -> None:
     assert "shelf:down  everything is nearer" in bench("list", "shelf").out
     assert "attack.steps" in bench("list", "shelf:down").out
 
@@ -111,10 +111,10 @@ def test_a_choice_is_checked_as_any_component_is() -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("attack=shelf", "attack 'shelf' stands for many; say shelf:NAME, with one of up, down"),
+        ("attack=shelf", "attack 'shelf' needs a choice; write shelf:NAME, with one of up, down"),
         ("attack=shelf:donw", "unknown attack 'shelf:donw'; did you mean 'down'? known: up, down"),
         ("attack=shelf:up attack.steps=3", "unknown parameter attack.steps of shelf:up; known: strength"),
-        ("attack=noise:up", "attack 'noise' leaves no choice; say noise"),
+        ("attack=noise:up", "attack 'noise' has no choices; write noise"),
         ("attack=shef:up", "unknown attack 'shef'; did you mean 'shelf'?"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The command line: what it prints, and one clear line and a non-zero exit for bad input."""
+"""The command line: its output, and one line with a non-zero exit code for bad input."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def assert_one_line(said: Said, *parts: str) -> None:
         assert part in lines[0]
 
 
-def test_a_components_page_says_what_it_does_and_what_its_parameters_are(bench: Bench) -> None:
+def test_a_component_is_listed_with_description_and_parameters(bench: Bench) -> None:
     said = bench("list", "nudge")
     assert said.code == 0
     for part in (
@@ -87,14 +87,14 @@ def test_a_results_folder_that_cannot_be_written_is_refused(bench: Bench, tmp_pa
     assert_one_line(bench("run", *TOY, f"out={tmp_path / 'file' / 'out'}"), "cannot be written", "out=")
 
 
-def test_a_run_prints_its_table_and_a_second_one_only_that(bench: Bench, tmp_path: Path) -> None:
+def test_a_repeated_run_only_prints_the_table(bench: Bench, tmp_path: Path) -> None:
     words = ("run", *TOY, "workers=1", "record=0", f"out={tmp_path}")
     first, again = bench(*words), bench(*words)
     assert (first.code, again.code) == (0, 0), first.err
     assert "nudge" in first.out
     assert first.out == again.out
     assert "36/36 episodes" in first.err
-    assert again.err.strip() == "36 of 36 episodes were there already"
+    assert again.err.strip() == "36 of 36 episodes are already done"
 
 
 def test_a_truncated_record_stops_every_command_that_reads_it(bench: Bench, tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_a_truncated_record_stops_every_command_that_reads_it(bench: Bench, tmp_
         assert_one_line(bench(*words), f"the record {path} is truncated")
 
 
-def test_show_says_what_made_the_records(bench: Bench, tmp_path: Path) -> None:
+def test_show_prints_the_provenance_of_the_records(bench: Bench, tmp_path: Path) -> None:
     bench("run", *TOY, "workers=1", "record=0", "attack.scale=0.5", f"out={tmp_path}")
     whole = bench("show", str(tmp_path))
     pair = next(line for line in whole.out.splitlines() if line.startswith("nudge-none-toy-")).strip()
@@ -116,7 +116,7 @@ def test_show_says_what_made_the_records(bench: Bench, tmp_path: Path) -> None:
         for part in (pair, "nudge(mood=calm, pause=0.0, scale=0.5)  cavbench-toy 1.0", "relative 0.1", "torch "):
             assert part in said.out
     assert_one_line(bench("show", "nothing", "--out", str(tmp_path)), "unknown pair 'nothing'", pair)
-    assert_one_line(bench("show", "no/where", "--out", str(tmp_path)), "there is nothing at no/where")
+    assert_one_line(bench("show", "no/where", "--out", str(tmp_path)), "the folder no/where does not exist")
 
 
 def test_report_prints_a_report_by_name(bench: Bench, tmp_path: Path) -> None:
@@ -142,12 +142,12 @@ def test_a_zoo_that_cannot_be_written_is_refused_before_the_training(bench: Benc
     assert_one_line(said, "cannot be written")
 
 
-def test_a_training_names_its_own_world_and_no_other(bench: Bench, tmp_path: Path) -> None:
+def test_trained_in_must_be_the_world_of_the_training(bench: Bench, tmp_path: Path) -> None:
     said = bench("train", "victim=toy", "world=toy", "victim.trained_in=elsewhere", f"out={tmp_path}")
-    assert_one_line(said, "victim.trained_in=elsewhere does not name the world of this training, toy")
+    assert_one_line(said, "victim.trained_in=elsewhere is not the world of this training, toy")
 
 
-def test_what_does_not_learn_cannot_be_trained(bench: Bench) -> None:
+def test_a_victim_that_does_not_learn_cannot_be_trained(bench: Bench) -> None:
     assert_one_line(bench("train", "victim=idm"), "there is nothing to train")
     assert_one_line(bench("train", "victim=toy", "defense=guard", "defense.digits=1"), "there is nothing to train")
 
@@ -159,10 +159,10 @@ def test_without_a_display_view_says_how_to_open_a_recording(
     path = tmp_path / "some.rrd"
     path.write_bytes(b"")
     assert f"rerun {path}" in bench("view", str(path)).out
-    assert_one_line(bench("view", str(tmp_path / "other.rrd")), "there is nothing at ")
+    assert_one_line(bench("view", str(tmp_path / "other.rrd")), "does not exist")
 
 
-def test_a_traceback_is_shown_to_who_asks_for_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_debug_shows_the_traceback(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     from bench.cli import main as cli
     from bench.errors import UserError
 
@@ -177,7 +177,7 @@ def test_the_console_script_ends_bad_input_in_one_line(toy_folder: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_kill_9_loses_no_finished_unit_and_the_same_command_goes_on(
+def test_kill_9_loses_no_finished_unit_and_the_same_command_continues(
     bench: Bench, toy_folder: Path, tmp_path: Path
 ) -> None:
     def words(out: Path) -> tuple[str, ...]:
@@ -201,7 +201,7 @@ def test_kill_9_loses_no_finished_unit_and_the_same_command_goes_on(
     assert 3 <= len(finished) < 18
     said = ran(toy_folder, *words(broken))
     assert said.code == 0, said.err
-    assert f"{4 * len(finished)} of 72 episodes were there already" in said.err
+    assert f"{4 * len(finished)} of 72 episodes are already done" in said.err
     assert all(path.read_bytes() == blob for path, blob in finished.items())
     assert bench(*words(whole)).code == 0
     assert comparable(results.read(broken)).equals(comparable(results.read(whole)))

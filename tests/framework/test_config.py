@@ -1,4 +1,4 @@
-"""Words become typed, checked configurations; what cannot be read is refused in one line that says what is allowed."""
+"""Options become typed, checked configurations; bad options are refused in one line that says what is allowed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_the_defaults_are_the_clean_dqn_on_the_standard_grid() -> None:
     assert (config.seeds, config.out, config.reference, config.record) == ((0, 1, 2), Path("results"), True, None)
 
 
-def test_a_line_of_words_sets_everything() -> None:
+def test_options_set_every_part_of_the_configuration() -> None:
     config = read(
         "attack=noise defense=advtrain victim=dqn attack.scale=0.5 defense.skip=0.25 lanes=3,4 density=1 weather=clear,rain "
         "episodes=20 threat.norm=linf threat.budget=0.2 world.vehicles=50 seeds=0,1 workers=2 out=some/where record=3"
@@ -56,7 +56,7 @@ def test_comma_lists_sweep_over_names_parameters_and_threats() -> None:
     assert len({pair.id for pair in config.pairs}) == 16
 
 
-def test_a_parameter_goes_to_those_of_a_sweep_that_have_it() -> None:
+def test_in_a_sweep_a_parameter_is_passed_to_the_components_that_have_it() -> None:
     config = read("attack=noise,nudge attack.pause=0.5 attack.distribution=gaussian victim=toy world=toy")
     noise, nudge = (pair.attack.component for pair in config.pairs)
     assert (noise.distribution, nudge.pause) == ("gaussian", 0.5)
@@ -66,7 +66,7 @@ def test_a_clean_pair_is_the_same_under_every_threat_model() -> None:
     assert len(read("attack=none threat.budget=0.1,0.2").pairs) == 1
 
 
-def test_a_path_is_taken_as_it_is() -> None:
+def test_a_path_is_not_parsed() -> None:
     assert run_config(["out=/some/a,b=c {d}/[e]"]).out == Path("/some/a,b=c {d}/[e]")
 
 
@@ -77,7 +77,7 @@ def test_plain_text_needs_no_quotes() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(pause=st.floats(0, 1e6), scale=st.floats(1e-6, 1), mood=st.sampled_from(["calm", "raise", "kill"]))
-def test_what_is_written_is_what_is_read(pause: float, scale: float, mood: str) -> None:
+def test_records_are_read_as_written(pause: float, scale: float, mood: str) -> None:
     values = {"pause": repr(pause), "scale": repr(scale), "mood": mood}
     assert component("attack", "nudge", values) == load("attack", "nudge")(pause=pause, scale=scale, mood=mood)
 
@@ -111,27 +111,27 @@ BAD = {
     "world.vehicles=0": "world 'highway': vehicles must be between 1",
     "executor=ray": "unknown executor 'ray'; known: serial, processes",
     "workers=0": "workers must be at least 1, got 0",
-    "seeds=-1": "seeds must be different numbers of at least 0, got -1",
+    "seeds=-1": "seeds must be distinct whole numbers of at least 0, got -1",
     "record=101": "record must be between 0 and the 100 episodes, got 101",
     "attack=zo attack=pgd": "attack is given twice",
-    "attack=": "attack has no value",
+    "attack=": "attack has an empty value",
     "zo": "cannot read 'zo': write key=value",
     "+attack=zo": "cannot read '+attack=zo': write key=value",
 }
 
 
 @pytest.mark.parametrize("line", BAD)
-def test_bad_words_are_refused_in_one_line(line: str) -> None:
+def test_bad_options_are_refused_in_one_line(line: str) -> None:
     with pytest.raises(UserError) as raised:
         read(line)
     assert BAD[line] in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
-def test_training_takes_one_policy_and_its_seeds() -> None:
+def test_a_training_takes_one_component_of_each_kind_and_several_seeds() -> None:
     config = train_config(["victim=dqn", "victim.batch=64", "seed=3"])
     assert (config.victim.component.batch, config.defense.name, config.seeds) == (64, "none", (3,))
-    with pytest.raises(UserError, match="one policy a seed"):
+    with pytest.raises(UserError, match="one network per seed"):
         train_config(["victim=dqn,ddpg"])
     with pytest.raises(UserError, match="unknown key 'attack'"):
         train_config(["attack=zo"])

@@ -1,4 +1,4 @@
-"""A run of the detection track: a patch is crafted once and kept, and the rest is as on the driving track."""
+"""Runs of the detection track: a patch is crafted once and kept; everything else is as on the driving track."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ def patch_path(out: Path, fingerprint: str) -> Path:
 
 @pytest.fixture(autouse=True)
 def without_reference_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is run is what is asked for, but where a test says otherwise."""
+    """Run without baselines, unless a test asks for them."""
     monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ())
 
 
-def test_the_victim_decides_the_track_and_the_track_the_defaults() -> None:
+def test_the_victim_determines_the_track_and_the_track_the_defaults() -> None:
     config = read("attack=paint victim=red world=red_street")
     (pair,) = config.pairs
     assert (pair.threat.norm, pair.threat.budget, pair.threat.queries) == ("patch", 0.5, 20_000)
@@ -70,10 +70,10 @@ def test_the_victim_decides_the_track_and_the_track_the_defaults() -> None:
 
 
 BAD = {
-    "attack=noise victim=red world=red_street": "attack 'noise' does not fit victim 'red' of the detection track; what fits:",
-    "attack=paint victim=toy world=toy": "attack 'paint' does not fit victim 'toy' of the driving track; what fits: art, bias",
-    "victim=red world=highway": "world 'highway' does not fit victim 'red' of the detection track; what fits: ",
-    "victim=toy,red": "victims 'toy' (driving) and 'red' (detection) are of different tracks",
+    "attack=noise victim=red world=red_street": "attack 'noise' does not fit victim 'red' of the detection track; fitting:",
+    "attack=paint victim=toy world=toy": "attack 'paint' does not fit victim 'toy' of the driving track; fitting: art, bias",
+    "victim=red world=highway": "world 'highway' does not fit victim 'red' of the detection track; fitting: ",
+    "victim=toy,red": "victims 'toy' (driving) and 'red' (detection) belong to different tracks",
     "victim=red world=red_street threat.norm=linf": "unknown threat.norm 'linf'; known: patch",
     "victim=red world=red_street threat.budget=1.5": "threat.budget must be in (0, 1]",
     "attack=paint victim=red world=red_street threat.budget=0": "threat.budget must be in (0, 1]",
@@ -84,7 +84,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("line", BAD)
-def test_what_does_not_fit_the_track_is_refused_in_one_line(line: str) -> None:
+def test_components_of_another_track_are_refused_in_one_line(line: str) -> None:
     with pytest.raises(UserError) as raised:
         read(line)
     assert BAD[line] in str(raised.value)
@@ -122,7 +122,7 @@ def test_a_detector_without_a_seed_is_scored_clean_once(tmp_path: Path) -> None:
     assert set(clean["threat_budget"].to_pylist()) == {0.0}
 
 
-def test_each_scenario_seed_has_its_place_and_every_frame_is_kept(tmp_path: Path) -> None:
+def test_each_scenario_seed_has_a_location_and_every_frame_is_recorded(tmp_path: Path) -> None:
     records, _ = run(tmp_path)
     for row in records.to_pylist():
         assert row["location"] == ("front", "side", "back")[row["seed"] % 3]
@@ -131,7 +131,7 @@ def test_each_scenario_seed_has_its_place_and_every_frame_is_kept(tmp_path: Path
         assert row["confidence_mean"] == pytest.approx(sum(row["frame_confidence"]) / 10)
 
 
-def test_every_attack_is_held_against_patches_that_know_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_attack_is_compared_with_baseline_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ("blank", "not_installed"))
     units = plan(read(SMALL))
     blank = [unit for unit in units if unit.pair.attack.name == "blank"]
@@ -166,7 +166,7 @@ def test_results_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     assert one.drop_columns(BESIDE).equals(three.drop_columns(BESIDE))
 
 
-def test_scoring_code_and_crafting_code_are_told_apart() -> None:
+def test_scoring_and_crafting_have_separate_code_digests() -> None:
     unit = next(unit for unit in plan(read(SMALL)) if unit.preparation)
     assert unit.preparation is not None
     scoring, crafting = (set(fingerprint.sources(work.modules)) for work in (unit, unit.preparation))
@@ -184,14 +184,16 @@ def test_scoring_code_and_crafting_code_are_told_apart() -> None:
         ("raise", "ZeroDivisionError: the attack is at a loss"),
     ],
 )
-def test_a_patch_that_is_not_made_fairly_is_refused_in_one_line(tmp_path: Path, mood: str, part: str) -> None:
+def test_an_attack_that_breaks_the_rules_of_crafting_is_refused_in_one_line(
+    tmp_path: Path, mood: str, part: str
+) -> None:
     with pytest.raises(UserError) as raised:
         run(tmp_path, f"attack.mood={mood}")
     assert part in str(raised.value)
     assert f"paint(mood={mood}) + none + red | patch, seed 0" in str(raised.value)
 
 
-def test_texels_are_brought_into_range_and_how_far_they_were_outside_is_kept(tmp_path: Path) -> None:
+def test_texels_are_clipped_and_their_excess_is_recorded(tmp_path: Path) -> None:
     loud, _ = run(tmp_path, "attack.mood=loud", "weather=clear")
     attacked = loud.filter(pc.field("attack") == "paint")
     assert 0 < min(attacked["excess"].to_pylist()) <= max(attacked["excess"].to_pylist()) <= 1
@@ -200,7 +202,9 @@ def test_texels_are_brought_into_range_and_how_far_they_were_outside_is_kept(tmp
     assert 0 <= float(texels.min()) < float(texels.max()) <= 1
 
 
-def test_a_hardened_detector_has_an_entry_a_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench) -> None:
+def test_a_trained_detector_has_one_zoo_entry_per_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench
+) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
     said = bench("train", "victim=red", "defense=harden", "world=red_street", "seeds=0,1")
     assert said.code == 0, said.err
@@ -246,7 +250,7 @@ def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path,
     assert bench("report", "count", f"out={tmp_path}").out == f"{rows}\n"
 
 
-def test_how_a_patch_came_about_is_kept_beside_it(tmp_path: Path) -> None:
+def test_the_file_of_a_patch_contains_its_provenance(tmp_path: Path) -> None:
     records, _ = run(tmp_path, "weather=clear", "seeds=0", "attack=paint,blank")
     kept = {
         name: Patch.read(patch_path(tmp_path, find(records, {"attack": name})["patch"]).read_bytes())
@@ -261,7 +265,7 @@ def test_how_a_patch_came_about_is_kept_beside_it(tmp_path: Path) -> None:
     assert (evolution.losses["score"].diff() < 0).all()
 
 
-def test_the_first_approaches_of_each_pair_that_was_asked_for_are_recorded(
+def test_the_first_approaches_of_each_requested_pair_are_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench
 ) -> None:
     monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ("blank",))
@@ -277,7 +281,7 @@ def test_the_first_approaches_of_each_pair_that_was_asked_for_are_recorded(
     assert names == {f"{weather}-{seed}.rrd" for weather in ("clear", "fog") for seed in (1_000_000, 1_000_001)}
 
 
-def test_a_replay_measures_what_the_record_says_and_records_it(tmp_path: Path, bench: Bench) -> None:
+def test_a_replay_reproduces_the_record_and_writes_a_recording(tmp_path: Path, bench: Bench) -> None:
     records, _ = run(tmp_path)
     record = find(records, {"attack": "paint", "location": "back"})
     again = replay(tmp_path, record)

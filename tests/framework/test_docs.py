@@ -1,4 +1,4 @@
-"""Every built-in component has a page with a formula, a figure and its parameters; the site says what the code says."""
+"""Every built-in component has a page with a formula, a figure and its parameters, which the site reads from the code."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BUILT_IN = [
 
 
 @pytest.mark.parametrize(("kind", "name"), BUILT_IN)
-def test_a_component_has_a_page_of_its_own(kind: Kind, name: str) -> None:
+def test_every_component_has_a_page(kind: Kind, name: str) -> None:
     page = f"{FOLDERS[kind]}/{name}"
     text = (DOCS / f"{page}.md").read_text()
     assert text.startswith(f"# `{name}`")
@@ -37,14 +37,14 @@ def test_a_component_has_a_page_of_its_own(kind: Kind, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
-def test_what_is_outside_of_the_site_links_what_is_there(name: str) -> None:
+def test_pages_outside_of_the_site_link_to_existing_targets(name: str) -> None:
     links = re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / name).read_text())
     assert links
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
 @pytest.mark.slow
-def test_the_site_reads_the_code_and_refuses_what_it_does_not_know(tmp_path: Path) -> None:
+def test_the_site_reads_the_code_and_refuses_unknown_names(tmp_path: Path) -> None:
     from sphinx.application import Sphinx
 
     source, built = tmp_path / "docs", tmp_path / "built"

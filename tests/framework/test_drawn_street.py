@@ -1,4 +1,4 @@
-"""The whole way with a real detector: a patch is crafted on a drawn street and scored on approaches it never saw."""
+"""End-to-end test with a real detector: a patch is crafted on a drawn street and scored on unseen approaches."""
 
 from __future__ import annotations
 

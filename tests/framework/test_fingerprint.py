@@ -1,4 +1,4 @@
-"""The fingerprint of a unit changes with everything that decides its result, and with nothing else."""
+"""The fingerprint of a unit changes with everything that determines its result, and with nothing else."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_changed_scenario_is_another_unit(word: str, other: str) -> None:
 
 
 @pytest.mark.parametrize("more", ["workers=7", "out=elsewhere", "record=2", "reference=false"])
-def test_what_cannot_change_a_result_is_the_same_unit(more: str) -> None:
+def test_options_that_cannot_change_a_result_keep_the_fingerprint(more: str) -> None:
     assert first(more).fingerprint == first().fingerprint
 
 
@@ -63,9 +63,7 @@ def test_other_library_versions_are_another_unit(monkeypatch: pytest.MonkeyPatch
     assert first().fingerprint != before
 
 
-def test_the_source_of_a_component_and_of_what_it_imports_counts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_digest_covers_a_component_and_its_imports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     package = tmp_path / "some_plugin"
     package.mkdir()
@@ -117,7 +115,7 @@ def test_another_track_outdates_no_record() -> None:
     assert not [name for name in fingerprint.sources(clean.modules) if "detect" in name or "yolo" in name]
 
 
-def test_the_code_of_a_unit_is_what_computes_it_and_nothing_else() -> None:
+def test_the_code_digest_covers_only_the_code_that_computes_a_unit() -> None:
     counted = set(fingerprint.sources(first("world=highway", "attack=pgd", "victim=ddpg").modules))
     assert counted >= {
         *(
@@ -138,7 +136,7 @@ def test_the_code_of_a_unit_is_what_computes_it_and_nothing_else() -> None:
     }
 
 
-def test_every_module_that_is_beside_the_result_exists() -> None:
+def test_every_module_excluded_from_the_digest_exists() -> None:
     for name in fingerprint.BESIDE_THE_RESULT:
         assert importlib.util.find_spec(f"bench.{name}"), f"{name} is gone: take it off the list"
 

@@ -1,4 +1,4 @@
-"""The whole way with real components: the highway world, a blind driver and, where the zoo ships one, the DQN."""
+"""End-to-end tests with real components: the highway world, an input-independent policy and the DQN of the zoo."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ROAD = ("lanes=3", "density=1", "weather=clear,fog", "episodes=3")
 
 
 @pytest.mark.slow
-def test_a_blind_driver_is_scored_on_the_highway_and_its_episode_replayed(
+def test_an_input_independent_policy_is_scored_and_an_episode_replayed(
     bench: Callable[..., Said], tmp_path: Path
 ) -> None:
     said = bench("run", "victim=blind", *ROAD, "workers=2", f"out={tmp_path}")
@@ -36,7 +36,7 @@ def test_a_blind_driver_is_scored_on_the_highway_and_its_episode_replayed(
 
 
 @pytest.mark.slow
-def test_noise_leaves_the_dqn_driving_on_the_highway(bench: Callable[..., Said], tmp_path: Path) -> None:
+def test_the_dqn_drives_on_the_highway_under_noise(bench: Callable[..., Said], tmp_path: Path) -> None:
     seed = f"seeds={zoo.seeds(zoo.Recipe.of(DQN()))[0]}"
     said = bench("run", "attack=noise", *ROAD, seed, "workers=2", "reference=false", f"out={tmp_path}")
     assert said.code == 0, said.err

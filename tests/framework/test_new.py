@@ -1,4 +1,4 @@
-"""`bench new`: what it writes installs, keeps the rules, passes its own test and can be scored."""
+"""`bench new`: its packages can be installed, follow the rules, pass their tests and can be scored."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def installed(written: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that pip installed them to, outside of the environment of the tests."""
+    """The folder into which pip installed the packages, outside of the environment of the tests."""
     site = tmp_path_factory.mktemp("site")
     pip_install(site, *written)
     return site
 
 
-def test_a_package_says_what_is_next(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_prints_the_next_commands(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     said = bench("new", "attack", "my_attack")
     assert said.code == 0, said.err
@@ -58,31 +58,31 @@ def test_a_package_says_what_is_next(bench: Bench, tmp_path: Path, monkeypatch: 
     ]
 
 
-def test_what_is_there_is_not_overwritten(bench: Bench, tmp_path: Path) -> None:
+def test_an_existing_folder_is_not_overwritten(bench: Bench, tmp_path: Path) -> None:
     out = f"out={tmp_path / 'package'}"
     assert bench("new", "attack", "my_attack", out).code == 0
     module = tmp_path / "package" / "cavbench_my_attack.py"
     module.write_text("mine")
-    assert_one_line(bench("new", "attack", "my_attack", out), "is there already and not empty", "out=")
+    assert_one_line(bench("new", "attack", "my_attack", out), "exists and is not empty", "out=")
     assert module.read_text() == "mine"
 
 
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (("attack", "zo"), "attack 'zo' is shipped by cavbench"),
-        (("attack", "MyAttack"), "'MyAttack' is no name for an attack: write lower-case words joined by _"),
-        (("attack", "my-attack"), "'my-attack' is no name for an attack"),
-        (("defense", "class"), "'class' is no name for a defence"),
+        (("attack", "zo"), "attack 'zo' is already shipped by cavbench"),
+        (("attack", "MyAttack"), "'MyAttack' is not a valid name for an attack: write lower-case words joined by _"),
+        (("attack", "my-attack"), "'my-attack' is not a valid name for an attack"),
+        (("defense", "class"), "'class' is not a valid name for a defence"),
         (("victim", "a" * 41), "at most 40 characters"),
         (("atack", "my_attack"), "unknown kind 'atack'; did you mean 'attack'?"),
         (("world", "my_world"), "unknown kind 'world'; known: attack, defense, victim"),
         (("attack", "my_attack", "track=street"), "unknown track 'street'; known: detection, driving"),
-        (("attack", "my_attack", "trak=driving"), "unknown word 'trak=driving'"),
+        (("attack", "my_attack", "trak=driving"), "unknown option 'trak=driving'"),
         (("attack", "my_attack", "out=/proc/none/here"), "cannot be written"),
     ],
 )
-def test_bad_words_are_refused_in_one_line_and_nothing_is_written(
+def test_bad_options_are_refused_in_one_line_and_nothing_is_written(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], part: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -129,7 +129,7 @@ def test_an_installed_package_is_listed_checked_and_scored_in_workers(installed:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "on"), EVERY)
-def test_the_first_run_of_a_package_is_as_it_says(installed: Path, tmp_path: Path, kind: str, on: str) -> None:
+def test_the_first_run_of_a_package_works_as_printed(installed: Path, tmp_path: Path, kind: str, on: str) -> None:
     name = name_of(kind, on)
     _, command, *words = scaffold.first_run(kind, name, on).split()
     quicker = ["seeds=0", "reference=false", "record=0", "workers=1"]

@@ -1,4 +1,4 @@
-"""What is installed: the wheel holds cavbench's packages with their data and nothing else."""
+"""The wheel contains cavbench's packages with their data, and nothing else."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bench.shadow import PACKAGES, ROOT
 TREE = Path(ROOT)
 OWN = ("bench", *PACKAGES)
 NOT_SHIPPED = {f"leaderboard/index.{kind}" for kind in ("html", "json", "csv")}
-"""The published page: made by a command, for readers of the repository."""
+"""The published page, which is generated for readers of the repository."""
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_the_base_dependencies_are_what_the_packages_import() -> None:
 
 
 def _imported() -> set[str]:
-    """The top-level packages that cavbench's own import, without those of Python and cavbench."""
+    """The top-level packages that cavbench imports, without those of Python and cavbench."""
     found: set[str] = set()
     for path in (path for package in OWN for path in (TREE / package).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_bytes())):

@@ -1,4 +1,4 @@
-"""All code of docs/plugins.md is written to the files it names, checked and run, in the order of the page."""
+"""All code of docs/plugins.md is written to the named files, checked and run, in the order of the page."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tests.framework.distributions import pip_install
 
 PAGE = Path(__file__).parents[2] / "docs" / "plugins.md"
 SMALLER = ("seeds=0", "reference=false", "record=0", "world.max_steps=30", "workers=1")
-"""Added to the runs of the page, so that they are quick."""
+"""Options added to the runs of the page, to make them quick."""
 TABLES = re.compile(r"# What makes it a plug-in.*?(?=\n\[tool\.pytest)", re.DOTALL)
-"""Of the pyproject.toml that `bench new` writes: entry points and modules."""
+"""Matches the entry points and modules in the pyproject.toml that `bench new` writes."""
 
 
 def blocks() -> list[tuple[str, str, str]]:
-    """Language, content, and the file named last before each code block of the page."""
+    """Language and content of each code block of the page, and the file named last before it."""
     text = PAGE.read_text()
     found = []
     for match in re.finditer(r"```(\w+)\n(.*?)```", text, re.DOTALL):
@@ -33,7 +33,7 @@ def blocks() -> list[tuple[str, str, str]]:
 
 
 @pytest.mark.slow
-def test_the_page_can_be_typed_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_commands_of_the_page_work_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     site, package = tmp_path / "site", tmp_path / "cavbench-my-attack"
     # The effect of `pip install -e`, beside the environment of the tests: the package's own files are found first.
@@ -66,7 +66,7 @@ def test_the_page_can_be_typed_from_top_to_bottom(tmp_path: Path, monkeypatch: p
 
 
 def typed(line: str, package: Path, site: Path) -> None:
-    """Carry out a line of the page."""
+    """Run a command of the page."""
     program, *words = shlex.split(line)
     if program == "pip":
         assert words == ["install", "-e", "cavbench-my-attack[test]"]

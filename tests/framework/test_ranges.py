@@ -1,4 +1,4 @@
-"""What a parameter may be stands in its annotation; what it may not be is refused in one line."""
+"""Annotations give the allowed values of parameters; other values are refused in one line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bench.plugins.ranges import Count, NotNegative, Positive, Share
 
 @dataclass(frozen=True, kw_only=True)
 class Ranged(Component):
-    """A component of every range.
+    """A dataclass with a parameter of every range.
 
     Args:
         share: of something.
@@ -55,7 +55,7 @@ WORDS = {
 }
 
 
-def test_a_parameter_says_what_is_allowed() -> None:
+def test_the_allowed_range_of_a_parameter_is_shown() -> None:
     assert {name: parameter.allowed for name, parameter in parameters(Ranged).items()} == WORDS
 
 
@@ -81,14 +81,14 @@ def test_a_share_is_a_number_from_0_to_1(value: float) -> None:
         {"count": True},
     ],
 )
-def test_what_is_out_of_range_is_refused(wrong: dict[str, object]) -> None:
+def test_a_value_out_of_range_is_refused(wrong: dict[str, object]) -> None:
     ((name, value),) = wrong.items()
     with pytest.raises(ValueError) as raised:
         Ranged(**wrong)  # type: ignore[arg-type]
     assert str(raised.value) == f"{name} must be {WORDS[name]}, got {value!r}"
 
 
-def test_nothing_is_allowed_where_the_type_says_so() -> None:
+def test_none_is_allowed_if_the_type_allows_it() -> None:
     assert Ranged(maybe=None, free=float("inf")).maybe is None
 
 

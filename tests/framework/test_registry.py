@@ -1,4 +1,4 @@
-"""Components are found by entry points only, and a broken plug-in is named and breaks no other."""
+"""Components are found by entry points only; a broken plug-in is reported and breaks no other."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_plugin_is_found_like_a_built_in(plugins: Path) -> None:
             assert issubclass(registry.load(kind, name), BASES[kind])
 
 
-def test_an_unknown_name_is_answered_with_the_nearest_and_all_others() -> None:
+def test_an_unknown_name_is_reported_with_the_nearest_and_all_known_names() -> None:
     with pytest.raises(UserError, match=r"unknown attack 'nois'; did you mean 'noise'\? known: .*noise.*pgd"):
         registry.load("attack", "nois")
 
@@ -46,7 +46,7 @@ BROKEN = {
     "cannot be imported: ZeroDivisionError": "1 / 0\n",
     "is not a subclass of bench.plugins.contracts.Attack": "class Plugin: ...\n",
     "cannot be imported: AttributeError": "class Other: ...\n",
-    "is of no track: derive it from a base class of one": (
+    "belongs to no track: derive it from a base class of": (
         "from dataclasses import dataclass\nfrom bench.plugins.contracts import Attack\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(Attack): ...\n"
     ),
@@ -58,7 +58,7 @@ BROKEN = {
         "from bench.driving.contracts import DrivingAttack\n"
         "class Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
     ),
-    "takes steps by position": (
+    "has the positional parameters steps": (
         "from dataclasses import dataclass\nfrom bench.driving.contracts import DrivingAttack\n"
         "@dataclass(frozen=True)\nclass Plugin(DrivingAttack):\n    steps: int = 1\n    def perturb(self, o, oracle): ...\n"
     ),
@@ -79,7 +79,7 @@ def test_a_broken_plugin_is_named_in_one_line_and_breaks_no_other(complaint: str
     registry.load("attack", "noise")
 
 
-def test_a_grid_that_cannot_be_imported_is_named_when_it_is_asked_for_and_breaks_no_other(plugins: Path) -> None:
+def test_a_broken_grid_is_reported_when_it_is_used_and_breaks_no_other(plugins: Path) -> None:
     points = {
         "cavbench.grids": {"rough-v1": "rough:GRID"},
         "cavbench.worlds": {"rough": "envs.highway.world:HighwayWorld"},
@@ -90,7 +90,7 @@ def test_a_grid_that_cannot_be_imported_is_named_when_it_is_asked_for_and_breaks
         run_config(["victim=blind", "world=rough", "grid=rough-v1"])
 
 
-def test_a_name_that_two_packages_claim_is_refused_and_both_are_named(plugins: Path) -> None:
+def test_a_name_that_two_packages_ship_is_refused_with_both_packages(plugins: Path) -> None:
     install(plugins, "rival", {"cavbench.attacks": {"noise": "rival:Noise"}}, {"rival": ""})
     with pytest.raises(UserError, match=r"'noise' is shipped by cavbench .* and by rival 1.0; uninstall one"):
         registry.load("attack", "noise")
@@ -111,7 +111,7 @@ def test_listing_names_imports_no_torch() -> None:
 
 
 def test_listing_names_costs_little_more_than_a_command_line_that_does_nothing() -> None:
-    """About half a second; here against importing what prints it, for machines are not idle."""
+    """Listing takes about 0.5 s; compared with the import of the console, because machines are not idle."""
 
     def cpu_seconds(*command: str) -> float:
         before = resource.getrusage(resource.RUSAGE_CHILDREN)

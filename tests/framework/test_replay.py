@@ -1,4 +1,4 @@
-"""Any episode can be driven again from its record alone, and comes out the same to the last bit."""
+"""Any episode can be replayed from its record alone, bit for bit."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ def records_of(folder: Path) -> pa.Table:
 
 @pytest.fixture
 def folder(bench: Bench, tmp_path: Path) -> Path:
-    """The results of a small run, one episode of each pair asked for recorded."""
+    """The results of a small run, with a recording of one episode of each requested pair."""
     said = bench("run", *TOY, "attack.scale=0.5", "workers=1", "reference=false", f"out={tmp_path}")
     assert said.code == 0, said.err
     assert "warning" not in said.err
     return tmp_path
 
 
-def test_a_run_records_the_first_episode_of_each_pair_that_was_asked_for(folder: Path) -> None:
+def test_a_run_records_the_first_episode_of_each_requested_pair(folder: Path) -> None:
     (path,) = folder.glob("recordings/*/*.rrd")
     assert path.parent.name.startswith("nudge-none-toy-")
     assert path.name == "lanes-3-density-1-weather-clear-1000000.rrd"
 
 
-def test_a_replay_measures_what_the_record_says(folder: Path) -> None:
+def test_a_replay_reproduces_the_record(folder: Path) -> None:
     record = find(records_of(folder), {"attack": "nudge", "seed": "1000002"})
     again = replay(folder, record)
     assert (again.differences, again.changed) == ((), "")
@@ -45,7 +45,7 @@ def test_a_replay_measures_what_the_record_says(folder: Path) -> None:
     assert again.path.stat().st_size > 0
 
 
-def test_a_replay_that_comes_out_otherwise_says_in_what_and_why(folder: Path) -> None:
+def test_a_replay_that_differs_reports_the_differences_and_the_cause(folder: Path) -> None:
     records = records_of(folder)
     record = find(records, {"attack": "nudge"})
     rows = records.filter(pa.compute.field("unit") == record["unit"]).to_pylist()
@@ -55,13 +55,13 @@ def test_a_replay_that_comes_out_otherwise_says_in_what_and_why(folder: Path) ->
     assert (again.differences, again.changed) == (("return",), "code_digest")
 
 
-def test_view_lists_recordings_and_makes_others(bench: Bench, folder: Path) -> None:
+def test_view_lists_recordings_and_records_other_episodes(bench: Bench, folder: Path) -> None:
     made = bench("view", "nudge", "lanes=3", "seed=1000003", "--out", str(folder))
     assert made.code == 0
     assert "Replayed bit for bit" in made.out
     listed = bench("view", str(folder))
     assert "has 2 recordings" in listed.out
-    assert_one_line(bench("view", str(folder), "lanes=5"), "no record has lanes=5; there are 3")
+    assert_one_line(bench("view", str(folder), "lanes=5"), "no record has lanes=5; known values: 3")
     assert_one_line(bench("view", str(folder), "lane=3"), "unknown column 'lane'; did you mean 'lanes'?")
     assert_one_line(bench("view", str(folder), "seed=first"), "cannot read seed=first: the column holds int64")
-    assert_one_line(bench("view", "none", "--out", str(folder)), "has no recordings; name an episode to make one")
+    assert_one_line(bench("view", "none", "--out", str(folder)), "has no recordings; record an episode")

@@ -1,4 +1,4 @@
-"""Records appear whole or not at all, and what cannot be read is named in one line."""
+"""Records are written atomically; unreadable ones are reported in one line."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def written(units: list[Unit], tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_rollout_measures_exactly_what_the_schema_says(units: list[Unit]) -> None:
+def test_a_rollout_returns_exactly_the_columns_of_the_schema(units: list[Unit]) -> None:
     measured = {field.name for field in (*TRACK.measurements, *TRACK.probes)} | {"seed"}
     assert set(drive(units[0])) == measured
     assert all(field.metadata[b"meaning"] for field in SCHEMA)
 
 
-def test_what_is_written_is_what_is_read(written: Path, units: list[Unit]) -> None:
+def test_records_are_read_as_written(written: Path, units: list[Unit]) -> None:
     records = read(written, [unit.fingerprint for unit in units])
     assert records.schema.equals(SCHEMA)
     assert records.num_rows == 3 * len(units)
@@ -84,7 +84,7 @@ def test_a_write_that_fails_leaves_nothing_behind(
     assert list((tmp_path / "episodes").iterdir()) == []
 
 
-def test_what_a_killed_writer_leaves_is_no_record(written: Path, units: list[Unit]) -> None:
+def test_a_killed_writer_leaves_no_record(written: Path, units: list[Unit]) -> None:
     (written / "episodes" / f".{units[0].fingerprint}-x.tmp").write_bytes(b"PAR1 half")
     assert read(written).num_rows == 3 * len(units)
 
@@ -107,10 +107,10 @@ def test_a_record_whose_data_is_damaged_is_named(written: Path, units: list[Unit
         read(written)
 
 
-def test_a_foreign_table_is_named(written: Path) -> None:
+def test_a_foreign_table_is_reported_by_its_path(written: Path) -> None:
     path = written / "episodes" / "other.parquet"
     pq.write_table(pa.table({"a": [1]}), path)
-    with pytest.raises(UserError, match=f"the record {path} has other columns"):
+    with pytest.raises(UserError, match=f"the record {path} has columns that this version does not write"):
         read(written)
 
 
@@ -118,7 +118,7 @@ CANNOT_BE = {
     "safe_progress": (5.0, "safe_progress must be between 0 and 1, got 5"),
     "changed": (float("nan"), "changed must be between 0 and 1, got nan"),
     "cell": ('{"lanes":-1,"density":1.0,"weather":"clear"}', "lanes must be "),
-    "world_facts": ("{}", "not a cell of a world that says its axes"),
+    "world_facts": ("{}", "not a cell, or world_facts has no axes"),
     "attack_params": ("{scale: 1}", "attack_params {scale: 1}: Expecting property name"),
     "world_params": ("[1]", "world_params [1]: not a JSON object"),
     "threat_access": ("all", "threat_access all: known: oblivious, decisions, scores, gradients"),
@@ -126,7 +126,7 @@ CANNOT_BE = {
 
 
 @pytest.mark.parametrize("name", CANNOT_BE)
-def test_a_value_that_cannot_be_is_named_with_its_record(written: Path, units: list[Unit], name: str) -> None:
+def test_an_invalid_value_is_reported_with_its_record(written: Path, units: list[Unit], name: str) -> None:
     value, why = CANNOT_BE[name]
     path = results.path_of(written, units[0].fingerprint)
     records = pq.read_table(path)
@@ -136,7 +136,7 @@ def test_a_value_that_cannot_be_is_named_with_its_record(written: Path, units: l
     for reads in (read, lambda out: reading.read_compact(out, {"safe_progress", "changed"})):
         with pytest.raises(UserError) as raised:
             reads(written)
-        assert str(raised.value).startswith(f"the record {path} cannot be right: ")
+        assert str(raised.value).startswith(f"the record {path} is invalid: ")
         assert why in str(raised.value)
 
 
@@ -147,11 +147,11 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_empty_folder_says_how_to_fill_it(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"there are no records in .*; `bench run out="):
+    with pytest.raises(UserError, match=r"there are no records in .*; create some with `bench run out="):
         read(tmp_path)
 
 
-def test_reading_a_folder_takes_the_newest_code_and_drives_no_scenario_twice(written: Path, units: list[Unit]) -> None:
+def test_reading_a_folder_keeps_the_newest_code_and_each_scenario_once(written: Path, units: list[Unit]) -> None:
     old = read(written, [units[0].fingerprint]).to_pylist()
     newer = [
         row | {"unit": "newer", "code_digest": "newer", "created_at": row["created_at"].replace(year=2999)}
@@ -166,8 +166,8 @@ def test_reading_a_folder_takes_the_newest_code_and_drives_no_scenario_twice(wri
     assert sorted(row["seed"] for row in same_pair) == sorted({row["seed"] for row in newer + longer})
 
 
-def test_records_of_the_first_format_are_read_as_those_of_today(written: Path, units: list[Unit]) -> None:
-    """They had a column each for lanes, density and weather, and said nothing of their world."""
+def test_records_of_format_1_are_converted(written: Path, units: list[Unit]) -> None:
+    """Format 1 had one column each for lanes, density and weather, and no facts of the world."""
     today = read(written)
     _, second, first = generations(TRACK)
     for number, unit in enumerate(units):

@@ -1,4 +1,4 @@
-"""A run: what it consists of, that its results depend on nothing but its configuration, and that it goes on where it stopped."""
+"""A run: its units, its results, which depend only on its configuration, and its resumption."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ pytestmark = pytest.mark.usefixtures("toy_folder")
 SMALL = "attack=nudge victim=toy world=toy lanes=3,4 density=1 weather=clear,fog episodes=4 seeds=0,1"
 Work = Unit | Preparation
 BESIDE = ("attack_ms", "created_at", "wall_s")
-"""What two runs of the same unit may differ in."""
+"""Columns in which two runs of the same unit may differ."""
 
 
 class Silent:
-    """A watcher that remembers, and can stop the run."""
+    """A watcher that stores what it receives, and can stop the run."""
 
     def __init__(self, stop_after: int | None = None) -> None:
         self.done: list[Work] = []
@@ -78,7 +78,7 @@ def test_a_run_has_the_pair_its_clean_control_and_the_reference_drivers(tmp_path
     assert watcher.episodes == records.num_rows
 
 
-def test_the_same_scenarios_are_driven_by_all(tmp_path: Path) -> None:
+def test_all_pairs_drive_the_same_scenarios(tmp_path: Path) -> None:
     records, _ = run(tmp_path)
     cells: dict[str, set[tuple[int, int]]] = {}
     for row in records.to_pylist():
@@ -93,12 +93,12 @@ def test_two_pairs_share_their_clean_control(tmp_path: Path) -> None:
     assert len(clean) == 2 * 2 * 2
 
 
-def test_references_can_be_left_out(tmp_path: Path) -> None:
+def test_baselines_can_be_switched_off(tmp_path: Path) -> None:
     records, _ = run(tmp_path, "reference=false")
     assert all(records["sees"].to_pylist())
 
 
-def test_continuous_victims_are_held_against_continuous_drivers() -> None:
+def test_continuous_victims_have_continuous_baselines() -> None:
     config = run_config(["attack=steer", "victim=toy", "victim.actions=continuous", "world=toy"])
     kinds = {(unit.pair.victim.name, unit.pair.victim.component.action_type) for unit in plan(config)}
     assert kinds == {("toy", "continuous"), ("blind", "continuous"), ("random", "continuous")}
@@ -127,7 +127,7 @@ def test_a_finished_run_does_nothing(tmp_path: Path) -> None:
     assert again.equals(first)
 
 
-def test_an_interrupted_run_keeps_what_is_finished_and_goes_on_from_there(tmp_path: Path) -> None:
+def test_an_interrupted_run_keeps_finished_units_and_continues(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "broken-off", watcher=Silent(stop_after=3))
     assert reading.read(tmp_path / "broken-off", track=track("driving")).num_rows == 3 * 4
@@ -137,7 +137,7 @@ def test_an_interrupted_run_keeps_what_is_finished_and_goes_on_from_there(tmp_pa
     assert comparable(went_on).equals(comparable(whole))
 
 
-def test_a_failing_attack_is_named_with_its_cell_in_one_line(tmp_path: Path) -> None:
+def test_a_failing_attack_is_reported_with_its_cell_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError) as raised:
         run(tmp_path, "attack.mood=raise")
     assert "nudge(mood=raise) + none + toy | lanes 4, density 1, clear" in str(raised.value)
@@ -154,7 +154,7 @@ def test_a_worker_that_is_killed_is_reported_and_loses_no_finished_unit(tmp_path
     assert kept.equals(calm)
 
 
-def test_a_policy_that_is_missing_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_policy_is_reported_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
     watcher = Silent()
     with pytest.raises(UserError, match="bench train"):
@@ -162,7 +162,7 @@ def test_a_policy_that_is_missing_is_refused_before_any_work(tmp_path: Path, mon
     assert watcher.done == []
 
 
-def test_the_grid_of_a_record_is_named_only_where_it_is_the_whole_cell() -> None:
+def test_a_record_names_its_grid_only_if_cell_and_seeds_match() -> None:
     whole = plan(run_config(["victim=toy", "world=toy", "lanes=3"]))
     short = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=99"]))
     other = plan(run_config(["victim=toy", "world=toy", "lanes=2"]))

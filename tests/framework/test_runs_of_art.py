@@ -1,4 +1,4 @@
-"""Attacks of the Adversarial Robustness Toolbox from the command line, in worker processes, to the records."""
+"""Attacks of the Adversarial Robustness Toolbox: from the command line, in worker processes, to the records."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.framework.conftest import Said
 pytest.importorskip("art")
 
 
-def test_a_run_says_which_attack_of_which_version(bench: Callable[..., Said], tmp_path: Path) -> None:
+def test_records_name_the_attack_and_the_version_of_art(bench: Callable[..., Said], tmp_path: Path) -> None:
     attacks = "art:SquareAttack,art:HopSkipJump,art:ProjectedGradientDescent,art:AutoProjectedGradientDescent"
     said = bench(
         "run",

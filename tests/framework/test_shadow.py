@@ -1,4 +1,4 @@
-"""A user's file or folder with the name of one of cavbench's packages: named in one line, or no hindrance."""
+"""A user's file or folder with the name of a package of cavbench is harmless, or reported in one line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.framework.distributions import install
 
 SHAPES = ("{}.py", "{}/__init__.py")
 COMMAND = "import sys\nfrom cavbench import main\nif __name__ == '__main__':\n    sys.exit(main())\n"
-"""The script that pip makes for the command; written by the tests, so that it is the command of this tree that is tried."""
+"""The script that pip creates for the command; written here, so that the command of this tree is tested."""
 TOY = ("attack=nudge", "victim=toy", "world=toy", "lanes=3", "density=1", "weather=clear,fog", "episodes=2", "seeds=0")
 
 
@@ -34,7 +34,7 @@ def write(path: Path, text: str = "") -> Path:
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("name", PACKAGES)
-def test_a_script_is_told_what_shadows_a_package(name: str, shape: str, tmp_path: Path) -> None:
+def test_a_script_gets_an_error_that_names_the_shadowing_file(name: str, shape: str, tmp_path: Path) -> None:
     write(tmp_path / shape.format(name))
     said = python(tmp_path, write(tmp_path / "script.py", "from bench.driving.contracts import DrivingAttack\n"))
     assert said.returncode == 1
@@ -45,7 +45,7 @@ def test_a_script_is_told_what_shadows_a_package(name: str, shape: str, tmp_path
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_import_cavbench_says_that_a_users_bench_comes_first_without_running_it(shape: str, tmp_path: Path) -> None:
+def test_import_cavbench_reports_a_users_bench_without_running_it(shape: str, tmp_path: Path) -> None:
     write(tmp_path / shape.format("bench"), "print('the benchmark of the user starts')\n")
     said = python(tmp_path, write(tmp_path / "script.py", "import cavbench\n"))
     assert said.returncode == 1
@@ -55,7 +55,7 @@ def test_import_cavbench_says_that_a_users_bench_comes_first_without_running_it(
 
 
 @pytest.mark.parametrize("name", ["bench", *PACKAGES])
-def test_folders_that_are_no_packages_and_files_elsewhere_are_no_hindrance(name: str, tmp_path: Path) -> None:
+def test_folders_without_modules_and_files_in_other_folders_do_not_shadow(name: str, tmp_path: Path) -> None:
     write(tmp_path / name / "mine.py")
     write(tmp_path / "lower" / f"{name}.py")
     said = python(tmp_path, "-c", "import bench, cavbench; print(cavbench.__version__ == bench.__version__)")
@@ -73,7 +73,7 @@ def test_the_command_says_what_shadows_a_package_in_one_line(name: str, tmp_path
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_so_does_python_m_bench(name: str, tmp_path: Path) -> None:
+def test_python_m_bench_says_what_shadows_a_package_in_one_line(name: str, tmp_path: Path) -> None:
     write(tmp_path / name / "__init__.py")
     said = python(tmp_path, "-m", "bench", "list")
     assert said.returncode == 2
@@ -104,6 +104,6 @@ def test_the_command_and_its_workers_run_in_a_folder_with_all_these_names(tmp_pa
     assert len(list((tmp_path / "runs" / "episodes").glob("*.parquet"))) == 4
 
 
-def test_the_modules_that_are_checked_are_those_beside_bench() -> None:
+def test_all_packages_next_to_bench_are_checked() -> None:
     beside = {path.parent.name for path in Path(ROOT).glob("*/__init__.py")}
     assert beside - {"bench", "tests"} == set(PACKAGES)

@@ -1,4 +1,4 @@
-"""A track that the framework has never heard of is listed, run, resumed, recorded and reported; so are its axes."""
+"""A third-party track, with its own axes, is listed, run, resumed, recorded and reported."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_its_axes_are_keys_of_the_command_line(bench: Bench, tmp_path: Path) -> 
     assert "pitch (of the lower tone)" in " ".join(bench("run", "--help").out.split())
 
 
-def test_its_records_make_a_page(bench: Bench, tmp_path: Path) -> None:
+def test_its_records_are_shown_on_the_page(bench: Bench, tmp_path: Path) -> None:
     out = tmp_path / "results"
     assert bench(*RUN, f"out={out}").code == 0
     said = bench("report", f"out={out}", f"html={tmp_path / 'page.html'}")
@@ -93,7 +93,7 @@ def test_its_records_make_a_page(bench: Bench, tmp_path: Path) -> None:
 def test_an_attack_of_another_track_does_not_fit(bench: Bench) -> None:
     said = bench("run", "attack=noise", "victim=ear")
     assert said.code == 2
-    assert "attack 'noise' does not fit victim 'ear' of the listening track; what fits: down, none" in said.err
+    assert "attack 'noise' does not fit victim 'ear' of the listening track; fitting: down, none" in said.err
 
 
 def test_a_results_folder_holds_both_tracks(bench: Bench, tmp_path: Path) -> None:

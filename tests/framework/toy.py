@@ -1,4 +1,4 @@
-"""A third party's plug-ins as small as they can be: a world of ten steps, a victim with weights, and attacks of every temper."""
+"""Minimal third-party plug-ins: a world of ten steps, a victim with weights, and attacks that misbehave on demand."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class ToyEnv(EnvBase):
 
 @dataclass(frozen=True, kw_only=True)
 class ToyWorld(DrivingWorld):
-    """Ten steps of nothing much, on the axes of a highway.
+    """Ten simple steps, on the axes of a highway.
 
     Args:
         max_steps: of an episode.
@@ -157,7 +157,7 @@ class ToyWorld(DrivingWorld):
 
 @dataclass(frozen=True, kw_only=True)
 class BendWorld(ToyWorld):
-    """Ten steps on a bend, five a second, with axes of its own and three actions."""
+    """Ten steps on a bend at 5 Hz, with other axes and three actions."""
 
     axes: ClassVar[Axes] = BEND_AXES
     grid: ClassVar[str] = BEND_V1.name
@@ -189,7 +189,7 @@ class ToyPolicy(Policy):
 
 @dataclass(frozen=True, kw_only=True)
 class ToyVictim(DrivingVictim):
-    """A driver that learned from nobody.
+    """A policy that is not trained.
 
     Args:
         actions: what it decides.
@@ -218,12 +218,12 @@ class ToyVictim(DrivingVictim):
 
 @dataclass(frozen=True, kw_only=True)
 class Nudge(DrivingAttack):
-    """Pushes everything by a random sign.
+    """Moves every value by the radius with a random sign.
 
     Args:
         scale: share of the radius.
         pause: seconds to sleep at every step.
-        mood: what it does beside that: nothing, raise an error, or kill its own process.
+        mood: misbehaviour: none, raise an error, or kill its process.
     """
 
     access: ClassVar[Access] = "oblivious"
@@ -247,7 +247,7 @@ class Nudge(DrivingAttack):
 
 @dataclass(frozen=True, kw_only=True)
 class Steer(DrivingAttack):
-    """Only for drivers that steer themselves, and only with their gradients."""
+    """An attack for continuous actions that needs gradients."""
 
     access: ClassVar[Access] = "gradients"
     action_types: ClassVar[tuple[ActionType, ...]] = ("continuous",)
@@ -259,7 +259,7 @@ class Steer(DrivingAttack):
 
 @dataclass(frozen=True, kw_only=True)
 class Guard(DrivingDefense):
-    """Rounds what the victim sees.
+    """Rounds the observation.
 
     Args:
         digits: kept after the point.

@@ -1,4 +1,4 @@
-"""A third party's plug-ins of the detection track: red squares, a detector of red, and patches that misbehave on demand."""
+"""Minimal third-party plug-ins of the detection track: red squares, a detector of red, attacks that misbehave on demand."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from bench.victims import zoo
 from envs.weather import WEATHERS
 
 SIDE, SIGN = 32, slice(8, 24)
-"""Of the pictures, and where the sign is in them, in both directions."""
+"""Side of the images, and the range of the sign in both directions, in pixels."""
 
 RED_AXES = Axes(
     (
@@ -54,7 +54,7 @@ RED_V1 = Grid(
 
 
 class RedScenes(Scenes):
-    """A red square that pales with the distance and the extinction of the air."""
+    """A red square that fades with the distance and the extinction of the air."""
 
     size = (SIDE, SIDE)
 
@@ -105,7 +105,7 @@ class RedStreet(CameraWorld):
 
 
 class RedDetector(Detector):
-    """Two boxes, the sign's and a corner's; there is a stop sign where it is red."""
+    """Two boxes, the sign's and a corner's; red boxes are stop signs."""
 
     names = ("car", "stop sign")
     stride = 8
@@ -125,7 +125,7 @@ class RedDetector(Detector):
 
 @dataclass(frozen=True, kw_only=True)
 class RedVictim(DetectorVictim):
-    """Sees red."""
+    """The victim of `RedDetector`."""
 
     def zoo_name(self) -> str:
         return "red"
@@ -186,7 +186,7 @@ class Blank(PatchAttack):
 
 @dataclass(frozen=True, kw_only=True)
 class Harden(DetectorDefense):
-    """Another bias, drawn from the seed.
+    """Changes the bias of the detector, depending on the seed.
 
     Args:
         trained_in: the world it was trained in.

@@ -1,4 +1,4 @@
-"""A third track, as a package of its own would bring it: listeners that tell high tones from low, and a shift of pitch."""
+"""A third track, as in a plug-in package: listeners that distinguish high from low tones, attacked by a shift of pitch."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class ShiftThreat(ThreatModel):
 
 
 class ToneVictim(Victim):
-    """Listens."""
+    """Base class of listeners."""
 
     track: ClassVar[str] = "listening"
     network: ClassVar[type[Any]] = Listener
@@ -55,17 +55,17 @@ class ToneVictim(Victim):
 
 
 class ToneAttack(Attack):
-    """Shifts tones."""
+    """Base class of attacks: shifts tones."""
 
     track: ClassVar[str] = "listening"
 
     @abstractmethod
     def shift(self, tones: Tensor, budget: float) -> Tensor:
-        """The tones [E, T] that are played instead."""
+        """The shifted tones [E, T]."""
 
 
 class ToneWorld(World):
-    """Plays tones."""
+    """Base class of worlds: plays tones."""
 
     track: ClassVar[str] = "listening"
 
@@ -108,7 +108,7 @@ class Down(ToneAttack):
 
 
 class ListeningTrack(Track):
-    """Listeners that tell high tones from low ones."""
+    """Listeners that distinguish high tones from low ones."""
 
     name: ClassVar[str] = "listening"
     world: ClassVar[str] = "booth"

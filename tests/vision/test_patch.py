@@ -46,7 +46,7 @@ def test_calls_above_the_access_level_are_refused(access: Access, allowed: int) 
         if number < allowed:
             ask(pictures(1))
         else:
-            with pytest.raises(UserError, match=f"declares that it needs '{access}' only"):
+            with pytest.raises(UserError, match=f"declares only '{access}'"):
                 ask(pictures(1))
     assert door.spent == allowed
 

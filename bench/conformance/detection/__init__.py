@@ -1,4 +1,4 @@
-"""What `bench check` and `bench new` know of the detection track."""
+"""The kit of the detection track, for `bench check` and `bench new`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def _attack(subject: Subject) -> Iterator[Suite]:
     from bench.detection import PatchAttack
 
     if not isinstance(subject.component, PatchAttack):
-        raise NotApplicableError("it is no PatchAttack: signs stay as they are")
+        raise NotApplicableError("it is not a PatchAttack: it does not change the sign")
     yield PatchSuite(subject)
 
 

@@ -1,4 +1,4 @@
-"""The rules for camera worlds."""
+"""Rules for camera worlds."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ FRAMES = 3
 SHARE = 0.5
 TEXELS = 8
 VISIBLE = 0.9
-"""A frame in which the patch must be seen shows this share of the sign."""
+"""The patch must be visible in frames that show at least this share of the sign."""
 
 
 class CameraSuite(Suite):
-    """Of a `CameraWorld`, on a few of its frames."""
+    """Checks of a `CameraWorld`, on a few of its frames."""
 
     component: CameraWorld
 
@@ -39,26 +39,28 @@ class CameraSuite(Suite):
         }
 
     def places(self) -> None:
-        """Names of the places, and of what there is to find."""
-        require(self.component.locations, "locations is empty: name the places that are scored")
+        """It has locations, and a stop sign among its classes."""
+        require(self.component.locations, "locations is empty: name the locations of its approaches")
         require(STOP_SIGN in self.component.classes, f"none of its classes is {STOP_SIGN!r}")
 
     def scenes(self) -> None:
-        """As many boxes, distances and shares as frames."""
+        """The training scenes have one box, distance and visible share per frame."""
         self._check_scenes(self.component.training_scenes())
 
     def pictures(self) -> None:
-        """In range, and a frame is the same whatever is rendered with it."""
+        """Colours are in [0, 1], and a frame does not depend on the others that are rendered with it."""
         scenes, frames = self._some()
         together = scenes.render(frames, None, SHARE)
         shape = (FRAMES, 3, *scenes.size)
-        require(tuple(together.shape) == shape, f"render gives {list(together.shape)}, not {list(shape)}")
-        require(bool(((together >= 0) & (together <= 1)).all()), "render gives colours outside [0, 1]")
+        require(tuple(together.shape) == shape, f"render returns shape {list(together.shape)}, not {list(shape)}")
+        require(bool(((together >= 0) & (together <= 1)).all()), "render returns colours outside [0, 1]")
         alone = scenes.render(frames[1:2], None, SHARE)
-        require(torch.allclose(together[1:2], alone, atol=1e-5), "a frame changes with the others that are rendered")
+        require(
+            torch.allclose(together[1:2], alone, atol=1e-5), "a frame depends on the others that are rendered with it"
+        )
 
     def patches(self) -> None:
-        """A patch is seen, and the way back to its texels is open."""
+        """A patch is visible, and the images have a gradient with respect to its texels."""
         scenes, frames = self._some()
         patch = self._patch().requires_grad_(True)
         shown = scenes.render(frames, patch, SHARE)
@@ -66,24 +68,25 @@ class CameraSuite(Suite):
         require(
             bool((shown != bare).flatten(1).any(1).all()), "a patch changes no pixel of a frame that shows the sign"
         )
-        require(shown.requires_grad, "the pictures have no graph to the patch")
+        require(shown.requires_grad, "the images have no graph to the patch: use differentiable operations in render")
         (gradient,) = torch.autograd.grad(shown.sum(), patch)
         require(
-            bool(gradient.isfinite().all() and gradient.any()), "the gradient of the pictures in the patch is 0 or NaN"
+            bool(gradient.isfinite().all() and gradient.any()),
+            "the gradient of the images with respect to the patch is 0 or NaN",
         )
 
     def windows(self) -> None:
-        """A part is what would be cut out of the picture."""
+        """`windows` equals crops of the rendered images."""
         scenes, frames = self._some()
         patch, size = self._patch(), (32, 32)
         limit = torch.tensor([scenes.size[1], scenes.size[0]]) - 32
         corners = torch.minimum(scenes.boxes[frames][:, :2].long().clamp(min=0), limit)
         cut = Scenes.windows(scenes, frames, patch, SHARE, corners, size)
         parts = scenes.windows(frames, patch, SHARE, corners, size)
-        require(torch.allclose(parts, cut, atol=1e-3), "windows differs from what render shows there")
+        require(torch.allclose(parts, cut, atol=1e-3), "windows differs from crops of render")
 
     def reach(self) -> None:
-        """Outside of `reach` a patch changes nothing."""
+        """A patch changes no pixels outside of `reach`."""
         scenes, frames = self._some()
         changed = (scenes.render(frames, self._patch(), SHARE) - scenes.render(frames, None, SHARE)).abs().amax(1)
         for picture, box in zip(changed, scenes.reach(SHARE)[frames], strict=True):
@@ -94,28 +97,34 @@ class CameraSuite(Suite):
             require(float(outside.max()) < 1e-4, "a patch changes pixels outside of reach: make the boxes larger")
 
     def every_cell(self) -> str:
-        """There is an approach in every cell of the default grid."""
+        """Every cell of the default grid has approaches."""
         grid = registry.grid(self.component.grid)
         for cell in grid.cells():
             found = self.component.approaches(cell, range(SeedBlock.REPORT, SeedBlock.REPORT + 1))
-            require(len(found) == 1, f"approaches gives {len(found)} for one seed in the cell {cell}: give one a seed")
+            require(
+                len(found) == 1, f"approaches returns {len(found)} for one seed in the cell {cell}: return one per seed"
+            )
         return f"{len(grid.cells())} cells"
 
     def approaches(self) -> None:
-        """One a seed, at the place of the seed, farthest first, all of the same length."""
+        """There is one approach per seed, at the location of the seed, farthest frame first, all of the same length."""
         places = self.component.locations
         seeds = range(SeedBlock.REPORT, SeedBlock.REPORT + len(places))
         found = self.component.approaches(first_cell(self.component), seeds)
-        require([one.seed for one in found] == list(seeds), "approaches must give one for each seed, in order")
+        require(
+            [one.seed for one in found] == list(seeds), "approaches must return one approach for each seed, in order"
+        )
         wanted = [places[seed % len(places)] for seed in seeds]
-        require([one.location for one in found] == wanted, "a seed's place must be locations[seed % len(locations)]")
-        require(len({len(one.scenes) for one in found}) == 1, "approaches differ in their number of frames")
+        require(
+            [one.location for one in found] == wanted, "the location of a seed must be locations[seed % len(locations)]"
+        )
+        require(len({len(one.scenes) for one in found}) == 1, "approaches have different numbers of frames")
         for one in found:
             self._check_scenes(one.scenes)
             require(bool((one.scenes.distance.diff() < 0).all()), "frames must come farthest first")
 
     def same_seed_same_approach(self) -> None:
-        """An approach is fixed by its seed."""
+        """The seed determines the approach."""
         frames = torch.tensor([0])
         first, second = (
             self.component.approaches(first_cell(self.component), range(SeedBlock.REPORT, SeedBlock.REPORT + 1))[
@@ -123,24 +132,24 @@ class CameraSuite(Suite):
             ].scenes.render(frames, None, SHARE)
             for _ in range(2)
         )
-        require(torch.equal(first, second), "the same seed gives two different pictures")
+        require(torch.equal(first, second), "the same seed gives two different images")
 
     def _check_scenes(self, scenes: Scenes) -> None:
         count = len(scenes)
-        require(count, "there are no frames")
+        require(count, "the scenes have no frames")
         require(scenes.boxes.shape == (count, 4), f"boxes is {list(scenes.boxes.shape)}, not [{count}, 4]")
         for name in ("visible", "distance"):
             shape = list(getattr(scenes, name).shape)
             require(shape == [count], f"{name} is {shape}, not [{count}]")
-        require(bool(((scenes.visible >= 0) & (scenes.visible <= 1)).all()), "visible leaves [0, 1]")
-        require(bool((scenes.distance > 0).all()), "a distance is not above 0")
+        require(bool(((scenes.visible >= 0) & (scenes.visible <= 1)).all()), "visible is outside [0, 1]")
+        require(bool((scenes.distance > 0).all()), "distances must be above 0")
 
     def _some(self) -> tuple[Scenes, Tensor]:
-        """A few frames in which the sign is to be seen, the nearest."""
+        """The nearest frames in which the sign is visible."""
         scenes = self.component.training_scenes()
         seen = (scenes.visible >= VISIBLE).nonzero().squeeze(1)
         nearest = scenes.distance[seen].argsort()[:FRAMES]
-        require(len(nearest) == FRAMES, f"the whole sign is seen in fewer than {FRAMES} training frames")
+        require(len(nearest) == FRAMES, f"fewer than {FRAMES} training frames show at least {VISIBLE:.0%} of the sign")
         return scenes, seen[nearest]
 
     def _patch(self) -> Tensor:

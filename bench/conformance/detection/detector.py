@@ -1,4 +1,4 @@
-"""The rules for detectors, of victims and of defences."""
+"""Rules for the detectors of victims and defences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PICTURES = 3
 
 
 class DetectorSuite(Suite):
-    """Of what a `DetectorVictim` or a `DetectorDefense` loads."""
+    """Checks of the detector of a `DetectorVictim` or a `DetectorDefense`."""
 
     def checks(self) -> Mapping[str, Check]:
         return {
@@ -30,18 +30,18 @@ class DetectorSuite(Suite):
         }
 
     def frozen(self) -> None:
-        """Eval mode, no gradients on weights, and a stop sign among its classes."""
+        """The detector is in eval mode, has weights without gradients, and a stop sign among its classes."""
         detector = self.subject.load()
         require(
             isinstance(detector, Detector),
             f"load returned a {type(detector).__name__}, not a bench.detection.Detector",
         )
         check_frozen(detector, "detector")
-        require(STOP_SIGN in detector.names, f"none of its classes is {STOP_SIGN!r}, which is what attacks hide")
+        require(STOP_SIGN in detector.names, f"none of its classes is {STOP_SIGN!r}, which attacks hide")
         require(isinstance(detector.stride, int) and detector.stride > 0, "stride must be a whole number of pixels")
 
     def predicts(self) -> None:
-        """Boxes and probabilities of the shapes and ranges that `Predictions` says."""
+        """Predictions have the shapes and ranges of `Predictions`."""
         detector, pictures = self.subject.load(), self._pictures()
         found = detector(pictures)
         boxes, objectness, classes = found.boxes, found.objectness, found.classes
@@ -50,25 +50,26 @@ class DetectorSuite(Suite):
         shapes = tuple(tuple(part.shape) for part in (boxes, objectness, classes))
         require(shapes == wanted, f"boxes, objectness and classes are {shapes}, not {wanted}")
         require(bool(boxes.isfinite().all()), "some boxes are NaN or infinite")
-        require(bool((boxes[..., 2:] >= boxes[..., :2]).all()), "some boxes end before they begin: [x1, y1, x2, y2]")
+        require(
+            bool((boxes[..., 2:] >= boxes[..., :2]).all()),
+            "some boxes have x2 < x1 or y2 < y1: return [x1, y1, x2, y2]",
+        )
         for name, part in (("objectness", objectness), ("classes", classes)):
-            require(
-                bool(((part >= 0) & (part <= 1)).all()), f"{name} has numbers outside [0, 1]: they are probabilities"
-            )
+            require(bool(((part >= 0) & (part <= 1)).all()), f"{name} has values outside [0, 1]: return probabilities")
 
     def neighbours_do_not_matter(self) -> None:
-        """Every picture of a batch is looked at by itself."""
+        """Predictions for an image do not depend on the others of its batch."""
         detector, among = self.subject.load(), self._pictures()
         others = among.flip(0).clone()
         others[0] = among[0]
         first, second = detector(among).scores[0], detector(others).scores[0]
         require(
             torch.allclose(first, second, rtol=1e-3, atol=1e-5),
-            "its predictions for a picture change with the others of the batch: is a batch normalisation in training mode?",
+            "its predictions for an image depend on the others of the batch: is a batch normalisation in training mode?",
         )
 
     def same_picture_same_answer(self) -> None:
-        """Loaded twice and asked twice, it says the same."""
+        """Two loads and two calls give the same predictions."""
         pictures, detector = self._pictures(), self.subject.load()
         first = detector(pictures).scores
         with torch.random.fork_rng(devices=[]):
@@ -76,44 +77,44 @@ class DetectorSuite(Suite):
             second, again = detector(pictures).scores, self.subject.load()(pictures).scores
         require(
             torch.equal(first, second),
-            "asked twice about a picture, it gives two answers: predict must have no side effect and draw nothing",
+            "two calls with the same image give different predictions: predict must have no side effect and no randomness",
         )
         require(
             torch.equal(first, again),
-            "two loads with the same seed predict differently: make weights from the seed only",
+            "two loads with the same seed give different predictions: derive the weights from the seed only",
         )
 
     def looks(self) -> None:
-        """What it says depends on the picture."""
+        """Predictions depend on the image."""
         scores = self.subject.load()(self._pictures()).scores
         require(
             not torch.equal(scores[0], scores[1]),
-            "its predictions are the same for two different pictures: does predict use its input?",
+            "its predictions are the same for two different images: does predict use its input?",
         )
 
     def differentiable(self) -> None:
-        """White-box attacks find a way back to the pixels."""
+        """Scores have a gradient with respect to the pixels, which white-box attacks need."""
         check_white_box(self.subject.victim)
         leaf, detector = self._pictures().requires_grad_(True), self.subject.load()
         scores = detector(leaf).scores_of(detector.index(STOP_SIGN))
-        require(scores.requires_grad, "its scores have no graph: no torch.no_grad in predict, no .detach, no NumPy")
+        require(scores.requires_grad, "its scores have no graph: do not use torch.no_grad, .detach or NumPy in predict")
         (gradient,) = torch.autograd.grad(scores.sum(), leaf)
         check_gradient(gradient)
 
     def keeps_weights(self) -> None:
-        """Loading and asking change nothing."""
+        """Loading and calling it changes neither weights nor images."""
         detector, pictures = self.subject.load(), self._pictures()
         shown = pictures.clone()
         with unchanged(detector, self.subject.load_victim):
             detector(pictures)
             self.subject.load()
-        require(torch.equal(pictures, shown), "the pictures were changed in place")
+        require(torch.equal(pictures, shown), "the images were changed in place: work on a copy")
 
     def _pictures(self) -> Tensor:
-        """Three of the street with a random veil, padded to what the stride needs."""
+        """Three images of the street with random noise, padded to a multiple of the stride."""
         scenes, stride = Street(), self.subject.load().stride
         pictures = scenes.render(torch.arange(PICTURES), None, 1.0)
         side = -(-max(scenes.size) // stride) * stride
-        veil = torch.rand(PICTURES, 3, side, side, generator=torch.Generator().manual_seed(0))
+        noise = torch.rand(PICTURES, 3, side, side, generator=torch.Generator().manual_seed(0))
         wide = torch.nn.functional.pad(pictures, (0, side - scenes.size[1], 0, side - scenes.size[0]), value=0.5)
-        return 0.8 * wide + 0.2 * veil
+        return 0.8 * wide + 0.2 * noise

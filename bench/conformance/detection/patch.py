@@ -1,4 +1,4 @@
-"""The rules for attacks that make a patch."""
+"""Rules for attacks that craft a patch."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from bench.plugins.contracts import QueryBudgetError
 from bench.plugins.fingerprint import state_digest
 
 QUERIES = 160
-"""Most pictures that a check lets the detector be asked about."""
+"""Query budget of the checks, in images."""
 BUDGETS = (0, 1, 10)
 
 
 class PatchSuite(Suite):
-    """Of a `PatchAttack`, on a small detector with random weights."""
+    """Checks of a `PatchAttack`, on a small detector with random weights."""
 
     component: PatchAttack
 
@@ -38,10 +38,10 @@ class PatchSuite(Suite):
         }
 
     def is_a_patch(self) -> str:
-        """[3, P, P] of texels, or None for none."""
+        """The patch is [3, P, P] texels, or None."""
         answer, oracle = self._craft()
         if answer is None:
-            return "it leaves the sign alone"
+            return "it makes no patch"
         require(isinstance(answer, Tensor), f"craft returned a {type(answer).__name__}, not a tensor")
         try:
             oracle.threat.project(answer)
@@ -53,27 +53,27 @@ class PatchSuite(Suite):
         return ""
 
     def made_once(self) -> None:
-        """There is no batch of episodes."""
-        raise NotApplicableError("a patch is made once, not an episode at a time")
+        """Skipped: a patch is not crafted per episode."""
+        raise NotApplicableError("a patch is crafted once, not per episode")
 
     def same_seed_same_patch(self) -> None:
-        """Only the run's generators decide what is drawn."""
+        """All random numbers come from the generators of the run."""
         first, second = self._craft(stir=1)[0], self._craft(stir=2)[0]
         require(
             _equal(first, second),
-            "the same seed made two patches: draw with generator=oracle.generator, keep no state between patches",
+            "the same seed gave two patches: draw with generator=oracle.generator, and store nothing on the object",
         )
 
     def seeded_or_not(self) -> None:
-        """`seeded` says whether another seed makes another patch, so that seeds are not spent for nothing."""
+        """`seeded` says whether the patch depends on the seed; a run then repeats only what differs."""
         same = _equal(self._craft()[0], self._craft(seed=1)[0])
         if self.component.seeded:
-            require(not same, "another seed makes the same patch: set seeded = False")
+            require(not same, "another seed gives the same patch: set seeded = False")
         else:
-            require(same, "another seed makes another patch: set seeded = True")
+            require(same, "another seed gives another patch: set seeded = True")
 
     def within_range(self) -> str:
-        """Texels outside [0, 1] are clipped, and recorded."""
+        """Texels outside [0, 1] are clipped; records contain how far outside they were."""
         outside = 0.0
         for budget in (0.5, 1.0):
             answer, oracle = self._craft(PatchThreat(budget=budget, queries=QUERIES))
@@ -81,32 +81,32 @@ class PatchSuite(Suite):
         return f"texels up to {outside:.2g} outside [0, 1], clipped: return patch.clamp(0, 1)" if outside else ""
 
     def within_the_budget(self) -> str:
-        """However few pictures it may ask about, it does with them."""
+        """It works within any query budget."""
         for queries in BUDGETS:
             try:
                 self._craft(PatchThreat(queries=queries))
             except QueryBudgetError as error:
                 raise BrokenRuleError(
-                    f"{one_line(error)}: look at oracle.remaining before asking, and return what is best so far"
+                    f"{one_line(error)}: check oracle.remaining before a query, and return the best patch so far"
                 ) from None
-        return f"{self._craft()[1].spent} of {QUERIES} pictures"
+        return f"{self._craft()[1].spent} of {QUERIES} images"
 
     def tells_how_far_it_is(self) -> None:
-        """The share done is in [0, 1] and does not fall."""
-        told: list[float] = []
-        self._craft(told=told)
-        require(all(0 <= share <= 1 for share in told), "progress was told a share outside [0, 1]")
-        require(told == sorted(told), "progress was told a share below the one before")
+        """The reported progress is in [0, 1] and does not decrease."""
+        shares: list[float] = []
+        self._craft(shares=shares)
+        require(all(0 <= share <= 1 for share in shares), "progress was called with a share outside [0, 1]")
+        require(shares == sorted(shares), "progress was called with a share below the previous one")
 
     def leaves_the_victim(self) -> None:
-        """The detector's weights and mode, and the scenes, are as they were."""
+        """It changes neither the weights nor the mode of the detector, nor the scenes."""
         detector, scenes = SignDetector(), Street()
         frames = torch.arange(len(scenes))
         before, pictures = state_digest(detector), scenes.render(frames, None, 1.0)
         self._craft(detector=detector, scenes=scenes)
-        require(state_digest(detector) == before, "the detector's weights changed: craft may only ask the oracle")
+        require(state_digest(detector) == before, "the detector's weights changed: craft may only query the oracle")
         marks = detector.training or any(weight.requires_grad for weight in detector.parameters())
-        require(not marks, "the detector's mode or gradients changed: craft may only ask the oracle")
+        require(not marks, "the detector's mode or gradients changed: craft may only query the oracle")
         require(torch.equal(scenes.render(frames, None, 1.0), pictures), "the scenes were changed in place")
 
     def _craft(
@@ -115,20 +115,22 @@ class PatchSuite(Suite):
         *,
         seed: int = 0,
         stir: int = 0,
-        told: list[float] | None = None,
+        shares: list[float] | None = None,
         detector: SignDetector | None = None,
         scenes: Street | None = None,
     ) -> tuple[Tensor | None, PatchOracle]:
         threat = threat or PatchThreat(queries=QUERIES)
-        told = [] if told is None else told
+        shares = [] if shares is None else shares
         generator = torch.Generator().manual_seed(seed)
         oracle = PatchOracle(detector or SignDetector(), threat, self.component.access, generator)
         with torch.random.fork_rng(devices=[]):
-            # A run seeds torch before it crafts, and no other library.
+            # Before crafting, a run seeds torch and no other library.
             torch.manual_seed(seed)
             stir_others(stir)
             try:
-                return self.component.craft(oracle, scenes or Street(), lambda share, text: told.append(share)), oracle
+                return self.component.craft(
+                    oracle, scenes or Street(), lambda share, text: shares.append(share)
+                ), oracle
             except QueryBudgetError:
                 raise
             except UserError as error:

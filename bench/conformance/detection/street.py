@@ -1,4 +1,4 @@
-"""The scenes and the detector that the checks of the detection track use: a red sign on grey, and random weights."""
+"""Scenes and a detector for the checks of the detection track: a red sign on grey, and random weights."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from bench.detection import STOP_SIGN, Detector, Predictions, Scenes
 
 SIDE, FRAMES, CELL = 96, 12, 16
 PIXELS_M = 320.0
-"""Width of the sign in pixels times its distance in metres."""
+"""Width of the sign in pixels, multiplied by its distance in metres."""
 
 
 class Street(Scenes):
-    """A red square in the middle of a grey picture, from 8 to 30 metres away."""
+    """A red square in the middle of a grey image, at 8 to 30 m."""
 
     size = (SIDE, SIDE)
 
@@ -31,19 +31,19 @@ class Street(Scenes):
         if patches is None:
             return pictures
         on_patch = (places.abs().amax(-1) <= share).unsqueeze(1)
-        each = patches.expand(len(frames), -1, -1, -1)
-        pasted = nn.functional.grid_sample(each, places / share, padding_mode="border", align_corners=False)
+        textures = patches.expand(len(frames), -1, -1, -1)
+        pasted = nn.functional.grid_sample(textures, places / share, padding_mode="border", align_corners=False)
         return torch.where(on_patch, pasted, pictures)
 
     def _places(self, frames: Tensor) -> Tensor:
-        """[N, H, W, 2] where every pixel is on the sign, whose edges are at -1 and 1."""
+        """Position [N, H, W, 2] of every pixel relative to the sign, whose edges are at -1 and 1."""
         middle = torch.arange(SIDE) + 0.5 - SIDE / 2
         pixels = torch.stack(torch.meshgrid(middle, middle, indexing="xy"), -1)
         return pixels / (PIXELS_M / self.distance[frames] / 2)[:, None, None, None]
 
 
 class SignDetector(Detector):
-    """One box a cell of the picture; what it makes of red depends on the texture, by weights that are drawn."""
+    """One box per cell of the image; its score is high for red and, by random weights, depends on the texture."""
 
     names = ("car", STOP_SIGN)
     stride = CELL

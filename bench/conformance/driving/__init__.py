@@ -1,4 +1,4 @@
-"""What `bench check` and `bench new` know of the driving track."""
+"""The kit of the driving track, for `bench check` and `bench new`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def _attack(subject: Subject) -> Iterator[Suite]:
     from bench.driving import DrivingAttack
 
     if not isinstance(subject.component, DrivingAttack):
-        raise NotApplicableError("it is no DrivingAttack: observations stay as they are")
+        raise NotApplicableError("it is not a DrivingAttack: it does not change observations")
     yield AttackSuite(subject)
     yield AttackMemorySuite(subject)
 

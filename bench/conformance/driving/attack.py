@@ -1,4 +1,4 @@
-"""The rules for attacks on drivers, in one step."""
+"""Rules for driving attacks, in one step."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from bench.plugins.fingerprint import state_digest
 
 EPISODES = 6
 BUDGETS = (0, 1, 2, 7, 50, 1000)
-"""Queries a step that an attack must get by with."""
+"""Query budgets per step that an attack must work with."""
 WITHIN = 1e-5
-"""On the normalised scale; what an answer may be outside the set by rounding."""
+"""Rounding tolerance for leaving the perturbation set, on the normalised scale."""
 
 
 class AttackSuite(Suite):
-    """Of a `DrivingAttack`, on networks with random weights. An attack with a memory is in its first step."""
+    """Checks of a `DrivingAttack` in the first step of an episode, on networks with random weights."""
 
     component: DrivingAttack
 
@@ -42,7 +42,7 @@ class AttackSuite(Suite):
         }
 
     def same_shape(self) -> None:
-        """[B, V, F] in, the same out, in the precision given."""
+        """The perturbed observation has the shape, dtype and device of the input [B, V, F]."""
         for action_type in self.component.action_types:
             for dtype in (torch.float32, torch.float64):
                 policy, observation = self._victim(action_type).to(dtype), self._observations().to(dtype)
@@ -60,23 +60,23 @@ class AttackSuite(Suite):
                 require(not answer.requires_grad, "the answer carries a graph: return answer.detach()")
 
     def finite(self) -> None:
-        """No NaN and no infinity."""
+        """The answer contains neither NaN nor infinity."""
         for action_type in self.component.action_types:
             answer, _ = self._answer(self._victim(action_type), self._observations())
             broken = int((~answer.isfinite()).sum())
-            require(not broken, f"{broken} of {answer.numel()} numbers of the answer are NaN or infinite")
+            require(not broken, f"{broken} of {answer.numel()} values of the answer are NaN or infinite")
 
     def nothing_to_do(self) -> None:
-        """No episode is running any more."""
+        """It accepts an empty batch: no episode is running any more."""
         for action_type in self.component.action_types:
             answer, _ = self._answer(self._victim(action_type), self._observations()[:0])
             require(
                 answer.shape[0] == 0,
-                f"{self._method} returned {answer.shape[0]} observations for none: if not len(observation): return observation",
+                f"{self._method} returned {answer.shape[0]} for an empty batch: if not len(observation): return observation",
             )
 
     def neighbours_do_not_matter(self) -> None:
-        """The same episode among others gets the same answer; in double precision, so that rounding decides no sign."""
+        """The answer for an episode does not depend on the others; in double precision, so that rounding changes no sign."""
         for action_type in self.component.action_types:
             policy = self._victim(action_type).double()
             among, others = self._observations(0).double(), self._observations(1).double()
@@ -85,12 +85,12 @@ class AttackSuite(Suite):
                 first, second = (self._answer(policy, batch, threat)[0] for batch in (among, others))
                 require(
                     torch.allclose(first[0], second[0], atol=1e-9),
-                    "an episode's answer changes with the other episodes of the batch: take means, norms, best points and "
-                    "random numbers episode by episode, not over the batch",
+                    "the answer for an episode depends on the others of its batch: compute means, norms, best points and "
+                    "random numbers per episode, not over the batch",
                 )
 
     def same_seed_same_answer(self) -> None:
-        """Only the run's generator decides what is drawn."""
+        """All random numbers come from the generator of the run."""
         for action_type in self.component.action_types:
             policy, observation = self._victim(action_type), self._observations()
             answers = []
@@ -101,11 +101,11 @@ class AttackSuite(Suite):
                     answers.append(self._answer(policy, observation)[0])
             require(
                 torch.equal(*answers),
-                "the same seed gave two answers: draw with generator=oracle.generator, and keep nothing on the object",
+                "the same seed gave two answers: draw with generator=oracle.generator, and store nothing on the object",
             )
 
     def within_the_set(self) -> str:
-        """An answer outside the set is projected by the oracle, and the record says how far it was outside."""
+        """The oracle projects answers to the perturbation set; records contain how far outside they were."""
         outside = 0.0
         for action_type in self.component.action_types:
             for threat in (self._threat(), self._threat(norm="linf", budget=0.2), self._threat(budget=0.0)):
@@ -115,15 +115,15 @@ class AttackSuite(Suite):
                 radius = threat.radius(observation, self.subject.world.features)
                 require(
                     bool(((shown - observation).abs() <= radius + WITHIN).all()),
-                    "what the oracle projected is outside the set: the attack must not change oracle.radius or its set",
+                    "the projected answer is outside the perturbation set: the attack must not change oracle.radius",
                 )
                 outside = max(outside, float((answer - shown).abs().max()))
         if outside > WITHIN:
-            return f"up to {outside:.2g} outside, projected by the oracle: return oracle.project(answer) to choose how"
+            return f"up to {outside:.2g} outside the set, projected by the oracle: return oracle.project(answer) to avoid it"
         return ""
 
     def within_the_budget(self) -> str:
-        """It works with any query budget, and stays within it."""
+        """It works within any query budget."""
         most = 0
         for action_type in self.component.action_types:
             policy, observation = self._victim(action_type), self._observations()
@@ -132,29 +132,29 @@ class AttackSuite(Suite):
                     _, oracle = self._answer(policy, observation, self._threat(queries=queries))
                 except QueryBudgetError as error:
                     raise BrokenRuleError(
-                        f"{one_line(error)}: look at oracle.remaining before asking, and return what is best so far"
+                        f"{one_line(error)}: check oracle.remaining before a query, and return the best answer so far"
                     ) from None
                 most = max(most, int(oracle.spent.max()))
         return f"{most} of 1000 queries a step"
 
     def leaves_the_victim(self) -> None:
-        """It changes neither weights, mode or gradients of the victim, nor the true observation."""
+        """It changes neither the weights, mode or gradients of the victim nor the true observation."""
         for action_type in self.component.action_types:
             policy, observation = self._victim(action_type), self._observations()
             before, truth = (state_digest(policy), _marks(policy)), observation.clone()
             self._answer(policy, observation)
             require(
-                state_digest(policy) == before[0], "the victim's weights changed: the attack may only ask the oracle"
+                state_digest(policy) == before[0], "the victim's weights changed: the attack may only query the oracle"
             )
             require(
                 _marks(policy) == before[1],
-                "the victim's mode or gradients changed: the attack may only ask the oracle",
+                "the victim's mode or gradients changed: the attack may only query the oracle",
             )
             require(torch.equal(observation, truth), "the true observation was changed in place: work on a clone")
 
     @property
     def _method(self) -> str:
-        """The method that its author wrote."""
+        """The method that the attack implements."""
         return "perturb" if type(self.component).step is DrivingAttack.step else "step"
 
     def _victim(self, action_type: ActionType) -> Policy:

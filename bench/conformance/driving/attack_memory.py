@@ -1,4 +1,4 @@
-"""The rules for attacks on drivers, over several steps: where an attack keeps what it remembers of an episode."""
+"""Rules for the memory of driving attacks, over several steps."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from bench.driving.attacker import Attacker
 
 EPISODES, STEPS = 6, 4
 ENDING, ENDED_AT = (1, 4), 2
-"""Episodes that end early, and the step at which they have ended."""
+"""Episodes that end early, and the first step after their end."""
 
 
 class AttackMemorySuite(Suite):
-    """Of a `DrivingAttack`, with a memory or without, as a run drives it."""
+    """Checks of a `DrivingAttack`, with or without a memory, as in a run."""
 
     component: DrivingAttack
 
@@ -32,25 +32,27 @@ class AttackMemorySuite(Suite):
         }
 
     def state_of_the_episodes(self) -> str:
-        """The state is a TensorDict with a row an episode, from the first step on, and costs no query."""
+        """The state is a TensorDict with one row per episode, from the first step on; creating it costs no query."""
         for action_type in self.component.action_types:
             observation = self._observations()[0]
             oracle = self._attacker(action_type).oracle
             oracle.begin_step(observation)
             with torch.no_grad(), refusals_are_broken_rules():
                 first = self.component.initial(observation, oracle)
-                require(not oracle.spent.any(), "initial asked the victim: ask in step, where queries are counted")
+                require(
+                    not oracle.spent.any(), "initial queried the victim: query it in step, where queries are counted"
+                )
                 check_state(first, "initial", EPISODES)
                 answer = self.component.step(observation, oracle, first)
             require(
                 isinstance(answer, tuple) and len(answer) == 2,
-                "step must return two things: what the victim is shown, and the state",
+                "step must return a tuple: the perturbed observation, and the state",
             )
             _check_step(first, answer[1])
         return named(first)
 
     def ended_episodes_do_not_matter(self) -> None:
-        """The state of an episode stays with it while others end."""
+        """The state of an episode does not depend on episodes that have ended."""
         changed = self._observations()
         changed[:ENDED_AT, list(ENDING)] = self._observations(seed=100)[:ENDED_AT, list(ENDING)]
         kept = [episode for episode in range(EPISODES) if episode not in ENDING]
@@ -60,23 +62,23 @@ class AttackMemorySuite(Suite):
             )
             require(
                 torch.allclose(first, second, atol=1e-9),
-                "what an episode is shown changes with episodes that have ended: keep what you remember in the state that "
-                "initial and step return, one row an episode",
+                "the perturbation of an episode depends on episodes that have ended: keep memory in the state that initial "
+                "and step return, one row per episode",
             )
 
     def keeps_nothing(self) -> None:
-        """The attack object itself remembers nothing: many runs use it at once."""
+        """The attack object stores no memory: many runs use it at once."""
         for action_type in self.component.action_types:
             alone = self._shown(action_type, self._observations())
             beside = self._shown(action_type, self._observations(), beside=self._observations(seed=100))
             require(
                 all(torch.equal(one, other) for one, other in zip(alone, beside, strict=True)),
-                "another run with the same attack object changes what is shown: keep what you remember in the state that "
-                "initial and step return, not on the object",
+                "another run with the same attack object changes the perturbation: keep memory in the state that initial and "
+                "step return, not on the object",
             )
 
     def _shown(self, action_type: ActionType, batch: Tensor, beside: Tensor | None = None) -> list[Tensor]:
-        """What the victim is shown at every step of a batch [STEPS, B, V, F], while another run takes turns with it."""
+        """The perturbed observations of a batch [STEPS, B, V, F] at every step, while another run alternates with it."""
         runs = [self._attacker(action_type)] + ([] if beside is None else [self._attacker(action_type, seed=1)])
         running = torch.ones(EPISODES, dtype=torch.bool)
         shown = []
@@ -96,21 +98,23 @@ class AttackMemorySuite(Suite):
         return Attacker(self.component, policy, ObservationThreat(), facts.features, seed=seed)
 
     def _observations(self, seed: int = 0) -> Tensor:
-        """[STEPS, B, V, F] in double precision, so that rounding decides no sign."""
+        """Observations [STEPS, B, V, F] in double precision, so that rounding changes no sign."""
         features = self.subject.world.features
         steps = [observations(EPISODES, features=features, seed=seed + step) for step in range(STEPS)]
         return torch.stack(steps).double()
 
 
 def _check_step(before: TensorDictBase | None, after: TensorDictBase | None) -> None:
-    """Raise BrokenRuleError unless a step keeps the form of the state."""
+    """Raise BrokenRuleError if a step changes the structure of the state."""
     require(
         before is not None or after is None,
-        "step returns a state, but initial gave none: write initial, which begins it",
+        "step returns a state, but initial returned None: create the state in initial",
     )
-    require(before is None or after is not None, "step returns None as the state: return it even where it is unchanged")
+    require(
+        before is None or after is not None, "step returns None as the state: return the state even if it is unchanged"
+    )
     check_state(after, "step", EPISODES)
     if before is None or after is None:
         return
     forms = [{name: (value.dtype, value.shape) for name, value in state.items(True, True)} for state in (before, after)]
-    require(forms[0] == forms[1], "step changed names, types or shapes in the state: give them in initial as they stay")
+    require(forms[0] == forms[1], "step changed names, types or shapes in the state: keep those of initial")

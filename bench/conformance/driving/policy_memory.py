@@ -1,4 +1,4 @@
-"""The rules for policies over several steps: what a policy remembers is in its state, and nowhere else."""
+"""Rules for the memory of policies, over several steps: all memory is in the state."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from bench.scenarios import SeedBlock
 
 EPISODES, STEPS = 6, 3
 SUBSETS = ((4,), (5, 0, 3), (2, 1))
-"""Episodes asked about, in orders of their own."""
+"""Subsets of the episodes to query, in different orders."""
 POINTS = CHUNK // EPISODES + 2
-"""Points asked about in each episode: more than the oracle answers at once, so that it splits an episode's."""
-ON_THE_OBJECT = "keep what it remembers in the state that initial and advance return, not on the object"
+"""Points per episode: more than the oracle scores in one chunk, so that it splits the points of an episode."""
+ON_THE_OBJECT = "keep memory in the state that initial and advance return, not on the object"
 
 
 class PolicyMemorySuite(Suite):
-    """Of what a `DrivingVictim` or a `DrivingDefense` loads, with a memory or without."""
+    """Checks of the policy of a `DrivingVictim` or a `DrivingDefense`, with or without a memory."""
 
     def __init__(self, subject: Subject) -> None:
         super().__init__(subject)
@@ -43,22 +43,25 @@ class PolicyMemorySuite(Suite):
         }
 
     def state_of_the_episodes(self) -> str:
-        """The state is a TensorDict with a row an episode; a policy without a memory has None."""
+        """The state is a TensorDict with one row per episode, or None for a policy without a memory."""
         policy = self.subject.load()
         first = policy.initial(_episodes())
         check_state(first, "initial", EPISODES)
         after = self._advanced(policy, first, 0)
         require(
-            first is not None or after is None, "advance returns a state, but initial gave None: begin it in initial"
+            first is not None or after is None,
+            "advance returns a state, but initial returned None: create the state in initial",
         )
         require(first is None or after is not None, "advance returns None: return the state of the next step")
         check_state(after, "advance", EPISODES)
         again = policy.initial(_episodes())
-        require(same(first, again), "initial gives two states for the same episodes: draw from a seeded generator only")
+        require(
+            same(first, again), "initial returns two states for the same episodes: draw from a seeded generator only"
+        )
         return named(first)
 
     def scores_are_pure(self) -> None:
-        """Asking changes no state, and the same question has the same answer, also after the step."""
+        """Scoring changes no state, and gives the same scores for the same input and state, also after the step."""
         policy = self.subject.load()
         state = policy.initial(_episodes())
         for step in range(STEPS):
@@ -66,19 +69,17 @@ class PolicyMemorySuite(Suite):
             observation = self._observations(step)
             first = policy.scores(observation, state)
             policy.scores(self._observations(100), state)
-            require(
-                same(before, state), "scores changed the state it was given: work on a copy, and change it in advance"
-            )
+            require(same(before, state), "scores changed its state argument: change the state in advance only")
             after = self._advanced(policy, state, step)
-            require(same(before, state), "advance changed the state it was given: return a new TensorDict")
+            require(same(before, state), "advance changed its state argument: return a new TensorDict")
             require(
                 torch.equal(policy.scores(observation, state), first),
-                f"asked again about an earlier step, it scores differently: {ON_THE_OBJECT}",
+                f"it gives different scores for an earlier step: {ON_THE_OBJECT}",
             )
             state = after
 
     def any_subset_in_any_chunk(self) -> None:
-        """An attack may ask about some of the episodes, in any order, and about many points at once."""
+        """Scores do not depend on which episodes are queried, in which order, and with how many points."""
         policy, state = self._after_some_steps()
         observation = self._observations(STEPS)
         together = policy.scores(observation, state)
@@ -87,12 +88,12 @@ class PolicyMemorySuite(Suite):
             alone = policy.scores(observation[rows], rows_of(state, rows))
             require(
                 torch.allclose(alone, together[rows], rtol=RTOL, atol=ATOL),
-                f"asked about episodes {list(subset)} only, it scores differently: use the rows of the state that is given",
+                f"it gives different scores for the episodes {list(subset)} alone: use the rows of its state argument",
             )
             self._check_oracle(policy, state, rows)
 
     def _check_oracle(self, policy: Policy, state: State, rows: Tensor) -> None:
-        """Points asked through the oracle get the scores that the policy gives when it is asked itself."""
+        """The oracle returns the scores of the policy."""
         observation = self._observations(STEPS)
         generator = torch.Generator().manual_seed(0)
         threat = ObservationThreat(queries=POINTS)
@@ -105,41 +106,40 @@ class PolicyMemorySuite(Suite):
             asked = policy.scores(points[place], rows_of(state, rows))
             require(
                 torch.allclose(answered[place], asked, rtol=RTOL, atol=ATOL),
-                "asked about many points at once, it scores differently: a row of the state belongs to the same row of the "
-                "observation",
+                "it gives different scores for many points at once: row i of the state belongs to row i of the observation",
             )
 
     def neighbours_do_not_matter(self) -> None:
-        """An episode's state is the same alone and among others."""
+        """The state of an episode does not depend on the others of its batch."""
         _, state = self._after_some_steps()
         if state is None:
-            raise NotApplicableError("it remembers nothing")
+            raise NotApplicableError("it has no memory")
         for subset in SUBSETS:
             rows = torch.tensor(subset)
             alone = self._after_some_steps(rows)[1]
             require(
                 close(alone, state[rows]),
-                "what is remembered of an episode changes with the others of the batch: begin and advance it row by row",
+                "the state of an episode depends on the others of its batch: create and advance it row by row",
             )
 
     def keeps_nothing(self) -> None:
-        """Another batch on the same object, and questions in between, change nothing: the state is all there is."""
+        """The policy object stores no memory: other batches and queries in between change nothing."""
         policy, state = self._after_some_steps()
         expected = policy.scores(self._observations(STEPS), state)
         asked = self.subject.load()
         state, other = asked.initial(_episodes()), asked.initial(_episodes() + EPISODES)
         for step in range(STEPS):
-            for question in range(3):
-                asked.scores(self._observations(200 + question), state)
+            for query in range(3):
+                asked.scores(self._observations(200 + query), state)
             other = self._advanced(asked, other, 100 + step)
             state = self._advanced(asked, state, step)
         require(
             torch.equal(asked.scores(self._observations(STEPS), state), expected),
-            f"questions and other batches in between change its scores: {ON_THE_OBJECT}",
+            f"other queries or batches in between change its scores: {ON_THE_OBJECT}",
         )
 
     def passes_on(self) -> None:
-        """A defence of a victim with a memory passes on what the victim remembers."""
+        """A defence passes on the state of a victim with a memory."""
         facts = self.subject.world.facts
         victim = Remembering(actions=self.subject.victim.action_type)
         try:
@@ -149,18 +149,18 @@ class PolicyMemorySuite(Suite):
         before = state = policy.initial(_episodes())
         require(
             state is not None,
-            "initial gives None where the victim remembers something: derive from PolicyWrapper, or call the policy's own",
+            "initial returns None for a victim with a memory: derive from PolicyWrapper, or return policy.initial(episodes)",
         )
         for step in range(STEPS):
             state = self._advanced(policy, state, step)
         first, last = (policy.scores(self._observations(STEPS), one) for one in (before, state))
         require(
             not torch.equal(first, last),
-            "what the victim remembers makes no difference: call policy.scores with the state, and policy.advance",
+            "the victim's memory has no effect: pass the state to policy.scores, and call policy.advance",
         )
 
     def _after_some_steps(self, rows: Tensor | None = None) -> tuple[Policy, State]:
-        """The policy, loaded anew, and what it remembers of all episodes, or of some that were driven alone."""
+        """A newly loaded policy and its state after some steps of all episodes, or of `rows` alone."""
         policy = self.subject.load()
         state = policy.initial(_episodes() if rows is None else _episodes()[rows])
         for step in range(STEPS):
@@ -168,14 +168,14 @@ class PolicyMemorySuite(Suite):
         return policy, state
 
     def _advanced(self, policy: Policy, state: State, step: int, rows: Tensor | None = None) -> State:
-        """The state after a step with the same actions for every policy."""
+        """The state after one step, with the same observations and actions for every policy."""
         observation, action = self._observations(step), self._actions(policy, step)
         if rows is not None:
             observation, action = observation[rows], action[rows]
         return policy.advance(observation, action, state)
 
     def _actions(self, policy: Policy, step: int) -> Tensor:
-        """[B] or [B, 2], different for every episode."""
+        """Actions [B] or [B, 2], different for every episode."""
         number = torch.arange(EPISODES) + step
         if policy.action_type == "discrete":
             return number % len(self.subject.world.facts.actions)

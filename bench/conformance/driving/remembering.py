@@ -1,4 +1,4 @@
-"""A victim with a memory, that defences are tried on."""
+"""A victim with a memory, to check defences with."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bench.conformance.driving.traffic import victim
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 
 SHARE = 0.5
-"""Of its past in what it looks at."""
+"""Weight of the past in the running mean."""
 
 
 class _Remembering(Policy):
-    """Looks at the mean of the observation and of those before it, as far as each row has been there."""
+    """Scores a running mean of the observations of an episode."""
 
     def __init__(self, policy: Policy) -> None:
         super().__init__()
@@ -26,14 +26,14 @@ class _Remembering(Policy):
         return TensorDict({}, batch_size=episodes.shape)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
-        return self.policy.scores(self._looked_at(observation, state))
+        return self.policy.scores(self._averaged(observation, state))
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None
-        return TensorDict({"past": self._looked_at(observation, state)}, batch_size=state.batch_size)
+        return TensorDict({"past": self._averaged(observation, state)}, batch_size=state.batch_size)
 
     @staticmethod
-    def _looked_at(observation: Tensor, state: State) -> Tensor:
+    def _averaged(observation: Tensor, state: State) -> Tensor:
         assert state is not None
         past = state.get("past", None)
         return observation if past is None else torch.lerp(observation, past, SHARE)
@@ -44,7 +44,7 @@ class Remembering(DrivingVictim):
     """A network with random weights and a memory.
 
     Args:
-        actions: what it decides.
+        actions: its action type.
     """
 
     actions: ActionType = "discrete"

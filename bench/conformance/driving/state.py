@@ -1,4 +1,4 @@
-"""What the checks of a memory have in common: the form of a state, and whether two states are equal."""
+"""Common code for checks of a memory: validates and compares states."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from bench.conformance.check import require
 from bench.driving import State
 
 RTOL, ATOL = 1e-4, 1e-5
-"""Rounding depends on how many observations are scored at once."""
+"""Tolerances for rounding, which depends on the number of observations in a batch."""
 
 
 def check_state(state: object, method: str, episodes: int) -> None:
-    """Raise BrokenRuleError unless a state is None, or a TensorDict with a row an episode and without a graph.
+    """Raise BrokenRuleError unless a state is None, or a TensorDict with one row per episode and without a graph.
 
     Args:
-        state: that was returned.
-        method: that returned it.
-        episodes: there are.
+        state: the returned state.
+        method: name of the method that returned it.
+        episodes: number of episodes.
     """
     if state is None:
         return
@@ -29,10 +29,10 @@ def check_state(state: object, method: str, episodes: int) -> None:
     assert isinstance(state, TensorDictBase)
     require(
         state.batch_size == (episodes,),
-        f"the state of {method} has batch size {list(state.batch_size)}, not [{episodes}]: one row an episode",
+        f"the state of {method} has batch size {list(state.batch_size)}, not [{episodes}]: use one row per episode",
     )
     graph = any(value.requires_grad for value in state.values(True, True))
-    require(not graph, f"the state of {method} carries a graph: detach what you keep")
+    require(not graph, f"the state of {method} carries a graph: detach its tensors")
 
 
 def same(first: State, second: State) -> bool:
@@ -45,7 +45,7 @@ def same(first: State, second: State) -> bool:
 
 
 def close(first: State, second: State) -> bool:
-    """Whether two states with the same entries are equal but for rounding."""
+    """Whether two states with the same entries are equal, except for rounding."""
     if first is None or second is None:
         return first is second
     return all(
@@ -55,7 +55,7 @@ def close(first: State, second: State) -> bool:
 
 
 def named(state: State) -> str:
-    """What is remembered, in a remark."""
+    """A remark with the entries of a state."""
     if state is None:
-        return "it remembers nothing"
-    return f"it remembers {', '.join(sorted(map(str, state.keys())))}"
+        return "it has no memory"
+    return f"its memory: {', '.join(sorted(map(str, state.keys())))}"

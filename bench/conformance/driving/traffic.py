@@ -1,4 +1,4 @@
-"""Random observations, and victims with random weights, that the checks of the driving track use."""
+"""Random observations and victims with random weights, for the checks of the driving track."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ HIDDEN = 16
 
 
 def observations(count: int, *, features: Features, rows: int = 10, seed: int = 0) -> Tensor:
-    """Random observations [count, rows, F] of which some rows are absent; the ego's never is."""
+    """Random observations [count, rows, F]; some rows are absent, but never that of the ego."""
     generator = torch.Generator().manual_seed(seed)
     measured = torch.rand(count, rows, len(features.names), generator=generator) * 2 - 1
     present = (torch.rand(count, rows, 1, generator=generator) > 0.3).float()
@@ -21,11 +21,11 @@ def observations(count: int, *, features: Features, rows: int = 10, seed: int = 
 
 
 def victim(action_type: ActionType, facts: DrivingFacts) -> Policy:
-    """A network of the zoo's kind with random weights, large enough that its decisions vary.
+    """A network as in the zoo, with random weights large enough that its decisions vary.
 
     Args:
-        action_type: of the network.
-        facts: of the world whose observations it reads and whose actions it chooses among.
+        action_type: action type of the network.
+        facts: facts of the world, with its features and actions.
     """
     from bench.victims.drivers.networks import ActorPolicy, QPolicy
 
@@ -41,7 +41,7 @@ def victim(action_type: ActionType, facts: DrivingFacts) -> Policy:
 
 
 def rows_of_observation(world: DrivingWorld) -> int:
-    """V of the observations [B, V, F] of a world."""
+    """V, the number of rows in the observations [B, V, F] of a world."""
     env = world.make([first_cell(world)], action_type="discrete" if world.facts.actions else "continuous")
     try:
         return int(env.observation_spec["observation"].shape[-2])

@@ -1,4 +1,4 @@
-"""The rules for worlds to drive in."""
+"""Rules for worlds of the driving track."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ MEASURES = ("progress", "speed", "x", "ttc", "crashed", "offroad")
 SEEDS = (5, 6, 7)
 STEPS = 12
 CELLS = 64
-"""Most cells of the default grid that are started."""
+"""Maximum number of cells of the default grid that are started."""
 
 
 class WorldSuite(Suite):
-    """Of a `DrivingWorld`, a dozen steps at a time in the first cell of its own grid."""
+    """Checks of a `DrivingWorld`, mostly over twelve steps in the first cell of its default grid."""
 
     component: DrivingWorld
 
@@ -45,23 +45,29 @@ class WorldSuite(Suite):
         facts = self.component.facts
         require(isinstance(facts, DrivingFacts), f"facts is a {type(facts).__name__}, not a bench.driving.DrivingFacts")
         features = facts.features
-        require(features == self.component.features, "facts.features are not the world's features: give both the same")
-        sizes = {len(part) for part in (features.names, features.low, features.high, features.units)}
-        require(len(sizes) == 1, "features needs as many low, high and units as names")
         require(
-            len(features.floors) in (0, len(features.names)), "features.floors needs as many numbers as names, or none"
+            features == self.component.features,
+            "facts.features differ from the world's features: use the same object for both",
+        )
+        sizes = {len(part) for part in (features.names, features.low, features.high, features.units)}
+        require(len(sizes) == 1, "features.low, high and units must be as long as features.names")
+        require(
+            len(features.floors) in (0, len(features.names)),
+            "features.floors must be empty or as long as features.names",
         )
         require(bool((features.half_range() > 0).all()), "the range of a feature is empty: low must be below high")
 
     def describes_its_decisions(self) -> str:
-        """How often is decided, for how long, and among what: defences and baselines rely on it."""
+        """Decision rate, episode length and actions are valid: defences and baselines rely on them."""
         facts = self.component.facts
         require(
-            facts.decision_hz > 0, f"decision_hz must be above 0, got {facts.decision_hz}: say how often is decided"
+            facts.decision_hz > 0,
+            f"decision_hz must be above 0, got {facts.decision_hz}: give the decisions per second",
         )
         require(facts.max_steps >= 1, f"max_steps must be at least 1, got {facts.max_steps}")
         require(
-            all(isinstance(name, str) and name for name in facts.actions), "actions must name every discrete action"
+            all(isinstance(name, str) and name for name in facts.actions),
+            "facts.actions must name every discrete action",
         )
         if facts.actions:
             env = self._env([first_cell(self.component)], "discrete")
@@ -69,14 +75,14 @@ class WorldSuite(Suite):
             env.close(raise_if_closed=False)
             require(
                 count == len(facts.actions),
-                f"the action_spec of the environment has {count} actions, facts.actions names {len(facts.actions)}: "
+                f"the environment's action_spec has {count} actions, but facts.actions has {len(facts.actions)}: "
                 "use torchrl.data.Categorical(len(actions))",
             )
         seconds = facts.max_steps / facts.decision_hz
         return f"{facts.decision_hz:g} Hz for {seconds:g} s, {len(facts.actions)} discrete actions"
 
     def starts_every_cell(self) -> str:
-        """Every cell of the default grid can be started, all in one batch."""
+        """All cells of the default grid can be started in one batch."""
         grid = registry.grid(self.component.grid)
         cells = grid.cells()[:CELLS]
         env = self._env(cells, self._action_types()[0])
@@ -86,21 +92,22 @@ class WorldSuite(Suite):
             env.close(raise_if_closed=False)
         count = td["observation"].shape[0]
         require(
-            count == len(cells), f"make({len(cells)} cells) gives {count} episodes: one for each cell, in their order"
+            count == len(cells),
+            f"make({len(cells)} cells) creates {count} episodes: create one for each cell, in order",
         )
         require(not bool(td["done"].any()), "an episode is done before its first step")
         return f"{len(cells)} of {len(grid.cells())} cells" if len(cells) < len(grid.cells()) else f"{len(cells)} cells"
 
     def makes_every_driver(self) -> str:
-        """Everybody in facts.drivers can be at the wheel."""
+        """Every driver in facts.drivers can drive."""
         drivers = self.component.facts.drivers
-        require("agent" in drivers, "facts.drivers lacks 'agent', the driver that obeys the actions: add it")
+        require("agent" in drivers, "facts.drivers lacks 'agent', the driver that carries out the actions: add it")
         for driver in drivers:
             self._driven(SEEDS[:1], driver=driver)
         return ", ".join(drivers)
 
     def shapes(self) -> None:
-        """The environment writes all that `DrivingWorld` asks for, in its shapes."""
+        """The environment returns all entries that `DrivingWorld` requires, in the required shapes."""
         first, *_, last = self._driven(SEEDS)
         batch = len(SEEDS)
         width = 1 + len(self.component.facts.features.names)
@@ -119,37 +126,40 @@ class WorldSuite(Suite):
             require(last[key].dtype == torch.float32, f"{key} is {last[key].dtype}, not float32")
 
     def ranges(self) -> None:
-        """Sensors end at -1 and 1, presence is 0 or 1, nothing is NaN."""
+        """Observations are in [-1, 1], presence is 0 or 1, nothing is NaN."""
         for step in self._driven(SEEDS):
             observation = step["observation"]
-            require(bool(observation.isfinite().all()), "an observation has NaN or infinity")
-            require(bool((observation.abs() <= 1).all()), "an observation leaves [-1, 1], the range of every sensor")
+            require(bool(observation.isfinite().all()), "an observation contains NaN or infinity")
+            require(bool((observation.abs() <= 1).all()), "an observation is outside [-1, 1]: normalise and clip it")
             presence = observation[..., 0]
             require(bool(((presence == 0) | (presence == 1)).all()), "presence, column 0, must be 0 or 1")
-            require(bool((observation[presence == 0] == 0).all()), "absent rows must be all zero")
+            require(bool((observation[presence == 0] == 0).all()), "rows with presence 0 must be all zero")
             if ("info", "progress") in step.keys(include_nested=True):
                 progress = step["info", "progress"]
-                require(bool(((progress >= 0) & (progress <= 1)).all()), "info.progress leaves [0, 1]")
+                require(bool(((progress >= 0) & (progress <= 1)).all()), "info.progress is outside [0, 1]")
 
     def same_seed_same_traffic(self) -> None:
-        """A scenario seed fixes the scenario."""
+        """The scenario seed determines the scenario."""
         first, second = self._driven(SEEDS), self._driven(SEEDS)
         for one, other in zip(first, second, strict=True):
-            require(torch.equal(one["observation"], other["observation"]), "the same seeds give different traffic")
+            require(
+                torch.equal(one["observation"], other["observation"]),
+                "the same seed gives different traffic: draw only from a generator with the episode's seed",
+            )
         other = self._driven(tuple(seed + 100 for seed in SEEDS))[0]
-        require(not torch.equal(first[0]["observation"], other["observation"]), "other seeds give the same traffic")
+        require(not torch.equal(first[0]["observation"], other["observation"]), "different seeds give the same traffic")
 
     def neighbours_do_not_matter(self) -> None:
-        """An episode is the same alone and among others."""
+        """An episode does not depend on the others of its batch."""
         together, alone = self._driven(SEEDS), self._driven(SEEDS[1:2])
         for one, other in zip(together, alone, strict=True):
             require(
                 torch.equal(one["observation"][1:2], other["observation"]),
-                "an episode changes with the others of the batch: give every episode a generator of its own",
+                "an episode depends on the others of its batch: use one generator per episode",
             )
 
     def takes_its_actions(self) -> str:
-        """It takes the discrete actions it names, each of them, and steering unless it refuses it."""
+        """It accepts every discrete action that it names, and continuous actions unless it refuses them."""
         refused = ""
         for action_type in ("discrete", "continuous"):
             if action_type not in self._action_types() and action_type == "discrete":
@@ -157,7 +167,7 @@ class WorldSuite(Suite):
             try:
                 steps = self._driven(SEEDS, action_type, every=True)
             except UserError as error:
-                require(action_type == "continuous", f"it refuses the actions that it names: {one_line(error)}")
+                require(action_type == "continuous", f"it refuses an action of facts.actions: {one_line(error)}")
                 refused = f"continuous actions are refused: {one_line(error)}"
                 continue
             require(
@@ -166,7 +176,7 @@ class WorldSuite(Suite):
         return refused
 
     def _action_types(self) -> tuple[ActionType, ...]:
-        """Those that can be tried: discrete ones only where the world names them."""
+        """The action types to check: discrete only if the world names discrete actions."""
         return ("discrete", "continuous") if self.component.facts.actions else ("continuous",)
 
     def _env(self, cells: Sequence[Cell], action_type: ActionType, driver: Driver = "agent") -> EnvBase:
@@ -180,19 +190,19 @@ class WorldSuite(Suite):
         driver: Driver = "agent",
         every: bool = False,
     ) -> list[TensorDictBase]:
-        """The reset and a dozen steps of always the same action, or of every action in turn."""
+        """The results of a reset and twelve steps, with one action or, if `every`, with each action in turn."""
         action_type = action_type or self._action_types()[0]
         env = self._env([first_cell(self.component)] * len(seeds), action_type, driver)
         try:
             td = _reset(env, seeds)
-            found = [td.clone()]
+            steps = [td.clone()]
             steering = torch.tensor([0.2, 0.0]).expand(len(seeds), 2)
             for step in range(min(STEPS, self.component.facts.max_steps)):
                 number = step % len(self.component.facts.actions) if every and action_type == "discrete" else 0
                 action = torch.full((len(seeds),), number) if action_type == "discrete" else steering
                 td = env.step(td.set("action", action))["next"]
-                found.append(td.clone())
-            return found
+                steps.append(td.clone())
+            return steps
         finally:
             env.close(raise_if_closed=False)
 
