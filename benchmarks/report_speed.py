@@ -58,7 +58,7 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: Cell, rng: np.
         "victim": "dqn",
         "victim_params": json.dumps(POLICY),
         "world": "highway",
-        "world_params": canonical(WORLD),
+        "world_params": "{}",
         "action_type": "discrete",
         "sees": True,
         "training_seed": seed,
