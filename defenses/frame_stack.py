@@ -1,4 +1,4 @@
-"""Smoothing over time: the victim sees the mean or the median of the last frames."""
+"""Smoothing over time: the victim receives the mean or the median of the last observations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Reduction = Literal["mean", "median"]
 
 
 class _FrameStack(Policy):
-    """A policy behind a stack of the last `frames` observations; its state is the stack, and the policy's own state."""
+    """A policy on a stack of the last `frames` observations; its state is the stack and the inner policy's state."""
 
     def __init__(self, inner: Policy, frames: int, reduce: Reduction) -> None:
         super().__init__()
@@ -44,14 +44,14 @@ class _FrameStack(Policy):
         return TensorDict({"stack": stack, **_own(inner)}, batch_size=state.batch_size)
 
     def _stack(self, observation: Tensor, state: TensorDictBase) -> Tensor:
-        """[..., frames, V, F] what was shown, the newest last; before the first step, the first observation again and again."""
+        """[..., frames, V, F] the last observations, the newest last; before the first step, repetitions of the first one."""
         newest = observation.unsqueeze(-3)
         if state.get("stack", None) is None:
             return newest.expand(*newest.shape[:-3], self.frames, *newest.shape[-2:])
         return torch.cat((state["stack"], newest), -3)
 
     def _smoothed(self, observation: Tensor, state: TensorDictBase) -> Tensor:
-        """[..., V, F] presence as it is now; each measured feature reduced over the frames in which its row is present."""
+        """[..., V, F] the current presence; each measured feature reduced over the frames in which its row is present."""
         if state.get("stack", None) is None:
             return observation
         stack, present = self._stack(observation, state), observation[..., :1] > 0
@@ -61,7 +61,7 @@ class _FrameStack(Policy):
 
 
 def _median(measured: Tensor) -> Tensor:
-    """The median [..., V, F - 1] over frames, without NaN; of an even number, the mean of the two in the middle."""
+    """The median [..., V, F - 1] over frames, ignoring NaN; for an even number, the mean of the two middle values."""
     return (measured.nanmedian(-3).values - (-measured).nanmedian(-3).values) / 2
 
 
@@ -71,18 +71,17 @@ def _own(state: State) -> dict[str, TensorDictBase]:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameStack(DrivingDefense):
-    """The victim sees the mean or the median of the last k observations.
+    """The victim receives the mean or the median of the last k observations.
 
-    An attack that changes its mind from frame to frame is averaged out; one that holds its perturbation is not. What the victim
-    sees is late: by (k - 1) / 2 frames under the mean. Rows of an observation are ordered by distance, so where two cars change
-    places their rows are mixed for k - 1 frames.
+    This removes perturbations that change from frame to frame, but not constant ones. The result is delayed: by (k - 1) / 2
+    frames with the mean. Rows are ordered by distance, so when two cars change order their rows are mixed for k - 1 frames.
 
     Args:
-        frames: k, how many observations are reduced; in the beginning the first one stands for those before it.
-        reduce: `mean` or `median`, feature by feature, over those of the frames in which the row is present.
+        frames: k, number of observations; before the k-th step, earlier ones are copies of the first.
+        reduce: `mean` or `median` of each feature, over the frames in which the row is present.
     """
 
-    frames: Annotated[int, Ge(2)] = 2
+    frames: Annotated[int, Ge(2)] = 4
     reduce: Reduction = "mean"
 
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:

@@ -108,7 +108,7 @@ def sb3_file(path: Path, algo: str, *, continuous: bool = False, **policy: objec
 def driven(*words: str) -> Columns:
     """The measurements of the first unit of these options, without the wall time."""
     unit = next(unit for unit in plan(run_config([*SHORT.split(), *words])))
-    return {name: column for name, column in drive(unit).items() if name != "attack_ms"}
+    return {name: column for name, column in drive(unit.job, []).columns.items() if name != "attack_ms"}
 
 
 @pytest.fixture(scope="module")
