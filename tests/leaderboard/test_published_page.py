@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,6 +23,29 @@ def remade(tmp_path_factory: pytest.TempPathFactory) -> Path:
     page = tmp_path_factory.mktemp("remade") / "index.html"
     write(None, page, Console(quiet=True))
     return page
+
+
+def test_reports_import_no_torch(tmp_path: Path) -> None:
+    """It takes seconds; records say all that a report needs."""
+    script = (
+        "import sys; from io import StringIO; from pathlib import Path; from rich.console import Console\n"
+        "from bench.plugins.track import track; from leaderboard.published import published\n"
+        "from leaderboard.page.write import write; from leaderboard.terminal.run import run_report\n"
+        "if __name__ == '__main__':\n"
+        "    write(None, Path(sys.argv[1]), Console(quiet=True))\n"
+        "    records = published(track('detection'))\n"
+        "    run_report({'detection': records.slice(0, 54)}, Console(file=StringIO()))\n"
+        "    print('torch' in sys.modules)\n"
+    )
+    (tmp_path / "report.py").write_text(script)
+    done = subprocess.run(
+        [sys.executable, "report.py", "page.html"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(leaderboard.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.stdout, done.stderr) == ("False\n", "")
 
 
 @pytest.mark.parametrize("ending", ["html", "json", "csv"])
