@@ -9,12 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import psutil
-import pyarrow as pa
 import pytest
 
 from bench.plugins import registry
 from bench.plugins.registry import GROUPS, KINDS
-from bench.records import store as results
+from bench.plugins.track import track
+from bench.records import reading
 from tests.framework.conftest import Said, ran, started
 from tests.framework.test_runner import comparable
 
@@ -36,7 +36,7 @@ def test_a_component_is_listed_with_description_and_parameters(bench: Bench) -> 
     assert said.code == 0
     for part in (
         "toy_plugin:Nudge, cavbench-toy 1.0",
-        "Pushes everything by a random sign.",
+        "Moves every value by the radius with a random sign.",
         "Track: driving. Needs access oblivious and discrete or continuous actions.",
         "attack.pause",
         "0.0",
@@ -204,7 +204,8 @@ def test_kill_9_loses_no_finished_unit_and_the_same_command_continues(
     assert f"{4 * len(finished)} of 72 episodes are already done" in said.err
     assert all(path.read_bytes() == blob for path, blob in finished.items())
     assert bench(*words(whole)).code == 0
-    assert comparable(results.read(broken)).equals(comparable(results.read(whole)))
+    driving = track("driving")
+    assert comparable(reading.read(broken, track=driving)).equals(comparable(reading.read(whole, track=driving)))
 
 
 @pytest.mark.slow
@@ -223,4 +224,4 @@ def test_ctrl_c_ends_a_run_in_one_line_and_with_its_workers(toy_folder: Path, tm
     assert err.strip().splitlines()[-1].startswith("error: interrupted; ")
     assert "Traceback" not in err
     assert not psutil.wait_procs(children, timeout=60)[1]
-    assert isinstance(results.read(tmp_path), pa.Table)
+    assert reading.read(tmp_path, track=track("driving")).num_rows
