@@ -92,7 +92,7 @@ def test_a_victim_is_checked_in_the_given_world(bench: Bench) -> None:
 
 def test_a_track_without_checks_of_its_own_has_those_of_every_component(plugins: Path) -> None:
     source = Path(__file__).with_name("toy_track.py").read_text()
-    install(plugins, "cavbench-listening", LISTENING, {"toy_track_plugin": source})
+    install(plugins, "cavbench-listening", LISTENING, {"listening_plugin": source})
     track.cache_clear()
     for kind, name in (("attack", "down"), ("victim", "ear"), ("world", "booth")):
         outcomes = {outcome.check: outcome for outcome in examine(kind, name)}  # type: ignore[arg-type]

@@ -297,7 +297,7 @@ def test_a_replay_reproduces_the_record_and_writes_a_recording(tmp_path: Path, b
         bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"the patch {path.name} is truncated"
     )
     path.unlink()
-    assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"{path} is not there")
+    assert_one_line(bench("view", "paint", "--out", str(tmp_path), "seed=1000000"), f"{path} is missing")
 
 
 @pytest.mark.slow

@@ -11,7 +11,8 @@ import pyarrow.compute as pc
 import pytest
 
 from bench.plugins import registry
-from bench.records import store as results
+from bench.plugins.track import track
+from bench.records import reading
 from bench.run.replay import find, replay
 from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.conftest import Said
@@ -23,7 +24,9 @@ WORDS = ("victim=yolov3_tiny", "world=drawn", "lanes=3", "density=1", "episodes=
 
 
 def mean(records: pa.Table, attack: str, weather: str, column: str = "confidence_mean") -> float:
-    kept = records.filter((pc.field("attack") == attack) & (pc.field("weather") == weather))
+    kept = records.filter(
+        (pc.field("attack") == attack) & pc.match_substring(pc.field("cell"), f'"weather":"{weather}"')
+    )
     return float(pc.mean(kept[column].cast(pa.float64())).as_py())
 
 
@@ -31,13 +34,17 @@ def mean(records: pa.Table, attack: str, weather: str, column: str = "confidence
 def test_a_patch_hides_a_sign_from_yolo_and_fog_alone_does_less(
     bench: Callable[..., Said], plugins: Path, tmp_path: Path, published: YOLOv3TinyNetwork
 ) -> None:
-    install(plugins, "drawn", {"cavbench.worlds": {"drawn": "tests.vision.drawn_street:DrawnStreet"}}, {})
+    points = {
+        "cavbench.worlds": {"drawn": "tests.vision.drawn_street:DrawnStreet"},
+        "cavbench.grids": {"drawn-v1": "tests.vision.drawn_street:DRAWN_V1"},
+    }
+    install(plugins, "drawn", points, {})
     registry.entries.cache_clear()
     attack = ("attack=paint,blank", "attack.texels=32", "attack.steps=15")
     said = bench("run", *attack, *WORDS, "weather=clear,fog", "workers=2", f"out={tmp_path}")
     assert said.code == 0, said.err
     assert "yolov3_tiny" in said.out
-    records = results.read(tmp_path, track="detection")
+    records = reading.read(tmp_path, track=track("detection"))
     assert set(records["attack"].to_pylist()) == {"none", "paint", "blank", "noise_patch", "grey_patch"}
     assert records.num_rows == 5 * 2 * 2
     assert mean(records, "none", "clear") > 0.7

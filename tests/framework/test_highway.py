@@ -9,7 +9,8 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from bench.records import store as results
+from bench.plugins.track import track
+from bench.records import reading
 from bench.run.replay import find, replay
 from bench.victims import zoo
 from bench.victims.drivers.dqn import DQN
@@ -25,7 +26,7 @@ def test_an_input_independent_policy_is_scored_and_an_episode_replayed(
     said = bench("run", "victim=blind", *ROAD, "workers=2", f"out={tmp_path}")
     assert said.code == 0, said.err
     assert "IDM" in said.out
-    records = results.read(tmp_path)
+    records = reading.read(tmp_path, track=track("driving"))
     assert set(records["weather"].to_pylist()) == {"clear"}
     braking = records.filter(pc.field("victim_params") == '{"policy":"slower"}')
     assert braking.num_rows == 3
@@ -40,7 +41,7 @@ def test_the_dqn_drives_on_the_highway_under_noise(bench: Callable[..., Said], t
     seed = f"seeds={zoo.seeds(zoo.Recipe.of(DQN()))[0]}"
     said = bench("run", "attack=noise", *ROAD, seed, "workers=2", "reference=false", f"out={tmp_path}")
     assert said.code == 0, said.err
-    records = results.read(tmp_path)
+    records = reading.read(tmp_path, track=track("driving"))
     assert records.num_rows == 2 * 2 * 3
     assert set(records["weights_sha256"].to_pylist()) == {DQN().load(zoo.seeds(zoo.Recipe.of(DQN()))[0]).weights_sha256}
     attacked, clean = (records.filter(pc.field("attack") == name) for name in ("noise", "none"))

@@ -91,7 +91,7 @@ def test_bad_options_are_refused_in_one_line_and_nothing_is_written(
 
 
 def test_a_track_without_templates_is_refused_in_one_line(bench: Bench, plugins: Path, tmp_path: Path) -> None:
-    install(plugins, "cavbench-listening", LISTENING, {"toy_track_plugin": TOY_TRACK.read_text()})
+    install(plugins, "cavbench-listening", LISTENING, {"listening_plugin": TOY_TRACK.read_text()})
     said = bench("new", "attack", "my_attack", "track=listening", f"out={tmp_path / 'package'}")
     assert_one_line(said, "the track 'listening' has no template for an attack", "templates: detection, driving")
     assert not (tmp_path / "package").exists()

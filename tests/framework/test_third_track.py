@@ -15,11 +15,11 @@ from tests.framework.conftest import Bench
 from tests.framework.distributions import install
 
 POINTS = {
-    "cavbench.tracks": {"listening": "toy_track_plugin:ListeningTrack"},
-    "cavbench.grids": {"melodies-v1": "toy_track_plugin:MELODIES"},
-    "cavbench.worlds": {"booth": "toy_track_plugin:Booth"},
-    "cavbench.victims": {"ear": "toy_track_plugin:Ear"},
-    "cavbench.attacks": {"down": "toy_track_plugin:Down"},
+    "cavbench.tracks": {"listening": "listening_plugin:ListeningTrack"},
+    "cavbench.grids": {"melodies-v1": "listening_plugin:MELODIES"},
+    "cavbench.worlds": {"booth": "listening_plugin:Booth"},
+    "cavbench.victims": {"ear": "listening_plugin:Ear"},
+    "cavbench.attacks": {"down": "listening_plugin:Down"},
 }
 RUN = ("run", "attack=down", "victim=ear", "seeds=0", "threat.budget=0.3", "workers=1")
 
@@ -30,7 +30,7 @@ def third_track(plugins: Path) -> Iterator[None]:
         plugins,
         "cavbench-listening",
         POINTS,
-        {"toy_track_plugin": Path(__file__).with_name("toy_track.py").read_text()},
+        {"listening_plugin": Path(__file__).with_name("toy_track.py").read_text()},
     )
     registry.entries.cache_clear()
     track.cache_clear()

@@ -122,7 +122,7 @@ class ListeningTrack(Track):
     metric: ClassVar[str] = "heard"
     metric_title: ClassVar[str] = "tones heard"
     measures: ClassVar[tuple[Measure, ...]] = (Measure(column="highest_khz", heading="highest\nkHz", digits=2),)
-    work: ClassVar[str] = "toy_track_plugin"
+    work: ClassVar[str] = "listening_plugin"
 
     def drive(self, job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
         listener, attack = job.pair.load(job.training_seed), job.pair.attack.component

@@ -138,9 +138,7 @@ def test_a_dqn_in_an_onnx_file_decides_like_the_zoos(onnx: str, attack: str) -> 
 
 
 def test_a_gradient_attack_on_a_black_box_is_refused_before_any_work() -> None:
-    with pytest.raises(
-        UserError, match="attack 'pgd' needs access 'gradients', victim 'onnx' answers 'scores' at most"
-    ):
+    with pytest.raises(UserError, match="victim 'onnx' is a black box that supports 'scores' at most"):
         run_config(["attack=pgd", "victim=onnx", "victim.path=nowhere.onnx"])
     run_config(["attack=zo", "victim=onnx", "victim.path=nowhere.onnx"])
 
@@ -229,7 +227,7 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
         lambda path: {"path": torch_file(path), "actions": "continuous"},
         "returns [1, 5] for 1 observations, continuous actions need [1, 2]",
     ),
-    "no rows": ("torch", lambda path: {"path": str(path), "rows": "0"}, "victim.rows must be at least 1"),
+    "no rows": ("torch", lambda path: {"path": str(path), "rows": "0"}, "rows must be at least 1"),
     "no onnx": ("onnx", bad_text, "cannot be read"),
     "fixed onnx": ("onnx", lambda path: {"path": onnx_file(path, fixed=True)}, "has a fixed batch size of 3"),
     "no zip": ("sb3", lambda path: bad_text(path) | {"algo": "dqn"}, "cannot be read: BadZipFile"),

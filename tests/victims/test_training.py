@@ -45,7 +45,7 @@ def test_the_card_has_the_checkpoint_selection(world: DrivingWorld) -> None:
     card = VICTIMS[0].train(world, seed=0, progress=silent).card
     assert set(card["selection"]["safe_progress"]["clean"]) == {
         "mean",
-        *(f"{n} lanes, density {d}" for n in (3, 4, 5) for d in (1, 2)),
+        *(f"lanes {n}, density {d}, clear" for n in (3, 4, 5) for d in (1, 2)),
     }
 
 

@@ -9,11 +9,18 @@ import torch
 from torch import Tensor, nn
 
 from bench.detection import Approach, CameraWorld, Scenes
-from bench.scenarios import Axes, Cell
+from bench.scenarios import Axes, Cell, Grid
 from envs.camera.axes import AXES
 from envs.weather import WEATHERS
 from tests.vision.pictures import stop_sign
 
+DRAWN_V1 = Grid(
+    name="drawn-v1",
+    world="drawn",
+    axes=AXES,
+    values={"lanes": (3,), "density": (1.0,), "weather": ("clear", "fog")},
+    episodes=2,
+)
 SIDE = 416
 PIXELS_M = 1040.0
 """Width of the sign in pixels times its distance in metres: 130 pixels at 8 m."""
@@ -55,6 +62,7 @@ class DrawnStreet(CameraWorld):
     """Ten frames from 30 to 8 metres, at one of two places."""
 
     axes: ClassVar[Axes] = AXES
+    grid: ClassVar[str] = DRAWN_V1.name
     locations: ClassVar[tuple[str, ...]] = ("left", "right")
 
     def training_scenes(self) -> Scenes:
