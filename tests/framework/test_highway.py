@@ -14,6 +14,7 @@ from bench.records import reading
 from bench.run.replay import find, replay
 from bench.victims import zoo
 from bench.victims.drivers.dqn import DQN
+from envs.highway.world import HighwayWorld
 from tests.framework.conftest import Said
 
 ROAD = ("lanes=3", "density=1", "weather=clear,fog", "episodes=3")
@@ -27,7 +28,7 @@ def test_an_input_independent_policy_is_scored_and_an_episode_replayed(
     assert said.code == 0, said.err
     assert "IDM" in said.out
     records = reading.read(tmp_path, track=track("driving"))
-    assert set(records["weather"].to_pylist()) == {"clear"}
+    assert set(records["cell"].to_pylist()) == {'{"lanes":3,"density":1.0,"weather":"clear"}'}
     braking = records.filter(pc.field("victim_params") == '{"policy":"slower"}')
     assert braking.num_rows == 3
     assert not any(braking["crashed"].to_pylist())
@@ -38,12 +39,12 @@ def test_an_input_independent_policy_is_scored_and_an_episode_replayed(
 
 @pytest.mark.slow
 def test_the_dqn_drives_on_the_highway_under_noise(bench: Callable[..., Said], tmp_path: Path) -> None:
-    seed = f"seeds={zoo.seeds(zoo.Recipe.of(DQN()))[0]}"
-    said = bench("run", "attack=noise", *ROAD, seed, "workers=2", "reference=false", f"out={tmp_path}")
+    seed = zoo.seeds(zoo.Recipe.of(DQN()))[0]
+    said = bench("run", "attack=noise", *ROAD, f"seeds={seed}", "workers=2", "reference=false", f"out={tmp_path}")
     assert said.code == 0, said.err
     records = reading.read(tmp_path, track=track("driving"))
     assert records.num_rows == 2 * 2 * 3
-    assert set(records["weights_sha256"].to_pylist()) == {DQN().load(zoo.seeds(zoo.Recipe.of(DQN()))[0]).weights_sha256}
+    assert set(records["weights_sha256"].to_pylist()) == {DQN().load(seed, HighwayWorld().facts).weights_sha256}
     attacked, clean = (records.filter(pc.field("attack") == name) for name in ("noise", "none"))
     assert min(attacked["linf"].to_pylist()) > 0
     assert set(clean["linf"].to_pylist()) == {0.0}
