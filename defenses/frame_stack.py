@@ -10,36 +10,32 @@ from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, State
+from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, PolicyWrapper, State
 
 Reduction = Literal["mean", "median"]
 
 
-class _FrameStack(Policy):
+class _FrameStack(PolicyWrapper):
     """A policy on a stack of the last `frames` observations; its state is the stack and the inner policy's state."""
 
     def __init__(self, inner: Policy, frames: int, reduce: Reduction) -> None:
-        super().__init__()
-        self.inner, self.frames, self.reduce = inner, frames, reduce
-        self.action_type, self.driver, self.weights_sha256 = inner.action_type, inner.driver, inner.weights_sha256
+        super().__init__(inner)
+        self.frames, self.reduce = frames, reduce
 
     def initial(self, episodes: Tensor) -> State:
-        return TensorDict(_own(self.inner.initial(episodes)), batch_size=episodes.shape)
+        return TensorDict(_own(self.policy.initial(episodes)), batch_size=episodes.shape)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         assert state is not None
-        return self.inner.scores(self._smoothed(observation, state), state.get("inner", None))
-
-    def choose(self, scores: Tensor) -> Tensor:
-        return self.inner.choose(scores)
+        return self.policy.scores(self._smoothed(observation, state), state.get("inner", None))
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         assert state is not None
-        return self.inner.value(self._smoothed(observation, state), action, state.get("inner", None))
+        return self.policy.value(self._smoothed(observation, state), action, state.get("inner", None))
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None
-        inner = self.inner.advance(self._smoothed(observation, state), action, state.get("inner", None))
+        inner = self.policy.advance(self._smoothed(observation, state), action, state.get("inner", None))
         stack = self._stack(observation, state)[..., 1:, :, :]
         return TensorDict({"stack": stack, **_own(inner)}, batch_size=state.batch_size)
 
