@@ -10,14 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from rliable import metrics as rliable_metrics
-from scipy.stats import binomtest
+from scipy.stats import binomtest, ttest_1samp
 
 from bench.plugins.contracts import Facts
 from bench.plugins.track import Measure
 from bench.scenarios import Cell
-from bench.statistics.episodes import Episodes, as_text, difference, measured, shared, unit_interval
-from bench.statistics.estimates import interval, iqm, wilson
+from bench.statistics.episodes import Episodes, as_text, difference, measured, shared
+from bench.statistics.estimates import components, interval, scenario_covariance, share_interval, task_intervals, wilson
 from envs.highway.axes import AXES
 
 quick = settings(max_examples=40, deadline=None)
@@ -62,9 +61,10 @@ def episodes(values: np.ndarray, first_seed: int = 100, shift: float = 0.0) -> p
 @given(scores)
 @quick
 def test_an_interval_holds_its_estimate(values: np.ndarray) -> None:
-    result = interval(values, replicates=200)
-    assert np.isnan(result.low) or result.low <= result.estimate <= result.high
-    assert values.min() - 1e-9 <= result.estimate <= values.max() + 1e-9
+    for result in (interval(values), share_interval(values)):
+        assert np.isnan(result.low) or result.low <= result.estimate <= result.high
+        assert result.estimate == pytest.approx(values.mean())
+    assert np.isnan(result.low) or 0 <= result.low < result.high <= 1
 
 
 def test_one_number_has_no_interval() -> None:
@@ -74,33 +74,61 @@ def test_one_number_has_no_interval() -> None:
     assert np.isnan(result.high)
 
 
+@pytest.mark.parametrize("alone", ["runs", "scenarios"])
+def test_with_one_random_factor_it_is_students_interval(alone: str) -> None:
+    values = np.random.default_rng(0).random((5, 4))
+    scores = values[:, :, None] if alone == "runs" else values.T[None]
+    expected = ttest_1samp(values.mean(1), 0).confidence_interval(0.95)
+    result = interval(scores)
+    assert (result.low, result.high) == pytest.approx((expected.low, expected.high))
+
+
+def test_the_components_are_those_of_a_crossed_design() -> None:
+    # Montgomery, "Design and Analysis of Experiments", two-factor random effects without replicates: by hand.
+    means = np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]])
+    found = components(means)
+    by_run, by_scenario, rest = 3 * (1 + 1) / 1, 2 * (1.5**2 + 1.5**2) / 2, (0.5**2 * 4) / 2
+    assert float(found.training) == pytest.approx(by_run / 6)
+    assert float(found.scenario) == pytest.approx((by_scenario - rest) / 6)
+
+
+def test_a_policy_that_is_lucky_in_every_cell_is_one_policy() -> None:
+    """Eighteen cells of three policies are three trainings, not fifty-four."""
+    one_cell = np.random.default_rng(0).random((3, 1, 50)) * 0.01 + np.array([0.2, 0.5, 0.8])[:, None, None]
+    eighteen = np.repeat(one_cell, 18, 1)
+    assert interval(eighteen) == interval(one_cell)
+    assert interval(eighteen).high - interval(eighteen).low > 1
+
+
 @given(scores)
 @quick
-def test_the_interquartile_mean_is_rliables(values: np.ndarray) -> None:
-    runs_by_tasks = values.mean(2)
-    assert iqm(runs_by_tasks) == pytest.approx(rliable_metrics.aggregate_iqm(runs_by_tasks))
+def test_the_covariance_of_cells_gives_the_component_of_any_of_them(values: np.ndarray) -> None:
+    covariance = scenario_covariance(values)
+    for some in (np.arange(values.shape[1]), np.arange(values.shape[1])[::2]):
+        expected = components(values[:, some].mean(1)).scenario
+        assert max(float(covariance[np.ix_(some, some)].mean()), 0.0) == pytest.approx(float(expected), abs=1e-12)
 
 
-def test_the_bootstrap_over_runs_is_rliables() -> None:
-    # rliable 1.2.0 with pandas 2: StratifiedBootstrap(x).conf_int(aggregate_iqm, reps=2000, method="percentile").
-    x = np.random.default_rng(0).random((5, 18, 1))
-    result = interval(x, replicates=20000)
-    assert (result.low, result.high) == pytest.approx((0.4652, 0.6093), abs=0.003)
+@given(scores)
+@quick
+def test_the_intervals_of_cells_are_those_of_each_alone(values: np.ndarray) -> None:
+    for share, alone in ((True, share_interval), (False, interval)):
+        for place, found in enumerate(task_intervals(values, share=share)):
+            expected = alone(values[:, [place]])
+            assert (found.estimate, found.low, found.high) == pytest.approx(
+                (expected.estimate, expected.low, expected.high), nan_ok=True, abs=1e-9
+            )
 
 
-def test_the_bootstrap_covers_the_truth_as_often_as_it_says() -> None:
-    generator = np.random.default_rng(1)
-    draws = generator.normal(0.5, 0.1, size=(300, 1, 1, 100))
-    hits = sum(0.5 in interval(x, seed=i, replicates=300) for i, x in enumerate(draws))
-    assert 0.90 < hits / 300 < 0.99
-
-
-def test_the_bootstrap_is_its_own_generators() -> None:
-    x = np.random.default_rng(0).random((4, 3, 2))
-    np.random.seed(0)  # noqa: NPY002 the global generator must not matter
-    first = interval(x)
-    np.random.seed(1)  # noqa: NPY002
-    assert interval(x) == first
+@given(st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+@quick
+def test_independent_episodes_of_one_driver_have_nearly_wilsons_interval(counts: tuple[int, int]) -> None:
+    successes, trials = counts
+    outcomes = np.zeros(trials)
+    outcomes[:successes] = 1
+    found, expected = share_interval(outcomes[None, None]), wilson(successes, trials)
+    if trials > 50:
+        assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=0.02)
 
 
 @pytest.mark.parametrize("bad", [np.zeros((2, 3)), np.zeros((0, 3, 2)), np.full((1, 1, 1), np.nan)])
@@ -111,7 +139,7 @@ def test_scores_that_mean_nothing_are_refused(bad: np.ndarray) -> None:
 
 @given(st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
 @quick
-def test_wilson_is_scipys_and_stays_in_the_unit_interval(counts: tuple[int, int]) -> None:
+def test_wilson_is_scipys_and_stays_in_the_share_interval(counts: tuple[int, int]) -> None:
     successes, trials = counts
     result = wilson(successes, trials)
     expected = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
@@ -133,7 +161,7 @@ def test_the_order_of_the_records_does_not_matter(values: np.ndarray, random: ob
     random.shuffle(rows)  # type: ignore[attr-defined]
     ordered, mixed = Episodes.arrange(table), Episodes.arrange(table.take(rows))
     assert ordered.table.equals(mixed.table)
-    assert unit_interval(ordered.column("safe_progress")) == unit_interval(mixed.column("safe_progress"))
+    assert share_interval(ordered.column("safe_progress")) == share_interval(mixed.column("safe_progress"))
 
 
 @given(scores)
@@ -154,6 +182,27 @@ def test_what_a_run_lacks_is_left_out_of_all_runs() -> None:
     arranged = Episodes.arrange(broken_off)
     assert [cell.lanes for cell in arranged.cells] == [3, 4]
     assert arranged.left_out == 4
+
+
+@pytest.mark.parametrize(
+    "stray",
+    [
+        {"training_seed": [7], "cell": [0], "seed": [100, 101, 102, 103]},
+        {"training_seed": [0, 1], "cell": [5], "seed": [100]},
+        {"training_seed": [0], "cell": [0], "seed": [200, 201]},
+    ],
+)
+def test_a_stray_partial_run_changes_nothing(stray: dict[str, list[int]]) -> None:
+    table = episodes(np.random.default_rng(0).random((2, 3, 4)))
+    rows = [(run, cell, seed) for run in stray["training_seed"] for cell in stray["cell"] for seed in stray["seed"]]
+    more = table.slice(0, 1).to_pylist()[0]
+    strays = [
+        more | {"training_seed": run, "cell": as_text(cell_of(cell)), "seed": seed, "safe_progress": 1.0}
+        for run, cell, seed in rows
+    ]
+    arranged = Episodes.arrange(pa.concat_tables([table, pa.Table.from_pylist(strays, table.schema)]))
+    assert arranged.table.equals(Episodes.arrange(table).table)
+    assert arranged.left_out == len(rows)
 
 
 def test_records_of_two_pairs_are_refused() -> None:
@@ -202,10 +251,10 @@ def test_a_blind_driver_stands_for_every_run_and_weather() -> None:
 
 
 def test_rates_near_zero_keep_an_interval() -> None:
-    crashes = Measure(column="crashed", heading="crashed", how="rate", unit="share")
+    crashes = Measure(column="crashed", heading="crashed", unit="share")
     never = measured(Episodes.arrange(episodes(np.full((1, 1, 100), 0.6))), crashes)
     assert never.high == pytest.approx(0.037, abs=0.001)
-    assert unit_interval(np.zeros((1, 1, 100))).high == pytest.approx(0.037, abs=0.001)
+    assert share_interval(np.zeros((1, 1, 100))).high == pytest.approx(0.037, abs=0.001)
     always = measured(Episodes.arrange(episodes(np.zeros((2, 1, 50)))), crashes)
     assert always.low == pytest.approx(0.963, abs=0.001)
 
@@ -215,8 +264,8 @@ def test_each_way_of_measuring_is_what_it_says() -> None:
     table = episodes(values)
     table = table.set_column(table.column_names.index("steps"), "steps", pa.array([100, 300, 100, 100]))
     arranged = Episodes.arrange(table)
-    expected = {"mean": 0.375, "median": 0.25, "iqm": 0.375, "step mean": (300 + 25 + 25) / 600}
+    expected = {"mean": 0.375, "median": 0.25, "step mean": (300 + 25 + 25) / 600}
     for how, value in expected.items():
         found = measured(arranged, Measure(column="safe_progress", heading="", how=how))  # type: ignore[arg-type]
         assert found.estimate == pytest.approx(value)
-        assert np.isnan(found.low) == (how != "iqm")
+        assert np.isnan(found.low) == (how != "mean")

@@ -68,9 +68,8 @@ class Measure:
     Args:
         column: column of the records.
         heading: at most two lines; may contain facts of the world, such as `{max_steps}`.
-        how: `iqm`: interquartile mean over runs and cells with a bootstrap interval; `mean`; `median`; `rate`: share of the
-            episodes for which a flag is set, with a Wilson interval; `step mean`: mean over all steps, from a column of
-            episode means.
+        how: `mean`: over all episodes, with its interval; of a flag it is the rate. `median`, and `step mean` (over all steps,
+            from a column of episode means) have no interval.
         unit: `share` is shown as a percentage.
         digits: decimal places.
         of_attack: whether it describes the attack; it is empty for clean runs.
@@ -81,7 +80,7 @@ class Measure:
 
     column: str
     heading: str
-    how: Literal["iqm", "mean", "rate", "step mean", "median"] = "mean"
+    how: Literal["mean", "step mean", "median"] = "mean"
     unit: Literal["", "share"] = ""
     digits: int = 0
     of_attack: bool = False
@@ -164,6 +163,8 @@ class Track(ABC):
     """Explains the columns of its tables."""
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {}
     """The names of its baselines (`baseline_of`) in reports, in order."""
+    safe_driver: ClassVar[str] = ""
+    """The baseline whose rate of `failure` is what safe means; empty for none."""
     contrast: ClassVar[Contrast | None] = None
     """The baseline that attacked pairs are compared with; None for none."""
     place: ClassVar[str] = ""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bench.plugins.track import Measure
 from bench.scenarios import Axes, Cell
-from bench.statistics.estimates import Array, Interval, interval, wilson
+from bench.statistics.estimates import Array, Interval, interval, share_interval
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Episodes:
         cells: [C], in the order of tables (`Axes.place`).
         axes: axes of the cells.
         seeds: scenario seeds [E], ascending.
-        left_out: number of records that `arrange` dropped because another run lacks their cell or seed.
+        left_out: number of records that `arrange` dropped because another run or cell lacks their scenario.
     """
 
     table: pa.Table
@@ -44,10 +44,12 @@ class Episodes:
 
     @classmethod
     def arrange(cls, records: pa.Table) -> Episodes:
-        """Sort the records of one pair. Keep the cells that every run has, and the seeds that all these cells have.
+        """Sort the records of one pair, and keep the largest part in which every run has every cell with every seed.
+
+        So a few stray records of another run, cell or seed do not change what is kept.
 
         Raises:
-            ValueError: if there are no records, a scenario occurs twice, or the runs have nothing in common.
+            ValueError: if there are no records, or a scenario occurs twice.
         """
         if not records.num_rows:
             raise ValueError("no records to measure")
@@ -60,19 +62,14 @@ class Episodes:
         driven = place >= 0
         if driven.sum() < records.num_rows:
             raise ValueError("a scenario occurs twice: these are records of more than one pair")
-        every_run: NDArray[np.bool_] = np.asarray(driven.any(2).all(0))
-        if not every_run.any():
-            raise ValueError("the training seeds have no cell in common")
-        every_cell: NDArray[np.bool_] = np.asarray(driven[:, every_run].all((0, 1)))
-        if not every_cell.any():
-            raise ValueError("the cells have no scenario seed in common")
-        rows = place[:, every_run][..., every_cell].ravel()
+        of_runs, of_cells, of_seeds = _largest(driven)
+        rows = place[np.ix_(of_runs, of_cells, of_seeds)].ravel()
         whole = len(rows) == records.num_rows and bool((rows[1:] > rows[:-1]).all())
         return Episodes(
             table=records if whole else records.take(pa.array(rows)),
-            runs=tuple(runs),
-            cells=tuple(one for one, kept in zip(cells, every_run, strict=True) if kept),
-            seeds=tuple(seed for seed, kept in zip(seeds, every_cell, strict=True) if kept),
+            runs=tuple(runs[i] for i in of_runs),
+            cells=tuple(cells[i] for i in of_cells),
+            seeds=tuple(seeds[i] for i in of_seeds),
             axes=axes,
             left_out=records.num_rows - len(rows),
         )
@@ -142,6 +139,25 @@ class Episodes:
         return Episodes.arrange(table)
 
 
+def _largest(driven: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """The indices of the runs, cells and seeds of the largest complete part of `driven` [R, C, E].
+
+    Looked for among the parts that one cell of one run begins: its seeds, with all cells of that run that have them, with all
+    runs that have these. Of equally large parts the one with more runs counts.
+    """
+    if driven.all():
+        return tuple(np.arange(count) for count in driven.shape)  # type: ignore[return-value]
+    best: tuple[tuple[int, int], Any] = ((0, 0), None)
+    for run in np.unique(driven.reshape(len(driven), -1), axis=0).reshape(-1, *driven.shape[1:]):
+        for seeds in np.unique(run[run.any(1)], axis=0):
+            cells = run[:, seeds].all(1)
+            runs = driven[:, cells][..., seeds].all((1, 2))
+            size = (int(runs.sum()) * int(cells.sum()) * int(seeds.sum()), int(runs.sum()))
+            if size > best[0]:
+                best = (size, tuple(map(np.flatnonzero, (runs, cells, seeds))))
+    return best[1]
+
+
 def _places(values: Sequence[object], wanted: Collection[object] | None) -> list[int]:
     kept = None if wanted is None else set(wanted)
     return [place for place, value in enumerate(values) if kept is None or value in kept]
@@ -202,7 +218,7 @@ def shared(first: Episodes, second: Episodes) -> tuple[Episodes, Episodes]:
 
 
 def difference(treated: Episodes, control: Episodes, name: str) -> Interval:
-    """Interquartile mean of `treated` - `control`, paired by training seed, cell and scenario seed.
+    """Mean of `treated` - `control`, paired by training seed, cell and scenario seed.
 
     Raises:
         ValueError: if runs, cells or scenario seeds differ: the difference would then include that of the traffic.
@@ -214,36 +230,12 @@ def difference(treated: Episodes, control: Episodes, name: str) -> Interval:
 
 def measured(episodes: Episodes, measure: Measure) -> Interval:
     """Aggregate some episodes by a measure; the bounds are NaN if it has no interval."""
-    if measure.how == "rate":
-        return rate(episodes, measure.column)
-    if measure.how == "step mean":
-        value = step_mean(episodes, measure.column)
-    elif measure.how == "median":
-        value = float(np.median(episodes.column(measure.column)))
-    elif measure.how == "mean":
-        value = float(episodes.column(measure.column).mean())
-    else:
+    if measure.how == "mean":
         scores = episodes.column(measure.column)
-        return unit_interval(scores) if measure.unit == "share" else interval(scores)
-    return Interval(value, np.nan, np.nan)
-
-
-def unit_interval(scores: Array) -> Interval:
-    """`interval` for scores [R, C, E] in [0, 1].
-
-    If all scores are 0, or all are 1, a bootstrap interval has no width; the interval is then Wilson's, which is conservative for
-    any variable in [0, 1].
-    """
-    estimate = interval(scores)
-    if np.all(scores == scores.flat[0]) and scores.flat[0] in (0.0, 1.0):
-        return wilson(float(scores.sum()), scores.size)
-    return estimate
-
-
-def rate(episodes: Episodes, name: str) -> Interval:
-    """The share of episodes with a boolean column set, over all runs and cells, with its Wilson interval."""
-    values = episodes.column(name)
-    return wilson(float(values.sum()), values.size)
+        return share_interval(scores) if measure.unit == "share" else interval(scores)
+    if measure.how == "step mean":
+        return Interval(step_mean(episodes, measure.column), np.nan, np.nan)
+    return Interval(float(np.median(episodes.column(measure.column))), np.nan, np.nan)
 
 
 def step_mean(episodes: Episodes, name: str) -> float:

@@ -1,17 +1,13 @@
-"""Estimates with intervals: interquartile mean and stratified bootstrap, Wilson rates, paired differences.
+"""Means with 95 % intervals over two crossed random factors: the training (runs) and the scenario.
 
-Pure functions on arrays; `bench.statistics.episodes` says what the arrays mean. Interquartile mean and resampling are those of
-rliable and its `StratifiedBootstrap` (Agarwal et al. 2021, "Deep RL at the edge of the statistical precipice"). The resampling is
-one vectorised pass with its own generator, because rliable 1.2 ignores its seed and uses numpy's global generator. `iqm` and
-`wilson` equal scipy's `trim_mean` and `binomtest(...).proportion_ci` to the last digit of a table (a test compares them), but
-are 6 and 100 times faster and need no `scipy.stats`, which takes 0.8 s to import.
+Pure functions on arrays; `bench.statistics.episodes` says what the arrays mean. docs/metrics.md derives the intervals and has the
+table of their coverage (`python benchmarks/coverage.py`).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from statistics import NormalDist
 
 import numpy as np
@@ -19,10 +15,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-REPLICATES = 2000
-"""Bootstrap draws. With 2000, another generator seed moves the bounds of an interval by about 2 % of its width."""
 CONFIDENCE = 0.95
-_TAILS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
+_TAIL = (1 + CONFIDENCE) / 2
+_Z2 = NormalDist().inv_cdf(_TAIL) ** 2
 
 
 @dataclass(frozen=True)
@@ -37,94 +32,131 @@ class Interval:
         return self.low <= value <= self.high
 
 
-def iqm(scores: Array, axis: int | None = None) -> Array:
-    """Interquartile mean along `axis` (default: all): the mean without the lowest and the highest quarter.
-
-    Defined as `rliable.metrics.aggregate_iqm`; of fewer than four values it is the mean.
-    """
-    count = scores.size if axis is None else scores.shape[axis]
-    if count < 4:
-        return np.asarray(scores.mean(axis))
-    ordered = np.sort(scores, axis=axis)
-    last = 0 if axis is None else axis
-    return np.asarray(np.take(ordered, range(count // 4, count - count // 4), axis=last).mean(last))
-
-
-def interval(scores: Array, *, seed: int = 0, replicates: int = REPLICATES) -> Interval:
-    """Interquartile mean over runs and tasks, with a 95 % percentile interval from a stratified bootstrap.
-
-    With two or more runs, runs are drawn with replacement within each task. With one run, episodes are drawn with replacement
-    within each task; the interval then does not include the variation between training seeds.
+@dataclass(frozen=True)
+class Components:
+    """The two parts of the variance of a mean over runs and scenarios, one entry for each mean.
 
     Args:
-        scores: [R, C, E], R runs (training seeds) x C tasks (cells) x E episodes (scenario seeds), finite.
-        seed: seed of the bootstrap's generator.
-        replicates: number of bootstrap draws.
+        training: the part that falls with the number of runs: mean square of the runs over the number of episodes.
+        scenario: the part that falls with the number of scenarios, at least 0.
+        runs: R, number of runs.
+        scenarios: E, number of scenarios.
+    """
+
+    training: Array
+    scenario: Array
+    runs: int
+    scenarios: int
+
+    def margin(self) -> Array:
+        """Half the width of the 95 % interval of each mean; NaN with one run and one scenario.
+
+        The square is the mean of two: Satterthwaite's (1946), a t-quantile with the degrees of freedom of the sum, which is too
+        narrow if few runs make most of the variance; and the sum of the squared margins of the two parts (the modified large
+        sample method of Graybill and Wang 1980), which is too wide if both are large. Each alone leaves 94 to 97 %.
+        """
+        own = max(self.runs - 1, 0), max(self.scenarios - 1, 0)
+        if not any(own):
+            return np.full_like(self.training, np.nan)
+        parts = [(part, df) for part, df in zip((self.training, self.scenario), own, strict=True) if df]
+        variance = np.asarray(sum(part for part, _ in parts))
+        freedom = sum(np.square(part) / df for part, df in parts)
+        known = variance > 0
+        effective = np.divide(np.square(variance), freedom, out=np.ones_like(variance), where=known)
+        joint = np.square(t_quantile(effective)) * variance
+        apart = sum(np.square(t_quantile(np.asarray(float(df)))) * part for part, df in parts)
+        return np.asarray(np.sqrt((joint + apart) / 2))
+
+
+def t_quantile(freedom: Array) -> Array:
+    """The 97.5 % quantile of Student's t."""
+    from scipy.special import stdtrit
+
+    return np.asarray(stdtrit(freedom, _TAIL))
+
+
+def components(means: Array) -> Components:
+    """The variance components of means over runs and scenarios, by the mean squares of a crossed design with two factors.
+
+    Args:
+        means: [..., R, E], finite.
+    """
+    runs, scenarios = means.shape[-2:]
+    grand = means.mean((-2, -1), keepdims=True)
+    by_run, by_scenario = means.mean(-1, keepdims=True), means.mean(-2, keepdims=True)
+    episodes = runs * scenarios
+    of_runs = scenarios * np.square(by_run - grand).sum((-2, -1)) / max(runs - 1, 1)
+    of_scenarios = runs * np.square(by_scenario - grand).sum((-2, -1)) / max(scenarios - 1, 1)
+    rest = np.square(means - by_run - by_scenario + grand).sum((-2, -1)) / max((runs - 1) * (scenarios - 1), 1)
+    return Components(of_runs / episodes, np.maximum(of_scenarios - rest, 0.0) / episodes, runs, scenarios)
+
+
+def interval(scores: Array) -> Interval:
+    """Mean over runs, tasks and scenarios, with a 95 % interval for other trainings and other scenarios.
+
+    With one run the interval covers that policy alone; with one scenario it covers that scenario alone.
+
+    Args:
+        scores: [R, C, E], R runs (training seeds) x C tasks (cells) x E scenarios, finite. Runs are the same in all cells, and
+            scenarios the same for all runs; those of one place E may be related between cells.
 
     Raises:
         ValueError: if `scores` is not three-dimensional, is empty, or holds a value that is not finite.
     """
     _check(scores)
-    runs, tasks, episodes = scores.shape
-    estimate = float(iqm(scores.mean(2)))
-    if runs == 1 and episodes == 1:
-        return Interval(estimate, np.nan, np.nan)
-    generator = np.random.default_rng(seed)
-    if runs > 1:
-        drawn = _drawn(runs, tasks, seed, replicates)
-        draws = scores.mean(2).ravel()[drawn].reshape(replicates, -1)
-    else:
-        draws = np.stack([_episode_means(task, generator, replicates) for task in scores[0]], 1)
-    return _percentiles(estimate, iqm(draws, axis=1))
+    means = scores.mean(1)
+    return _symmetric(float(means.mean()), float(components(means).margin()))
 
 
-def task_intervals(scores: Array, *, seed: int = 0, replicates: int = REPLICATES) -> list[Interval]:
-    """`interval` for each task separately, in one pass.
+def share_interval(scores: Array) -> Interval:
+    """`interval` for scores in [0, 1], such as rates: within [0, 1], and with a width where all scores are 0 or 1.
+
+    Wilson's score interval (1927), with the variance of the mean in place of the binomial one.
+
+    Args:
+        scores: [R, C, E], as in `interval`, in [0, 1].
+    """
+    _check(scores)
+    means = scores.mean(1)
+    return _wilson(float(means.mean()), float(components(means).margin()), scores.size)
+
+
+def task_intervals(scores: Array, *, share: bool) -> list[Interval]:
+    """`interval`, or `share_interval`, for each task separately.
 
     Args:
         scores: [R, C, E], as in `interval`.
-        seed: seed of the bootstrap's generator.
-        replicates: number of bootstrap draws.
+        share: whether the scores are in [0, 1].
     """
     _check(scores)
-    runs, tasks, _ = scores.shape
-    if runs == 1:
-        return [interval(scores[:, [task]], seed=seed, replicates=replicates) for task in range(tasks)]
-    drawn = _drawn(runs, 1, seed, replicates)[..., 0]
-    means = scores.mean(2)
-    estimates, (low, high) = iqm(means, 0), np.quantile(iqm(means[drawn], 1), _TAILS, axis=0)
-    bounds = np.minimum(low, estimates), np.maximum(high, estimates)
-    return [Interval(*map(float, values)) for values in zip(estimates, *bounds, strict=True)]
+    means = np.moveaxis(scores, 1, 0)
+    estimates, margins = means.mean((1, 2)).tolist(), components(means).margin().tolist()
+    episodes = means[0].size
+    return [
+        _wilson(estimate, margin, episodes) if share else _symmetric(estimate, margin)
+        for estimate, margin in zip(estimates, margins, strict=True)
+    ]
 
 
-@cache
-def _drawn(runs: int, tasks: int, seed: int, replicates: int) -> NDArray[np.int64]:
-    """[replicates, R, C] flat indices into [R, C] of the runs drawn for each task."""
-    drawn = np.random.default_rng(seed).integers(runs, size=(replicates, runs, tasks))
-    return drawn * tasks + np.arange(tasks)
+def scenario_covariance(scores: Array) -> Array:
+    """[C, C] what two cells add to the variance of a mean over cells by the scenarios that they share.
 
+    The `scenario` of `components` for a set of cells is the mean of its block, or 0 if that is negative.
 
-def _episode_means(values: Array, generator: np.random.Generator, replicates: int) -> Array:
-    """[replicates] means of samples of `values` [E], drawn with replacement."""
-    drawn = generator.integers(len(values), size=(replicates, len(values)))
-    return np.asarray(values[drawn].mean(1))
-
-
-def _percentiles(estimate: float, draws: Array) -> Interval:
-    """The percentile interval, widened to include the estimate, which the bootstrap of a trimmed mean can just miss."""
-    low, high = np.quantile(draws, _TAILS)
-    return Interval(estimate, min(float(low), estimate), max(float(high), estimate))
-
-
-def _check(scores: Array) -> None:
-    if scores.ndim != 3 or not scores.size:
-        raise ValueError(f"scores must be runs x tasks x episodes and not empty, got shape {scores.shape}")
-    if not np.isfinite(scores).all():
-        raise ValueError("scores must be finite")
+    Args:
+        scores: [R, C, E], as in `interval`.
+    """
+    _check(scores)
+    runs, _, scenarios = scores.shape
+    by_scenario = scores.mean(0) - scores.mean((0, 2))[:, None]
+    rest = scores - scores.mean(2, keepdims=True) - by_scenario
+    of_scenarios = runs * by_scenario @ by_scenario.T / max(scenarios - 1, 1)
+    of_rest = np.einsum("rce,rde->cd", rest, rest) / max((runs - 1) * (scenarios - 1), 1)
+    return np.asarray((of_scenarios - of_rest) / (runs * scenarios))
 
 
 def wilson(successes: float, trials: int) -> Interval:
-    """A rate in [0, 1] with its 95 % Wilson score interval (Wilson 1927), which does not collapse at 0 or 1.
+    """A rate in [0, 1] of independent trials with its 95 % Wilson score interval (Wilson 1927).
 
     Raises:
         ValueError: unless 0 <= successes <= trials.
@@ -133,8 +165,31 @@ def wilson(successes: float, trials: int) -> Interval:
         raise ValueError(f"successes must be between 0 and the {trials} trials, got {successes}")
     if trials == 0:
         return Interval(np.nan, 0.0, 1.0)
-    z2 = NormalDist().inv_cdf((1 + CONFIDENCE) / 2) ** 2
     rate = successes / trials
-    centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = math.sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (1 + z2 / trials)
-    return Interval(rate, min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate))
+    return _wilson(rate, math.sqrt(_Z2 * rate * (1 - rate) / trials), trials)
+
+
+def _symmetric(estimate: float, margin: float) -> Interval:
+    return Interval(estimate, estimate - margin, estimate + margin)
+
+
+def _wilson(share: float, margin: float, episodes: int) -> Interval:
+    """Wilson's interval of a share whose symmetric interval is share +- margin.
+
+    If the margin is no wider than that of independent episodes without a success (0 where all are equal), that one counts.
+    """
+    if math.isnan(margin):
+        return Interval(share, np.nan, np.nan)
+    share = min(max(share, 0.0), 1.0)
+    spread = share * (1 - share)
+    ratio = max(margin**2 / spread if spread > 0 else 0.0, _Z2 / episodes)
+    centre = (share + ratio / 2) / (1 + ratio)
+    half = math.sqrt(ratio * spread + ratio**2 / 4) / (1 + ratio)
+    return Interval(share, min(max(centre - half, 0.0), share), max(min(centre + half, 1.0), share))
+
+
+def _check(scores: Array) -> None:
+    if scores.ndim != 3 or not scores.size:
+        raise ValueError(f"scores must be runs x tasks x episodes and not empty, got shape {scores.shape}")
+    if not np.isfinite(scores).all():
+        raise ValueError("scores must be finite")

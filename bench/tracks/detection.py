@@ -72,9 +72,9 @@ class DetectionTrack(Track):
     metric_title: ClassVar[str] = "confidence"
     failure: ClassVar[str] = "ran"
     measures: ClassVar[tuple[Measure, ...]] = (
-        Measure(column="detection_rate", heading="frames\nseen", how="iqm", unit="share"),
-        Measure(column="first_seen_m", heading="first\nseen m", how="iqm", digits=1, spare=2),
-        Measure(column="ran", heading="runs the\nsign", how="rate", unit="share", with_interval=True),
+        Measure(column="detection_rate", heading="frames\nseen", unit="share"),
+        Measure(column="first_seen_m", heading="first\nseen m", digits=1, spare=2),
+        Measure(column="ran", heading="runs the\nsign", unit="share", with_interval=True),
         Measure(column="overrun_m", heading="over-\nrun m", digits=1, spare=3),
         Measure(column="visible_share", heading="\nvisible", unit="share", tables="cells", spare=5),
         Measure(column="false_alarms", heading="false\nalarms", digits=2, spare=7),

@@ -75,9 +75,9 @@ class DrivingTrack(Track):
     metric_title: ClassVar[str] = "safe progress"
     failure: ClassVar[str] = "crashed"
     measures: ClassVar[tuple[Measure, ...]] = (
-        Measure(column="return", heading="return\nof {max_steps}", how="iqm"),
-        Measure(column="crashed", heading="\ncrashed", how="rate", unit="share"),
-        Measure(column="offroad", heading="off\nroad", how="rate", unit="share", tables="overview", spare=4),
+        Measure(column="return", heading="return\nof {max_steps}"),
+        Measure(column="crashed", heading="\ncrashed", unit="share"),
+        Measure(column="offroad", heading="off\nroad", unit="share", tables="overview", spare=4),
         Measure(column="min_ttc_s", heading="min\nTTC s", how="median", digits=1, tables="overview", spare=6),
         Measure(column="changed", heading="success\n/ step", how="step mean", unit="share", of_attack=True, spare=2),
         Measure(column="queries", heading="queries\n/ step", how="step mean", of_attack=True),
@@ -93,6 +93,7 @@ class DrivingTrack(Track):
         RANDOM: Baseline(title="random", heading="ran-\ndom"),
         IDM: Baseline(title="IDM and MOBIL", heading="\nIDM"),
     }
+    safe_driver: ClassVar[str] = IDM
     contrast: ClassVar[Contrast | None] = Contrast(
         side="victim",
         baseline=BEST_BLIND,

@@ -9,8 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import blended_transform_factory
 
 from bench.plugins.track import tracks
-from bench.statistics.episodes import unit_interval
-from bench.statistics.estimates import Interval
+from bench.statistics.estimates import Interval, share_interval
 from docs.figures import style
 from leaderboard.published import published
 from leaderboard.ranking.boards import Board, Row, read_boards
@@ -45,12 +44,12 @@ def _draw(axes: Axes, board: Board) -> None:
     for place, row in enumerate(board.rows):
         opacity = FLAGGED if row.flagged else 1
         worst = row.worst.score
-        if row.clean:
-            axes.plot([worst.estimate, row.clean.estimate], [place, place], color=style.FAINT, lw=5, zorder=1)
-            _point(axes, row.clean, place, style.TRUE, opacity)
+        if row.worst.clean:
+            axes.plot([worst.estimate, row.worst.clean.estimate], [place, place], color=style.FAINT, lw=5, zorder=1)
+            _point(axes, row.worst.clean, place, style.TRUE, opacity)
         _point(axes, worst, place, style.SHOWN, opacity)
         if np.isfinite(row.worst.rival).all():
-            blind = unit_interval(row.worst.rival[None]).estimate
+            blind = share_interval(row.worst.rival[None]).estimate
             axes.plot(blind, place, "|", color=style.INK, ms=13, mew=1.8)
         axes.text(-0.02, place, _name(row), transform=names, ha="right", va="center", alpha=max(opacity, 0.65))
     axes.set(xlim=(0, 1), ylim=(len(board.rows) - 0.5, -0.5), yticks=[], xlabel=MEASURES[board.track.name])

@@ -1,4 +1,4 @@
-"""Several comparisons on the scenarios that all of them have, and the difference of two."""
+"""Several comparisons on the scenarios that all of them have."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.scenarios import Cell
-from bench.statistics.estimates import Array, Interval, interval
+from bench.statistics.estimates import Array
 from leaderboard.comparisons.comparison import Comparison
 
 
@@ -48,9 +48,3 @@ def align(comparisons: Sequence[Comparison]) -> Aligned | None:
         )
         scores.append(one.scores[np.ix_(*places)])
     return Aligned(scores, tuple(runs), tuple(cells), tuple(seeds))
-
-
-def gap(first: Comparison, second: Comparison) -> Interval | None:
-    """`first` minus `second`, paired on the runs, cells and scenarios that both have; None where they have none."""
-    aligned = align([first, second])
-    return interval(aligned.scores[0] - aligned.scores[1]) if aligned else None

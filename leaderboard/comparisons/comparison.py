@@ -14,8 +14,8 @@ import pyarrow.compute as pc
 
 from bench.plugins.track import Measure, Track
 from bench.scenarios import Axes, Cell
-from bench.statistics.episodes import Episodes, difference, measured, unit_interval
-from bench.statistics.estimates import Array, Interval
+from bench.statistics.episodes import Episodes, difference, measured
+from bench.statistics.estimates import Array, Interval, share_interval
 from leaderboard.comparisons.pairing import beside
 
 DEFENDED = ("defense", "defense_params", "victim", "victim_params", "world", "world_params")
@@ -122,7 +122,7 @@ class Comparison:
     @cached_property
     def score(self) -> Interval:
         """The metric over all runs and cells."""
-        return unit_interval(self.scores)
+        return share_interval(self.scores)
 
     @cached_property
     def clean_score(self) -> Interval | None:
@@ -136,7 +136,7 @@ class Comparison:
 
     def score_of(self, episodes: Episodes) -> Interval:
         """The metric of other episodes, over all runs and cells."""
-        return unit_interval(episodes.column(self.track.metric))
+        return share_interval(episodes.column(self.track.metric))
 
     @property
     def retained(self) -> float:

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from bench.plugins.track import Measure, Track, track
 from bench.statistics.episodes import Episodes
-from bench.statistics.estimates import iqm
 from leaderboard.comparisons.baselines import Baselines, identity_of
 from leaderboard.comparisons.comparison import ATTACKER, DEFENDED, NO_ATTACK, Comparison
 from leaderboard.comparisons.pairing import with_control
 
 SCENARIO = ("training_seed", "cell", "seed")
+CONTROL = (*DEFENDED, "grid")
+"""The columns that attacked episodes share with their clean control."""
 
 
 def measurements(of: Track) -> set[str]:
@@ -46,15 +47,15 @@ def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:
     attacked = [
         Episodes.arrange(rows) for _, rows in groups(records, attack, pc.not_equal(records["attack"], NO_ATTACK))
     ]
-    clean = groups(records, DEFENDED, pc.equal(records["attack"], NO_ATTACK))
-    controls = {tuple(identity.values()): Episodes.arrange(newest(rows, DEFENDED)) for identity, rows in clean}
+    clean = groups(records, CONTROL, pc.equal(records["attack"], NO_ATTACK))
+    controls = {tuple(identity.values()): Episodes.arrange(newest(rows, CONTROL)) for identity, rows in clean}
     baselines = Baselines(of, [*controls.values(), *attacked])
     found = []
     for own in attacked:
         identity = identity_of(own)
-        own, control = with_control(own, controls.get(tuple(identity[name] for name in DEFENDED)))
+        own, control = with_control(own, controls.get(tuple(identity[name] for name in CONTROL)))
         found.append(Comparison(identity, of, own, control, baselines.beside(own)))
-    defended = {one.defended for one in found}
+    defended = {tuple(one.identity[name] for name in CONTROL) for one in found}
     alone = [
         Comparison(identity_of(own), of, own, own, baselines.beside(own))
         for drives, own in controls.items()
@@ -74,7 +75,7 @@ def read_tracks(records: Mapping[str, pa.Table]) -> list[Comparison]:
 def _rank(one: Comparison) -> tuple[object, ...]:
     """By world, victim and defence (`none` first); then the strongest attack first, baselines last."""
     text = {name: str(value) for name, value in one.identity.items()}
-    score = round(float(iqm(one.scores.mean(2))), 9) if one.is_attacked else -1.0
+    score = round(float(one.scores.mean()), 9) if one.is_attacked else -1.0
     return (
         *(text[name] for name in ("world", "world_params", "victim", "victim_params")),
         text["defense"] != "none",

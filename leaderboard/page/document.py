@@ -14,8 +14,7 @@ import numpy as np
 
 from bench.plugins.track import Track
 from bench.scenarios import Axes, Cell
-from bench.statistics.episodes import unit_interval
-from bench.statistics.estimates import Array, Interval, task_intervals
+from bench.statistics.estimates import Array, Interval, scenario_covariance, t_quantile, task_intervals
 from leaderboard.comparisons.alignment import Aligned, align
 from leaderboard.comparisons.baselines import identity_of
 from leaderboard.comparisons.comparison import THREAT, Comparison, parameters
@@ -23,12 +22,15 @@ from leaderboard.comparisons.naming import labels
 from leaderboard.comparisons.reading import headline
 from leaderboard.page.cards import card
 from leaderboard.ranking.boards import Board, Row
+from leaderboard.ranking.curves import Curve
 from leaderboard.ranking.families import budgets, efforts
 from leaderboard.ranking.flags import FLAGS
 
-VERSION = 2
+VERSION = 3
 """Of the schema; a reader that knows it can read every later document of the same version. Version 1 had the values of three
-fixed axes in each cell."""
+fixed axes in each cell; version 2 had interquartile means."""
+DEGREES = (1, 1.25, 1.5, 1.75, 2, 2.5, 3, 4, 5, 6, 8, 10, 14, 20, 30, 60, 120, 1e6)
+"""Degrees of freedom for which the document has quantiles of Student's t; between them 1 / df interpolates."""
 Labels = Mapping[str, Mapping[tuple[object, object], str]]
 """What a component is called: by its kind, then by its name and parameters."""
 
@@ -59,8 +61,11 @@ def document(boards: Sequence[Board], comparisons: Sequence[Comparison], folder:
         "boards": [_board(board, keys, called) for board in boards],
         "pairs": [_pair(one, keys[id(one)], called, folder) for one in everything],
         "curves": [
-            _curve(family, kind, aligned, keys) for kind, family in _families(comparisons) if (aligned := align(family))
+            _curve(found, kind, aligned, keys)
+            for kind, family in _families(comparisons)
+            if (aligned := align(family)) and (found := Curve.of(family, aligned))
         ],
+        "t": [[df, round(float(t_quantile(np.array(df))), 5)] for df in DEGREES],
     }
 
 
@@ -102,22 +107,23 @@ def _families(comparisons: Sequence[Comparison]) -> list[tuple[str, list[Compari
     ]
 
 
-def _curve(family: Sequence[Comparison], kind: str, aligned: Aligned, keys: Mapping[int, int]) -> dict[str, Any]:
-    """On the scenarios that all points have."""
-    known = (one.clean for one in family if one.clean)
-    control = next((one for one in known if set(aligned.cells) <= set(one.cells)), None)
-    clean = family[0].score_of(control.only(cells=aligned.cells)) if control else None
+def _curve(curve: Curve, kind: str, aligned: Aligned, keys: Mapping[int, int]) -> dict[str, Any]:
+    """On the scenarios that all points have, in the cells that are not at the floor or the ceiling."""
+    known = (one.clean for one in curve.points if one.clean)
+    control = next((one for one in known if set(curve.cells) <= set(one.cells)), None)
+    clean = curve.points[0].score_of(control.only(cells=curve.cells)) if control else None
     return {
         "kind": kind,
-        "cells": len(aligned.cells),
+        "cells": [dict(cell) for cell in curve.cells],
+        "left_out": curve.left_out,
         "clean": _interval(clean),
         "points": [
             {
                 "x": one.queries if kind == "queries" else one.identity["threat_budget"],
-                **(_interval(unit_interval(scores)) or {}),
+                **(_interval(score) or {}),
                 "pair": keys[id(one)],
             }
-            for one, scores in zip(family, aligned.scores, strict=True)
+            for one, score in zip(curve.points, curve.scores, strict=True)
         ],
     }
 
@@ -130,6 +136,7 @@ def _board(board: Board, keys: Mapping[int, int], called: Labels) -> dict[str, A
     return {
         "track": board.track.name,
         "world": {"name": board.world[0], "params": parameters(board.world[1])},
+        "grid": board.grid,
         "threat": {**_threat(board.threat), "allowed": allowed},
         "axes": _axes(first.axes, cells),
         "rows": [_row(row, keys, called) for row in board.rows],
@@ -137,7 +144,7 @@ def _board(board: Board, keys: Mapping[int, int], called: Labels) -> dict[str, A
             {
                 "name": name,
                 "score": _interval(first.score_of(drive)),
-                "cells": _cells(drive.cells, drive.column(board.track.metric)),
+                **_cells(drive.cells, drive.column(board.track.metric)),
             }
             for name, drive in board.baselines.items()
         ],
@@ -164,22 +171,27 @@ def _threat(values: Sequence[object]) -> dict[str, object]:
 
 def _row(row: Row, keys: Mapping[int, int], called: Labels) -> dict[str, Any]:
     worst = row.worst
-    cells = _cells(worst.cells, worst.scores)
-    for cell, attack, rival in zip(cells, worst.attacks, worst.rival, strict=True):
-        cell |= {"pair": keys[id(attack)], "baseline": _number(float(rival.mean()))}
+    scored = _cells(worst.cells, worst.scores)
+    failed = worst.failed.mean((0, 2)).tolist()
+    for cell, attack, rival, share in zip(scored["cells"], worst.attacks, worst.rival, failed, strict=True):
+        cell |= {"pair": keys[id(attack)], "baseline": _number(float(rival.mean())), "failed": _number(share)}
     first = row.attacks[0]
+    lowest, lowest_score = worst.worst_cell
     return {
         "group": row.group,
         "flagged": row.flagged,
         **_named(first, ("defense", "victim"), called),
         "score": _interval(worst.score),
-        "clean": _interval(row.clean),
+        "failed": _interval(worst.failure),
+        "worst_cell": {"cell": dict(lowest), **(_interval(lowest_score) or {})},
+        "clean": _interval(worst.clean),
         "lead": _interval(worst.lead),
         "strongest": keys[id(first)],
         "pairs": [keys[id(attack)] for attack in row.attacks],
+        "marginal": [_interval(row.marginal.get(attack)) for attack in row.attacks],
+        "left_out": [keys[id(attack)] for attack in row.left_out],
         "training_seeds": list(worst.runs),
-        "scenarios": worst.scores.shape[2],
-        "cells": cells,
+        **scored,
         "flags": [
             {"name": flag.name, "title": FLAGS[flag.name][0], "fired": flag.fired, "reason": flag.reason}
             for flag in row.flags
@@ -200,10 +212,10 @@ def _named(one: Comparison, kinds: Sequence[str], called: Labels) -> dict[str, A
 
 def _pair(one: Comparison, key: int, called: Labels, folder: Path | None) -> dict[str, Any]:
     own, identity = one.own, one.identity
-    cells = _cells(own.cells, one.scores)
+    scored = _cells(own.cells, one.scores)
     for name, column in (("failed", one.track.failure), ("queries", one.track.queries)):
         if column in own.table.column_names:
-            for cell, value in zip(cells, own.column(column).mean((0, 2)).tolist(), strict=True):
+            for cell, value in zip(scored["cells"], own.column(column).mean((0, 2)).tolist(), strict=True):
                 cell[name] = _number(value)
     return {
         "key": key,
@@ -216,24 +228,27 @@ def _pair(one: Comparison, key: int, called: Labels, folder: Path | None) -> dic
         "clean": _interval(one.clean_score),
         "queries": _number(one.queries),
         "measures": {measure.column: _interval(one.measured(measure)) for measure in headline(one.track)},
-        "cells": cells,
+        **scored,
         "card": card(one, folder),
     }
 
 
-def _cells(cells: Sequence[Cell], scores: Array) -> list[dict[str, Any]]:
-    """Each cell's estimate and interval, and the mean of each run there, so that a reader can average over some of them."""
+def _cells(cells: Sequence[Cell], scores: Array) -> dict[str, Any]:
+    """Each cell's estimate and interval, with all that a reader needs to compute them for some of the cells together."""
     means = scores.mean(2)
-    errors = scores[0].std(1) / np.sqrt(scores.shape[2])
-    return [
-        {
-            "cell": dict(cell),
-            **(_interval(found) or {}),
-            "runs": [_number(value) for value in means[:, place].tolist()],
-            "error": _number(float(errors[place])),
-        }
-        for place, (cell, found) in enumerate(zip(cells, task_intervals(scores), strict=True))
-    ]
+    covariance = scenario_covariance(scores)
+    return {
+        "cells": [
+            {
+                "cell": dict(cell),
+                **(_interval(found) or {}),
+                "runs": [_number(value) for value in means[:, place].tolist()],
+            }
+            for place, (cell, found) in enumerate(zip(cells, task_intervals(scores, share=True), strict=True))
+        ],
+        "scenarios": scores.shape[2],
+        "covariance": [[float(f"{value:.3g}") for value in row[: n + 1]] for n, row in enumerate(covariance.tolist())],
+    }
 
 
 def _interval(found: Interval | None) -> dict[str, Any] | None:

@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from typing import Any
 
 CSV = (
-    "track", "world", "threat_norm", "threat_budget", "threat_access", "threat_queries", "group", "flagged", "flags",
-    "defense", "defense_params", "victim", "victim_params", "score", "low", "high", "clean", "clean_low", "clean_high",
+    "track", "world", "grid", "threat_norm", "threat_budget", "threat_access", "threat_queries", "group", "flagged", "flags",
+    "defense", "defense_params", "victim", "victim_params", "score", "low", "high", "failed", "failed_low", "failed_high",
+    "worst_cell", "worst_cell_score", "worst_cell_low", "worst_cell_high", "clean", "clean_low", "clean_high",
     "lead", "lead_low", "lead_high", "strongest_attack", "strongest_attack_params", "training_seeds", "cells", "scenarios",
 )  # fmt: skip
 """The columns of `leaderboard.csv`, a line a ranked row."""
@@ -28,6 +29,8 @@ def table(made: Mapping[str, Any]) -> str:
             line = {
                 "track": board["track"],
                 "world": board["world"]["name"],
+                "grid": board["grid"],
+                "worst_cell": json.dumps(row["worst_cell"]["cell"]),
                 **{f"threat_{name}": board["threat"][name] for name in ("norm", "budget", "access", "queries")},
                 "group": row["group"],
                 "flagged": str(row["flagged"]).lower(),
@@ -40,9 +43,10 @@ def table(made: Mapping[str, Any]) -> str:
             }
             for kind in ("defense", "victim"):
                 line |= {kind: row[kind]["name"], f"{kind}_params": json.dumps(row[kind]["params"], sort_keys=True)}
-            for name in ("score", "clean", "lead"):
+            for name in ("score", "failed", "worst_cell", "clean", "lead"):
                 found = row[name] or dict.fromkeys(("estimate", "low", "high"))
                 prefix = "" if name == "score" else f"{name}_"
-                line |= {name: found["estimate"], f"{prefix}low": found["low"], f"{prefix}high": found["high"]}
+                value = "worst_cell_score" if name == "worst_cell" else name
+                line |= {value: found["estimate"], f"{prefix}low": found["low"], f"{prefix}high": found["high"]}
             writer.writerow(line)
     return out.getvalue()

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import get_args
+from typing import Any, get_args
 
 import pyarrow as pa
 
+from bench.plugins import registry
 from bench.plugins.contracts import Access
 from bench.plugins.track import Track
 from bench.statistics.episodes import Episodes
@@ -16,7 +17,7 @@ from bench.statistics.estimates import Interval
 from leaderboard.comparisons.comparison import THREAT, Comparison
 from leaderboard.comparisons.reading import read_tracks
 from leaderboard.ranking.flags import Flag, Subject, flags
-from leaderboard.ranking.worst import Worst, worst
+from leaderboard.ranking.worst import Panel, Worst, margin
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +27,16 @@ class Row:
     Args:
         attacks: those that count: first the one that is the strongest in most cells.
         worst: the score under the strongest of each cell.
-        clean: without an attack in the same cells; None where that was not driven.
+        marginal: by how much each attack lowers the score further than all the others do.
+        left_out: attacks that were driven on other scenarios, or on a part of them.
         flags: each with its measurement, fired or not.
         group: rank group, from 1; rows of a group cannot be told from its first. Flagged rows follow the others.
     """
 
     attacks: tuple[Comparison, ...]
     worst: Worst
-    clean: Interval | None
+    marginal: Mapping[Comparison, Interval]
+    left_out: tuple[Comparison, ...]
     flags: tuple[Flag, ...]
     group: int = 0
 
@@ -50,11 +53,12 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """The leaderboard of a threat model in a world.
+    """The leaderboard of a threat model on a grid of a world.
 
     Args:
         track: of its victims.
         world: name and parameters.
+        grid: name of the grid; `custom` for any that has none.
         threat: the values of `THREAT`.
         rows: best first; flagged ones last.
         baselines: victims that ignore their input, by title.
@@ -62,20 +66,21 @@ class Board:
 
     track: Track
     world: tuple[str, str]
-    threat: tuple[str, float, str, int]
+    grid: str
+    threat: tuple[Any, ...]
     rows: tuple[Row, ...]
     baselines: Mapping[str, Episodes] = field(default_factory=dict)
 
 
-Key = tuple[str, str, str, str, float, str, int]
-"""Track, world and its parameters, and the values of `THREAT`."""
+Key = tuple[Any, ...]
+"""Track, world and its parameters, grid, and the values of `THREAT`."""
 
 
 def boards(comparisons: Sequence[Comparison]) -> list[Board]:
-    """A leaderboard for every threat model in which something was attacked.
+    """A leaderboard for every threat model and grid on which something was attacked.
 
-    The track with the most episodes comes first; then by world, the norm with the most episodes, the largest budget, the most
-    access.
+    The track with the most episodes comes first; then by world, the newest grid (custom ones last), the norm with the most
+    episodes, the largest budget, the most access.
     """
     attacked = [one for one in comparisons if one.is_attacked]
     episodes: Counter[tuple[str, ...]] = Counter()
@@ -85,12 +90,14 @@ def boards(comparisons: Sequence[Comparison]) -> list[Board]:
     tracks = {_key(one): one.track for one in attacked}
 
     def rank(key: Key) -> tuple[object, ...]:
-        track, world, params, norm, budget, access, queries = key
+        track, world, params, grid, norm, budget, access, queries = key
+        named = [one.name for one in registry.grids(world)]
         return (
             -episodes[track,],
             track,
             world,
             params,
+            -named.index(grid) if grid in named else 1,
             -episodes[track, norm],
             norm,
             -budget,
@@ -102,7 +109,7 @@ def boards(comparisons: Sequence[Comparison]) -> list[Board]:
 
 
 def _key(one: Comparison) -> Key:
-    return (one.track.name, *(one.identity[name] for name in ("world", "world_params", *THREAT)))
+    return (one.track.name, *(one.identity[name] for name in ("world", "world_params", "grid", *THREAT)))
 
 
 def _access(name: str) -> int:
@@ -111,25 +118,29 @@ def _access(name: str) -> int:
 
 
 def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
-    _, world, world_params, *threat = key
+    _, world, world_params, grid, *threat = key
     allowed = [one for one in attacked if _within(one, key)]
     rows = []
     for defended in dict.fromkeys(one.defended for one in attacked if _key(one) == key):
         own = [one for one in allowed if one.defended == defended]
-        found = worst(own)
-        own.sort(key=lambda one: (-found.attacks.count(one), one.score.estimate))
-        others = [one for one in attacked if one.defended == defended and one.identity["threat_norm"] == threat[0]]
-        rows.append(Row(tuple(own), found, found.clean, tuple(flags(Subject(track, own, others, found)))))
-    return Board(track, (world, world_params), tuple(threat), tuple(ranked(rows)), _baselines(allowed))  # type: ignore[arg-type]
+        panel = Panel.of(own)
+        found = panel.strongest()
+        assert found is not None, "the attack that was driven most has a cell"
+        own = sorted(panel.attacks, key=lambda one: (-found.attacks.count(one), one.score.estimate))
+        same = [one for one in attacked if one.defended == defended and one.identity["grid"] == grid]
+        others = [one for one in same if one.identity["threat_norm"] == threat[0]]
+        doubts = tuple(flags(Subject(track, own, others, found)))
+        rows.append(Row(tuple(own), found, panel.marginal(), panel.left_out, doubts))
+    return Board(track, (world, world_params), grid, tuple(threat), tuple(ranked(rows)), _baselines(allowed))
 
 
 def _within(one: Comparison, key: Key) -> bool:
     """Whether the threat model allows what an attack did: it had no more knowledge, budget and queries."""
-    track, world, world_params, norm, budget, access, queries = key
+    track, world, world_params, grid, norm, budget, access, queries = key
     identity = one.identity
+    same = tuple(identity[name] for name in ("world", "world_params", "grid", "threat_norm"))
     return (
-        (one.track.name, identity["world"], identity["world_params"], identity["threat_norm"])
-        == (track, world, world_params, norm)
+        (one.track.name, *same) == (track, world, world_params, grid, norm)
         and float(str(identity["threat_budget"])) <= budget
         and _access(str(identity["threat_access"])) <= _access(access)
         and int(str(identity["threat_queries"])) <= queries
@@ -137,13 +148,19 @@ def _within(one: Comparison, key: Key) -> bool:
 
 
 def ranked(rows: Iterable[Row]) -> Iterator[Row]:
-    """Best first, flagged ones last, in groups: a group's rows have intervals that overlap that of its first."""
+    """Best first, flagged ones last, in groups: a group's rows are not significantly below its first."""
     ordered = sorted(rows, key=lambda row: (row.flagged, -row.worst.score.estimate))
     group, leader = 0, None
     for row in ordered:
-        if leader is None or row.flagged != leader.flagged or row.worst.score.high < leader.worst.score.low:
+        if leader is None or row.flagged != leader.flagged or _below(row.worst, leader.worst):
             group, leader = group + 1, row
         yield replace(row, group=group)
+
+
+def _below(row: Worst, leader: Worst) -> bool:
+    """Whether a score is significantly lower, paired on what both have; by their intervals where that is nothing."""
+    lead = margin(leader, row)
+    return lead.low > 0 if lead else row.score.high < leader.score.low
 
 
 def _baselines(attacks: Sequence[Comparison]) -> dict[str, Episodes]:

@@ -17,13 +17,16 @@ from bench.plugins import registry
 from bench.plugins.track import Track
 from bench.scenarios import Grid
 from bench.statistics.estimates import Interval
-from leaderboard.comparisons.alignment import gap
+from leaderboard.comparisons.alignment import align
 from leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison, mean
+from leaderboard.ranking.curves import Curve
 from leaderboard.ranking.families import budgets, efforts
-from leaderboard.ranking.worst import Worst, margin, worst
+from leaderboard.ranking.worst import Worst, margin
 
 NOTHING_LEFT = 0.01
 """A score this low cannot fall further: attacks that reach it are not told apart."""
+TOO_MANY_CRASHES = 0.2
+"""How much more often than the traffic's own driver a victim may crash."""
 STILL_FALLING = 0.02
 """A curve that falls by more than this with its last increase has not flattened."""
 SAME, MASKED, DRAWN, ONE_DRAW = 0.99, 0.5, 0.01, 2.0
@@ -64,8 +67,7 @@ class Subject:
 
     def strongest(self, *knowledge: str) -> Worst | None:
         """The score under the attacks that asked so much, the strongest in each cell."""
-        some = [attack for attack in self.attacks if attack.knowledge in knowledge]
-        return worst(some) if some else None
+        return self.worst.panel.strongest([one for one in self.attacks if one.knowledge in knowledge])
 
     def shares(self, name: str) -> float:
         """Mean of a probe over all its episodes, under attack and without; NaN where none was measured."""
@@ -126,6 +128,23 @@ def blind(of: Subject) -> Finding:
     )
 
 
+def unsafe(of: Subject) -> Finding:
+    """Fires where, under attack, it fails more than 20 points more often than the traffic's own driver does."""
+    name = of.track.safe_driver
+    if not name:
+        return None, f"Not measured: the {of.track.name} track has no driver of the traffic."
+    title = of.track.baseline_kinds[name].title
+    safe = of.worst.beside(name, of.track.failure)
+    known = np.isfinite(safe).all(1)
+    if not known.any():
+        return None, f"Not measured: {title} was not driven."
+    own, others = (float(rates.mean()) for rates in (of.worst.failed[:, known], safe[known]))
+    return (
+        own - others > TOO_MANY_CRASHES,
+        f"Under attack {100 * own:.0f} % of its episodes end so, {100 * others:.0f} % of those of {title}.",
+    )
+
+
 def ignores_input(of: Subject) -> Finding:
     """Fires where the victim gives the same answer on another input in at least 99 % of probes."""
     share = of.shares("same_answer")
@@ -163,36 +182,33 @@ def one_draw(of: Subject) -> Finding:
 
 def no_fall(of: Subject) -> Finding:
     """Fires where the same attack lowers the score no more with the largest perturbation budget than with the smallest."""
-    found = []
-    for family in budgets(of.others):
-        small, large = family[0], family[-1]
-        change = gap(small, large)
-        if change:
-            found.append((large.score.estimate, small, large, change))
+    found = _curves(of, budgets(of.others))
     if not found:
-        return None, "Not measured: no attack was run with two budgets."
-    _, small, large, change = min(found, key=lambda one: one[0])
+        return None, "Not measured: no attack was run with two budgets, in cells where a score can fall."
+    curve = min(found, key=lambda one: one.scores[-1].estimate)
+    small, large = curve.points[0], curve.points[-1]
     span = f"from budget {small.identity['threat_budget']:g} to {large.identity['threat_budget']:g} {large.identity['attack']}"
-    if small.score.estimate <= NOTHING_LEFT:
-        return False, f"At the smallest budget the score under {small.identity['attack']} is as low as it can be."
-    return change.low <= 0, f"The score falls by {_signed(change)} {span}."
+    change = curve.fall(0, -1)
+    return change.low <= 0, f"The score falls by {_signed(change)} {span}, in {curve.where}."
 
 
 def not_flattened(of: Subject) -> Finding:
     """Fires where the last increase of an attack's steps, restarts or queries still lowered the score by more than 0.02."""
-    found = [
-        (family[-1].score.estimate, family[-2], family[-1], change)
-        for family in efforts(of.attacks)
-        if (change := gap(family[-2], family[-1]))
-    ]
+    found = _curves(of, efforts(of.attacks))
     if not found:
-        return None, "Not measured: no attack was run with two efforts."
-    _, less, more, change = min(found, key=lambda one: one[0])
+        return None, "Not measured: no attack was run with two efforts, in cells where a score can fall."
+    curve = min(found, key=lambda one: one.scores[-1].estimate)
+    less, more = curve.points[-2:]
+    change = curve.fall(-2, -1)
     fired = change.low > 0 and change.estimate > STILL_FALLING
-    return (
-        fired,
-        f"From {less.queries:.0f} to {more.queries:.0f} queries {more.identity['attack']} lowers the score by {_signed(change)}.",
-    )
+    span = f"From {less.queries:.0f} to {more.queries:.0f} queries {more.identity['attack']}"
+    return fired, f"{span} lowers the score by {_signed(change)}, in {curve.where}."
+
+
+def _curves(of: Subject, families: Sequence[Sequence[Comparison]]) -> list[Curve]:
+    """The curves of these families in the cells that tell something, those in too few of them left out."""
+    found = (Curve.of(family, aligned) for family in families if (aligned := align(family)))
+    return [curve for curve in found if curve and curve.tells]
 
 
 def too_little(of: Subject) -> Finding:
@@ -213,6 +229,7 @@ def too_little(of: Subject) -> Finding:
 FLAGS: dict[str, tuple[str, Callable[[Subject], Finding]]] = {
     "unattacked": ("attacked by noise alone", unattacked),
     "blind": ("no better than a blind policy", blind),
+    "unsafe": ("crashes far more often than the traffic's own driver", unsafe),
     "ignores_input": ("the answer does not depend on the input", ignores_input),
     "masked_gradients": ("a black-box attack beats the white-box one", masked_gradients),
     "zero_gradients": ("gradients are zero", zero_gradients),

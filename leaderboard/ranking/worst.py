@@ -1,18 +1,112 @@
-"""The score of a defended victim where the strongest attack of each cell counts."""
+"""The score of a defended victim under the strongest attack of each cell, chosen on other scenarios than it is reported on."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.scenarios import Cell
-from bench.statistics.episodes import unit_interval
-from bench.statistics.estimates import Array, Interval, interval
-from leaderboard.comparisons.alignment import Aligned, align
+from bench.statistics.episodes import Episodes
+from bench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
 from leaderboard.comparisons.comparison import Comparison
+
+FOLDS = 5
+"""Parts of the scenarios. In each, the attack counts that is the strongest in the others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """The attacks on a defended victim that were driven on the same scenarios.
+
+    Args:
+        attacks: [A], those that have at least one whole cell.
+        runs: training or patch seeds [R].
+        cells: [C], those that at least one attack has.
+        seeds: scenario seeds [E].
+        scores: [A, R, C, E] of the metric, NaN in the cells that an attack does not have.
+        failed: [A, R, C, E], whether the episode has the failure of the track; NaN likewise.
+        left_out: attacks without a whole cell: those that were driven on other seeds, or on a part of them.
+    """
+
+    attacks: tuple[Comparison, ...]
+    runs: tuple[int, ...]
+    cells: tuple[Cell, ...]
+    seeds: tuple[int, ...]
+    scores: Array
+    failed: Array
+    left_out: tuple[Comparison, ...]
+
+    @classmethod
+    def of(cls, attacks: Sequence[Comparison]) -> Panel:
+        """The attacks on the training and scenario seeds of the one that was driven most.
+
+        An attack counts in the cells in which it has all of them, so that a partial run changes nothing.
+        """
+        most = max(attacks, key=lambda one: (not one.stands_for_all, one.own.table.num_rows))
+        runs, seeds = most.own.runs, most.own.seeds
+        whole = [
+            one
+            for one in attacks
+            if set(seeds) <= set(one.own.seeds) and (one.stands_for_all or set(runs) <= set(one.own.runs))
+        ]
+        cells = sorted({cell for one in whole for cell in one.cells}, key=most.axes.place)
+        shape = (len(whole), len(runs), len(cells), len(seeds))
+        scores, failed = np.full(shape, np.nan), np.full(shape, np.nan)
+        for number, one in enumerate(whole):
+            of_runs = [0] * len(runs) if one.stands_for_all else [one.own.runs.index(run) for run in runs]
+            there = [cells.index(cell) for cell in one.cells]
+            from_ = np.ix_(of_runs, range(len(one.cells)), [one.own.seeds.index(seed) for seed in seeds])
+            scores[number][:, there] = one.scores[from_]
+            if one.track.failure:
+                failed[number][:, there] = one.own.column(one.track.failure)[from_]
+        left_out = tuple(one for one in attacks if one not in whole)
+        return cls(tuple(whole), runs, tuple(cells), seeds, scores, failed, left_out)
+
+    def strongest(self, attacks: Collection[Comparison] | None = None) -> Worst | None:
+        """The score where in each cell the strongest of `attacks` counts; None where none of them has a cell.
+
+        Args:
+            attacks: some of those of the panel; None for all.
+        """
+        some = [n for n, one in enumerate(self.attacks) if attacks is None or one in attacks]
+        known = ~np.isnan(self.scores[some, 0, :, 0])
+        cells = np.flatnonzero(known.any(0))
+        if not len(cells):
+            return None
+        choice = np.array(some)[_chosen(self.scores[some][:, :, cells])]
+        pick = (
+            choice[None],
+            np.arange(len(self.runs))[:, None, None],
+            cells[None, :, None],
+            np.arange(len(self.seeds)),
+        )
+        return Worst(self, tuple(cells.tolist()), choice, self.scores[pick], self.failed[pick])
+
+    def marginal(self) -> dict[Comparison, Interval]:
+        """By how much each attack lowers the score further than all the others do together."""
+        found: dict[Comparison, Interval] = {}
+        full = self.strongest()
+        for attack in self.attacks if full else ():
+            rest = self.strongest([one for one in self.attacks if one is not attack])
+            change = margin(rest, full) if rest and full else None
+            if change:
+                found[attack] = change
+        return found
+
+
+def _chosen(scores: Array) -> NDArray[np.int64]:
+    """[C, E] the attack with the lowest mean over runs and the other folds' scenarios, from scores [A, R, C, E]."""
+    totals = scores.sum(1)
+    count = scores.shape[-1]
+    fold = np.arange(count) % min(FOLDS, count)
+    others = (fold[:, None] != fold).astype(float) if count > 1 else np.ones((1, 1))
+    means = np.where(np.isnan(totals), np.inf, np.nan_to_num(totals) @ others / others.sum(0))
+    return np.asarray(means.argmin(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,110 +114,124 @@ class Worst:
     """The robust score of a defended victim.
 
     Args:
-        scores: [R, C, E] of the metric, under the strongest attack of each cell.
-        runs: training or patch seeds.
-        cells: [C].
-        attacks: the strongest attack of each cell.
-        rival: [C, E] of the baseline that the victim is compared with, on the same scenarios; NaN where it was not driven.
+        panel: the attacks that it was chosen from.
+        places: [C'] the cells, as indices of the panel's.
+        choice: [C', E] the attack of each cell and scenario, as an index of the panel's.
+        scores: [R, C', E] of the metric, under that attack.
+        failed: [R, C', E] whether the episode failed under it.
     """
 
+    panel: Panel
+    places: tuple[int, ...]
+    choice: NDArray[np.int64]
     scores: Array
-    runs: tuple[int, ...]
-    cells: tuple[Cell, ...]
-    attacks: tuple[Comparison, ...]
-    rival: Array
+    failed: Array
+
+    @property
+    def runs(self) -> tuple[int, ...]:
+        """Training or patch seeds [R]."""
+        return self.panel.runs
 
     @cached_property
-    def score(self) -> Interval:
-        """Over all runs and cells."""
-        return unit_interval(self.scores)
+    def cells(self) -> tuple[Cell, ...]:
+        """[C']."""
+        return tuple(self.panel.cells[place] for place in self.places)
+
+    @cached_property
+    def attacks(self) -> tuple[Comparison, ...]:
+        """The attack of most scenarios of each cell [C']."""
+        return tuple(self.panel.attacks[np.bincount(row).argmax()] for row in self.choice)
 
     @cached_property
     def name(self) -> str:
         """The attack that is the strongest in most cells."""
-        return str(max(self.attacks, key=self.attacks.count).identity["attack"])
+        return str(self.most.identity["attack"])
+
+    @cached_property
+    def most(self) -> Comparison:
+        """The attack that is the strongest in most cells."""
+        return Counter(self.attacks).most_common(1)[0][0]
+
+    @cached_property
+    def score(self) -> Interval:
+        """The headline: over all runs, cells and scenarios."""
+        return share_interval(self.scores)
+
+    @cached_property
+    def failure(self) -> Interval | None:
+        """The share of episodes that fail; None where the track has no failure."""
+        return share_interval(self.failed) if self.most.track.failure else None
+
+    @cached_property
+    def worst_cell(self) -> tuple[Cell, Interval]:
+        """The cell with the lowest score."""
+        place = int(self.scores.mean((0, 2)).argmin())
+        return self.cells[place], task_intervals(self.scores[:, [place]], share=True)[0]
 
     @cached_property
     def clean(self) -> Interval | None:
-        """The same cells without an attack, as far as they were driven."""
-        parts = []
-        for attack, cell in zip(self.attacks, self.cells, strict=True):
-            control = attack.clean
-            if control and cell in control.cells:
-                # A control that stands for all runs is one run, whatever their seeds are.
-                runs = control.runs if control.runs == attack.own.runs else (0,)
-                parts.append((runs, control.column(attack.track.metric)[:, control.cells.index(cell)]))
-        scores = _joined(parts)
-        return None if scores is None else unit_interval(scores)
+        """The same cells and scenarios without an attack; None where a part of them was not driven."""
+        found = self._control(lambda one: one.clean, self._metric)
+        return None if found is None or np.isnan(found).any() else share_interval(found)
+
+    @cached_property
+    def rival(self) -> Array:
+        """[C', E] of the baseline that the victim is compared with, NaN where it was not driven."""
+        contrast = self.most.track.contrast
+        if contrast is None or contrast.side != "victim":
+            return np.full(self.choice.shape, np.nan)
+        return self.beside(self.most.rival, self._metric)
 
     @cached_property
     def lead(self) -> Interval | None:
-        """Minus the baseline of the cell, paired scenario by scenario, in the cells where that was driven."""
+        """Minus that baseline, paired scenario by scenario, in the cells where that was driven."""
         known = np.isfinite(self.rival).all(1)
         return interval((self.scores - self.rival)[:, known]) if known.any() else None
 
+    def beside(self, baseline: str, column: str) -> Array:
+        """[C', E] a measurement of a baseline on the same scenarios, NaN where it was not driven."""
+        found = self._control(lambda one: one.baselines.get(baseline), column)
+        return np.full(self.choice.shape, np.nan) if found is None else found[0]
 
-def worst(attacks: Sequence[Comparison]) -> Worst:
-    """Of each cell the attack with the lowest score, on the runs that all attacks share.
+    @property
+    def _metric(self) -> str:
+        return self.panel.attacks[0].track.metric
 
-    An attack that shares no run with those that were driven more is left out.
-    """
-    kept: list[Comparison] = []
-    shared: set[int] = set()
-    for attack in sorted(attacks, key=lambda one: (one.stands_for_all, -one.own.table.num_rows)):
-        own = shared if kept and attack.stands_for_all else set(attack.own.runs)
-        if not kept or shared & own:
-            shared = shared & own if kept else own
-            kept.append(attack)
-    runs = tuple(sorted(shared))
-    cells = sorted({cell for attack in kept for cell in attack.cells}, key=kept[0].axes.place)
-    chosen = [_strongest(kept, cell, runs) for cell in cells]
-    fewest = min(scores.shape[1] for _, scores, _ in chosen)
-    return Worst(
-        scores=np.stack([scores[:, :fewest] for _, scores, _ in chosen], 1),
-        runs=runs,
-        cells=tuple(cells),
-        attacks=tuple(attack for attack, _, _ in chosen),
-        rival=np.stack([rival[:fewest] for _, _, rival in chosen]),
-    )
-
-
-def _strongest(attacks: Iterable[Comparison], cell: Cell, runs: Sequence[int]) -> tuple[Comparison, Array, Array]:
-    """The attack with the lowest score in a cell, its scores [R, E], and those of the victim's baseline there [E]."""
-    found = []
-    for attack in attacks:
-        if cell in attack.cells:
-            place = attack.cells.index(cell)
-            rows = [0] * len(runs) if attack.stands_for_all else [attack.own.runs.index(run) for run in runs]
-            found.append((attack, attack.scores[rows, place]))
-    attack, scores = min(found, key=lambda pair: float(pair[1].mean()))
-    contrast = attack.track.contrast
-    rival = attack.baselines.get(attack.rival) if contrast and contrast.side == "victim" else None
-    if rival is None or cell not in rival.cells or rival.seeds != attack.own.seeds:
-        return attack, scores, np.full(scores.shape[1], np.nan)
-    return attack, scores, rival.column(attack.track.metric)[0, rival.cells.index(cell)]
+    def _control(self, of: Callable[[Comparison], Episodes | None], column: str) -> Array | None:
+        """[R or 1, C', E] of a control of the attacks, from the first that has a cell; NaN in cells that none has."""
+        runs, seeds = self.panel.runs, self.panel.seeds
+        found = None
+        for control in filter(None, map(of, self.panel.attacks)):
+            if not set(seeds) <= set(control.seeds):
+                continue
+            alone = len(control.runs) == 1 and control.runs != runs
+            if not (alone or set(runs) <= set(control.runs)):
+                continue
+            rows = [0] if alone else [control.runs.index(run) for run in runs]
+            if found is None:
+                found = np.full((len(rows), *self.choice.shape), np.nan)
+            missing = [n for n, cell in enumerate(self.cells) if np.isnan(found[:, n]).any() and cell in control.cells]
+            if len(rows) == len(found) and missing:
+                places = [control.cells.index(self.cells[n]) for n in missing]
+                from_ = np.ix_(rows, places, [control.seeds.index(seed) for seed in seeds])
+                found[:, missing] = control.column(column)[from_]
+        return found
 
 
 def margin(first: Worst, second: Worst) -> Interval | None:
-    """`first` minus `second`, paired, in the cells, runs and scenarios that both have; None where they have none."""
-    parts, known = [], dict[tuple[int, int], Aligned | None]()
-    for cell in first.cells:
-        if cell in second.cells:
-            one, other = (worst.attacks[worst.cells.index(cell)] for worst in (first, second))
-            key = id(one), id(other)
-            if key not in known:
-                known[key] = align([one, other])
-            if aligned := known[key]:
-                place = aligned.cells.index(cell)
-                parts.append((aligned.runs, (aligned.scores[0] - aligned.scores[1])[:, place]))
-    differences = _joined(parts)
-    return None if differences is None else interval(differences)
+    """`first` minus `second`, paired, in the cells, runs and scenarios that both have; None where they have none.
 
-
-def _joined(parts: Sequence[tuple[tuple[int, ...], Array]]) -> Array | None:
-    """[R, C, E] of what single cells have, each as its runs and [R, E]: the runs that all have; None where there are none."""
-    runs = sorted(set.intersection(*(set(own) for own, _ in parts))) if parts else []
-    if not runs:
+    A side with one run, such as a driver that does not learn, is compared with every run of the other.
+    """
+    cells = [cell for cell in first.cells if cell in second.cells]
+    seeds = [seed for seed in first.panel.seeds if seed in second.panel.seeds]
+    several = [set(one.runs) for one in (first, second) if len(one.runs) > 1]
+    runs = sorted(set.intersection(*several)) if several else [0]
+    if not (cells and seeds and runs):
         return None
-    fewest = min(values.shape[1] for _, values in parts)
-    return np.stack([values[[own.index(run) for run in runs], :fewest] for own, values in parts], 1)
+    parts = []
+    for one in (first, second):
+        rows = [one.runs.index(run) for run in runs] if len(one.runs) > 1 else [0]
+        from_ = np.ix_(rows, [one.cells.index(cell) for cell in cells], [one.panel.seeds.index(seed) for seed in seeds])
+        parts.append(one.scores[from_])
+    return interval(parts[0] - parts[1])

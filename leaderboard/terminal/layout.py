@@ -107,6 +107,11 @@ def cell_heading(axes: Axes) -> str:
     return f"{names[0]}\n× {' × '.join(names[1:])}" if len(names) > 1 else f"\n{names[0]}"
 
 
+def cell_name(cell: Cell) -> str:
+    """A cell in one line: its values in the order of its axes."""
+    return " × ".join(written(value) for value in cell.values())
+
+
 def cell_rows(cells: Iterable[Cell], axes: Axes) -> list[list[tuple[Text, list[Cell]]]]:
     """The rows of a table of cells, grouped by the perceptual axes.
 

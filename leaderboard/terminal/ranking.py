@@ -9,12 +9,13 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from bench.statistics.episodes import unit_interval
+from bench.plugins.track import Track
+from bench.statistics.estimates import share_interval
 from leaderboard.comparisons.naming import component, varying
 from leaderboard.ranking.boards import Board, Row, read_boards
 from leaderboard.ranking.flags import FLAGS
-from leaderboard.terminal.layout import STRIP, Column, Section, axis, fitted
-from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, estimate, strip, verdict
+from leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
+from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, estimate, number, share, strip, verdict
 
 
 def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> None:
@@ -32,12 +33,13 @@ def print_boards(boards: Sequence[Board], console: Console) -> None:
     for board in boards:
         norm, budget, access, queries = board.threat
         title = Text.assemble(
-            (board.track.name, "bold"), f" in {board.world[0]}, {norm} {budget:g}, access {access}, {queries} queries"
+            (board.track.name, "bold"),
+            f" in {board.world[0]}, {board.grid}, {norm} {budget:g}, access {access}, {queries} queries",
         )
         console.print(Padding(title, (1, 1)))
         console.print(Padding(fitted(_columns(board), [Section(board.rows)], console), (0, 1)))
         for name, drive in board.baselines.items():
-            score = estimate(unit_interval(drive.column(board.track.metric)), style=BASELINE)
+            score = estimate(share_interval(drive.column(board.track.metric)), style=BASELINE)
             console.print(Padding(Text.assemble(f"{name}: ", score), (0, 3)))
         for row in board.rows:
             if row.flagged:
@@ -64,7 +66,10 @@ def _columns(board: Board) -> list[Column[Row]]:
         Column("defence", lambda row: component(row.attacks[0], "defense", shown["defense"]), "left", folds=True),
         Column("victim", lambda row: component(row.attacks[0], "victim", shown["victim"]), "left", folds=True),
         Column(f"{measure}\nworst [95 %]", lambda row: estimate(row.worst.score, style=ATTACKED), "left"),
-        Column("\nclean", lambda row: estimate(row.clean, style=CLEAN), "left", spare=3),
+        *_failures(board.track),
+        Column("worst\ncell", lambda row: number(row.worst.worst_cell[1].estimate, 2)),
+        Column("\n ", lambda row: Text(cell_name(row.worst.worst_cell[0]), style="dim"), "left", spare=2),
+        Column("\nclean", lambda row: estimate(row.worst.clean, style=CLEAN), "left", spare=3),
     ]
     if contrast and contrast.side == "victim":
         columns.append(Column(contrast.short, lambda row: verdict(row.worst.lead)))
@@ -72,8 +77,21 @@ def _columns(board: Board) -> list[Column[Row]]:
         *columns,
         Column("strongest\nattack", lambda row: str(row.identity["attack"]), "left"),
         Column("flags", _fired),
-        Column(axis(measure), lambda row: strip({ATTACKED: row.worst.score, CLEAN: row.clean}, STRIP), "left", spare=9),
+        Column(
+            axis(measure),
+            lambda row: strip({ATTACKED: row.worst.score, CLEAN: row.worst.clean}, STRIP),
+            "left",
+            spare=9,
+        ),
     ]
+
+
+def _failures(track: Track) -> list[Column[Row]]:
+    """How often the victim fails under the strongest attack."""
+    measure = next((one for one in track.measures if one.column == track.failure), None)
+    if measure is None:
+        return []
+    return [Column(measure.heading, lambda row: share(row.worst.failure.estimate if row.worst.failure else None))]
 
 
 def _fired(row: Row) -> Text:

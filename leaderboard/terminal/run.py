@@ -105,8 +105,8 @@ def legend(track: Track) -> Text:
         ):
             text.append(f"{mark} ", style=f"not dim {style}").append(f"{meaning}   ")
     scores = (
-        f"Scores: interquartile mean over {track.run}s and cells, with a 95 % bootstrap interval. Attacked, clean and baselines "
-        f"have the same {track.episode[1]}."
+        f"Scores: mean over {track.run}s, cells and {track.episode[1]}, with the 95 % interval for other {track.run}s and other "
+        f"{track.episode[1]}. Attacked, clean and baselines have the same {track.episode[1]}."
     )
     said = (track.legend, "kept: retention, attacked / clean score.", scores)
     return text.append("\n" + " ".join(filter(None, said)))

@@ -46,7 +46,7 @@ def heading() -> Text:
         "A detector's confidence in a stop sign, 0 in a frame that misses it: thesis ",
         ("as printed", THESIS),
         " (YOLOv5, size not stated; 10 frames), ours on approaches of 10 frames at places that no patch was crafted at, ",
-        "interquartile mean over patch seeds and roads (3 to 5 lanes, density 1 and 2) with its 95 % interval.\n",
+        "mean over patch seeds and roads (3 to 5 lanes, density 1 and 2) with its 95 % interval.\n",
         f"Ours: attack eot, a patch {CONFIGURATIONS[STANDARD].budget:g} as wide as the sign where nothing else is said; ",
         "sun is clear weather. lost: share of the confidence without a patch. beyond control: confidence minus that under ",
         "random noise or grey of the same size, whichever is lower, paired (thesis: random noise); below 0 the patch knows ",

@@ -33,7 +33,7 @@ def heading(max_reward: float) -> Text:
     return Text.assemble(
         f"Return of at most {max_reward} (highway-env's normalised reward over 450 steps): thesis ",
         ("as printed", THESIS),
-        ", ours as interquartile mean over training seeds with its 95 % interval, ",
+        ", ours as mean over training seeds with its 95 % interval, ",
         ("clean", CLEAN),
         " and ",
         ("attacked", ATTACKED),

@@ -13,8 +13,8 @@ import pyarrow.compute as pc
 
 from bench.plugins.track import track
 from bench.scenarios import Cell
-from bench.statistics.episodes import Episodes, unit_interval
-from bench.statistics.estimates import Interval, interval
+from bench.statistics.episodes import Episodes
+from bench.statistics.estimates import Interval, interval, share_interval
 from bench.tracks.driving import BEST_BLIND, DrivingTrack
 from leaderboard.comparisons.baselines import Baselines
 from leaderboard.comparisons.comparison import ATTACKER, DEFENDED, IDENTITY, parameters
@@ -88,7 +88,7 @@ class Found:
     @cached_property
     def safe_progress(self) -> Interval:
         """In [0, 1]."""
-        return unit_interval(self.episodes.column("safe_progress"))
+        return share_interval(self.episodes.column("safe_progress"))
 
 
 class Source:

@@ -24,61 +24,45 @@ function estimate(found) {
 }
 
 /* ---- statistics: those of bench/statistics/estimates.py, for the cells that are left ---- */
-function iqm(values) {
-  const ordered = Float64Array.from(values).sort();
-  const cut = Math.floor(ordered.length / 4);
-  let sum = 0;
-  for (let i = cut; i < ordered.length - cut; i++) sum += ordered[i];
-  return sum / (ordered.length - 2 * cut);
+const average = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
+function tQuantile(freedom) {
+  const after = data.t.findIndex(([df]) => df >= freedom);
+  if (after <= 0) return data.t[after < 0 ? data.t.length - 1 : 0][1];
+  const [[low, from], [high, to]] = [data.t[after - 1], data.t[after]];
+  return to + ((from - to) * (1 / freedom - 1 / high)) / (1 / low - 1 / high);
 }
-function generator(seed) {
-  return () => {
-    seed = (seed + 0x6d2b79f5) | 0;
-    let t = Math.imul(seed ^ (seed >>> 15), 1 | seed);
-    t = (t + Math.imul(t ^ (t >>> 7), 61 | t)) ^ t;
-    return ((t ^ (t >>> 14)) >>> 0) / 4294967296;
-  };
-}
-function wilson(rate, trials) {
-  const z2 = 3.8414588206941236;
-  const centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials);
-  const half = (Math.sqrt(z2 * ((rate * (1 - rate)) / trials + z2 / (4 * trials * trials)))) / (1 + z2 / trials);
-  return { estimate: rate, low: Math.max(0, Math.min(centre - half, rate)), high: Math.min(1, Math.max(centre + half, rate)) };
-}
-function interval(cells, scenarios) {
-  const values = cells.flatMap((cell) => cell.runs);
-  const found = iqm(values);
-  if (values.every((value) => value === values[0]) && (values[0] === 0 || values[0] === 1)) return wilson(values[0], values.length * scenarios);
-  const random = generator(1);
-  const normal = () => Math.sqrt(-2 * Math.log(1 - random())) * Math.cos(2 * Math.PI * random());
-  const draws = [];
-  for (let replicate = 0; replicate < 500; replicate++) {
-    draws.push(iqm(cells.flatMap(({ runs, error }) =>
-      runs.length > 1 ? runs.map(() => runs[Math.floor(random() * runs.length)]) : [runs[0] + (error ?? 0) * normal()])));
-  }
-  draws.sort((a, b) => a - b);
-  return { estimate: found, low: Math.min(draws[12], found), high: Math.max(draws[487], found) };
+function interval(one, places) {
+  const runs = one.cells[0].runs.length, scenarios = one.scenarios;
+  const means = Array.from({ length: runs }, (_, run) => average(places.map((place) => one.cells[place].runs[run])));
+  const share = Math.min(1, Math.max(0, average(means)));
+  const parts = [];
+  if (runs > 1) parts.push([means.reduce((sum, value) => sum + (value - share) ** 2, 0) / (runs * (runs - 1)), runs - 1]);
+  const block = average(places.flatMap((x) => places.map((y) => one.covariance[Math.max(x, y)][Math.min(x, y)])));
+  if (scenarios > 1) parts.push([Math.max(0, block), scenarios - 1]);
+  if (!parts.length) return { estimate: share, low: null, high: null };
+  const variance = parts.reduce((sum, [part]) => sum + part, 0);
+  const freedom = parts.reduce((sum, [part, df]) => sum + part ** 2 / df, 0);
+  const joint = variance > 0 ? tQuantile(variance ** 2 / freedom) ** 2 * variance : 0;
+  const apart = parts.reduce((sum, [part, df]) => sum + tQuantile(df) ** 2 * part, 0);
+  const spread = share * (1 - share), least = data.t[data.t.length - 1][1] ** 2 / (runs * scenarios * places.length);
+  const ratio = Math.max(spread > 0 ? (joint + apart) / 2 / spread : 0, least);
+  const centre = (share + ratio / 2) / (1 + ratio), half = Math.sqrt(ratio * spread + ratio ** 2 / 4) / (1 + ratio);
+  return { estimate: share, low: Math.max(0, Math.min(centre - half, share)), high: Math.min(1, Math.max(centre + half, share)) };
 }
 function kept(cells) {
   return cells.filter(({ cell }) => Object.entries(state.axes).every(([axis, values]) => values.has(cell[axis])));
 }
-function over(cells, whole, scenarios) {
-  const left = kept(cells);
+function over(one, whole) {
+  const left = kept(one.cells);
   if (!left.length) return null;
-  return left.length === cells.length ? whole : interval(left, scenarios);
+  return left.length === one.cells.length ? whole : interval(one, left.map((cell) => one.cells.indexOf(cell)));
 }
-function mean(pair, name, whole) {
-  const left = kept(pair.cells);
-  return left.length === pair.cells.length ? whole : left.reduce((sum, cell) => sum + cell[name], 0) / left.length;
+function mean(one, name, whole) {
+  const left = kept(one.cells);
+  return left.length === one.cells.length ? whole : average(left.map((cell) => cell[name]));
 }
 function ranked(rows) {
-  const ordered = [...rows].sort((a, b) => a.row.flagged - b.row.flagged || b.score.estimate - a.score.estimate);
-  let group = 0, leader = null;
-  for (const one of ordered) {
-    if (!leader || one.row.flagged !== leader.row.flagged || one.score.high < leader.score.low) { group++; leader = one; }
-    one.group = group;
-  }
-  return ordered;
+  return [...rows].sort((a, b) => a.row.flagged - b.row.flagged || b.score.estimate - a.score.estimate);
 }
 
 /* ---- tables: columns say what a row shows, sorts by and copies ---- */
@@ -109,7 +93,8 @@ function draw(id, columns, rows, classes) {
     });
   }
   const focused = document.activeElement?.dataset?.column;
-  const head = el("tr", {}, ...columns.map((column) => {
+  const shown = columns.filter((column) => !column.copied);
+  const head = el("tr", {}, ...shown.map((column) => {
     const own = sort?.name === column.name ? (sort.down ? "descending" : "ascending") : "none";
     const cell = el("th", { scope: "col", class: column.number ? "number" : null });
     if (column.value) {
@@ -124,7 +109,7 @@ function draw(id, columns, rows, classes) {
   }));
   const body = ordered.map((row, place) => {
     const grouped = classes?.(row, ordered[place - 1], !sort) ?? "";
-    return el("tr", { class: grouped || null }, ...columns.map((column) =>
+    return el("tr", { class: grouped || null }, ...shown.map((column) =>
       el("td", { class: [column.number && "number", column.class].filter(Boolean).join(" ") || null }, ...[column.show(row)].flat())));
   });
   table.replaceChildren(el("thead", {}, head), el("tbody", {}, ...body));
@@ -190,7 +175,7 @@ function setTrack(track) {
 function setBoard(place) {
   state.board = place; state.shown = null;
   const board = current();
-  options(at("threat"), boards().map((one, i) => [i, `${one.world.name}: ${threatName(one.threat)}`]), place);
+  options(at("threat"), boards().map((one, i) => [i, `${one.world.name}, ${one.grid}: ${threatName(one.threat)}`]), place);
   state.axes = Object.fromEntries(board.axes.map((axis) => [axis.name, new Set(axis.values)]));
   const ordered = [...board.axes].sort((a, b) => b.perceptual - a.perceptual);
   at("axes").replaceChildren(...ordered.map((axis) => el("fieldset", {}, el("legend", { title: axis.meaning }, capital(axis.name) + (axis.unit ? ` (${axis.unit})` : "")),
@@ -218,28 +203,31 @@ function chosen(one) {
 function render() {
   const board = current();
   if (!board) return;
-  const rows = ranked(board.rows.filter(chosen).map((row) => ({ row, score: over(row.cells, row.score, row.scenarios) })).filter((one) => one.score));
-  const baselines = board.baselines.map((baseline) => ({ baseline, score: over(baseline.cells, baseline.score, 100) })).filter((one) => one.score);
+  const rows = ranked(board.rows.filter(chosen).map((row) => ({ row, score: over(row, row.score) })).filter((one) => one.score));
+  const baselines = board.baselines.map((baseline) => ({ baseline, score: over(baseline, baseline.score) })).filter((one) => one.score);
   const metric = said().title;
   const total = new Set(board.rows.flatMap((row) => row.cells.map(({ cell }) => place(cell)))).size;
   const left = new Set(board.rows.flatMap((row) => kept(row.cells).map(({ cell }) => place(cell)))).size;
-  at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, interquartile mean with its 95 % interval.` +
+  at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, mean with its 95 % interval.` + (left === total ? "" : " Ranks and flags are those of all cells.") +
     (rows.length ? "" : " Nothing was driven in the cells that are left.");
 
   const whole = left === total;
   const columns = [
-    { name: "Rank", show: (one) => (one.row ? String(one.group) : ""), value: (one) => one.group ?? null },
+    { name: "Rank", show: (one) => (one.row ? String(one.row.group) : ""), value: (one) => one.row?.group ?? null },
     { name: "Defence", class: "name", show: (one) => (one.row ? el("a", { href: "#grid", onclick: () => { state.shown = `r${board.rows.indexOf(one.row)}`; render(); } }, one.row.defense.label) : one.baseline.name), value: (one) => one.row?.defense.label ?? one.baseline.name },
     { name: "Victim", show: (one) => one.row?.victim.label ?? "", value: (one) => one.row?.victim.label ?? "" },
     { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, number: true },
+    { name: "95 %", copied: true, value: (one) => bounds(one.score) },
     { name: "0 – 1", show: (one) => strip(one.score, baselineOf(one)) },
+    ...(said().failure ? [{ name: capital(said().failure_title), show: (one) => (one.row ? percent(failedOf(one)) : ""), value: (one) => (one.row ? failedOf(one) : null), number: true }] : []),
+    { name: "Worst cell", show: (one) => worstCell(one), value: (one) => lowest(one)?.estimate ?? null, number: true },
     { name: "Clean", show: (one) => (whole ? fixed(one.row?.clean?.estimate) : fixed(cleanOf(one)?.estimate)), value: (one) => (whole ? one.row?.clean?.estimate : cleanOf(one)?.estimate) ?? null, number: true },
     ...(said().baseline ? [{ name: `Against ${said().baseline.replace(/^the /, "")}`, show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, number: true }] : []),
     { name: "Strongest attack", class: "name", show: (one) => (one.row ? cardLink(pairs.get(one.row.strongest), pairs.get(one.row.strongest).attack.label) : ""), value: (one) => (one.row ? pairs.get(one.row.strongest).attack.label : "") },
     { name: "Flags", class: "doubts", show: (one) => (one.row ? doubts(one.row) : ""), value: (one) => (one.row ? one.row.flags.filter((flag) => flag.fired).map((flag) => flag.name).join(" ") : "") },
   ];
   draw("ranks", columns, [...rows, ...baselines], (one, before, unsorted) =>
-    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", unsorted && before && one.group !== before.group ? "group" : ""].filter(Boolean).join(" "));
+    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", unsorted && before && one.row?.group !== before.row?.group ? "group" : ""].filter(Boolean).join(" "));
 
   drawPairs(board, metric);
   drawMatrix(board);
@@ -254,24 +242,33 @@ function cleanOf(one) {
   const strongest = pairs.get(one.row.strongest);
   const control = data.pairs.find((pair) => pair.attack.name === "none" && pair.track === strongest.track &&
     sameDefended(pair, strongest));
-  return control ? over(control.cells, control.score, 100) : null;
+  return control ? over(control, control.score) : null;
 }
 function besideBaseline(row) {
   return kept(row.cells).filter((cell) => cell.baseline != null);
 }
 function baselineOf(one) {
   const cells = one.row ? besideBaseline(one.row) : [];
-  return cells.length ? iqm(cells.map((cell) => cell.baseline)) : null;
+  return cells.length ? average(cells.map((cell) => cell.baseline)) : null;
 }
 function leadOf(one, whole) {
   if (!one.row) return null;
   if (whole) return one.row.lead;
-  const cells = besideBaseline(one.row).map((cell) => ({ ...cell, runs: cell.runs.map((run) => run - cell.baseline) }));
-  return cells.length ? interval(cells, one.row.scenarios) : null;
+  const differences = besideBaseline(one.row).map((cell) => average(cell.runs) - cell.baseline);
+  return differences.length ? { estimate: average(differences), low: null, high: null } : null;
 }
 function lead(one, whole) {
   const found = leadOf(one, whole);
   return found ? [el("b", {}, signed(found)), " ", el("small", {}, found.low == null ? "" : `${fixed(found.low)} … ${fixed(found.high)}`)] : "—";
+}
+const failedOf = ({ row }) => mean(row, "failed", row.failed?.estimate ?? null);
+function lowest(one) {
+  const cells = one.row ? kept(one.row.cells) : [];
+  return cells.length ? cells.reduce((least, cell) => (cell.estimate < least.estimate ? cell : least)) : null;
+}
+function worstCell(one) {
+  const cell = lowest(one);
+  return cell ? [el("b", {}, fixed(cell.estimate)), " ", el("small", {}, joined(Object.values(cell.cell)))] : "";
 }
 function doubts(row) {
   const fired = row.flags.filter((flag) => flag.fired);
@@ -282,7 +279,7 @@ function doubts(row) {
 }
 function drawPairs(board, metric) {
   const rows = within(board).filter(chosen).filter((pair) => !state.attack || pair.attack.name === state.attack)
-    .map((pair) => ({ pair, score: over(pair.cells, pair.score, 100) })).filter((one) => one.score);
+    .map((pair) => ({ pair, score: over(pair, pair.score) })).filter((one) => one.score);
   const rowOf = (pair) => board.rows.find((row) => sameDefended(row, pair));
   const failed = ({ pair }) => mean(pair, "failed", pair.measures[said().failure]?.estimate ?? null);
   const queries = ({ pair }) => mean(pair, "queries", pair.queries);
@@ -292,6 +289,7 @@ function drawPairs(board, metric) {
     { name: "Victim", show: ({ pair }) => pair.victim.label, value: ({ pair }) => pair.victim.label },
     { name: "Threat model", show: ({ pair }) => threatShort(pair.threat), value: ({ pair }) => threatShort(pair.threat) },
     { name: capital(metric), show: (one) => [estimate(one.score), el("small", {}, " ", part(one.pair, rowOf(one.pair)))].flat(), value: (one) => one.score.estimate, number: true },
+    { name: "95 %", copied: true, value: (one) => bounds(one.score) },
     { name: "0 – 1", show: (one) => strip(one.score) },
     ...(said().failure ? [{ name: capital(said().failure_title), show: (one) => percent(failed(one)), value: failed, number: true }] : []),
     { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
@@ -350,7 +348,7 @@ function drawMatrix(board) {
   const attacks = [...new Set([...controls, ...all.filter((pair) => pair.attack.name !== "none")].map(label))]
     .sort((a, b) => (b === "no attack") - (a === "no attack") || driven(b) - driven(a));
   const find = (row, attack) => all.find((pair) => label(pair) === attack && sameDefended(pair, row));
-  const scored = rows.map((row) => attacks.map((attack) => { const pair = find(row, attack); return pair && { pair, score: over(pair.cells, pair.score, 100) }; }));
+  const scored = rows.map((row) => attacks.map((attack) => { const pair = find(row, attack); return pair && { pair, score: over(pair, pair.score) }; }));
   at("matrix").replaceChildren(
     el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Defence · victim"), ...attacks.map((attack) => el("th", { scope: "col" }, attack)))),
     el("tbody", {}, ...rows.map((row, i) => el("tr", {}, el("th", { scope: "row" }, `${row.defense.label} · ${row.victim.label}`),
@@ -379,7 +377,7 @@ function figure(curve, board) {
   for (const p of points) svg.append(make("circle", { cx: X(p.x), cy: Y(p.estimate), r: 3 }), make("text", { x: X(p.x), y: H - B + 15, "text-anchor": "middle" }, p.x >= 100 ? Math.round(p.x) : +p.x.toFixed(3)));
   const unit = curve.kind === "budget" ? `budget (${board.threat.norm})` : said().queries_title;
   svg.append(make("text", { x: (L + W - R) / 2, y: H - 4, "text-anchor": "middle" }, unit + (log ? ", log scale" : "")));
-  return el("figure", {}, svg, el("figcaption", {}, `${curve.first.attack.label} on ${curve.first.defense.label} · ${curve.first.victim.label}, ${curve.cells} cell${curve.cells > 1 ? "s" : ""}`));
+  return el("figure", {}, svg, el("figcaption", { title: curve.cells.map((cell) => joined(Object.values(cell))).join("; ") }, `${curve.first.attack.label} on ${curve.first.defense.label} · ${curve.first.victim.label}, ${curve.cells.length} cell${curve.cells.length > 1 ? "s" : ""}${curve.left_out ? ` (${curve.left_out} at the floor or the ceiling left out)` : ""}`));
 }
 
 /* ---- the card of a pair: #pair-12 ---- */
