@@ -98,7 +98,7 @@ class RunOptions:
 
     grid: str | None = None
     episodes: int | None = None
-    seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
+    seeds: list[int] | None = None
     executor: str = "processes"
     workers: int = field(default_factory=cores)
     out: str = "results"
@@ -135,7 +135,7 @@ def run_config(words: Sequence[str]) -> RunConfig:
         return RunConfig(
             pairs=tuple({pair.id: pair for pair in pairs}.values()),
             grid=grid,
-            seeds=tuple(settings["seeds"]),
+            seeds=tuple(range(standard.training_seeds) if settings["seeds"] is None else settings["seeds"]),
             executor=settings["executor"],
             workers=settings["workers"],
             out=Path(settings["out"]).expanduser(),

@@ -29,6 +29,7 @@ class Grid:
         axes: axes of that world.
         values: at least one value for each axis.
         episodes: scenario seeds per cell.
+        training_seeds: number of training (or patch) seeds that a run drives if it is not told which.
         first_seed: first scenario seed.
 
     Raises:
@@ -40,11 +41,14 @@ class Grid:
     axes: Axes
     values: Mapping[str, Sequence[Value]]
     episodes: int
+    training_seeds: int = 3
     first_seed: int = SeedBlock.REPORT
 
     def __post_init__(self) -> None:
         if not 1 <= self.episodes <= SeedBlock.SELECT - SeedBlock.REPORT:
             raise ValueError(f"episodes must be between 1 and 1000000, got {self.episodes}")
+        if self.training_seeds < 1:
+            raise ValueError(f"training_seeds must be at least 1, got {self.training_seeds}")
         for name in self.axes:
             if not self.values.get(name):
                 raise ValueError(f"a grid needs at least one value for {name}")

@@ -15,7 +15,10 @@ from leaderboard.comparisons.naming import component, varying
 from leaderboard.ranking.boards import Board, Row, read_boards
 from leaderboard.ranking.flags import FLAGS
 from leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
-from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, estimate, number, share, strip, verdict
+from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, estimate, number, share, signed, strip, verdict
+
+ADDED = 0.01
+"""What an attack must add to be named."""
 
 
 def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> None:
@@ -42,6 +45,10 @@ def print_boards(boards: Sequence[Board], console: Console) -> None:
             score = estimate(share_interval(drive.column(board.track.metric)), style=BASELINE)
             console.print(Padding(Text.assemble(f"{name}: ", score), (0, 3)))
         for row in board.rows:
+            if len(row.attacks) > 1:
+                console.print(
+                    Padding(Text.assemble(("added ", "dim"), f"{_name(row, board)}: ", (_added(row), "dim")), (0, 1))
+                )
             if row.flagged:
                 titles = "; ".join(FLAGS[flag.name][0] for flag in row.flags if flag.fired)
                 said = Text.assemble(("flagged ", "yellow"), f"{_name(row, board)}: ", (titles, "dim"))
@@ -52,6 +59,14 @@ def print_boards(boards: Sequence[Board], console: Console) -> None:
 def _name(row: Row, board: Board) -> str:
     shown = _shown(board)
     return " ".join(component(row.attacks[0], kind, shown[kind]) for kind in ("defense", "victim"))
+
+
+def _added(row: Row) -> str:
+    """By how much each attack lowers the score further than all the others do, the most first."""
+    shown = varying(row.attacks, "attack")
+    found = sorted(row.marginal.items(), key=lambda item: -item[1].estimate)
+    said = [f"{component(one, 'attack', shown)} {signed(-by.estimate, 2)}" for one, by in found if by.estimate >= ADDED]
+    return "; ".join(said) or f"no attack takes {ADDED:g} that the others together leave"
 
 
 def _shown(board: Board) -> dict[str, set[str]]:

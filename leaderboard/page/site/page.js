@@ -277,6 +277,15 @@ function doubts(row) {
   return el("details", {}, el("summary", { class: fired.length ? null : "quiet" }, summary), el("ul", {}, ...row.flags.map((flag) =>
     el("li", {}, el("b", {}, `${flag.fired ? "⚑ " : ""}${flag.name.replaceAll("_", " ")}: `), flag.reason))));
 }
+/* By how much an attack lowers the score of its row further than all the others do. */
+function added(pair, row) {
+  const place = row ? row.pairs.indexOf(pair.key) : -1;
+  return place < 0 ? null : row.marginal[place];
+}
+function adds(pair, row) {
+  const found = added(pair, row);
+  return found ? [fixed(found.estimate), " ", el("small", {}, found.low == null ? "" : `${fixed(found.low)} … ${fixed(found.high)}`)] : "";
+}
 function drawPairs(board, metric) {
   const rows = within(board).filter(chosen).filter((pair) => !state.attack || pair.attack.name === state.attack)
     .map((pair) => ({ pair, score: over(pair, pair.score) })).filter((one) => one.score);
@@ -294,6 +303,7 @@ function drawPairs(board, metric) {
     ...(said().failure ? [{ name: capital(said().failure_title), show: (one) => percent(failed(one)), value: failed, number: true }] : []),
     { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
     { name: "Queries", show: (one) => fixed(queries(one), 0), value: queries, number: true },
+    { name: "Adds", show: ({ pair }) => adds(pair, rowOf(pair)), value: ({ pair }) => added(pair, rowOf(pair))?.estimate ?? null, number: true },
     { name: "Recording", show: ({ pair }) => (pair.card.recording ? el("a", { href: data.recordings + pair.card.recording }, "rrd") : "") },
   ], rows);
 }
