@@ -60,9 +60,8 @@ class Components:
             return np.full_like(self.training, np.nan)
         parts = [(part, df) for part, df in zip((self.training, self.scenario), own, strict=True) if df]
         variance = np.asarray(sum(part for part, _ in parts))
-        freedom = sum(np.square(part) / df for part, df in parts)
-        known = variance > 0
-        effective = np.divide(np.square(variance), freedom, out=np.ones_like(variance), where=known)
+        freedom = np.asarray(sum(np.square(part) / df for part, df in parts))
+        effective = np.divide(np.square(variance), freedom, out=np.ones_like(variance), where=freedom > 0)
         joint = np.square(t_quantile(effective)) * variance
         apart = sum(np.square(t_quantile(np.asarray(float(df)))) * part for part, df in parts)
         return np.asarray(np.sqrt((joint + apart) / 2))

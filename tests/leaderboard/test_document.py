@@ -68,7 +68,7 @@ def test_the_table_has_a_line_a_ranked_row(site: Path) -> None:
 
 def test_the_terminal_says_the_ranking(site: Path) -> None:
     text = (site / "terminal.txt").read_text()
-    assert "driving in highway, relative 0.1, access scores, 1000 queries" in text
+    assert "driving in highway, standard-v1, relative 0.1, access scores, 1000 queries" in text
     assert "best blind policy" in text
     assert "flagged masked dqn: a black-box attack beats the white-box one" in " ".join(text.split())
     assert max(map(len, text.splitlines()[:-4])) <= 120
@@ -149,6 +149,6 @@ def test_a_curve_is_about_the_cells_that_all_its_points_have() -> None:
     (curve,) = document(boards, comparisons, None)["curves"]
     only = read_tracks({"driving": pa.concat_tables([clean, few, many]).filter(part)})
     wanted = {one.identity["threat_budget"]: one.score.estimate for one in only if one.is_attacked}
-    assert curve["cells"] == 2
+    assert [cell["lanes"] for cell in curve["cells"]] == [3, 3]
     assert {point["x"]: point["estimate"] for point in curve["points"]} == pytest.approx(wanted, abs=1e-4)
     assert curve["clean"]["estimate"] == pytest.approx(only[0].clean_score.estimate, abs=1e-4)

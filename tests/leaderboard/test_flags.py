@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from full_house import PGD, SEEN
@@ -46,6 +47,7 @@ BLIND = baseline_drivers()
 FIRES: dict[str, tuple[pa.Table, ...]] = {
     "unattacked": (clean(), noise()),
     "blind": (clean(), zo(0.1), BLIND),
+    "unsafe": (clean(), zo(0.1), BLIND),
     "ignores_input": (clean(same_answer=1.0), probed(zo(), same_answer=1.0)),
     "masked_gradients": (clean(), zo(0.2), pgd(0.5)),
     "zero_gradients": (clean(), pgd(0.5, zero_gradients=0.9)),
@@ -62,6 +64,7 @@ FIRES: dict[str, tuple[pa.Table, ...]] = {
 FIRES_NOT: dict[str, tuple[pa.Table, ...]] = {
     "unattacked": (clean(), zo(), noise()),
     "blind": (clean(), zo(0.6), BLIND),
+    "unsafe": (clean(), zo(0.6), BLIND),
     "ignores_input": (clean(), zo()),
     "masked_gradients": (clean(), zo(0.5), pgd(0.2)),
     "zero_gradients": (clean(), pgd(0.5)),
@@ -77,6 +80,7 @@ FIRES_NOT: dict[str, tuple[pa.Table, ...]] = {
 }
 NOT_MEASURED: dict[str, tuple[pa.Table, ...]] = {
     "blind": (clean(), zo()),
+    "unsafe": (clean(), zo()),
     "ignores_input": (drive(), drive(attack="zo", queries=44.0)),
     "masked_gradients": (drive(), drive(attack="zo", queries=44.0), drive(attack="pgd", queries=45.0)),
     "zero_gradients": (clean(), zo()),
@@ -157,7 +161,7 @@ def test_an_attack_with_less_counts_in_a_larger_threat_model_but_not_the_other_w
     assert budgets == {0.1: [0.05, 0.1], 0.05: [0.05]}
 
 
-def test_rows_whose_intervals_overlap_that_of_the_first_share_its_group() -> None:
+def test_rows_that_are_not_significantly_below_the_first_share_its_group() -> None:
     skills = {"a": 0.7, "b": 0.69, "c": 0.3}
     tables = []
     for name, skill in skills.items():
@@ -175,7 +179,7 @@ def test_an_attack_on_a_few_cells_changes_nothing_but_their_score() -> None:
     )
     (also,) = board(clean(), BLIND, pgd(0.3), zo(0.5), longer).rows
     assert also.worst.score.estimate < row.worst.score.estimate
-    assert also.clean == row.clean
+    assert also.worst.clean == row.worst.clean
     assert also.attacks[0].identity["attack_params"] == row.attacks[0].identity["attack_params"]
     fired = [[flag.name for flag in each.flags if flag.fired] for each in (row, also)]
     assert fired[1] == fired[0]
@@ -191,3 +195,50 @@ def test_masked_gradients_are_judged_cell_by_cell() -> None:
     assert not flag("masked_gradients", clean(), zo(0.3), pgd(0.5), strong).fired
     easy = drive(attack="pgd", attack_params={"steps": 30}, skill=0.5, queries=99.0, weights="ab", cells=HALF[:1])
     assert flag("masked_gradients", clean(), zo(0.3), pgd(0.5), probed(easy, **(PGD | SEEN))).fired
+
+
+@pytest.mark.parametrize("stray", [{"episodes": 3, "grid": "custom"}, {"episodes": 3}, {"runs": (7,)}, {"runs": (0,)}])
+def test_a_stray_partial_run_changes_no_row(stray: dict[str, object]) -> None:
+    """Three episodes of one cell, or one training seed, of an attack that takes everything."""
+    records = [clean(), zo(0.5), pgd(0.4), BLIND]
+    more = zo(0.0, attack_params={"steps": 99}, cells=HALF[:1], **stray)
+    rows = [next(one for one in boards(read_tracks({"driving": pa.concat_tables(tables)})) if one.grid == "standard-v1").rows
+            for tables in (records, [*records, more])]  # fmt: skip
+    (before,), (after,) = rows
+    assert (after.worst.score, after.worst.failure, after.flags) == (
+        before.worst.score,
+        before.worst.failure,
+        before.flags,
+    )
+
+
+def test_the_strongest_attack_is_not_the_luckiest() -> None:
+    """Ten attacks that differ in luck alone: the score is that of one of them, not of the best of ten."""
+    attacks = [probed(zo(0.5, attack_params={"draw": draw}, queries=44.0 + draw), **SEEN) for draw in range(10)]
+    generator = np.random.default_rng(0)
+    lucky = []
+    for table in attacks:
+        scores = generator.permutation(table["safe_progress"].to_numpy())
+        place = table.schema.get_field_index("safe_progress")
+        lucky.append(
+            table.set_column(place, table.schema.field(place), pa.array(scores, table.schema.field(place).type))
+        )
+    (row,) = board(clean(), *lucky).rows
+    single = [one.score.estimate for one in row.attacks]
+    assert np.stack([one.scores for one in row.attacks]).min(0).mean() < 0.5 * np.mean(single)
+    assert row.worst.score.estimate == pytest.approx(np.mean(single), abs=0.03)
+
+
+def test_a_curve_at_the_floor_is_no_evidence() -> None:
+    """Where an attack takes everything with its least effort, more effort shows nothing."""
+    weak = zo(0.02, attack_params={"steps": 4}, queries=40.0)
+    strong = zo(0.0, attack_params={"steps": 40}, queries=400.0)
+    found = flag("not_flattened", clean(), weak, strong)
+    assert found.fired is None
+
+
+def test_a_curve_says_its_cells() -> None:
+    reason = flag("not_flattened", *FIRES["not_flattened"]).reason
+    assert "18 of 18 cells" in reason or "at the floor or the ceiling" in reason
+    two = [zo(0.2, attack_params={"steps": steps}, queries=10.0 * steps, cells=HALF[:2]) for steps in (4, 40)]
+    assert flag("not_flattened", clean(), zo(0.5), *two).fired is not True

@@ -137,7 +137,7 @@ def test_its_tables_have_its_metric_its_measures_and_the_axes_of_its_world(
 def test_its_page_has_its_board_its_curve_and_the_axes_as_filters(plugin: Path, results: Path, browser: Any) -> None:
     page = results.parent / "page.html"
     said = bench(plugin, "report", f"out={results}", f"html={page}")
-    assert "balancing in pole, push 0.2, access scores, 10 queries" in said
+    assert "balancing in pole, bends, push 0.2, access scores, 10 queries" in said
     made = json.loads(page.with_suffix(".json").read_text())
     jsonschema.Draft202012Validator(document_schema()).validate(made)
     assert [(axis["name"], axis["values"]) for axis in made["boards"][0]["axes"]] == [
