@@ -11,6 +11,10 @@ from typing import Any
 
 import pytest
 
+from bench.records import reading
+from bench.statistics.estimates import share_interval
+from leaderboard.ranking.boards import read_boards
+
 Open = Callable[..., Any]
 
 
@@ -84,20 +88,17 @@ def test_a_heading_sorts_up_and_down_by_mouse_and_by_keyboard(opened: Open) -> N
 
 def test_filters_choose_rows_and_compute_scores_again_from_the_cells_that_are_left(opened: Open, site: Path) -> None:
     page = opened()
-    made = json.loads((site / "leaderboard.json").read_text())
-    row = next(row for row in made["boards"][0]["rows"] if row["defense"]["name"] == "advtrain")
-    runs = [
-        run
-        for cell in row["cells"]
-        if cell["cell"]["weather"] == "clear" and cell["cell"]["density"] == 1
-        for run in cell["runs"]
-    ]
-    middle = sorted(runs)[len(runs) // 4 : len(runs) - len(runs) // 4]
+    (board, *_), _ = read_boards(reading.read_all(site / "results"))
+    worst = next(row.worst for row in board.rows if row.identity["defense"] == "advtrain")
+    left = [n for n, cell in enumerate(worst.cells) if cell.weather == "clear" and cell.density == 1]
+    expected = share_interval(worst.scores[:, left])
     for name, value in (("weather", "rain"), ("weather", "fog"), ("density", "2")):
         page.locator(f"input[name={name}][value='{value}']").uncheck()
     assert "3 of 18 cells" in page.locator("#scope").inner_text()
     shown = page.locator("#ranks tr", has_text="advtrain").locator("td").nth(3).inner_text()
-    assert float(shown.split()[0]) == pytest.approx(sum(middle) / len(middle), abs=0.006)
+    assert shown == f"{expected.estimate:.2f} {expected.low:.2f}–{expected.high:.2f}".replace(" 0.", " .").replace(
+        "–0.", "–."
+    )
     assert texts(page, "#heat thead th") == ["Lanes × density", "clear"]
     page.locator("#defense").select_option("advtrain")
     assert set(column(page, "pairs", 2)) == {"advtrain"}
