@@ -106,8 +106,8 @@ def _print_facts(records: pa.Table, console: Console) -> None:
     facts.add_column()
     for kind in registry.KINDS:
         facts.add_row(kind, _each(records, (kind, f"{kind}_params", f"{kind}_shipped_by"), _component))
-    threat = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
-    facts.add_row("threat", _each(records, threat, "{} {:g}, access {}, {} queries".format))
+    threat = ("threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share")
+    facts.add_row("threat", _each(records, threat, _threat))
     facts.add_row("cells", _axes(records["cell"]))
     seeds = pc.min_max(records["seed"]).as_py()
     facts.add_row("scenario seeds", f"{seeds['min']} to {seeds['max']} ({_listed(records['grid'])})")
@@ -139,6 +139,11 @@ def _each(records: pa.Table, names: tuple[str, ...], describe: Callable[..., str
     """One line for each distinct combination of values in these columns."""
     rows = records.select(names).group_by(list(names)).aggregate([]).to_pylist()
     return Text("\n".join(sorted(describe(*(row[name] for name in names)) for row in rows)))
+
+
+def _threat(norm: str, budget: float, access: str, queries: int, share: float) -> str:
+    frames = "" if share == 1 else f", {100 * share:g} % of the frames"
+    return f"{norm} {budget:g}, access {access}, {queries} queries{frames}"
 
 
 def _component(name: str, params: str, shipped_by: str) -> str:

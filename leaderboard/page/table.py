@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 CSV = (
-    "track", "world", "threat_norm", "threat_budget", "threat_access", "threat_queries", "group", "flagged", "flags",
+    "track", "world", "threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share",
+    "group", "flagged", "flags",
     "defense", "defense_params", "victim", "victim_params", "score", "low", "high", "clean", "clean_low", "clean_high",
     "lead", "lead_low", "lead_high", "strongest_attack", "strongest_attack_params", "training_seeds", "cells", "scenarios",
 )  # fmt: skip
@@ -25,10 +26,11 @@ def table(made: Mapping[str, Any]) -> str:
     for board in made["boards"]:
         for row in board["rows"]:
             strongest = pairs[row["strongest"]]["attack"]
+            threat = board["threat"]
             line = {
                 "track": board["track"],
                 "world": board["world"]["name"],
-                **{f"threat_{name}": board["threat"][name] for name in ("norm", "budget", "access", "queries")},
+                **{f"threat_{name}": threat[name] for name in ("norm", "budget", "access", "queries", "share")},
                 "group": row["group"],
                 "flagged": str(row["flagged"]).lower(),
                 "flags": " ".join(flag["name"] for flag in row["flags"] if flag["fired"]),

@@ -67,7 +67,7 @@ class Board:
     baselines: Mapping[str, Episodes] = field(default_factory=dict)
 
 
-Key = tuple[str, str, str, str, float, str, int]
+Key = tuple[str, str, str, str, float, str, int, float]
 """Track, world and its parameters, and the values of `THREAT`."""
 
 
@@ -85,7 +85,7 @@ def boards(comparisons: Sequence[Comparison]) -> list[Board]:
     tracks = {_key(one): one.track for one in attacked}
 
     def rank(key: Key) -> tuple[object, ...]:
-        track, world, params, norm, budget, access, queries = key
+        track, world, params, norm, budget, access, queries, share = key
         return (
             -episodes[track,],
             track,
@@ -96,6 +96,7 @@ def boards(comparisons: Sequence[Comparison]) -> list[Board]:
             -budget,
             -_access(access),
             -queries,
+            -share,
         )
 
     return [_board(key, tracks[key], attacked) for key in sorted(tracks, key=rank)]
@@ -124,8 +125,8 @@ def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
 
 
 def _within(one: Comparison, key: Key) -> bool:
-    """Whether the threat model allows what an attack did: it had no more knowledge, budget and queries."""
-    track, world, world_params, norm, budget, access, queries = key
+    """Whether the threat model allows what an attack did: it had no more knowledge, budget, queries and frames."""
+    track, world, world_params, norm, budget, access, queries, share = key
     identity = one.identity
     return (
         (one.track.name, identity["world"], identity["world_params"], identity["threat_norm"])
@@ -133,6 +134,7 @@ def _within(one: Comparison, key: Key) -> bool:
         and float(str(identity["threat_budget"])) <= budget
         and _access(str(identity["threat_access"])) <= _access(access)
         and int(str(identity["threat_queries"])) <= queries
+        and float(str(identity["threat_share"])) <= share
     )
 
 

@@ -121,7 +121,7 @@ CANNOT_BE = {
     "world_facts": ("{}", "not a cell, or world_facts has no axes"),
     "attack_params": ("{scale: 1}", "attack_params {scale: 1}: Expecting property name"),
     "world_params": ("[1]", "world_params [1]: not a JSON object"),
-    "threat_access": ("all", "threat_access all: known: oblivious, decisions, scores, gradients"),
+    "threat_access": ("all", "threat_access all: known: oblivious, decisions, scores, gradients, dynamics"),
 }
 
 
