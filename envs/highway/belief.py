@@ -144,15 +144,15 @@ def nearest_prediction(vehicles: Vehicles, taken: NDArray[np.bool_], count: int,
 
 @inner
 def track(
-    cars: Vehicles,
+    cars: NDArray[np.void],
     count: int,
     rows: NDArray[np.float64],
     clipped: NDArray[np.bool_],
     lanes: int,
     sensor_range: float,
     parameters: Parameters,
-    before: Vehicles,
-    trial: Vehicles,
+    before: NDArray[np.void],
+    trial: NDArray[np.void],
     taken: NDArray[np.bool_],
     order: Integers,
     places: Integers,
