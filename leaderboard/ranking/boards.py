@@ -62,7 +62,7 @@ class Board:
 
     track: Track
     world: tuple[str, str]
-    threat: tuple[str, float, str, int]
+    threat: tuple[str, float, str, int, float]
     rows: tuple[Row, ...]
     baselines: Mapping[str, Episodes] = field(default_factory=dict)
 
