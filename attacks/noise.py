@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bench.driving import DrivingAttack
 from bench.plugins.contracts import Access
+from bench.plugins.ranges import Natural
 
 if TYPE_CHECKING:
     from bench.driving import Oracle
@@ -28,6 +29,7 @@ class Noise(DrivingAttack):
         distribution: `uniform` over the whole set, or `gaussian` with a standard deviation of `scale` times the radius,
             clipped to the set (default uniform).
         scale: width of the noise as a share of the radius, in (0, 1] (default 1).
+        draw: number of the random draw: another number is other noise of the same kind.
 
     Shapes: observation [B, V, F] in, the same out.
 
@@ -41,6 +43,7 @@ class Noise(DrivingAttack):
 
     distribution: Distribution = "uniform"
     scale: Annotated[float, Interval(gt=0, le=1)] = 1.0
+    draw: Natural = 0
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if self.distribution == "uniform":

@@ -12,19 +12,20 @@ from torch import Tensor
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Objective
 from bench.driving import DrivingAttack
 from bench.plugins.contracts import Access
-from bench.plugins.ranges import Count, Natural, Positive
+from bench.plugins.ranges import Count, Natural, Positive, Share
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bench.driving import Oracle
+    from bench.driving import DrivingVictim, Oracle
 
 
 @dataclass(frozen=True, kw_only=True)
 class PGD(DrivingAttack):
     """Projected gradient descent (Madry et al. 2018, "Towards Deep Learning Models Resistant to Adversarial Attacks").
 
-    Sign steps on the victim's gradient, each followed by a projection; returns the best iterate of all restarts. With
+    Sign steps on the victim's gradient, each followed by a projection; returns the best of the true observation and all
+    iterates, random starts included. With
     `steps=1 step_size=1 random_start=false restarts=1` it is FGSM (Goodfellow et al. 2015). White box: access `gradients`.
     All episodes share the random starts of a step, so the result for one does not depend on the rest of the batch.
 
@@ -47,6 +48,11 @@ class PGD(DrivingAttack):
         target_acceleration: continuous target, in [-1, 1] (default 1).
         target_steering: continuous target, in [-1, 1] (default 0.5).
         braking_action: index of the braking action for `collision`, at least 0 (default 4, SLOWER).
+        gap: attack only where the victim's preference gap is at least this, in [0, 1]; 0 attacks every frame. This is the
+            strategically-timed attack (Lin et al. 2017, "Tactics of Adversarial Attack on Deep Reinforcement Learning Agents",
+            Eq. 3); it makes the most of a threat model with `share` below 1. For discrete actions.
+        gap_temperature: temperature T of the softmax over the Q-values in the gap, above 0.
+        draw: number of the random draw: another number is the same attack with other random starts.
 
     Shapes: observation [B, V, F] in, the same out. Queries per step: 1 + restarts * (steps + 1). With a smaller query budget it
     uses fewer restarts, then fewer steps.
@@ -69,37 +75,51 @@ class PGD(DrivingAttack):
     target_acceleration: Annotated[float, Interval(ge=-1, le=1)] = 1.0
     target_steering: Annotated[float, Interval(ge=-1, le=1)] = 0.5
     braking_action: Natural = 4
+    gap: Share = 0.0
+    gap_temperature: Positive = 0.05
+    draw: Natural = 0
+
+    def misfit(self, victim: DrivingVictim) -> str:
+        if self.gap > 0 and victim.action_type != "discrete":
+            return f"whose actions are {victim.action_type}: a preference gap needs discrete ones"
+        return super().misfit(victim)
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
-        if not len(observation):
+        if not len(observation) or int(oracle.remaining.min()) < 1:
             return observation
-        affordable = int(oracle.remaining.min()) - 1
+        clean = oracle.scores(observation)
+        if self.gap == 0:
+            return self._descend(observation, clean, oracle)
+        rows = (preference_gap(clean, self.gap_temperature) >= self.gap).nonzero().squeeze(-1)
+        shown = observation.clone()
+        if len(rows):
+            shown[rows] = self._descend(observation[rows], clean[rows], oracle, rows)
+        return shown
+
+    def _descend(self, observation: Tensor, clean: Tensor, oracle: Oracle, rows: Tensor | None = None) -> Tensor:
+        """The attacked observations of all episodes, or of `rows`."""
+        affordable = int((oracle.remaining if rows is None else oracle.remaining[rows]).min())
         restarts = min(self.restarts, affordable // 2)
         if restarts < 1:
             return observation
         steps = min(self.steps, affordable // restarts - 1)
-        loss, key = self._loss(observation, oracle)
-        x = observation.expand(restarts, *observation.shape)
-        if self.random_start:
-            share = torch.rand((restarts, 1, *observation.shape[1:]), generator=oracle.generator) * 2 - 1
-            x = oracle.project(x + share * oracle.radius)
-        accumulated = torch.zeros_like(x)
-        best, lowest = x, torch.full(x.shape[:2], torch.inf)
-        for step in range(steps):
-            asked, gradient = _ask(x, loss, key, oracle)
-            if step > 0:
-                best, lowest = _better(best, lowest, x, asked)
-            accumulated = self.momentum * accumulated + _unit(gradient)
-            x = oracle.project(x - self.step_size * oracle.radius * accumulated.sign())
-        scores = oracle.scores(x)
-        best, lowest = _better(best, lowest, x, key(scores, loss(scores)))
-        return best[lowest.argmin(0), torch.arange(len(observation))]
+        loss, key = self._loss(observation, clean, oracle)
+        start = (
+            random_starts(observation, restarts, oracle, rows)
+            if self.random_start
+            else observation.expand(restarts, *observation.shape)
+        )
+        # The scores on the true observation are known: it is the first candidate.
+        known = key(clean, loss(clean))
+        best, lowest = descend(
+            start, loss, key, oracle, rows, steps=steps, step_size=self.step_size, momentum=self.momentum
+        )
+        return better(observation, known, best, lowest)
 
     def _loss(
-        self, observation: Tensor, oracle: Oracle
+        self, observation: Tensor, clean: Tensor, oracle: Oracle
     ) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], Tensor]]:
         """The loss to minimise, from scores, and the key to compare iterates, from scores and loss; [..., B] each."""
-        clean = oracle.scores(observation)
         if oracle.action_type == "discrete":
             discrete = DiscreteLoss(
                 objective=self.objective,
@@ -123,8 +143,79 @@ class PGD(DrivingAttack):
         return critic, lambda _, loss: loss
 
 
+def random_starts(observation: Tensor, restarts: int, oracle: Oracle, rows: Tensor | None = None) -> Tensor:
+    """[R, B, V, F] random points of the perturbation set; all episodes share the random numbers."""
+    share = torch.rand((restarts, 1, *observation.shape[1:]), generator=oracle.generator) * 2 - 1
+    return oracle.project(observation + share * _radius(oracle, rows), rows)
+
+
+def descend(
+    x: Tensor,
+    loss: Callable[[Tensor], Tensor],
+    key: Callable[[Tensor, Tensor], Tensor],
+    oracle: Oracle,
+    rows: Tensor | None = None,
+    *,
+    steps: int,
+    step_size: float,
+    momentum: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Sign steps from the points `x` [R, B, V, F] (of all episodes, or of `rows`), with R * (steps + 1) queries.
+
+    Args:
+        x: starts in the perturbation set.
+        loss: the loss to minimise [R, B], from scores.
+        key: the key to compare points [R, B], from scores and loss.
+        oracle: access to the victim.
+        rows: the episodes.
+        steps, step_size, momentum: as in `PGD`.
+
+    Returns:
+        The best point of each start [R, B, V, F], the starts included, and its key [R, B].
+    """
+    radius, accumulated = _radius(oracle, rows), torch.zeros_like(x)
+    best, lowest = x, torch.full(x.shape[:2], torch.inf)
+    for _ in range(steps):
+        asked, gradient = _ask(x, loss, key, oracle, rows)
+        best, lowest = _better(best, lowest, x, asked)
+        accumulated = momentum * accumulated + _unit(gradient)
+        x = oracle.project(x - step_size * radius * accumulated.sign(), rows)
+    scores = oracle.scores(x, rows)
+    return _better(best, lowest, x, key(scores, loss(scores)))
+
+
+def better(observation: Tensor, known: Tensor, best: Tensor, lowest: Tensor) -> Tensor:
+    """[B, V, F] the point with the lowest key; the true observation if none is below its key `known` [B].
+
+    Args:
+        observation: the true observation [B, V, F].
+        known: its key [B].
+        best, lowest: points [R, B, V, F] and their keys [R, B].
+    """
+    least, start = lowest.min(0)
+    found = best[start, torch.arange(len(observation))]
+    return torch.where((least < known)[:, None, None], found, observation)
+
+
+def preference_gap(scores: Tensor, temperature: float) -> Tensor:
+    """[B] how much the victim prefers its best action: the largest minus the smallest entry of softmax(Q / T).
+
+    Lin et al. 2017, "Tactics of Adversarial Attack on Deep Reinforcement Learning Agents", Eq. 3.
+    """
+    preferred = torch.softmax(scores / temperature, -1)
+    return preferred.amax(-1) - preferred.amin(-1)
+
+
+def _radius(oracle: Oracle, rows: Tensor | None) -> Tensor:
+    return oracle.radius if rows is None else oracle.radius[rows]
+
+
 def _ask(
-    x: Tensor, loss: Callable[[Tensor], Tensor], key: Callable[[Tensor, Tensor], Tensor], oracle: Oracle
+    x: Tensor,
+    loss: Callable[[Tensor], Tensor],
+    key: Callable[[Tensor, Tensor], Tensor],
+    oracle: Oracle,
+    rows: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """The keys of the iterates [R, B] and the gradient of the loss [R, B, V, F], from one query."""
     keys: list[Tensor] = []
@@ -134,7 +225,7 @@ def _ask(
         keys.append(key(scores.detach(), value.detach()))
         return value
 
-    _, gradient = oracle.gradient(x, asked)
+    _, gradient = oracle.gradient(x, asked, rows)
     return keys[0], gradient
 
 

@@ -54,6 +54,7 @@ class ZOSignSGD(DrivingAttack):
         enough: goal of `expected` and `collision`: the greedy action loses this share of the range from best to worst action,
             in (0, 1] (default 1: it is the worst action).
         random_start: start at a random point of the set, with one more query (default false).
+        draw: number of the random draw: another number is the same attack with other random directions.
 
     Shapes: observation [B, V, F] in, the same out. Queries per step: at most T (q + 1), one more with a random start; never
     more than the threat model allows.
@@ -80,6 +81,7 @@ class ZOSignSGD(DrivingAttack):
     early_stop: bool = True
     enough: Annotated[float, Interval(gt=0, le=1)] = 1.0
     random_start: bool = False
+    draw: Natural = 0
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if not len(observation) or int(oracle.remaining.min()) < 1:

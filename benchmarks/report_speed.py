@@ -66,6 +66,7 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: Cell, rng: np.
         "threat_budget": 0.0 if clean else 0.1,
         "threat_access": "oblivious" if clean else "gradients",
         "threat_queries": 0 if clean else 1000,
+        "threat_share": 1.0,
         "grid": "standard-v1",
         "cell": as_text(cell),
         "world_facts": FACTS,

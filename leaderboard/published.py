@@ -27,7 +27,7 @@ def published(track: Track) -> pa.Table:
     """Every record of a track in `leaderboard/data/*.parquet`, an empty table if none is shipped."""
     with as_file(files("leaderboard") / "data") as folder:
         paths = [path for path in sorted(folder.glob("*.parquet")) if check(path)[0].name == track.name]
-        tables = [pq.read_table(path) for path in paths]
+        tables = [reading.upgraded(path) for path in paths]
     return pa.concat_tables([schema(track).empty_table(), *tables])
 
 

@@ -10,10 +10,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.plugins import registry
+from bench.errors import UserError
+from bench.plugins import registry, suites
 from bench.plugins.contracts import ANY_TRACK
 from bench.plugins.registry import GROUPS, KINDS, Kind
 from bench.plugins.sources import tracks_of
+from bench.plugins.suites import Suite
 
 
 def print_names(console: Console) -> None:
@@ -27,6 +29,14 @@ def print_names(console: Console) -> None:
             shipped_by = Text(complaint, style="red") if complaint else Text(claims[0].shipped_by)
             served = ", ".join(tracks_of(claims[0].target)) or "?"
             table.add_row(kind if number == 0 else "", Text(name, style="bold"), served, shipped_by)
+    for number, (name, claims) in enumerate(registry.entries(registry.SUITES).items()):
+        complaint = registry.problem(claims)
+        try:
+            served = suites.suite(name).track
+        except UserError as error:
+            served, complaint = "?", complaint or str(error)
+        shipped_by = Text(complaint, style="red") if complaint else Text(claims[0].shipped_by)
+        table.add_row("suite" if number == 0 else "", Text(name, style="bold"), served, shipped_by)
     console.print(table)
     console.print("\n`bench list NAME` describes a component and its parameters.", style="dim", highlight=False)
 
@@ -37,6 +47,9 @@ def print_component(name: str, console: Console) -> None:
     Raises:
         UserError: if no component has the name, or its plug-in is broken.
     """
+    if name in suites.names():
+        _print_suite(suites.suite(name), console)
+        return
     for number, kind in enumerate(registry.kinds_of(name)):
         if number:
             console.rule(style="dim")
@@ -78,6 +91,26 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
         written = Text(f"{kind}.{parameter.name}", style="bold")
         table.add_row(written, parameter.type_name, parameter.default_text, meaning)
     console.print(table)
+
+
+def _print_suite(suite: Suite, console: Console) -> None:
+    """Print the members of a suite."""
+    entry = registry.find(registry.SUITES, suite.name, "suite")
+    console.print(
+        Text.assemble(("suite ", "dim"), (suite.name, "bold"), (f"   {entry.target}, {entry.shipped_by}", "dim"))
+    )
+    meaning = f"{suite.meaning[:1].upper()}{suite.meaning[1:]}."
+    console.print(f"\n{meaning} Track: {suite.track}. Access: {suite.access}.\n", highlight=False)
+    table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
+    for column in ("attack", "victims", "purpose"):
+        table.add_column(column)
+    for member in suite.members:
+        victims = ", ".join(f"{name} {value}" for name, value in member.victims.items()) or "all"
+        table.add_row(Text(str(member), style="bold"), victims, member.purpose)
+    console.print(table)
+    console.print(
+        f"\n`bench run attack={suite.name}` runs all of them that fit the victim.", style="dim", highlight=False
+    )
 
 
 def _print_choices(name: str, choices: Mapping[str, str], console: Console) -> None:

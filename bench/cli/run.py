@@ -30,6 +30,8 @@ def run(words: Sequence[str], console: Console, report: Callable[[Track, pa.Tabl
     show_downloads()
     config = run_config(words)
     with RunProgress(Console(stderr=True)) as progress:
+        for line in config.skipped:
+            progress.warn(line)
         try:
             units = runner.run(config, progress)
         except KeyboardInterrupt:

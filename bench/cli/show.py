@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.errors import UserError
-from bench.plugins import registry
+from bench.plugins import registry, suites
 from bench.plugins.track import Track, track
 from bench.records import reading
 from bench.records.schema import IDENTITY
@@ -106,8 +106,10 @@ def _print_facts(records: pa.Table, console: Console) -> None:
     facts.add_column()
     for kind in registry.KINDS:
         facts.add_row(kind, _each(records, (kind, f"{kind}_params", f"{kind}_shipped_by"), _component))
-    threat = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
-    facts.add_row("threat", _each(records, threat, "{} {:g}, access {}, {} queries".format))
+    threat = ("threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share")
+    facts.add_row("threat", _each(records, threat, _threat))
+    for line in _suites(records):
+        facts.add_row("suite", line)
     facts.add_row("cells", _axes(records["cell"]))
     seeds = pc.min_max(records["seed"]).as_py()
     facts.add_row("scenario seeds", f"{seeds['min']} to {seeds['max']} ({_listed(records['grid'])})")
@@ -139,6 +141,24 @@ def _each(records: pa.Table, names: tuple[str, ...], describe: Callable[..., str
     """One line for each distinct combination of values in these columns."""
     rows = records.select(names).group_by(list(names)).aggregate([]).to_pylist()
     return Text("\n".join(sorted(describe(*(row[name] for name in names)) for row in rows)))
+
+
+def _suites(records: pa.Table) -> list[str]:
+    """The suites of which there is more than one member, with the numbers of their members."""
+    rows = records.select(["attack", "attack_params"]).group_by(["attack", "attack_params"]).aggregate([]).to_pylist()
+    present = {(row["attack"], row["attack_params"]) for row in rows}
+    lines = []
+    for name in registry.entries(registry.SUITES):
+        members = suites.suite(name).members
+        found = sum((member.attack, member.chosen.params) in present for member in members)
+        if found > 1:
+            lines.append(f"{name}: {found} of {len(members)} members")
+    return lines
+
+
+def _threat(norm: str, budget: float, access: str, queries: int, share: float) -> str:
+    frames = "" if share == 1 else f", {100 * share:g} % of the frames"
+    return f"{norm} {budget:g}, access {access}, {queries} queries{frames}"
 
 
 def _component(name: str, params: str, shipped_by: str) -> str:

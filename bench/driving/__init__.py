@@ -1,6 +1,7 @@
 """The driving track: driving policies, attacked through their observations. Plug-ins import from here."""
 
 from bench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, DrivingWorld, TrainingHooks
+from bench.driving.dynamics import Dynamics, Forecast
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features
 from bench.driving.oracle import Oracle
 from bench.driving.policy import Policy, PolicyWrapper, State
@@ -14,7 +15,9 @@ __all__ = [
     "DrivingFacts",
     "DrivingVictim",
     "DrivingWorld",
+    "Dynamics",
     "Features",
+    "Forecast",
     "ObservationThreat",
     "Oracle",
     "Policy",

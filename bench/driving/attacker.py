@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.driving.contracts import DrivingAttack
+from bench.driving.dynamics import Dynamics
 from bench.driving.features import Features
 from bench.driving.oracle import Oracle
 from bench.driving.policy import Policy, State, rows_of
@@ -45,19 +46,34 @@ class Attacker:
         threat: the threat model, enforced here.
         features: features of the observation.
         seed: seed of the attack's random generator.
+        dynamics: the world's rules of motion; None if the world does not offer them.
+        frames: frames of each episode that may be attacked (`ObservationThreat.frames`); None for all.
     """
 
     def __init__(
-        self, attack: DrivingAttack | None, policy: Policy, threat: ObservationThreat, features: Features, *, seed: int
+        self,
+        attack: DrivingAttack | None,
+        policy: Policy,
+        threat: ObservationThreat,
+        features: Features,
+        *,
+        seed: int,
+        dynamics: Dynamics | None = None,
+        frames: int | None = None,
     ) -> None:
         self.attack = attack
         access = attack.access if attack else "oblivious"
-        self.oracle = Oracle(policy, threat, access, features, torch.Generator().manual_seed(seed))
+        self.oracle = Oracle(policy, threat, access, features, torch.Generator().manual_seed(seed), dynamics)
+        self.frames = frames
+        self.changed = torch.zeros(0, dtype=torch.int64)
         self.state: State = None
         self.begun = False
 
     def show(self, observation: Tensor, running: Tensor, policy_state: State) -> Shown:
         """Attack the running episodes and return the observations for the victim.
+
+        A frame is attacked if any value shown differs from the truth. Once an episode has no frame left, the truth is shown and
+        the attack is not asked.
 
         Args:
             observation: the true observation, [B, V, F].
@@ -70,12 +86,15 @@ class Attacker:
             return Shown(observation, counts[0], counts[1], counts[2], excess)
         if not self.begun:
             self._begin(observation, policy_state)
+        if self.frames is not None:
+            running = running & (self.changed < self.frames)
         rows = running.nonzero().squeeze(-1)
         perturbed = observation.clone()
         start = time.perf_counter()
         if rows.numel():
             self.oracle.begin_step(observation[rows], rows_of(policy_state, rows))
             perturbed[rows], excess[rows] = self._answer(observation[rows], rows)
+            self.changed += (perturbed != observation).flatten(1).any(1)
             spent = (self.oracle.spent, self.oracle.gradients, self.oracle.zero_gradients)
             counts[:, rows] = torch.stack(spent)
         milliseconds = (time.perf_counter() - start) * 1000
@@ -87,6 +106,7 @@ class Attacker:
         The run keeps its own copy of the state and updates it in place.
         """
         assert self.attack is not None
+        self.changed = torch.zeros(len(observation), dtype=torch.int64)
         self.oracle.begin_step(observation, policy_state)
         state = self.attack.initial(observation, self.oracle)
         if bool(self.oracle.spent.any()):

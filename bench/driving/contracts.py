@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
+from bench.driving.dynamics import Dynamics
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features
 from bench.driving.oracle import Oracle
 from bench.driving.policy import Policy, State
@@ -74,6 +75,13 @@ class DrivingWorld(World):
             action_repeat: number of frames for which a decision is held (training only). A lane change is sent once, other
                 actions are repeated. Reward and progress are summed over the frames; an episode may end between them.
         """
+
+    def dynamics(self, cell: Cell, action_type: ActionType) -> Dynamics | None:
+        """The rules of motion on a cell's roads, for attacks with access `dynamics`; None if the world does not offer them.
+
+        They must not depend on an episode.
+        """
+        return None
 
 
 class DrivingVictim(Victim):

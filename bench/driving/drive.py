@@ -36,6 +36,7 @@ def drive(job: Job, traced: Sequence[int]) -> Driven:
                 job.seeds,
                 facts=world.facts,
                 attack_seed=job.attack_seed,
+                dynamics=world.dynamics(job.cell, policy.action_type),
                 trace=trace,
             )
         finally:

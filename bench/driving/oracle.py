@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from bench.driving.dynamics import Dynamics
 from bench.driving.features import Features
 from bench.driving.policy import Policy, State, repeated, rows_of
 from bench.driving.threat import ObservationThreat, bounds, within
@@ -31,15 +32,23 @@ class Oracle:
         access: the access level that the attack declares; calls above it are refused.
         features: features of the observation.
         generator: the run's random generator, for randomised attacks.
+        dynamics: the world's rules of motion; None if the world does not offer them.
     """
 
     def __init__(
-        self, policy: Policy, threat: ObservationThreat, access: Access, features: Features, generator: torch.Generator
+        self,
+        policy: Policy,
+        threat: ObservationThreat,
+        access: Access,
+        features: Features,
+        generator: torch.Generator,
+        dynamics: Dynamics | None = None,
     ) -> None:
         if not threat.allows(access):
             raise UserError(f"the attack needs access {access!r}, the threat model allows {threat.access!r} at most")
         self._policy = policy
         self._access: Access = access
+        self._dynamics = dynamics
         self.threat = threat
         self.features = features
         self.generator = generator
@@ -70,6 +79,18 @@ class Oracle:
     def remaining(self) -> Tensor:
         """[B] number of queries left for each episode in this step."""
         return self.threat.queries - self.spent
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The world's rules of motion; needs access `dynamics`.
+
+        Raises:
+            UserError: if the attack declares less access, or the world does not offer them.
+        """
+        permit("dynamics", self._access)
+        if self._dynamics is None:
+            raise UserError("the attack needs the dynamics of the world, which this world does not offer")
+        return self._dynamics
 
     def project(self, perturbed: Tensor, rows: Tensor | None = None) -> Tensor:
         """Project `perturbed` [..., B, V, F] (of all episodes, or of `rows`) onto the perturbation set. Costs no query."""

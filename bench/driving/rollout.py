@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 
 from bench.driving.attacker import Attacker, Shown
 from bench.driving.contracts import DrivingAttack
+from bench.driving.dynamics import Dynamics
 from bench.driving.features import DrivingFacts
 from bench.driving.meter import Columns, Meter
 from bench.driving.policy import Policy, State
@@ -51,6 +52,7 @@ def rollout(
     *,
     facts: DrivingFacts,
     attack_seed: int,
+    dynamics: Dynamics | None = None,
     trace: Trace | None = None,
 ) -> Columns:
     """Drive every episode of `env` once, to its end, and measure it.
@@ -63,6 +65,7 @@ def rollout(
         seeds: the scenario seed of each episode [B].
         facts: facts of the world.
         attack_seed: seed of the attack's random generator.
+        dynamics: the world's rules of motion, for attacks with that access; None if the world does not offer them.
         trace: collects every step of its episodes.
 
     Returns:
@@ -71,7 +74,8 @@ def rollout(
     Raises:
         UserError: if the numbers of actions of the victim and the world differ.
     """
-    attacker = Attacker(attack, policy, threat, facts.features, seed=attack_seed)
+    frames = threat.frames(facts.max_steps)
+    attacker = Attacker(attack, policy, threat, facts.features, seed=attack_seed, dynamics=dynamics, frames=frames)
     meter, probe = Meter(len(seeds), policy, facts), Probe(len(seeds), policy)
     episodes = torch.as_tensor(list(seeds), dtype=torch.int64)
     with torch.no_grad():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from bench.driving.features import Features
 from bench.plugins.contracts import ThreatModel
-from bench.plugins.ranges import Natural
+from bench.plugins.ranges import Natural, Share
 
 Norm = Literal["relative", "linf"]
 
@@ -26,6 +27,7 @@ class ObservationThreat(ThreatModel):
             scale (thesis 4.4.3, read as a range; a stress test).
         budget: size of the set, in [0, 2].
         queries: largest number of policy evaluations per episode and step.
+        share: share of the frames of a full episode that may be attacked, rounded down; the attack chooses the frames.
 
     `presence` cannot be changed and absent rows cannot be filled. Values are clipped to [-1, 1], the range of every sensor.
     """
@@ -33,6 +35,12 @@ class ObservationThreat(ThreatModel):
     norm: Norm = "relative"
     budget: Annotated[float, Interval(ge=0, le=2)] = 0.1
     queries: Natural = 1000
+    share: Share = 1.0
+
+    def frames(self, steps: int) -> int:
+        """Number of frames that may be attacked in an episode of at most `steps` decisions: floor(share * steps)."""
+        # A share such as 0.3 is a little below three tenths.
+        return math.floor(self.share * steps + 1e-9)
 
     def radius(self, observation: Tensor, features: Features, scale: float = 1.0) -> Tensor:
         """[..., V, F] the largest deviation of each entry, on the normalised scale; 0 for presence and absent rows.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, get_args
 
 from bench.errors import UserError
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 ANY_TRACK = "any"
 """The track of a component that works on all of them, such as `none`."""
-Access = Literal["oblivious", "decisions", "scores", "gradients"]
-"""What an attacker may ask of the victim, from the least access to the most."""
+Access = Literal["oblivious", "decisions", "scores", "gradients", "dynamics"]
+"""What an attacker may ask of the victim, from the least access to the most. `dynamics` also knows how the world moves."""
 Progress = Callable[[float, str], None]
 """Called with the share done in [0, 1] and a short text; the command line draws a progress bar."""
 Network = TypeVar("Network", bound="nn.Module")
@@ -153,10 +153,14 @@ class Victim(Component):
 
 
 class Attack(Component):
-    """Changes what the victim sees, within a threat model."""
+    """Changes what the victim sees, within a threat model.
+
+    A random attack may have a parameter `draw: Natural = 0`. The run then seeds the attack's generator with it, too: another
+    number is the same attack with other random numbers.
+    """
 
     access: ClassVar[Access]
-    """The access that it needs: oblivious, decisions, scores or gradients."""
+    """The access that it needs: oblivious, decisions, scores, gradients or dynamics."""
     seeded: ClassVar[bool] = False
     """Whether it prepares something once for each training seed, such as a patch."""
 
@@ -227,6 +231,16 @@ class ThreatModel:
     def of_nobody(cls) -> Self:
         """The threat model of all clean runs, so that runs under different threat models share them."""
         return cls(budget=0.0, access="oblivious", queries=0)  # type: ignore[call-arg]
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """Its columns of records, `threat_NAME` for each field; `threat_share` is 1 where the track has no such limit."""
+        return {"threat_share": 1.0} | {f"threat_{name}": value for name, value in asdict(self).items()}
+
+    @classmethod
+    def recorded(cls, record: Mapping[str, Any]) -> Self:
+        """The threat model of a record."""
+        return cls(**{field.name: record[f"threat_{field.name}"] for field in fields(cls)})
 
     def allows(self, access: Access) -> bool:
         """Whether this threat model allows an attack that needs `access`."""

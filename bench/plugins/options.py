@@ -26,11 +26,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import UserError
-from bench.plugins import registry
-from bench.plugins.contracts import ThreatModel
+from bench.plugins import registry, suites
+from bench.plugins.contracts import Access, ThreatModel
 from bench.plugins.pair import Chosen, choose
 from bench.plugins.parameters import Parameter, parameters
 from bench.plugins.registry import Kind
+from bench.plugins.suites import Suite
 from bench.plugins.track import track
 from bench.scenarios import Axes, Axis, Value
 
@@ -65,6 +66,9 @@ class Options:
     def _check_key(self, key: str) -> None:
         head, _, parameter = key.partition(".")
         threats = [f"threat.{item.name}" for item in fields(ThreatModel)] if "attack" in self.kinds else []
+        if threats and head == "threat" and parameter:
+            # `threats` checks it against the threat model of the victim's track.
+            return
         known = [*self.kinds, *(item.name for item in fields(self.schema)), *self.axes, *threats]
         if key not in known and not (head in self.kinds and parameter):
             raise UserError(registry.unknown(f"key {key!r}", key, known))
@@ -117,10 +121,15 @@ class Options:
         names = self.values.get(kind) or (track(self.track).world if kind == "world" else DEFAULTS[kind],)
         # Hydra's grammar escapes the colon of NAME:CHOICE.
         names = tuple(name.replace("\\:", ":") for name in names)
+        if kind == "attack":
+            names = tuple(name for name in names if name not in suites.names())
         if kind != "victim":
             names = tuple(registry.on_track(kind, name, self.track) for name in names)
         known = {name: parameters(registry.load(kind, name)) for name in names}
         swept = {key.partition(".")[2]: v for key, v in self.values.items() if key.startswith(f"{kind}.")}
+        if swept and not names:
+            fixed = " and ".join(suite.name for suite in self.suites)
+            raise UserError(f"the attacks of the suite {fixed} have fixed parameters, got {kind}.{next(iter(swept))}")
         for key in swept:
             if not any(key.partition(".")[0] in owned for owned in known.values()):
                 what = f"parameter {kind}.{key} of {', '.join(names)}"
@@ -135,12 +144,34 @@ class Options:
                 found[f"{name} {one.params}"] = one
         return list(found.values())
 
+    @cached_property
+    def suites(self) -> list[Suite]:
+        """The suites of attacks in `attack=`.
+
+        Raises:
+            UserError: if a suite is broken, or is not for the track of the victims.
+        """
+        found = [suites.suite(name) for name in self.values.get("attack", ()) if name in suites.names()]
+        for suite in found:
+            if suite.track != self.track:
+                fitting = [one for one in suites.names() if suites.suite(one).track == self.track]
+                raise UserError(
+                    f"suite {suite.name!r} is for the {suite.track} track; suites for the {self.track} track of the victim: "
+                    f"{', '.join(fitting) or 'none is installed'}"
+                )
+        return found
+
     def threats(self) -> list[ThreatModel]:
-        """The threat models: every combination of the given values."""
+        """The threat models: every combination of the given values. A suite needs the access of its members by default."""
         model = self.chosen("victim")[0].component.threat
         owned = parameters(model)
+        if self.suites and "threat.access" not in self.values:
+            self.values["threat.access"] = (max((suite.access for suite in self.suites), key=get_args(Access).index),)
         keys = [key for key in self.values if key.startswith("threat.")]
         names = [key.removeprefix("threat.") for key in keys]
+        if strange := [key for key, name in zip(keys, names, strict=True) if name not in owned]:
+            known = [f"threat.{name}" for name in owned]
+            raise UserError(registry.unknown(f"key {strange[0]!r} of the {self.track} track", strange[0], known))
         found = []
         for values in itertools.product(*(self.values[key] for key in keys)):
             arguments = _arguments("threat", "model", owned, dict(zip(names, values, strict=True)))

@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from bench.errors import UserError, reason
 from bench.plugins import registry, sources
-from bench.plugins.contracts import Attack, Defense, ThreatModel, Victim, World, permits
+from bench.plugins.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
 from bench.plugins.fingerprint import canonical, digest, state_digest
 from bench.plugins.parameters import parameters
 from bench.plugins.registry import Kind
@@ -94,9 +94,11 @@ class Pair:
             raise UserError(f"{type(self.threat).__name__} is not a threat model of the {self.track} track")
         if not self.is_clean and (why := attack.misfit(victim) or ("" if victim.sees else "which ignores its input")):
             raise UserError(f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}, {why}")
-        if not permits(victim.answers, attack.access):
+        # The dynamics are the world's: of the victim such an attack asks what a white-box attack asks.
+        asked: Access = "gradients" if attack.access == "dynamics" else attack.access
+        if not permits(victim.answers, asked):
             raise UserError(
-                f"attack {self.attack.name!r} needs access {attack.access!r}, but victim {self.victim.name!r} is a black box "
+                f"attack {self.attack.name!r} needs access {asked!r}, but victim {self.victim.name!r} is a black box "
                 f"that supports {victim.answers!r} at most"
             )
         if not self.threat.allows(attack.access):

@@ -26,7 +26,7 @@ GROUPS: dict[Kind, str] = {
     "victim": "cavbench.victims",
     "world": "cavbench.worlds",
 }
-REPORTS, TRACKS, GRIDS = "cavbench.reports", "cavbench.tracks", "cavbench.grids"
+REPORTS, TRACKS, GRIDS, SUITES = "cavbench.reports", "cavbench.tracks", "cavbench.grids", "cavbench.suites"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,16 +24,20 @@ AXES_OF_V1 = (
 )
 CELL_OF_V1 = "to_json({'lanes': lanes, 'density': density, 'weather': weather})::varchar"
 
+ADDED = {"threat_share": "1.0::double"}
+"""Identity columns that records of version 2 got later, with the value of records without them."""
+
 
 @cache
 def generations(track: Track) -> tuple[pa.Schema, ...]:
     """The schemas of a track's records, the current one first."""
     today = schema(track)
+    whole = pa.schema([column for column in today if column.name not in ADDED])
     if not track.facts_of_v1:
-        return (today,)
-    place = today.get_field_index("cell")
-    first = pa.schema([*list(today)[:place], *AXES_OF_V1, *list(today)[place + 2 :]])
-    return today, first, pa.schema(list(first)[: len(first) - len(track.probes)])
+        return today, whole
+    place = whole.get_field_index("cell")
+    first = pa.schema([*list(whole)[:place], *AXES_OF_V1, *list(whole)[place + 2 :]])
+    return today, whole, first, pa.schema(list(first)[: len(first) - len(track.probes)])
 
 
 def selection(track: Track, columns: pa.Schema) -> str:
@@ -42,6 +46,7 @@ def selection(track: Track, columns: pa.Schema) -> str:
     facts = json.dumps(track.facts_of_v1, separators=(",", ":")).replace("'", "''")
     older = {"cell": f'{CELL_OF_V1} as "cell"', "world_facts": f"'{facts}' as \"world_facts\""}
     missing = {name: f'null::double as "{name}"' for name in (field.name for field in track.probes)} | older
+    missing |= {name: f'{value} as "{name}"' for name, value in ADDED.items()}
     return ", ".join(f'"{name}"' if name in present else missing[name] for name in schema(track).names)
 
 

@@ -53,6 +53,17 @@ def read(out: Path, units: Collection[str] | None = None, *, track: Track) -> pa
     return _valid(records, out, track)
 
 
+def upgraded(path: Path) -> pa.Table:
+    """All records of one file, of whatever format, as a table of its track's schema.
+
+    Raises:
+        UserError: if the file is truncated or foreign.
+    """
+    track, generation = check(path)
+    with _records(path.parent, [(path, generation)], track) as connection:
+        return connection.sql("from records").to_arrow_table().cast(schema(track))
+
+
 def _paths(out: Path) -> list[Path]:
     paths = sorted((out / FOLDER).glob("[!.]*.parquet"))
     if not paths:

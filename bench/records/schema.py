@@ -34,6 +34,7 @@ IDENTITY: tuple[pa.Field, ...] = (
     field("threat_budget", FLOAT, "size of the perturbation set", "share or normalised, depending on the norm"),
     field("threat_access", TEXT, "highest access allowed to the attacker"),
     field("threat_queries", INT, "query budget of a step or of a patch", "queries"),
+    field("threat_share", FLOAT, "share of the frames of an episode that may be attacked", "share, 0 to 1"),
     field("grid", TEXT, "name of the grid"),
     field("cell", TEXT, "JSON: the value on each axis of the world"),
     field("world_facts", TEXT, "JSON: axes, decision rate, episode length and actions of the world"),

@@ -32,6 +32,7 @@ class RunConfig:
         out: results folder.
         record: episodes to record in every cell of each pair; None records one episode of the first cell.
         reference: whether to run the baselines of the pairs, too.
+        skipped: members of suites that do not fit a victim, one line each.
 
     Raises:
         ValueError: if a number is out of range.
@@ -45,6 +46,7 @@ class RunConfig:
     out: Path = Path("results")
     record: int | None = None
     reference: bool = True
+    skipped: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
@@ -126,12 +128,7 @@ def run_config(words: Sequence[str]) -> RunConfig:
     with _one_line():
         standard = _grid(given, settings["grid"])
         grid = standard.with_(episodes=settings["episodes"], **given.cell_values(standard.axes))
-        choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS]
-        pairs = [
-            Pair(attack=attack, defense=defense, victim=victim, world=world, threat=threat)
-            for attack, defense, victim, world, threat in itertools.product(*choices, given.threats())
-        ]
-        pairs = [pair.clean() if pair.is_clean else pair for pair in pairs]
+        pairs, skipped = _pairs(given)
         return RunConfig(
             pairs=tuple({pair.id: pair for pair in pairs}.values()),
             grid=grid,
@@ -141,7 +138,30 @@ def run_config(words: Sequence[str]) -> RunConfig:
             out=Path(settings["out"]).expanduser(),
             record=settings["record"],
             reference=settings["reference"],
+            skipped=tuple(dict.fromkeys(skipped)),
         )
+
+
+def _pairs(given: Options) -> tuple[list[Pair], list[str]]:
+    """Every combination of the chosen components and threat models, and the members of suites that are skipped.
+
+    Raises:
+        UserError: if an attack that was chosen by its name does not fit, or no member of a suite does.
+    """
+    attacks = given.chosen("attack")
+    pairs, skipped = [], []
+    others: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS if kind != "attack"]
+    for defense, victim, world, threat in itertools.product(*others, given.threats()):
+        parts = {"defense": defense, "victim": victim, "world": world, "threat": threat}
+        own = [Pair(attack=attack, **parts) for attack in attacks]
+        pairs += [pair.clean() if pair.is_clean else pair for pair in own]
+        for suite in given.suites:
+            made, left = suite.pairs(**parts)
+            pairs += made
+            skipped += left
+    if not pairs:
+        raise UserError(skipped[0] if skipped else f"no member of {given.suites[0].name} is meant for the victim")
+    return pairs, skipped
 
 
 def _grid(given: Options, name: str | None) -> Grid:

@@ -117,12 +117,7 @@ def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
         defense=_chosen("defense", record),
         victim=victim,
         world=_chosen("world", record),
-        threat=victim.component.threat(
-            norm=record["threat_norm"],
-            budget=record["threat_budget"],
-            access=record["threat_access"],
-            queries=record["threat_queries"],
-        ),
+        threat=victim.component.threat.recorded(record),
     )
     unit = Unit(
         pair=pair,

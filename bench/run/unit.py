@@ -130,8 +130,9 @@ class Unit(Work):
 
     @property
     def attack_seed(self) -> int:
-        """Seed of the attack's random generator; the same for every pair and order of work."""
-        return int(digest([canonical(self.cell), self.training_seed])[:15], 16)
+        """Seed of the attack's random generator; the same for every order of work, and for every pair with the same `draw`."""
+        draw = getattr(self.pair.attack.component, "draw", 0)
+        return int(digest([canonical(self.cell), self.training_seed, *([draw] if draw else [])])[:15], 16)
 
     @cached_property
     def preparation(self) -> Preparation | None:
@@ -168,7 +169,7 @@ class Unit(Work):
 
         Call it in the process that did the work: it reads machine, code and libraries there.
         """
-        pair, threat = self.pair, self.pair.threat
+        pair = self.pair
         return {
             "unit": self.fingerprint,
             "pair": pair.id,
@@ -177,10 +178,7 @@ class Unit(Work):
             **self.track.identity(pair),
             "sees": pair.victim.component.sees,
             "training_seed": self.training_seed,
-            "threat_norm": threat.norm,
-            "threat_budget": float(threat.budget),
-            "threat_access": threat.access,
-            "threat_queries": threat.queries,
+            **pair.threat.columns,
             "grid": self.grid,
             "cell": json.dumps(dict(self.cell), separators=(",", ":")),
             "world_facts": json.dumps(pair.world.component.facts.written(), separators=(",", ":")),

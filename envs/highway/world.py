@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from bench.driving import ActionType, Driver, DrivingWorld, Features
+from bench.driving import ActionType, Driver, DrivingWorld, Dynamics, Features
 from bench.scenarios import Axes, Cell
 from envs.highway.axes import AXES, STANDARD_V1
 from envs.highway.config import (
@@ -111,6 +111,12 @@ class HighwayWorld(DrivingWorld):
             observed_vehicles=rows,
             offroad_terminal=self.offroad_terminal,
         )
+
+    def dynamics(self, cell: Cell, action_type: ActionType) -> Dynamics:
+        """See `bench.driving.DrivingWorld.dynamics`; on the compiled engine for both backends."""
+        from envs.highway.forecast import HighwayDynamics
+
+        return HighwayDynamics(self.config((cell,), action_type=action_type))
 
     def make(
         self,

@@ -20,7 +20,7 @@ from leaderboard.comparisons.pairing import beside
 
 DEFENDED = ("defense", "defense_params", "victim", "victim_params", "world", "world_params")
 """The columns that name what is attacked; a clean control shares them with the attacked episodes."""
-THREAT = ("threat_norm", "threat_budget", "threat_access", "threat_queries")
+THREAT = ("threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share")
 ATTACKER = ("attack", "attack_params", *THREAT)
 IDENTITY = (*DEFENDED, *ATTACKER, "grid", "action_type", "sees")
 """The columns that all episodes of a comparison share."""

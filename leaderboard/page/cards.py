@@ -62,7 +62,9 @@ def run_command(one: Comparison) -> str:
         words.append(f"{kind}={identity[kind]}")
         words += [f"{kind}.{name}={_word(value)}" for name, value in parameters(identity[f"{kind}_params"]).items()]
     if one.is_attacked:
-        words += [f"threat.{name.removeprefix('threat_')}={_word(identity[name])}" for name in THREAT]
+        # Every frame is the default, and tracks without frames do not know the option.
+        given = [name for name in THREAT if (name, identity[name]) != ("threat_share", 1)]
+        words += [f"threat.{name.removeprefix('threat_')}={_word(identity[name])}" for name in given]
     for axis in one.axes:
         values = dict.fromkeys(cell[axis] for cell in one.cells)
         words.append(f"{axis}={','.join(_word(value) for value in values)}")

@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 CSV = (
-    "track", "world", "grid", "threat_norm", "threat_budget", "threat_access", "threat_queries", "group", "flagged", "flags",
+    "track", "world", "grid", "threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share",
+    "group", "flagged", "flags",
     "defense", "defense_params", "victim", "victim_params", "score", "low", "high", "failed", "failed_low", "failed_high",
     "worst_cell", "worst_cell_score", "worst_cell_low", "worst_cell_high", "clean", "clean_low", "clean_high",
     "lead", "lead_low", "lead_high", "strongest_attack", "strongest_attack_params", "training_seeds", "cells", "scenarios",
@@ -26,12 +27,13 @@ def table(made: Mapping[str, Any]) -> str:
     for board in made["boards"]:
         for row in board["rows"]:
             strongest = pairs[row["strongest"]]["attack"]
+            threat = board["threat"]
             line = {
                 "track": board["track"],
                 "world": board["world"]["name"],
                 "grid": board["grid"],
                 "worst_cell": json.dumps(row["worst_cell"]["cell"]),
-                **{f"threat_{name}": board["threat"][name] for name in ("norm", "budget", "access", "queries")},
+                **{f"threat_{name}": threat[name] for name in ("norm", "budget", "access", "queries", "share")},
                 "group": row["group"],
                 "flagged": str(row["flagged"]).lower(),
                 "flags": " ".join(flag["name"] for flag in row["flags"] if flag["fired"]),

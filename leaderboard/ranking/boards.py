@@ -90,7 +90,7 @@ def boards(comparisons: Sequence[Comparison]) -> list[Board]:
     tracks = {_key(one): one.track for one in attacked}
 
     def rank(key: Key) -> tuple[object, ...]:
-        track, world, params, grid, norm, budget, access, queries = key
+        track, world, params, grid, norm, budget, access, queries, share = key
         named = [one.name for one in registry.grids(world)]
         return (
             -episodes[track,],
@@ -103,6 +103,7 @@ def boards(comparisons: Sequence[Comparison]) -> list[Board]:
             -budget,
             -_access(access),
             -queries,
+            -share,
         )
 
     return [_board(key, tracks[key], attacked) for key in sorted(tracks, key=rank)]
@@ -135,8 +136,8 @@ def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
 
 
 def _within(one: Comparison, key: Key) -> bool:
-    """Whether the threat model allows what an attack did: it had no more knowledge, budget and queries."""
-    track, world, world_params, grid, norm, budget, access, queries = key
+    """Whether the threat model allows what an attack did: it had no more knowledge, budget, queries and frames."""
+    track, world, world_params, grid, norm, budget, access, queries, share = key
     identity = one.identity
     same = tuple(identity[name] for name in ("world", "world_params", "grid", "threat_norm"))
     return (
@@ -144,6 +145,7 @@ def _within(one: Comparison, key: Key) -> bool:
         and float(str(identity["threat_budget"])) <= budget
         and _access(str(identity["threat_access"])) <= _access(access)
         and int(str(identity["threat_queries"])) <= queries
+        and float(str(identity["threat_share"])) <= share
     )
 
 

@@ -34,11 +34,10 @@ def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> Non
 def print_boards(boards: Sequence[Board], console: Console) -> None:
     """Print the leaderboard of each threat model."""
     for board in boards:
-        norm, budget, access, queries = board.threat
-        title = Text.assemble(
-            (board.track.name, "bold"),
-            f" in {board.world[0]}, {board.grid}, {norm} {budget:g}, access {access}, {queries} queries",
-        )
+        norm, budget, access, queries, share = board.threat
+        frames = "" if share == 1 else f", {100 * share:g} % of the frames"
+        allowed = f"{board.grid}, {norm} {budget:g}, access {access}, {queries} queries{frames}"
+        title = Text.assemble((board.track.name, "bold"), f" in {board.world[0]}, {allowed}")
         console.print(Padding(title, (1, 1)))
         console.print(Padding(fitted(_columns(board), [Section(board.rows)], console), (0, 1)))
         for name, drive in board.baselines.items():

@@ -114,6 +114,7 @@ def threat(one: Comparison) -> str:
     """The threat model of a comparison in one sentence."""
     if not one.is_attacked:
         return "nothing is attacked"
-    norm, budget, access, queries = (one.identity[name] for name in THREAT)
+    norm, budget, access, queries, share = (one.identity[name] for name in THREAT)
     allowed = one.track.allowed(norm, budget, one.facts)
-    return f"{norm} {budget:g}: {allowed}; access {access}, at most {queries} {one.track.queries_title}"
+    frames = "" if share == 1 else f", {100 * share:g} % of the frames"
+    return f"{norm} {budget:g}: {allowed}; access {access}, at most {queries} {one.track.queries_title}{frames}"

@@ -1,4 +1,4 @@
-"""PGD: its first step is FGSM, more steps are never weaker, and it beats noise."""
+"""PGD: its first step is FGSM, more steps are never weaker, it is never worse than its start points, and it beats noise."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from hypothesis import strategies as st
 
 from attacks.noise import Noise
 from attacks.objectives import Objective
-from attacks.pgd import PGD
+from attacks.pgd import PGD, random_starts
 from bench.driving import ActionType, ObservationThreat
 from bench.driving.threat import project
-from tests.attacks.victims import FEATURES, Linear, left, loss_of, observations, perturb, victim
+from tests.attacks.victims import FEATURES, Linear, left, loss_of, observations, open_oracle, perturb, victim
 
 OBJECTIVES: tuple[Objective, ...] = ("collision", "expected", "margin", "target")
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 999), st.sampled_from(OBJECTIVES))
-def test_one_whole_step_from_the_truth_is_fgsm(seed: int, objective: Objective) -> None:
+def test_one_whole_step_from_the_truth_is_fgsm_where_that_is_better_than_the_truth(
+    seed: int, objective: Objective
+) -> None:
     threat, policy, observation = ObservationThreat(budget=0.1), victim("discrete", seed), observations(8, seed)
     leaf = observation.clone().requires_grad_(True)
     loss_of(policy, objective, observation)(policy.scores(leaf)).sum().backward()
@@ -28,7 +30,21 @@ def test_one_whole_step_from_the_truth_is_fgsm(seed: int, objective: Objective) 
     fgsm = project(observation - radius * leaf.grad.sign(), observation, radius)
     attack = PGD(steps=1, step_size=1.0, restarts=1, random_start=False, objective=objective)
     shown, _ = perturb(attack, policy, observation, threat)
-    assert torch.equal(shown, fgsm)
+    loss = loss_of(policy, objective, observation)
+    before, after = (loss.key(scores, loss(scores)) for scores in map(policy.scores, (observation, fgsm)))
+    assert torch.equal(shown, torch.where((after < before)[:, None, None], fgsm, observation))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 999), st.sampled_from(OBJECTIVES))
+def test_it_is_never_worse_than_the_truth_and_its_random_starts(seed: int, objective: Objective) -> None:
+    policy, observation = victim("discrete", seed), observations(8, seed)
+    attack = PGD(steps=1, step_size=2.0, restarts=3, objective=objective)
+    oracle = open_oracle(policy, attack, observation)
+    starts = random_starts(observation, 3, oracle)
+    loss = loss_of(policy, objective, observation)
+    scores = policy.scores(torch.cat((observation[None], starts)))
+    assert (left(attack, policy, observation, objective) <= loss.key(scores, loss(scores)).amin(0) + 1e-6).all()
 
 
 @settings(max_examples=20, deadline=None)

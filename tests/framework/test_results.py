@@ -121,7 +121,7 @@ CANNOT_BE = {
     "world_facts": ("{}", "not a cell, or world_facts has no axes"),
     "attack_params": ("{scale: 1}", "attack_params {scale: 1}: Expecting property name"),
     "world_params": ("[1]", "world_params [1]: not a JSON object"),
-    "threat_access": ("all", "threat_access all: known: oblivious, decisions, scores, gradients"),
+    "threat_access": ("all", "threat_access all: known: oblivious, decisions, scores, gradients, dynamics"),
 }
 
 
@@ -166,10 +166,20 @@ def test_reading_a_folder_keeps_the_newest_code_and_each_scenario_once(written: 
     assert sorted(row["seed"] for row in same_pair) == sorted({row["seed"] for row in newer + longer})
 
 
+def test_records_without_a_share_of_frames_read_as_all_frames(written: Path, units: list[Unit]) -> None:
+    today = read(written)
+    _, before, *_ = generations(TRACK)
+    assert "threat_share" not in before.names
+    path = results.path_of(written, units[0].fingerprint)
+    pq.write_table(pq.read_table(path).select(before.names).cast(before), path)
+    assert read(written).equals(today)
+    assert set(today["threat_share"].to_pylist()) == {1.0}
+
+
 def test_records_of_format_1_are_converted(written: Path, units: list[Unit]) -> None:
     """Format 1 had one column each for lanes, density and weather, and no facts of the world."""
     today = read(written)
-    _, second, first = generations(TRACK)
+    _, _, second, first = generations(TRACK)
     for number, unit in enumerate(units):
         path = results.path_of(written, unit.fingerprint)
         older = []

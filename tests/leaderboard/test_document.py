@@ -103,7 +103,7 @@ def test_every_published_run_command_makes_the_same_pair_on_the_same_scenarios()
             # A parameter that is younger than the records has its default.
             same = {name: json.loads(chosen.params)[name] for name in component["params"]}
             assert (chosen.name, same) == (component["name"], component["params"]), card["run"]
-        assert {name: getattr(found.threat, name) for name in pair["threat"]} == pair["threat"]
+        assert {name: found.threat.columns[f"threat_{name}"] for name in pair["threat"]} == pair["threat"]
         assert list(config.seeds) == card["training_seeds"]
         assert {cell for one in pair["cells"] for cell in [Cell(**one["cell"])]} <= set(config.grid.cells())
 

@@ -80,6 +80,7 @@ def records(attack: str, budget: float, left: float) -> pa.Table:
         "threat_budget": budget,
         "threat_access": "scores" if budget else "oblivious",
         "threat_queries": 10 if budget else 0,
+        "threat_share": 1.0,
         "grid": "bends",
         "cell": [as_text(cells[i]) for i in place],
         "world_facts": json.dumps(

@@ -1,0 +1,9 @@
+"""The built-in suites of attacks; the lists are in the TOML files of this folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bench.plugins.suites import Suite
+
+STANDARD_1 = Suite.read(Path(__file__).with_name("standard-1.toml"))

@@ -1,0 +1,65 @@
+"""What an attacker with access `dynamics` knows: how a world moves, never the hidden state of an episode."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from bench.driving.features import ActionType
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """The predicted course of B episodes under P plans each.
+
+    Args:
+        failed: int64 [B, P], number of decisions before the car crashes or leaves the road; T if it does neither.
+        crashed: bool [B, P], whether the failure is a crash.
+        progress: float32 [B, P], progress summed over the decisions, in [0, T]; 0 from a failure on.
+    """
+
+    failed: Tensor
+    crashed: Tensor
+    progress: Tensor
+
+
+class Dynamics(ABC):
+    """A world's rules of motion, for attackers. It is bound to a road and a kind of control, but to no episode.
+
+    An attacker keeps a `belief` for each of its episodes, a TensorDict of batch size [B] whose content belongs to the world. It
+    is computed from true observations alone. A belief may be edited: it is the attacker's own.
+
+    Attributes:
+        action_type: kind of the actions in a plan.
+        actions: number of discrete actions; 0 for continuous ones.
+        period: seconds per decision.
+    """
+
+    action_type: ActionType
+    actions: int
+    period: float
+
+    @abstractmethod
+    def unknown(self, batch: int) -> TensorDict:
+        """The belief about `batch` episodes of which nothing was seen."""
+
+    @abstractmethod
+    def believe(self, observation: Tensor, before: TensorDictBase) -> TensorDict:
+        """The belief after one more true observation.
+
+        Args:
+            observation: the true observation, [B, V, F].
+            before: the belief one decision earlier, batch size [B].
+        """
+
+    @abstractmethod
+    def roll(self, belief: TensorDictBase, plans: Tensor) -> Forecast:
+        """Predict what happens if the victim executes plans.
+
+        Args:
+            belief: the state to start from, batch size [B].
+            plans: actions of T decisions: int64 [P, T] or [B, P, T], or for continuous actions float [P, T, 2] or [B, P, T, 2].
+        """

@@ -1,0 +1,149 @@
+"""The highway's dynamics for attackers: beliefs from observations, and forecasts from beliefs, on the compiled engine."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from bench.driving.dynamics import Dynamics, Forecast
+from envs.highway.belief import track_batch
+from envs.highway.collision import find_collisions
+from envs.highway.compiled import entry_point
+from envs.highway.config import ACTIONS, HighwayConfig
+from envs.highway.dynamics import is_on_lane, move
+from envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED, apply_action, lane_share, speed_share
+from envs.highway.engine import physical_controls
+from envs.highway.sensor import sensor_range_m
+from envs.highway.state import VEHICLE, EgoKind, Floats, Integers, Parameters, parameters
+from envs.highway.traffic import act, sort_by_position
+from envs.weather import WEATHERS
+
+FIELDS = ("x", "y", "heading", "speed", "target_speed", "timer", "delta", "lane", "target_lane")
+"""The fields of a vehicle that a belief holds."""
+
+NEAR_AHEAD, NEAR_BEHIND = 150.0, 60.0
+"""Cars within this distance of the ego in m are simulated; the others hardly matter within a few seconds."""
+
+
+@entry_point
+def roll_batch(
+    cars: NDArray[np.void],
+    counts: Integers,
+    actions: Integers,
+    controls: Floats,
+    lanes: int,
+    parameters: Parameters,
+    failed: Integers,
+    crashed: NDArray[np.bool_],
+    progress: NDArray[np.float32],
+) -> None:
+    """Simulate every plan from every belief; see `HighwayDynamics.roll`.
+
+    Args:
+        cars: beliefs [B, N], of which the first `counts` [B] are known.
+        actions: [B, P, T]; controls: [B, P, T, 2].
+        failed, crashed, progress: outputs [B, P].
+    """
+    size = cars.shape[1]
+    near, copy = np.empty_like(cars[0]), np.empty_like(cars[0])
+    order, ordered, places = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
+    corners = np.empty((2, 5, 2))
+    for episode in range(cars.shape[0]):
+        count = 0
+        for number in range(counts[episode]):
+            ahead = cars[episode, number].x - cars[episode, 0].x
+            if -NEAR_BEHIND < ahead < NEAR_AHEAD:
+                near[count : count + 1] = cars[episode, number : number + 1]
+                ordered[count] = count
+                count += 1
+        sort_by_position(near, ordered[:count])
+        for plan in range(actions.shape[1]):
+            copy[:count] = near[:count]
+            order[:count] = ordered[:count]
+            vehicles, sequence, ego = copy[:count], order[:count], copy[0]
+            total, step = 0.0, 0
+            while step < actions.shape[2]:
+                apply_action(ego, actions[episode, plan, step], controls[episode, plan, step], True, lanes, parameters)
+                for _ in range(parameters.substeps):
+                    act(vehicles, sequence, places[:count], lanes, parameters.ego)
+                    for number in range(count):
+                        move(vehicles[number], lanes, parameters.dt)
+                    sort_by_position(vehicles, sequence)
+                    find_collisions(vehicles, sequence, parameters.dt, corners)
+                if ego.crashed or not is_on_lane(ego, ego.lane, 0.0):
+                    break
+                share = PROGRESS_LANE * lane_share(ego, lanes, parameters) + PROGRESS_SPEED * speed_share(
+                    ego, parameters
+                )
+                total += share / (PROGRESS_LANE + PROGRESS_SPEED)
+                step += 1
+            failed[episode, plan] = step
+            crashed[episode, plan] = ego.crashed
+            progress[episode, plan] = total
+
+
+class HighwayDynamics(Dynamics):
+    """The highway's rules of motion on the roads of one cell.
+
+    Args:
+        config: configuration with the cell; its other values are parameters of the world, which are no secret.
+    """
+
+    def __init__(self, config: HighwayConfig) -> None:
+        self.config, self.parameters = config, parameters(config)
+        self.action_type, self.period = config.action_type, 1 / config.policy_frequency
+        self.actions = len(ACTIONS) if config.action_type == "discrete" else 0
+        cell = config.cells[0]
+        self.lanes: int = cell.lanes
+        self.sensor_range = sensor_range_m(WEATHERS[cell.weather])
+        features = config.features
+        self._half = (np.array(features.high) - np.array(features.low)) / 2
+        self._centre = (np.array(features.high) + np.array(features.low)) / 2
+
+    def unknown(self, batch: int) -> TensorDict:
+        size = self.config.vehicles + 1
+        fields = {name: torch.zeros(batch, size, dtype=torch.float64) for name in FIELDS}
+        return TensorDict({**fields, "count": torch.zeros(batch, dtype=torch.int64)}, batch_size=[batch])
+
+    def believe(self, observation: Tensor, before: TensorDictBase) -> TensorDict:
+        cars, counts = self._records(before)
+        normalised = observation.numpy().astype(np.float64)
+        rows = normalised.copy()
+        rows[..., 1:] = normalised[..., 1:] * self._half + self._centre
+        clipped = (np.abs(normalised[..., 1:]) >= 1).any(-1)
+        track_batch(cars, counts, rows, clipped, self.lanes, self.sensor_range, self.parameters)
+        return self._belief(cars, counts)
+
+    def roll(self, belief: TensorDictBase, plans: Tensor) -> Forecast:
+        cars, counts = self._records(belief)
+        discrete = self.parameters.ego == EgoKind.DISCRETE
+        wanted = 3 if discrete else 4
+        given = plans.numpy()
+        given = np.broadcast_to(given, (len(cars), *given.shape[-(wanted - 1) :]))
+        shape = given.shape[:3]
+        if discrete:
+            actions, controls = np.ascontiguousarray(given, dtype=np.int64), np.zeros((*shape, 2))
+        else:
+            actions = np.ones(shape, np.int64)
+            controls = np.ascontiguousarray(physical_controls(given.reshape(-1, 2)).reshape(*shape, 2))
+        failed, progress = np.zeros(shape[:2], np.int64), np.zeros(shape[:2], np.float32)
+        crashed = np.zeros(shape[:2], np.bool_)
+        roll_batch(cars, counts, actions, controls, self.lanes, self.parameters, failed, crashed, progress)
+        return Forecast(torch.from_numpy(failed), torch.from_numpy(crashed), torch.from_numpy(progress))
+
+    def _belief(self, cars: NDArray[np.void], counts: Integers) -> TensorDict:
+        fields = {name: torch.from_numpy(cars[name].astype(np.float64)) for name in FIELDS}
+        return TensorDict({**fields, "count": torch.from_numpy(counts)}, batch_size=[len(counts)])
+
+    def _records(self, belief: TensorDictBase) -> tuple[NDArray[np.void], Integers]:
+        """A belief as records of the engine [B, N], and the number of known cars [B]."""
+        counts = belief["count"].numpy().copy()
+        cars = np.zeros((len(counts), self.config.vehicles + 1), dtype=VEHICLE)
+        for name in FIELDS:
+            cars[name] = belief[name].numpy()
+        cars["cos_heading"], cars["sin_heading"] = np.cos(cars["heading"]), np.sin(cars["heading"])
+        cars["impact_pair"] = -1
+        return cars, counts
