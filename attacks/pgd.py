@@ -48,8 +48,9 @@ class PGD(DrivingAttack):
         target_steering: continuous target, in [-1, 1] (default 0.5).
         braking_action: index of the braking action for `collision`, at least 0 (default 4, SLOWER).
 
-    Shapes: observation [B, V, F] in, the same out. Queries per step: 1 + restarts * (steps + 1). With a smaller query budget it
-    uses fewer restarts, then fewer steps.
+    Shapes: observation [B, V, F] in, the same out. Queries per step: 1 + restarts * (steps + 1), where an iterate
+    counts twice if the loss asks the critic of a continuous victim. With a smaller query budget it uses fewer restarts, then
+    fewer steps.
 
     Example:
         >>> from attacks.pgd import PGD
@@ -73,7 +74,7 @@ class PGD(DrivingAttack):
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if not len(observation):
             return observation
-        affordable = int(oracle.remaining.min()) - 1
+        affordable = (int(oracle.remaining.min()) - 1) // self._price(oracle)
         restarts = min(self.restarts, affordable // 2)
         if restarts < 1:
             return observation
@@ -94,6 +95,10 @@ class PGD(DrivingAttack):
         scores = oracle.scores(x)
         best, lowest = _better(best, lowest, x, key(scores, loss(scores)))
         return best[lowest.argmin(0), torch.arange(len(observation))]
+
+    def _price(self, oracle: Oracle) -> int:
+        """Queries per iterate: one, and one more where the loss asks the victim's critic."""
+        return 2 if oracle.action_type == "continuous" and self.objective not in ("margin", "target") else 1
 
     def _loss(
         self, observation: Tensor, oracle: Oracle
@@ -126,7 +131,7 @@ class PGD(DrivingAttack):
 def _ask(
     x: Tensor, loss: Callable[[Tensor], Tensor], key: Callable[[Tensor, Tensor], Tensor], oracle: Oracle
 ) -> tuple[Tensor, Tensor]:
-    """The keys of the iterates [R, B] and the gradient of the loss [R, B, V, F], from one query."""
+    """The keys of the iterates [R, B] and the gradient of the loss [R, B, V, F], each from one query."""
     keys: list[Tensor] = []
 
     def asked(scores: Tensor) -> Tensor:

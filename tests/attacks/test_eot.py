@@ -15,6 +15,7 @@ from attacks.grey_patch import GreyPatch
 from attacks.noise_patch import NoisePatch
 from bench.detection import Detector, PatchOracle, PatchThreat, Scenes
 from bench.detection.boxes import confidence
+from bench.detection.enforcer import PatchEnforcer
 from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.vision.drawn_street import DrawnStreet
@@ -27,7 +28,7 @@ def crafted(
 ) -> tuple[Tensor, PatchOracle]:
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    oracle = PatchOracle(detector or RedDetector(), PatchThreat(queries=queries), attack.access, generator)
+    oracle = PatchEnforcer(detector or RedDetector(), PatchThreat(queries=queries), attack.access, generator).oracle
     scenes: Scenes = SCENES if detector is None else DrawnStreet().training_scenes()
     return attack.craft(oracle, scenes, lambda share, text: None), oracle
 

@@ -169,7 +169,7 @@ def test_reading_a_folder_keeps_the_newest_code_and_each_scenario_once(written: 
 def test_records_of_format_1_are_converted(written: Path, units: list[Unit]) -> None:
     """Format 1 had one column each for lanes, density and weather, and no facts of the world."""
     today = read(written)
-    _, second, first = generations(TRACK)
+    second, *_, first = [one for one in generations(TRACK) if "lanes" in one.names]
     for number, unit in enumerate(units):
         path = results.path_of(written, unit.fingerprint)
         older = []

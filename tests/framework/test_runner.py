@@ -12,6 +12,7 @@ import pytest
 from bench.errors import UserError
 from bench.plugins.track import track
 from bench.records import reading
+from bench.records.schema import PROBES
 from bench.run import runner
 from bench.run.config import run_config
 from bench.run.plan import plan
@@ -21,8 +22,8 @@ pytestmark = pytest.mark.usefixtures("toy_folder")
 
 SMALL = "attack=nudge victim=toy world=toy lanes=3,4 density=1 weather=clear,fog episodes=4 seeds=0,1"
 Work = Unit | Preparation
-BESIDE = ("attack_ms", "created_at", "wall_s")
-"""Columns in which two runs of the same unit may differ."""
+BESIDE = ("attack_ms", "created_at", "wall_s", *(field.name for field in PROBES))
+"""Columns in which two runs of the same unit may differ; nobody can foresee which moments are probed."""
 
 
 class Silent:
