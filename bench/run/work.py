@@ -68,7 +68,8 @@ def perform(task: Task, tell: Tell) -> Outcome:
     try:
         return _prepared(work, tell) if isinstance(work, Preparation) else _driven(work, task)
     except TamperError as error:
-        parts = [part for part in work.pair.parts if part.kind in error.sides]
+        kinds = {"attack": ("attack",), "defense": ("defense", "victim")}
+        parts = [part for part in work.pair.parts if any(part.kind in kinds[side] for side in error.sides)]
         shipped = " and ".join(f"{part.kind} {part.name!r} of {shipped_by(part)}" for part in parts)
         raise UserError(f"{work} is refused: {error} ({shipped})") from error
     except UserError as error:
