@@ -36,7 +36,7 @@ def drive(job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
         approaches = world.approaches(job.cell, job.seeds)
         check_approaches(approaches, job.seeds, type(world).__name__)
         trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
-        with Watch(detector, "detector", "defense"):
+        with Watch(detector, "detector", "defense", listens=False):
             columns = score(detector, approaches, patch, share=pair.threat.budget, entropy=job.entropy, trace=trace)
     SEAL.check()
     made = {"patch": np.array([job.artefact] * len(approaches))}

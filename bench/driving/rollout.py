@@ -79,7 +79,11 @@ def rollout(
         TamperError: if the attack or the victim changes what it may not change.
     """
     episodes = torch.as_tensor(list(seeds), dtype=torch.int64)
-    with torch.no_grad(), Stream("victim", attack_seed).in_use(), Watch(policy, "victim") as watch:
+    with (
+        torch.no_grad(),
+        Stream("victim", attack_seed).in_use(),
+        Watch(policy, "victim", listens=attack is not None) as watch,
+    ):
         subject = CountedPolicy(policy, watch, Stream("attack", attack_seed))
         attacker = Attacker(attack, subject, threat, facts.features, seed=attack_seed)
         td = env.reset(TensorDict({"seed": episodes}, batch_size=env.batch_size))

@@ -37,34 +37,37 @@ class TamperError(UserError):
 class Watch:
     """Watches a network for the time of a unit: `with Watch(network, "victim") as watch: ...`.
 
-    A forward pass of any of its modules while foreign code runs (`away`), other than through the oracle, is counted in
+    A forward pass of a module with weights while foreign code runs (`away`), other than through the oracle, is counted in
     `strays`. Tensors are compared by their version counters at any time (`touched`), and by their contents at the end.
 
     Args:
         network: the (defended) victim.
         noun: what messages call it.
         sides: who can have changed it.
+        listens: whether to count forward passes; without foreign code there are none to count.
 
     Raises:
         TamperError: at the end, if weights, hooks, mode or methods of the network have changed.
     """
 
-    def __init__(self, network: nn.Module, noun: str, *sides: Side) -> None:
+    def __init__(self, network: nn.Module, noun: str, *sides: Side, listens: bool = True) -> None:
         self.network, self.noun, self.sides = network, noun, sides or ("attack", "defense")
         self.away = False
         self.strays = 0
         self._tensors = [value for _, value in _tensors(network) if not value.is_inference()]
         self._version = self._versions()
+        # A hook takes time on every call: only modules that compute with weights of their own, and the network itself, have one.
+        own = [one for one in network.modules() if one is network or any(True for _ in _own(one))]
+        self._heard = own if listens else []
 
     def __enter__(self) -> Watch:
         self._before = marks(self.network)
-        self._handles = [module.register_forward_pre_hook(self._called) for module in self.network.modules()]
+        self._handles = [module.register_forward_pre_hook(self._called) for module in self._heard]
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         there = [
-            handle.id in module._forward_pre_hooks
-            for handle, module in zip(self._handles, self.network.modules(), strict=False)
+            handle.id in module._forward_pre_hooks for handle, module in zip(self._handles, self._heard, strict=True)
         ]
         for handle in self._handles:
             handle.remove()
@@ -107,6 +110,11 @@ def marks(network: nn.Module) -> Mapping[str, str]:
         inherited = [id(getattr(type(module), method, None)) for method in ("__call__", "forward", "scores", "predict")]
         methods += [(name, id(type(module)), own, inherited)]
     return {"weights": weights.hexdigest(), "hooks": repr(hooks), "mode": repr(mode), "methods": repr(methods)}
+
+
+def _own(module: nn.Module) -> Iterator[Tensor]:
+    yield from module.parameters(recurse=False)
+    yield from module.buffers(recurse=False)
 
 
 def _tensors(network: nn.Module) -> Iterator[tuple[str, Tensor]]:

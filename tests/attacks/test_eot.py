@@ -44,7 +44,7 @@ def test_the_patch_is_close_to_the_optimum() -> None:
     patch, oracle = crafted(EOT(texels=16, steps=40, batch=4, window=32))
     assert patch.shape == (3, 16, 16)
     assert 0 <= patch.min() <= patch.max() <= 1
-    assert (oracle.spent, oracle.backwards) == (160, 160)
+    assert (oracle.spent, oracle._door.backwards) == (160, 160)
     best = red(torch.tensor([0.0, 1.0, 1.0])[:, None, None].expand(3, 8, 8))
     controls = [red(crafted(control)[0]) for control in (NoisePatch(texels=16), GreyPatch())]
     assert best <= red(patch) < best + 0.1 * (min(controls) - best)

@@ -232,7 +232,7 @@ class BadPatch(PatchAttack):
                 progress(2.0, "done twice")
             case "weights":
                 with torch.no_grad():
-                    for weight in oracle._detector.parameters():
+                    for weight in oracle._door.detector.parameters():
                         weight.add_(0.1)
             case "scenes":
                 scenes.distance += 1
