@@ -54,8 +54,9 @@ class PGD(DrivingAttack):
         gap_temperature: temperature T of the softmax over the Q-values in the gap, above 0.
         draw: number of the random draw: another number is the same attack with other random starts.
 
-    Shapes: observation [B, V, F] in, the same out. Queries per step: 1 + restarts * (steps + 1). With a smaller query budget it
-    uses fewer restarts, then fewer steps.
+    Shapes: observation [B, V, F] in, the same out. Queries per step: 1 + restarts * (steps + 1), where an iterate
+    counts twice if the loss asks the critic of a continuous victim. With a smaller query budget it uses fewer restarts, then
+    fewer steps.
 
     Example:
         >>> from attacks.pgd import PGD
@@ -98,7 +99,10 @@ class PGD(DrivingAttack):
 
     def _descend(self, observation: Tensor, clean: Tensor, oracle: Oracle, rows: Tensor | None = None) -> Tensor:
         """The attacked observations of all episodes, or of `rows`."""
-        affordable = int((oracle.remaining if rows is None else oracle.remaining[rows]).min())
+        price = self._price(oracle)
+        left = int((oracle.remaining if rows is None else oracle.remaining[rows]).min())
+        # The value of the true observation costs the critic's query alone.
+        affordable = (left - (price - 1)) // price
         restarts = min(self.restarts, affordable // 2)
         if restarts < 1:
             return observation
@@ -115,6 +119,10 @@ class PGD(DrivingAttack):
             start, loss, key, oracle, rows, steps=steps, step_size=self.step_size, momentum=self.momentum
         )
         return better(observation, known, best, lowest)
+
+    def _price(self, oracle: Oracle) -> int:
+        """Queries per iterate: one, and one more where the loss asks the victim's critic."""
+        return 2 if oracle.action_type == "continuous" and self.objective not in ("margin", "target") else 1
 
     def _loss(
         self, observation: Tensor, clean: Tensor, oracle: Oracle
@@ -217,7 +225,7 @@ def _ask(
     oracle: Oracle,
     rows: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """The keys of the iterates [R, B] and the gradient of the loss [R, B, V, F], from one query."""
+    """The keys of the iterates [R, B] and the gradient of the loss [R, B, V, F], each from one query."""
     keys: list[Tensor] = []
 
     def asked(scores: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from torch import Tensor
 from attacks.zo import ZOSignSGD
 from bench.driving import DrivingAttack, ObservationThreat, Policy
 from bench.driving.attacker import Attacker
+from bench.driving.victim import CountedPolicy
 from bench.run.process import settle
 from bench.scenarios import SeedBlock
 from bench.victims.drivers.networks import QPolicy
@@ -107,7 +108,7 @@ def _observations(world: HighwayWorld, episodes: int) -> Tensor:
 
 def _batched(attack: DrivingAttack, policy: Policy, world: HighwayWorld, observation: Tensor) -> Callable[[], object]:
     """One step of an attack as in a run, with the oracle and its checks."""
-    attacker = Attacker(attack, policy, ObservationThreat(queries=1_000_000), world.features, seed=0)
+    attacker = Attacker(attack, CountedPolicy(policy), ObservationThreat(queries=1_000_000), world.features, seed=0)
     running = torch.ones(len(observation), dtype=torch.bool)
     return lambda: attacker.show(observation, running, None)
 

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 
 from attacks.eot import EOT
-from bench.detection import STOP_SIGN, Detector, PatchOracle, PatchThreat, Scenes
+from bench.detection import STOP_SIGN, Detector, PatchThreat, Scenes
 from bench.detection.approach import look
+from bench.detection.enforcer import PatchEnforcer
 from bench.errors import UserError
 from bench.run.process import settle
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
@@ -57,7 +58,7 @@ def craft(detector: Detector, scenes: Scenes, rounds: int, steps: int) -> None:
             detector(shown).scores_of(label).amax(-1).mean().backward()
 
     def step() -> None:
-        attack.craft(PatchOracle(detector, THREAT, attack.access, generator), scenes, lambda share, text: None)
+        attack.craft(PatchEnforcer(detector, THREAT, attack.access, generator).oracle, scenes, lambda share, text: None)
 
     def first_rendering() -> None:
         for frame in torch.arange(len(scenes)).split(1):

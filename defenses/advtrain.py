@@ -18,11 +18,12 @@ from bench.driving import (
     DrivingVictim,
     DrivingWorld,
     ObservationThreat,
-    Oracle,
     Policy,
     TrainingHooks,
 )
+from bench.driving.enforcer import Enforcer
 from bench.driving.threat import Norm
+from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
 from bench.plugins.contracts import Progress, Trained
 from bench.plugins.options import configured, parameter_words
@@ -159,9 +160,8 @@ class AttackInLoop(TrainingHooks):
 
     def perturbed(self, observation: Tensor, policy: Policy, scale: float = 1.0) -> Tensor:
         """attack(policy, o) [B, V, F], with a budget multiplied by `scale`."""
-        oracle = Oracle(policy, self.threat, self.attack.access, self.facts.features, self.noise)
-        oracle.begin_step(observation, scale=scale)
-        return oracle.project(self.attack.perturb(observation, oracle)).detach()
+        enforcer = Enforcer(CountedPolicy(policy), self.threat, self.attack.access, self.facts.features, self.noise)
+        return enforcer.project(self.attack.perturb(observation, enforcer.begin(observation, scale=scale)))[0]
 
     def selection(self, policy: Policy) -> dict[str, Callable[[Tensor], Tensor]]:
         return {"attacked": lambda observation: self.perturbed(observation, policy)} if self.recipe.skip < 1 else {}

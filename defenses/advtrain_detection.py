@@ -17,10 +17,10 @@ from bench.detection import (
     DetectorDefense,
     DetectorVictim,
     PatchAttack,
-    PatchOracle,
     PatchThreat,
     Scenes,
 )
+from bench.detection.enforcer import PatchEnforcer
 from bench.errors import UserError
 from bench.plugins.contracts import Facts, Progress, Trained
 from bench.plugins.options import configured, parameter_words
@@ -152,7 +152,7 @@ class _Hardening:
             self.progress(number / self.recipe.rounds, f"patch {number + 1}, {share:.0%}: {text}")
 
         threat = PatchThreat(budget=self.recipe.budget)
-        oracle = PatchOracle(self.detector.requires_grad_(False), threat, self.attack.access, self.generator)
+        oracle = PatchEnforcer(self.detector.requires_grad_(False), threat, self.attack.access, self.generator).oracle
         patch = self.attack.craft(oracle, self.scenes, tell)
         self.detector.requires_grad_(True)
         if patch is None:

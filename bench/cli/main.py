@@ -1,4 +1,4 @@
-"""The command line: `bench run | train | list | new | check | render | show | view | report | fetch`.
+"""The command line: `bench run | audit | train | list | new | check | render | show | view | report | fetch`.
 
 A command imports what it needs when it is called, so that `bench list` and `--help` do not import torch.
 """
@@ -96,6 +96,17 @@ def run(words: Words = None) -> None:
     from bench.cli import run as cli_run
 
     cli_run.run(words or [], Console(), _print_report)
+
+
+@app.command()
+def audit(words: Words = None) -> None:
+    """Score pairs again on scenarios drawn at this moment. A pair that scores higher on the public ones is flagged, exit code 1.
+
+    The options are those of bench run; salt=NUMBER repeats an audit. For instance: bench audit attack=pgd defense=advtrain
+    """
+    from bench.cli import audit as cli_audit
+
+    raise typer.Exit(cli_audit.audit(words or [], Console()))
 
 
 @app.command()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -15,6 +16,8 @@ from bench.detection.boxes import confidence, detections, overlap
 from bench.detection.detector import STOP_SIGN, Detections, Detector, Predictions
 from bench.detection.patch import Patch
 from bench.detection.scenes import Approach, Scenes
+from bench.errors import UserError
+from bench.trust.streams import Stream
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -77,6 +80,7 @@ def score(
     patch: Patch | None,
     *,
     share: float,
+    entropy: int = 0,
     trace: Trace | None = None,
 ) -> Columns:
     """Run a detector on every frame of A approaches and return the measurements, [A] each.
@@ -86,6 +90,7 @@ def score(
         approaches: the approaches.
         patch: the patch on the sign; None for no patch.
         share: side of the patch as a share of the sign's side.
+        entropy: seed of the frame that is probed; no measurement depends on it.
         trace: collects the detector's output on its episodes.
     """
     texels = patch.texels if patch else None
@@ -105,7 +110,7 @@ def score(
         "gradient_queries": float(crafted.gradients),
         "zero_gradients": crafted.zero_gradients / crafted.gradients if crafted.gradients else np.nan,
         "draws": np.nan,
-        **probed(detector, approaches[0].scenes),
+        **probed(detector, approaches, seen, texels, share, entropy),
     }
     return {
         "seed": np.array([approach.seed for approach in approaches], np.int64),
@@ -123,27 +128,70 @@ def look(detector: Detector, scenes: Scenes, texels: Tensor | None, share: float
         scenes: F frames.
         texels: the patch [3, P, P]; None for no patch.
         share: side of the patch as a share of the sign's side.
+
+    Raises:
+        UserError: if a prediction is NaN or infinite.
     """
     label = detector.index(STOP_SIGN)
     patches = texels.unsqueeze(0) if texels is not None else None
     confidences, found = [], []
     for frames in torch.arange(len(scenes)).split(BATCH):
         predictions = detector(scenes.render(frames, patches, share))
+        if not all(
+            bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)
+        ):
+            raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
         boxes = scenes.boxes[frames].to(predictions.boxes)
         confidences.append(confidence(predictions, label, boxes, iou=SAME_IOU))
         found += found_of(predictions, label)
     return Sight(torch.cat(confidences).numpy(), found)
 
 
-@torch.no_grad()
-def probed(detector: Detector, scenes: Scenes) -> dict[str, float]:
-    """Whether the detector's answer on the nearest frame is random, and whether it is the same as on a grey image."""
-    label, last = detector.index(STOP_SIGN), torch.tensor([len(scenes) - 1])
-    image, box = scenes.render(last, None, 0.0), scenes.boxes[last]
-    with torch.random.fork_rng(devices=[]):
-        outputs = [detector(probe) for probe in (image, image, torch.full_like(image, 0.5))]
-    first, again, grey = (confidence(output, label, box.to(output.boxes), iou=SAME_IOU) for output in outputs)
-    return {"redrawn": float(first != again), "same_answer": float((first - grey).abs() <= SAME_CONFIDENCE)}
+def probed(
+    detector: Detector,
+    approaches: Sequence[Approach],
+    seen: Sequence[Sight],
+    texels: Tensor | None,
+    share: float,
+    entropy: int,
+) -> dict[str, float | int]:
+    """Probes on a frame that the detector cannot foresee (`bench.records.schema.PROBES`).
+
+    `redrawn`: another answer when asked again. `same_answer`: the same on a grey image. `inconsistent`: asked as an oracle asks,
+    alone, in another batch or with gradients, the answer is not the one that was scored.
+    """
+    chance = random.Random(entropy)
+    place = chance.randrange(len(approaches))
+    scenes = approaches[place].scenes
+    frame = chance.randrange(len(scenes))
+    patches = texels.unsqueeze(0) if texels is not None else None
+    image, box, label = (
+        scenes.render(torch.tensor([frame]), patches, share),
+        scenes.boxes[[frame]],
+        detector.index(STOP_SIGN),
+    )
+
+    def ask(pictures: Tensor, at: int = 0, gradients: bool = False) -> float:
+        with torch.set_grad_enabled(gradients):
+            output = detector(pictures.clone().requires_grad_(gradients))
+        boxes = box.to(output.boxes).expand(len(pictures), 4)
+        return float(confidence(output, label, boxes, iou=SAME_IOU)[at].detach())
+
+    with Stream("probe", entropy).in_use():
+        first, again = ask(image), ask(image)
+        grey = ask(torch.full_like(image, 0.5))
+        at = chance.randrange(3)
+        path = chance.choice(("alone", "batch", "gradients"))
+        batch = torch.full_like(image, 0.5).repeat(3, 1, 1, 1).index_copy(0, torch.tensor([at]), image)
+        answer = ask(batch, at) if path == "batch" else ask(image, gradients=path == "gradients")
+    scored = float(seen[place].confidence[frame])
+    spread = max(first, again, scored) - min(first, again, scored) if first != again else 0.0
+    return {
+        "redrawn": float(first != again),
+        "same_answer": float(abs(first - grey) <= SAME_CONFIDENCE),
+        "inconsistent": float(abs(answer - scored) > SAME_CONFIDENCE + 4 * spread),
+        "entropy": entropy,
+    }
 
 
 def found_of(predictions: Predictions, label: int) -> list[Detections]:

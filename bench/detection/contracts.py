@@ -22,6 +22,7 @@ class CameraWorld(World):
     track: ClassVar[str] = "detection"
     locations: ClassVar[tuple[str, ...]]
     """Names of the places; scenario seed s is driven at `locations[s % len(locations)]`."""
+    redraws: ClassVar[bool] = False
     classes: ClassVar[tuple[str, ...]] = (STOP_SIGN,)
     """Names of the object classes in its scenes (`Scenes.objects`)."""
 

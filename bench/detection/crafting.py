@@ -5,17 +5,19 @@ from __future__ import annotations
 import time
 
 import torch
+from torch import Tensor
 
 from bench.detection.contracts import CameraWorld, PatchAttack
 from bench.detection.detector import Detector
-from bench.detection.oracle import PatchOracle
+from bench.detection.enforcer import PatchEnforcer
 from bench.detection.patch import Patch
 from bench.detection.scenes import Scenes
 from bench.detection.threat import PatchThreat
 from bench.errors import UserError
 from bench.plugins.contracts import Progress
-from bench.plugins.fingerprint import state_digest
 from bench.plugins.track import Job
+from bench.trust.streams import Stream
+from bench.trust.watch import Watch
 
 
 def craft(
@@ -38,24 +40,27 @@ def craft(
         progress: called with the finished share.
 
     Raises:
-        UserError: if the attack exceeds the threat model, returns no valid patch, or changes the detector's weights.
+        UserError: if the attack exceeds the threat model, or returns no valid patch.
+        TamperError: if it changes the detector, or asks it past the oracle.
     """
     generator = torch.Generator().manual_seed(attack_seed)
-    oracle = PatchOracle(detector, threat, attack.access, generator)
-    before, start = state_digest(detector), time.perf_counter()
-    answer = attack.craft(oracle, scenes, progress)
-    seconds = time.perf_counter() - start
-    if state_digest(detector) != before:
-        raise UserError("the attack changed the detector's weights")
+    with Stream("victim", attack_seed).in_use(), Watch(detector, "detector") as watch:
+        enforcer = PatchEnforcer(detector, threat, attack.access, generator, watch, Stream("attack", attack_seed))
+        start = time.perf_counter()
+        with enforcer.turn():
+            answer = attack.craft(enforcer.oracle, scenes, progress)
+        seconds = time.perf_counter() - start
+    if answer is not None and type(answer) is not Tensor:
+        raise UserError(f"the attack returned a {type(answer).__name__}, not a torch.Tensor")
     texels, excess = threat.project(answer) if answer is not None else (None, 0.0)
     return Patch(
         texels=texels,
-        queries=oracle.spent,
-        gradients=oracle.backwards,
-        zero_gradients=oracle.zeros,
+        queries=enforcer.spent,
+        gradients=enforcer.backwards,
+        zero_gradients=enforcer.zeros,
         seconds=seconds,
         excess=excess,
-        evolution=oracle.evolution,
+        evolution=enforcer.oracle.evolution,
     )
 
 
@@ -66,8 +71,7 @@ def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
     assert isinstance(attack, PatchAttack)
     assert isinstance(world, CameraWorld)
     assert isinstance(threat, PatchThreat)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(job.attack_seed)
+    with Stream("load", job.attack_seed).in_use():
         detector = pair.load(job.training_seed)
         scenes = world.training_scenes()
         patch = craft(attack, detector, scenes, threat, attack_seed=job.attack_seed, progress=progress)

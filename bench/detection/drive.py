@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
+from bench.detection import approach, boxes, crafting, enforcer, oracle, stopping, threat
 from bench.detection.approach import Trace, check_approaches, score
 from bench.detection.contracts import CameraWorld
 from bench.detection.patch import Patch
 from bench.errors import UserError
 from bench.plugins.track import Driven, Job
+from bench.trust.seal import Seal
+from bench.trust.streams import Stream
+from bench.trust.watch import Watch
+
+SEAL = Seal(approach, boxes, crafting, enforcer, oracle, stopping, threat)
 
 
 def drive(job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
@@ -25,13 +30,15 @@ def drive(job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
     pair, world = job.pair, job.pair.world.component
     assert isinstance(world, CameraWorld)
     patch = _patch(artefact, job.artefact) if artefact else None
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(job.attack_seed)
+    SEAL.check()
+    with Stream("load", job.attack_seed).in_use():
         detector = pair.load(job.training_seed)
         approaches = world.approaches(job.cell, job.seeds)
         check_approaches(approaches, job.seeds, type(world).__name__)
         trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
-        columns = score(detector, approaches, patch, share=pair.threat.budget, trace=trace)
+        with Watch(detector, "detector", "defense", listens=False):
+            columns = score(detector, approaches, patch, share=pair.threat.budget, entropy=job.entropy, trace=trace)
+    SEAL.check()
     made = {"patch": np.array([job.artefact] * len(approaches))}
     return Driven(columns | made, dict(zip(traced, trace.sightings, strict=True)) if trace else {})
 

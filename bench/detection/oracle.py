@@ -1,58 +1,67 @@
-"""A patch attack's only access to the detector; enforces the access level and the query budget."""
+"""A patch attack's only access to the detector: a face of the run's enforcer (`bench.detection.enforcer`)."""
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from bench.detection.detector import STOP_SIGN, Detector, Predictions
+from bench.detection.detector import Predictions
 from bench.detection.patch import MOMENTS, Evolution
 from bench.detection.threat import PatchThreat
 from bench.errors import UserError
-from bench.plugins.contracts import Access, QueryBudgetError, permit
+from bench.plugins.contracts import Access
+
+
+class Door(Protocol):
+    """How an oracle reaches the run: queries are counted and answered behind it."""
+
+    @property
+    def spent(self) -> int:
+        """Number of queries so far."""
+
+    def ask(self, pictures: Tensor, access: Access) -> Predictions:
+        """The detector's predictions."""
 
 
 class PatchOracle:
     """The only access to the (defended) detector while a patch is crafted. One image is one query.
 
-    `spent` counts the queries, `backwards` the images whose gradient was computed, `zeros` the gradients that were 0 everywhere.
+    It refuses access above the declared level, and queries above the budget. The run keeps its own counters and threat model:
+    nothing that is changed on this object changes what the attack may do or what is recorded.
 
     Args:
-        detector: the victim.
+        door: answers the queries.
         threat: the threat model.
-        access: the access level that the attack declares; calls above it are refused.
-        generator: the run's random generator, for randomised attacks.
+        generator: the attack's random generator.
+        label: the class to hide.
+        stride: height and width of an image must be multiples of it.
     """
 
-    def __init__(self, detector: Detector, threat: PatchThreat, access: Access, generator: torch.Generator) -> None:
-        self._detector = detector
-        self._access: Access = access
-        self.threat = threat
-        self.generator = generator
-        self.label = detector.index(STOP_SIGN)
-        self.stride = detector.stride
-        self.spent = self.backwards = self.zeros = 0
+    def __init__(self, door: Door, threat: PatchThreat, generator: torch.Generator, *, label: int, stride: int) -> None:
+        self._door = door
+        self.threat, self.generator, self.label, self.stride = threat, generator, label, stride
         self._reports, self._every = 0, 1
         self._moments: list[tuple[int, Tensor, dict[str, float]]] = []
+
+    @property
+    def spent(self) -> int:
+        """Number of queries so far."""
+        return self._door.spent
 
     @property
     def remaining(self) -> int:
         """Number of queries left."""
         return self.threat.queries - self.spent
 
-    @torch.no_grad()
     def predict(self, pictures: Tensor) -> Predictions:
         """The detector's predictions on images [N, 3, H, W] sRGB in [0, 1], without a graph; needs access `scores`."""
-        self._spend(len(pictures), "scores")
-        return self._detector(pictures)
+        return self._door.ask(pictures, "scores")
 
     def differentiable(self, pictures: Tensor) -> Predictions:
         """The detector's predictions on images [N, 3, H, W], with the graph back to the pixels; needs access `gradients`."""
-        self._spend(len(pictures), "gradients")
-        asked = pictures.view_as(pictures)
-        if asked.requires_grad:
-            asked.register_hook(self._came_back)
-        return self._detector(asked)
+        return self._door.ask(pictures, "gradients")
 
     def report(self, patch: Tensor, **losses: Tensor | float) -> None:
         """Report an intermediate patch for recordings, once per crafting step: `oracle.report(patch, found=loss)`.
@@ -90,15 +99,3 @@ class PatchOracle:
             texels=torch.stack(texels),
             losses={name: torch.tensor([values.get(name, torch.nan) for values in losses]) for name in names},
         )
-
-    def _came_back(self, gradient: Tensor) -> None:
-        self.backwards += len(gradient)
-        self.zeros += int((gradient == 0).flatten(1).all(1).sum())
-
-    def _spend(self, pictures: int, access: Access) -> None:
-        permit(access, self._access)
-        if pictures > self.remaining:
-            raise QueryBudgetError(
-                f"the attack asked about {self.spent + pictures} images, the threat model allows {self.threat.queries}"
-            )
-        self.spent += pictures

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from bench.driving.contracts import DrivingAttack
 from bench.driving.dynamics import Dynamics
+from bench.driving.enforcer import Enforcer
 from bench.driving.features import Features
-from bench.driving.oracle import Oracle
-from bench.driving.policy import Policy, State, rows_of
+from bench.driving.policy import State, rows_of
 from bench.driving.threat import ObservationThreat
+from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
 
 
@@ -42,7 +43,7 @@ class Attacker:
 
     Args:
         attack: the attack; None leaves the observations unchanged.
-        policy: the victim; the attack reaches it only through an oracle.
+        subject: the victim; the attack reaches it only through an oracle.
         threat: the threat model, enforced here.
         features: features of the observation.
         seed: seed of the attack's random generator.
@@ -53,7 +54,7 @@ class Attacker:
     def __init__(
         self,
         attack: DrivingAttack | None,
-        policy: Policy,
+        subject: CountedPolicy,
         threat: ObservationThreat,
         features: Features,
         *,
@@ -61,9 +62,9 @@ class Attacker:
         dynamics: Dynamics | None = None,
         frames: int | None = None,
     ) -> None:
-        self.attack = attack
+        self.attack, self.subject = attack, subject
         access = attack.access if attack else "oblivious"
-        self.oracle = Oracle(policy, threat, access, features, torch.Generator().manual_seed(seed), dynamics)
+        self.enforcer = Enforcer(subject, threat, access, features, torch.Generator().manual_seed(seed), dynamics)
         self.frames = frames
         self.changed = torch.zeros(0, dtype=torch.int64)
         self.state: State = None
@@ -85,51 +86,52 @@ class Attacker:
         if self.attack is None:
             return Shown(observation, counts[0], counts[1], counts[2], excess)
         if not self.begun:
-            self._begin(observation, policy_state)
+            self._begin(self.attack, observation, policy_state)
         if self.frames is not None:
             running = running & (self.changed < self.frames)
         rows = running.nonzero().squeeze(-1)
         perturbed = observation.clone()
         start = time.perf_counter()
         if rows.numel():
-            self.oracle.begin_step(observation[rows], rows_of(policy_state, rows))
-            perturbed[rows], excess[rows] = self._answer(observation[rows], rows)
+            perturbed[rows], excess[rows] = self._answer(
+                self.attack, observation[rows], rows, rows_of(policy_state, rows)
+            )
             self.changed += (perturbed != observation).flatten(1).any(1)
-            spent = (self.oracle.spent, self.oracle.gradients, self.oracle.zero_gradients)
-            counts[:, rows] = torch.stack(spent)
+            counts[:, rows] = torch.stack(self.enforcer.counts)
         milliseconds = (time.perf_counter() - start) * 1000
         return Shown(perturbed, counts[0], counts[1], counts[2], excess, milliseconds)
 
-    def _begin(self, observation: Tensor, policy_state: State) -> None:
+    def _begin(self, attack: DrivingAttack, observation: Tensor, policy_state: State) -> None:
         """Get the attack's initial state. It may not query the victim: no record would count these queries.
 
         The run keeps its own copy of the state and updates it in place.
         """
-        assert self.attack is not None
         self.changed = torch.zeros(len(observation), dtype=torch.int64)
-        self.oracle.begin_step(observation, policy_state)
-        state = self.attack.initial(observation, self.oracle)
-        if bool(self.oracle.spent.any()):
-            raise UserError(
-                f"{type(self.attack).__name__}.initial asked the victim: ask in step, where queries are counted"
-            )
+        oracle = self.enforcer.begin(observation, policy_state)
+        with self.subject.turn():
+            state = attack.initial(observation.clone(), oracle)
+        self.enforcer.close()
+        if bool(self.enforcer.counts[0].any()):
+            raise UserError(f"{type(attack).__name__}.initial asked the victim: ask in step, where queries are counted")
         self.state, self.begun = None if state is None else state.detach().clone(), True
 
-    def _answer(self, observation: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def _answer(
+        self, attack: DrivingAttack, observation: Tensor, rows: Tensor, policy_state: State
+    ) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and its distance to the perturbation set."""
-        assert self.attack is not None
-        answer, state = self.attack.step(observation, self.oracle, rows_of(self.state, rows))
-        name = type(self.attack).__name__
-        if not isinstance(answer, Tensor) or answer.shape != observation.shape:
-            got = f"shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else f"a {type(answer).__name__}"
-            raise UserError(f"{name}.perturb returned {got}, not {tuple(observation.shape)}")
+        oracle, name = self.enforcer.begin(observation, policy_state), type(attack).__name__
+        with self.subject.turn():
+            answer, state = attack.step(observation, oracle, rows_of(self.state, rows))
+        self.enforcer.close()
+        # A subclass of Tensor could change what its methods answer.
+        if type(answer) is not Tensor or answer.shape != observation.shape:
+            got = f"shape {tuple(answer.shape)}" if type(answer) is Tensor else f"a {type(answer).__name__}"
+            raise UserError(f"{name}.perturb returned {got}, not a torch.Tensor of shape {tuple(observation.shape)}")
         if (self.state is None) != (state is None):
             raise UserError(f"{name}.step and {name}.initial must both return a state or both return None")
         if self.state is not None and state is not None:
             self.state[rows] = state.detach()
-        answer = answer.detach()
-        shown = self.oracle.project(answer)
-        excess = (answer - shown).abs().flatten(1).amax(1)
+        shown, excess = self.enforcer.project(answer.detach().to(observation.dtype))
         if not bool(excess.isfinite().all()):
             raise UserError(f"{name}.perturb returned numbers that are NaN or infinite")
         return shown, excess

@@ -90,6 +90,8 @@ class DrivingVictim(Victim):
     track: ClassVar[str] = "driving"
     network: ClassVar[type[Policy]] = Policy
     threat: ClassVar[type[ThreatModel]] = ObservationThreat
+    driver: ClassVar[Driver] = "agent"
+    """Who is at the wheel; its policies must have the same. Only a victim that does not see may leave it to the world (`idm`)."""
     policy_type: ClassVar[type[Policy] | None] = None
     """The class of its trained policies; the zoo builds it from a card."""
 

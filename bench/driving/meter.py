@@ -13,7 +13,8 @@ from torch import Tensor
 from bench.driving.attacker import Shown
 from bench.driving.features import DrivingFacts
 from bench.driving.metrics import safe_progress
-from bench.driving.policy import Policy, State, rows_of
+from bench.driving.policy import State, rows_of
+from bench.driving.victim import CountedPolicy
 
 CHANGED = 0.1
 """A continuous action counts as changed if it differs by more than this on its [-1, 1] scale."""
@@ -25,12 +26,18 @@ class Meter:
     """Running sums over a batch of episodes; an episode is counted until it is done.
 
     Uses NumPy because a step is about forty operations on [B] numbers, where the call overhead dominates.
+
+    Args:
+        subject: the victim.
+        facts: facts of the world.
+        start_x: [B] place along the road before the first step, in m.
     """
 
     SUMS = ("steps", "return", "progress", "mean_speed", "changed", "linf", "l2", "linf_m", "linf_mps", "attack_ms")
 
-    def __init__(self, batch: int, policy: Policy, facts: DrivingFacts) -> None:
-        self.policy, self.facts = policy, facts
+    def __init__(self, subject: CountedPolicy, facts: DrivingFacts, start_x: Tensor) -> None:
+        batch = len(start_x)
+        self.subject, self.facts = subject, facts
         features = facts.features
         self.half_range = features.half_range().numpy()
         self.positions = np.array([unit == "m" for unit in features.units])
@@ -38,7 +45,8 @@ class Meter:
         self.linf_max, self.excess_max = np.zeros(batch, np.float32), np.zeros(batch, np.float32)
         self.min_ttc = np.full(batch, np.inf, np.float32)
         self.crashed, self.offroad = np.zeros(batch, np.bool_), np.zeros(batch, np.bool_)
-        self.start_x, self.end_x = np.full(batch, np.nan, np.float32), np.zeros(batch, np.float32)
+        self.start_x = start_x.numpy().copy()
+        self.end_x = self.start_x.copy()
         self.gradients, self.zero_gradients = np.zeros(batch), np.zeros(batch)
         self.queries: list[NDArray[np.int64]] = []
         self.actions: list[NDArray[np.int64]] = []
@@ -79,12 +87,11 @@ class Meter:
         np.minimum(self.min_ttc, info["ttc"], out=self.min_ttc, where=running)
         self.crashed |= info["crashed"] & running
         self.offroad |= info["offroad"] & running
-        np.copyto(self.start_x, info["x"], where=np.isnan(self.start_x))
         np.copyto(self.end_x, info["x"], where=running)
         self.gradients += shown.gradients.numpy()
         self.zero_gradients += shown.zero_gradients.numpy()
         self.queries.append(np.where(running, shown.queries.numpy(), -1))
-        if self.policy.action_type == "discrete":
+        if self.subject.action_type == "discrete":
             self.actions.append(np.where(running, action.numpy(), -1))
 
     def _changed(self, truth: Tensor, action: Tensor, state: State, touched: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -92,8 +99,8 @@ class Meter:
         changed = np.zeros(len(touched))
         if touched.any():
             rows = torch.from_numpy(touched)
-            taken, clean = action[rows], self.policy.decide(truth[rows], rows_of(state, rows))
-            if self.policy.action_type == "discrete":
+            taken, clean = action[rows], self.subject.decided(truth[rows], rows_of(state, rows))
+            if self.subject.action_type == "discrete":
                 changed[touched] = (clean != taken).numpy()
             else:
                 changed[touched] = ((clean - taken).abs().amax(-1) > CHANGED).numpy()

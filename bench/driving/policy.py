@@ -39,7 +39,8 @@ class Policy(nn.Module, ABC):
         """The state before the first step.
 
         Args:
-            episodes: int64 [B], a number that identifies each episode; a randomised policy seeds its generators with it.
+            episodes: int64 [B], an opaque number for each episode (not its scenario seed), the same whenever the episode is
+                driven; a randomised policy seeds its generators with it.
         """
         return None
 

@@ -1,51 +1,183 @@
-"""Probes whether a victim is stochastic and whether it ignores its input; the leaderboard's flags use the results.
+"""Probes of a victim, at steps that it cannot foresee: is it random, does it see, and does it answer an attack as it drives?
 
-At some steps a probe evaluates the victim twice on the same observation, and once on the observation of another episode. It
-does not count as a query of the attack, and it restores torch's global random generator.
+A probe asks in every way in which an oracle asks. It does not count as a query of the attack, and it has its own random numbers.
+The leaderboard's flags use the results.
 """
 
 from __future__ import annotations
 
+import random
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.driving.policy import Policy, State
+from bench.driving.policy import State, repeated, rows_of
+from bench.driving.victim import CHUNK, CountedPolicy
+from bench.errors import UserError
+from bench.trust.streams import Stream
 
 EVERY = 15
-"""Steps between two probes: a second of driving."""
+"""Mean number of steps between two probes: a second of driving."""
 SAME = 1e-6
 """Two scores count as the same answer if they differ by at most this."""
+ROUNDING = 1e-3
+"""Scores may differ by this share of their largest value between batches of different sizes."""
+SPREAD = 4.0
+"""An answer of a random victim is another one if it is this many times farther away than repeated answers are from each other."""
+REPEATS = 4
+"""How often an answer that differs is asked again: a victim that is random now and then must not look like a decoy."""
+PATH_WEIGHTS = (4, 4, 4, 1, 4)
+PATHS = ("some", "one", "many", "chunks", "gradient")
+"""How an oracle asks: some episodes in any order, one, many points each, more than a batch holds, with gradients."""
+
+
+@dataclass(frozen=True)
+class _Question:
+    """A question along one of `PATHS`.
+
+    Args:
+        path: the path.
+        rows: int64 [R], the episodes in question.
+        place: which of the K copies of each episode is the observation that it is driven with; others are near it.
+        points: [K * R, V, F].
+        state: the victim's state of each point.
+    """
+
+    path: str
+    rows: Tensor
+    place: int
+    points: Tensor
+    state: State
 
 
 class Probe:
-    """Counts over a batch of B episodes."""
+    """Counts over a batch of B episodes.
 
-    def __init__(self, batch: int, policy: Policy) -> None:
-        self.policy = policy
+    Args:
+        batch: B.
+        subject: the victim.
+        entropy: seed of the choice of steps, episodes and questions.
+    """
+
+    def __init__(self, batch: int, subject: CountedPolicy, entropy: int) -> None:
+        self.subject, self.entropy = subject, entropy
+        self.chance = random.Random(entropy)
+        self.stream = Stream("probe", entropy)
         self.redrawn, self.same, self.probed = (np.zeros(batch) for _ in range(3))
+        self.otherwise, self.compared = np.zeros(batch), np.zeros(batch)
         self.draws, self.drawn = np.zeros(batch), np.zeros(batch)
 
-    @torch.no_grad()
-    def look(self, observation: Tensor, running: Tensor, state: State) -> bool:
-        """Probe the running episodes of a step; return whether any answer changed on the second evaluation.
+    def due(self) -> bool:
+        """Whether to probe the coming step."""
+        return self.chance.random() < 1 / EVERY
+
+    def driven(
+        self,
+        shown: Tensor,
+        truth: Tensor,
+        running: Tensor,
+        state: State,
+        asked: Sequence[tuple[Tensor | None, Tensor]],
+    ) -> tuple[Tensor, Tensor]:
+        """The scores and actions of a step, as `CountedPolicy.driven`, and probes before or after it.
 
         Args:
-            observation: the true observation, [B, V, F].
+            shown: the observation that the victim receives, [B, V, F].
+            truth: the true observation, [B, V, F].
             running: bool [B].
-            state: the policy's state.
+            state: the victim's state.
+            asked: the attack's queries of this step, as in `count_draws`.
         """
+        first = self.chance.random() < 0.5
+        before = self._ask(shown, running, state) if first else None
+        scores, action = self.subject.driven(shown, state)
+        question, answer = before or self._ask(shown, running, state)
+        if len(question.rows):
+            self._compare(shown, scores, action, question, answer, state)
+        if self._look(truth, running, state) and asked:
+            self.count_draws(asked, running)
+        return scores, action
+
+    def _ask(self, observation: Tensor, running: Tensor, state: State) -> tuple[_Question, Tensor]:
+        """Ask about some running episodes along one of the oracle's paths."""
+        rows = running.nonzero().squeeze(-1)
+        path = self.chance.choices(PATHS, PATH_WEIGHTS)[0]
+        order = list(range(len(rows)))
+        self.chance.shuffle(order)
+        rows = rows[order[: 1 if path == "one" else self.chance.randint(1, len(order)) if order else 0]]
+        copies = {"many": self.chance.randint(2, 12), "chunks": CHUNK // max(len(rows), 1) + 2}.get(path, 1)
+        place = self.chance.randrange(copies)
+        points = observation[rows]
+        noise = torch.rand(
+            (copies, *points.shape), generator=torch.Generator().manual_seed(self.chance.getrandbits(62))
+        )
+        points = points + 0.02 * (noise.to(points) - 0.5) * (points[..., :1] > 0)
+        points[..., 0] = observation[rows][..., 0]
+        points[place] = observation[rows]
+        question = _Question(path, rows, place, points.flatten(0, 1), repeated(rows_of(state, rows), points.shape[:1]))
+        return question, self._answer(question)
+
+    def _answer(self, question: _Question) -> Tensor:
+        """[R, A] the answer about the episodes in question."""
+        if not len(question.rows):
+            return question.points
+        found: list[Tensor] = []
+
+        def loss(scores: Tensor) -> Tensor:
+            found.append(scores.detach())
+            return scores.sum(-1)
+
+        with self.stream.in_use():
+            if question.path == "gradient":
+                self.subject.differentiated(question.points, question.state, loss)
+            else:
+                found.append(self.subject.answered(question.points, question.state))
+        answer = found[0][question.place * len(question.rows) :][: len(question.rows)]
+        if not bool(answer.isfinite().all()):
+            raise UserError(
+                f"the victim ({type(self.subject.policy).__name__}) answered NaN or infinite scores to a query"
+            )
+        return answer
+
+    def _compare(
+        self, shown: Tensor, scores: Tensor, action: Tensor, question: _Question, answer: Tensor, state: State
+    ) -> None:
+        """Count the episodes that were answered otherwise than they were driven."""
+        rows = question.rows
+        driven, taken = scores[rows], action[rows]
+        tolerance = ROUNDING * driven.abs().amax(-1).clamp(min=1e-3)
+        other = _apart(answer, driven) > tolerance
+        if bool(other.any()):
+            with self.stream.in_use():
+                again = [driven, *(self.subject.driven(shown, state)[0][rows] for _ in range(REPEATS))]
+            spread = torch.stack([_apart(*two) for two in combinations(again, 2)]).amax(0)
+            for one in (answer, *(self._answer(question) for _ in range(REPEATS - 1))):
+                nearest = torch.stack([_apart(one, each) for each in again]).amin(0)
+                other &= nearest > tolerance + SPREAD * spread
+        if self.subject.action_type == "discrete":
+            other |= driven.gather(-1, taken.unsqueeze(-1)).squeeze(-1) < driven.amax(-1)
+        else:
+            other |= (taken != driven).any(-1)
+        places = rows.numpy()
+        self.compared[places] += 1
+        self.otherwise[places] += other.numpy()
+
+    @torch.no_grad()
+    def _look(self, observation: Tensor, running: Tensor, state: State) -> bool:
+        """Probe the running episodes with others' observations; return whether an answer changed when asked again."""
         rows = running.nonzero().squeeze(-1)
         if len(rows) < 2:
             return False
         others = observation.clone()
         others[rows] = observation[rows].roll(len(rows) // 2, 0)
-        with torch.random.fork_rng(devices=[]):
-            inputs = (observation, observation, others)
-            first, again, other = (self.policy.scores(probe, state)[rows] for probe in inputs)
+        with self.stream.in_use():
+            first, again = (self.subject.aside(observation, state)[rows], self._once(observation, state)[rows])
+            other = self._once(others, state)[rows]
         redrawn = (first != again).flatten(1).any(1)
         same = ((first - other).abs() <= SAME).flatten(1).all(1)
         places = rows.numpy()
@@ -53,6 +185,9 @@ class Probe:
         self.redrawn[places] += redrawn.numpy()
         self.same[places] += same.numpy()
         return bool(redrawn.any())
+
+    def _once(self, observation: Tensor, state: State) -> Tensor:
+        return self.subject.driven(observation, state)[0]
 
     def count_draws(self, asked: Sequence[tuple[Tensor | None, Tensor]], running: Tensor) -> None:
         """Count how often an attack queried each distinct observation in a step.
@@ -73,14 +208,21 @@ class Probe:
         self.draws[queried] += (asked_of / distinct.clamp(min=1))[asked_of > 0].numpy()
         self.drawn[queried] += 1
 
-    def columns(self) -> Mapping[str, NDArray[np.float64]]:
-        """`redrawn` and `same_answer`, shares of the probes, and `draws`, queries per observation; [B], NaN if not measured."""
+    def columns(self) -> Mapping[str, NDArray[np.generic]]:
+        """The probes of a record (`bench.records.schema.PROBES`), [B] each; shares are NaN if not measured."""
         with np.errstate(invalid="ignore"):
             return {
                 "redrawn": self.redrawn / self.probed,
                 "same_answer": self.same / self.probed,
                 "draws": self.draws / self.drawn,
+                "inconsistent": self.otherwise / self.compared,
+                "entropy": np.full(len(self.probed), self.entropy, np.int64),
             }
+
+
+def _apart(first: Tensor, second: Tensor) -> Tensor:
+    """[R] largest difference between answers [R, A]."""
+    return (first - second).abs().amax(-1)
 
 
 def _keys(rows: Tensor | None, observation: Tensor) -> Tensor:

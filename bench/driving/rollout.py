@@ -18,9 +18,13 @@ from bench.driving.dynamics import Dynamics
 from bench.driving.features import DrivingFacts
 from bench.driving.meter import Columns, Meter
 from bench.driving.policy import Policy, State
-from bench.driving.probes import EVERY, Probe
+from bench.driving.probes import Probe
 from bench.driving.threat import ObservationThreat
+from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
+from bench.trust.identifiers import opaque
+from bench.trust.streams import Stream
+from bench.trust.watch import Watch
 
 
 @dataclass
@@ -53,6 +57,7 @@ def rollout(
     facts: DrivingFacts,
     attack_seed: int,
     dynamics: Dynamics | None = None,
+    entropy: int = 0,
     trace: Trace | None = None,
 ) -> Columns:
     """Drive every episode of `env` once, to its end, and measure it.
@@ -66,44 +71,52 @@ def rollout(
         facts: facts of the world.
         attack_seed: seed of the attack's random generator.
         dynamics: the world's rules of motion, for attacks with that access; None if the world does not offer them.
+        entropy: seed of the steps that are probed, which a victim must not be able to foresee; no measurement depends on it.
         trace: collects every step of its episodes.
 
     Returns:
         One column [B] for each measurement; `bench.tracks.driving` has the names and units.
 
     Raises:
-        UserError: if the numbers of actions of the victim and the world differ.
+        UserError: if the numbers of actions of the victim and the world differ, or the victim answers NaN or infinity.
+        TamperError: if the attack or the victim changes what it may not change.
     """
     frames = threat.frames(facts.max_steps)
-    attacker = Attacker(attack, policy, threat, facts.features, seed=attack_seed, dynamics=dynamics, frames=frames)
-    meter, probe = Meter(len(seeds), policy, facts), Probe(len(seeds), policy)
     episodes = torch.as_tensor(list(seeds), dtype=torch.int64)
-    with torch.no_grad():
+    with (
+        torch.no_grad(),
+        Stream("victim", attack_seed).in_use(),
+        Watch(policy, "victim", listens=attack is not None) as watch,
+    ):
+        subject = CountedPolicy(policy, watch, Stream("attack", attack_seed))
+        attacker = Attacker(attack, subject, threat, facts.features, seed=attack_seed, dynamics=dynamics, frames=frames)
         td = env.reset(TensorDict({"seed": episodes}, batch_size=env.batch_size))
-        state = policy.initial(episodes)
-        _check_actions(policy, td["observation"], state, facts)
-        for step in range(facts.max_steps):
+        state = subject.initial(opaque(seeds, attack_seed))
+        meter, probe = Meter(subject, facts, td["info", "x"].squeeze(-1)), Probe(len(seeds), subject, entropy)
+        _check_actions(subject, td["observation"], state, facts)
+        for _ in range(facts.max_steps):
             truth, running = td["observation"], ~td["done"].squeeze(-1)
-            probing = step % EVERY == 0 and probe.look(truth, running, state)
-            attacker.oracle.asked = [] if probing else None
+            probing = probe.due()
+            attacker.enforcer.asked = [] if probing else None
             shown = attacker.show(truth, running, state)
-            if attacker.oracle.asked:
-                probe.count_draws(attacker.oracle.asked, running)
-            action = policy.decide(shown.observation, state)
+            if probing:
+                scores, action = probe.driven(shown.observation, truth, running, state, attacker.enforcer.asked or [])
+            else:
+                scores, action = subject.driven(shown.observation, state)
             td = env.step(td.set("action", action))["next"]
             meter.step(truth, shown, action, running, state, td)
             if trace is not None:
-                trace.append(_traced(truth, shown, action, running, state, td, policy))
-            state = policy.advance(shown.observation, action, state)
+                trace.append(_traced(truth, shown, scores, action, running, state, td, subject))
+            state = subject.advance(shown.observation, action, state)
             if bool(td["done"].all()):
                 break
     return {"seed": episodes.numpy(), **meter.columns(), **probe.columns()}
 
 
-def _check_actions(policy: Policy, observation: Tensor, state: State, facts: DrivingFacts) -> None:
-    if policy.action_type == "discrete" and facts.actions:
-        with torch.random.fork_rng(devices=[]):
-            count = policy.scores(observation, state).shape[-1]
+def _check_actions(subject: CountedPolicy, observation: Tensor, state: State, facts: DrivingFacts) -> None:
+    scores = subject.aside(observation, state)
+    if subject.action_type == "discrete" and facts.actions:
+        count = scores.shape[-1]
         if count != len(facts.actions):
             raise UserError(
                 f"the victim has {count} actions, the world has {len(facts.actions)}: {', '.join(facts.actions)}"
@@ -113,19 +126,20 @@ def _check_actions(policy: Policy, observation: Tensor, state: State, facts: Dri
 def _traced(
     truth: Tensor,
     shown: Shown,
+    scores: Tensor,
     action: Tensor,
     running: Tensor,
     state: State,
     after: TensorDictBase,
-    policy: Policy,
+    subject: CountedPolicy,
 ) -> dict[str, Tensor]:
     """The values of one step that a recording needs."""
     names = ("progress", "speed", "x", "ttc", "crashed", "offroad")
     return {
         "observation": truth,
         "perturbed": shown.observation,
-        "scores": policy.scores(shown.observation, state),
-        "clean_scores": policy.scores(truth, state),
+        "scores": scores,
+        "clean_scores": subject.aside(truth, state),
         "action": action,
         "queries": shown.queries,
         "running": running,

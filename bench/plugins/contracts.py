@@ -110,6 +110,8 @@ class World(Component):
     """The axes of its cells."""
     grid: ClassVar[str]
     """Name of the default grid of a run, an entry of `cavbench.grids`."""
+    redraws: ClassVar[bool] = True
+    """Whether every scenario seed is another scenario, so that an audit can draw scenarios that nobody knew before."""
 
     @property
     def facts(self) -> Facts:

@@ -38,6 +38,7 @@ class Job:
         cell: cell of the grid.
         seeds: the scenario seed of each episode.
         artefact: fingerprint of the artefact that was prepared for it; empty if there is none.
+        entropy: seed of the moments at which the victim is probed, drawn when the work is done; no measurement depends on it.
     """
 
     pair: Pair
@@ -46,6 +47,7 @@ class Job:
     cell: Cell
     seeds: range
     artefact: str = ""
+    entropy: int = 0
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Identifies the track and the format version of a file of records, and reads older versions.
 
 Version 1 had one column each for lanes, density and weather, and no facts of the world; its first files had no probes either.
+Probes are added at the end: files that have only the first of them can be read.
 """
 
 from __future__ import annotations
@@ -32,12 +33,14 @@ ADDED = {"threat_share": "1.0::double"}
 def generations(track: Track) -> tuple[pa.Schema, ...]:
     """The schemas of a track's records, the current one first."""
     today = schema(track)
-    whole = pa.schema([column for column in today if column.name not in ADDED])
-    if not track.facts_of_v1:
-        return today, whole
-    place = whole.get_field_index("cell")
-    first = pa.schema([*list(whole)[:place], *AXES_OF_V1, *list(whole)[place + 2 :]])
-    return today, whole, first, pa.schema(list(first)[: len(first) - len(track.probes)])
+    # A newer file also holds the names of an older format, so the newest comes first.
+    versions = [today, pa.schema([column for column in today if column.name not in ADDED], today.metadata)]
+    if track.facts_of_v1:
+        whole = versions[-1]
+        place = whole.get_field_index("cell")
+        versions.append(pa.schema([*list(whole)[:place], *AXES_OF_V1, *list(whole)[place + 2 :]]))
+    counts = range(len(track.probes) + 1)
+    return tuple(pa.schema(list(one)[: len(one) - count], one.metadata) for one in versions for count in counts)
 
 
 def selection(track: Track, columns: pa.Schema) -> str:
@@ -45,7 +48,8 @@ def selection(track: Track, columns: pa.Schema) -> str:
     present = set(columns.names)
     facts = json.dumps(track.facts_of_v1, separators=(",", ":")).replace("'", "''")
     older = {"cell": f'{CELL_OF_V1} as "cell"', "world_facts": f"'{facts}' as \"world_facts\""}
-    missing = {name: f'null::double as "{name}"' for name in (field.name for field in track.probes)} | older
+    kinds = {field.name: "double" if pa.types.is_floating(field.type) else "bigint" for field in track.probes}
+    missing = {name: f'null::{kind} as "{name}"' for name, kind in kinds.items()} | older
     missing |= {name: f'{value} as "{name}"' for name, value in ADDED.items()}
     return ", ".join(f'"{name}"' if name in present else missing[name] for name in schema(track).names)
 

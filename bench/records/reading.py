@@ -155,13 +155,13 @@ def _records(out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track) -
 _NOTHING = "there are no records in {out}; create some with `bench run out={out}`"
 _NEWEST = """
     qualify (code_digest, weights_sha256) = first_value((code_digest, weights_sha256)) over (
-        partition by pair, training_seed order by created_at desc, unit)
+        partition by pair, training_seed, grid = 'audit' order by created_at desc, unit)
     and row_number() over (
         partition by pair, training_seed, cell, seed order by created_at desc, unit) = 1
 """
 _NEWEST_UNITS = """
     qualify (code_digest, weights_sha256) = first_value((code_digest, weights_sha256)) over (
-        partition by pair, training_seed order by created_at desc, unit)
+        partition by pair, training_seed, grid = 'audit' order by created_at desc, unit)
 """
 """The same for units; if two of them drove a scenario, the caller keeps the last."""
 _UNIT_ORDER = " order by pair, training_seed, cell, created_at"

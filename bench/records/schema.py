@@ -8,6 +8,8 @@ from bench.plugins.track import Track
 
 VERSION = "2"
 """Version of the format. 1 had the columns lanes, density and weather; 2 has `cell` and `world_facts`."""
+AUDIT = "audit"
+"""`grid` of records on scenarios that were drawn for an audit; no score contains them."""
 TEXT, FLOAT, INT = pa.string(), pa.float64(), pa.int64()
 
 
@@ -35,7 +37,7 @@ IDENTITY: tuple[pa.Field, ...] = (
     field("threat_access", TEXT, "highest access allowed to the attacker"),
     field("threat_queries", INT, "query budget of a step or of a patch", "queries"),
     field("threat_share", FLOAT, "share of the frames of an episode that may be attacked", "share, 0 to 1"),
-    field("grid", TEXT, "name of the grid"),
+    field("grid", TEXT, "name of the grid; `audit` for scenarios that an audit drew"),
     field("cell", TEXT, "JSON: the value on each axis of the world"),
     field("world_facts", TEXT, "JSON: axes, decision rate, episode length and actions of the world"),
     field("seed", INT, "scenario seed of the episode"),
@@ -103,5 +105,13 @@ PROBES: tuple[pa.Field, ...] = (
         "queries",
         nullable=True,
     ),
+    field(
+        "inconsistent",
+        FLOAT,
+        "probes on which the victim answered a query otherwise than it acts",
+        "share, 0 to 1",
+        nullable=True,
+    ),
+    field("entropy", INT, "seed of the moments that were probed, drawn when the unit was driven", nullable=True),
 )
 """Columns for the flags of a leaderboard; null if not measured. A track that measures them lists them in `probes`."""

@@ -90,7 +90,12 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     unit, before = _unit(out, record)
     noun, folder = unit.track.artefact or ("", "")
     path = out / folder / f"{record[noun]}.safetensors" if record.get(noun) else None
-    task = Task(work=unit, artefact=artefacts.read(path) if path else None, recorded=[record["seed"]])
+    task = Task(
+        work=unit,
+        artefact=artefacts.read(path) if path else None,
+        recorded=[record["seed"]],
+        entropy=record.get("entropy"),
+    )
     outcome = perform(task, lambda *news: None)
     after = outcome.records
     assert after is not None

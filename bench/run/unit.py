@@ -6,12 +6,14 @@ import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
+from typing import Any
 
 from bench.plugins import registry
 from bench.plugins.fingerprint import canonical, code_digest, digest, libraries, machine
 from bench.plugins.pair import Chosen, Pair
 from bench.plugins.track import Job, Track, track_of
-from bench.scenarios import Cell
+from bench.records.schema import AUDIT
+from bench.scenarios import Cell, SeedBlock
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +90,7 @@ class Work:
             "attack_seed": self.attack_seed,
             "weights": self.weights_sha256,
             "code": self.code_digest,
-            "shipped_by": [_entry(part).shipped_by for part in self.pair.parts],
+            "shipped_by": [shipped_by(part) for part in self.pair.parts],
             "libraries": self.libraries,
         }
 
@@ -160,7 +162,9 @@ class Unit(Work):
 
     @property
     def grid(self) -> str:
-        """Name of the grid of its world with this cell and these seeds; `custom` if there is none."""
+        """Name of the grid of its world with this cell and these seeds; `audit` for drawn seeds, `custom` for others."""
+        if self.seeds.start >= SeedBlock.AUDIT:
+            return AUDIT
         grids = registry.grids(self.pair.world.name)
         return next((grid.name for grid in grids if self.cell in grid.cells() and self.seeds == grid.seeds()), "custom")
 
@@ -182,7 +186,7 @@ class Unit(Work):
             "grid": self.grid,
             "cell": json.dumps(dict(self.cell), separators=(",", ":")),
             "world_facts": json.dumps(pair.world.component.facts.written(), separators=(",", ":")),
-            **{f"{part.kind}_shipped_by": _entry(part).shipped_by for part in pair.parts},
+            **{f"{part.kind}_shipped_by": shipped_by(part) for part in pair.parts},
             "weights_sha256": self.weights_sha256,
             "code_digest": self.code_digest,
             "libraries": canonical(self.libraries),
@@ -196,5 +200,6 @@ class Unit(Work):
         return f"{self.pair} | {self.cell}{seed}"
 
 
-def _entry(part: Chosen[object]) -> registry.Entry:  # type: ignore[type-var]
-    return registry.find(registry.GROUPS[part.kind], part.name, part.kind)
+def shipped_by(part: Chosen[Any]) -> str:
+    """The distribution and version that ship a component."""
+    return registry.find(registry.GROUPS[part.kind], part.name, part.kind).shipped_by

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import secrets
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,8 @@ import pyarrow as pa
 from bench.errors import UserError, reason
 from bench.plugins.fingerprint import canonical
 from bench.records.store import table
-from bench.run.unit import Preparation, Unit
+from bench.run.unit import Preparation, Unit, shipped_by
+from bench.trust.watch import TamperError
 
 Tell = Callable[[str, float, str], None]
 """Called with the name of the work, the share done in [0, 1], and a short text."""
@@ -28,11 +30,13 @@ class Task:
         work: the unit or preparation.
         artefact: content of the file of the unit's preparation; None if it has none.
         recorded: scenario seeds of the episodes to record.
+        entropy: seed of the probes of a replay; None draws one, which nobody can foresee.
     """
 
     work: Unit | Preparation
     artefact: bytes | None = None
     recorded: Sequence[int] = ()
+    entropy: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +67,11 @@ def perform(task: Task, tell: Tell) -> Outcome:
     work = task.work
     try:
         return _prepared(work, tell) if isinstance(work, Preparation) else _driven(work, task)
+    except TamperError as error:
+        kinds = {"attack": ("attack",), "defense": ("defense", "victim")}
+        parts = [part for part in work.pair.parts if any(part.kind in kinds[side] for side in error.sides)]
+        shipped = " and ".join(f"{part.kind} {part.name!r} of {shipped_by(part)}" for part in parts)
+        raise UserError(f"{work} is refused: {error} ({shipped})") from error
     except UserError as error:
         raise UserError(f"{work}: {error}") from error
     # Third-party code may raise anything: name the component that failed.
@@ -78,7 +87,8 @@ def _prepared(work: Preparation, tell: Tell) -> Outcome:
 
 def _driven(unit: Unit, task: Task) -> Outcome:
     start = time.perf_counter()
-    driven = unit.track.drive(unit.job, task.artefact, task.recorded)
+    entropy = secrets.randbits(62) if task.entropy is None else task.entropy
+    driven = unit.track.drive(replace(unit.job, entropy=entropy), task.artefact, task.recorded)
     wall_s = time.perf_counter() - start
     constants = unit.constants(wall_s)
     records = table(constants, driven.columns, track=unit.track)

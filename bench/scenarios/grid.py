@@ -11,12 +11,13 @@ from bench.scenarios.axes import Axes, Cell, Value
 
 
 class SeedBlock(IntEnum):
-    """First scenario seed of each use. Seeds for selection or tuning are never reported."""
+    """First scenario seed of each use. Seeds for selection or tuning are never reported; those of an audit are drawn by it."""
 
     REPORT = 1_000_000
     SELECT = 2_000_000
     TUNE = 3_000_000
     TRAIN = 10_000_000
+    AUDIT = 2**40
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ from bench.driving import DrivingAttack, ObservationThreat, Policy
 from bench.driving.attacker import Attacker
 from bench.driving.drive import drive
 from bench.driving.rollout import Trace
+from bench.driving.victim import CountedPolicy
 from bench.plugins.pair import choose
 from bench.plugins.track import Columns, Driven
 from bench.run.config import run_config
@@ -70,10 +71,12 @@ class Moment:
 
 def attacked(attack: DrivingAttack, observation: Tensor, trials: int = 1) -> Moment:
     """Attack the undefended `dqn` at one moment [V, F], under the default threat model."""
-    attacker = Attacker(attack, policy(), ObservationThreat(), FEATURES, seed=0)
-    attacker.oracle.asked = []
+    attacker = Attacker(attack, CountedPolicy(policy()), ObservationThreat(), FEATURES, seed=0)
+    asked: list[tuple[Tensor | None, Tensor]] = []
+    attacker.enforcer.asked = asked
     shown = attacker.show(observation.repeat(trials, 1, 1), torch.ones(trials, dtype=torch.bool), None).observation
-    return Moment(observation, shown, attacker.oracle.radius[0], [points for _, points in attacker.oracle.asked])
+    radius = ObservationThreat().radius(observation, FEATURES)
+    return Moment(observation, shown, radius, [points for _, points in asked])
 
 
 def physical(observation: Tensor) -> Tensor:

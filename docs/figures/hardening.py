@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from bench.driving import ObservationThreat
 from bench.driving.attacker import Attacker
+from bench.driving.victim import CountedPolicy
 from bench.plugins.pair import choose
 from bench.victims import zoo
 from bench.victims.drivers.dqn import DQN
@@ -96,7 +97,7 @@ def _changed(attack: str, defense: str, budget: float) -> float:
     moments = torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"][::EVERY])
     driver = policy("dqn", defense)
     threat = ObservationThreat(budget=budget)
-    attacker = Attacker(choose("attack", attack).component, driver, threat, FEATURES, seed=0)
+    attacker = Attacker(choose("attack", attack).component, CountedPolicy(driver), threat, FEATURES, seed=0)
     shown = attacker.show(moments, torch.ones(len(moments), dtype=torch.bool), None).observation
     with torch.no_grad():
         return float((driver.decide(shown) != driver.decide(moments)).float().mean())

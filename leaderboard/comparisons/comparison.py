@@ -40,6 +40,7 @@ class Comparison:
         own: the episodes, under attack if there is an attack.
         clean: the same scenarios without an attack; None where they were not driven. A single run stands for every run of `own`
             whose training seed changes nothing in the victim.
+        audit: the same attack on the same defended victim, on scenarios that an audit drew; None where there was none.
         baselines: the same scenarios by name of a baseline (`Track.baseline_of`), in the cells that it has.
     """
 
@@ -48,6 +49,7 @@ class Comparison:
     own: Episodes
     clean: Episodes | None
     baselines: Mapping[str, Episodes]
+    audit: Episodes | None = None
 
     @property
     def is_attacked(self) -> bool:

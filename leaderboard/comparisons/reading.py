@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from bench.plugins.track import Measure, Track, track
+from bench.records.schema import AUDIT
 from bench.statistics.episodes import Episodes
 from leaderboard.comparisons.baselines import Baselines, identity_of
 from leaderboard.comparisons.comparison import ATTACKER, DEFENDED, NO_ATTACK, Comparison
@@ -43,6 +44,8 @@ def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:
         of: that track.
     """
     records = newest(records)
+    audits = _audits(records)
+    records = records.filter(pc.not_equal(records["grid"], AUDIT))
     attack = (*DEFENDED, *ATTACKER, "grid")
     attacked = [
         Episodes.arrange(rows) for _, rows in groups(records, attack, pc.not_equal(records["attack"], NO_ATTACK))
@@ -54,7 +57,8 @@ def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:
     for own in attacked:
         identity = identity_of(own)
         own, control = with_control(own, controls.get(tuple(identity[name] for name in CONTROL)))
-        found.append(Comparison(identity, of, own, control, baselines.beside(own)))
+        audit = audits.get(tuple(identity[name] for name in (*DEFENDED, *ATTACKER)))
+        found.append(Comparison(identity, of, own, control, baselines.beside(own), audit))
     defended = {tuple(one.identity[name] for name in CONTROL) for one in found}
     alone = [
         Comparison(identity_of(own), of, own, own, baselines.beside(own))
@@ -63,6 +67,12 @@ def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:
     ]
     found += [one for one in alone if not one.is_baseline] or ([] if found else alone)
     return sorted(found, key=_rank)
+
+
+def _audits(records: pa.Table) -> dict[tuple[object, ...], Episodes]:
+    """The episodes that an audit drove, by the values of `DEFENDED` and `ATTACKER`."""
+    drawn = groups(records, (*DEFENDED, *ATTACKER), pc.equal(records["grid"], AUDIT))
+    return {tuple(identity.values()): Episodes.arrange(rows) for identity, rows in drawn}
 
 
 def read_tracks(records: Mapping[str, pa.Table]) -> list[Comparison]:

@@ -17,6 +17,7 @@ from bench.plugins import registry
 from bench.plugins.track import Track
 from bench.scenarios import Grid
 from bench.statistics.estimates import Interval
+from bench.statistics.unpaired import unpaired
 from leaderboard.comparisons.alignment import align
 from leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison, mean
 from leaderboard.ranking.curves import Curve
@@ -226,11 +227,50 @@ def too_little(of: Subject) -> Finding:
     return few, f"It was driven with {runs} seed{'s' * (runs != 1)}, {driven}, {episodes} scenarios each."
 
 
+def decoy(of: Subject) -> Finding:
+    """Fires where at least 1 % of probes, asked as an attack asks, were answered otherwise than the victim acts."""
+    share = of.shares("inconsistent")
+    if math.isnan(share):
+        return None, "Not measured: the records have no probes of an attack's paths."
+    return (
+        share >= DRAWN,
+        f"Asked as an attack asks, it answered otherwise than it acts in {100 * share:.1f} % of probes.",
+    )
+
+
+def public_only(of: Subject) -> Finding:
+    """Fires where the score on the public scenarios is significantly above that on scenarios that an audit drew."""
+    audited = [one for one in of.attacks if one.audit]
+    found = [gain for one in audited if (gain := public_gain(one, len(audited)))]
+    if not found:
+        return None, "Not measured: no audit was driven (`bench audit`)."
+    largest = max(found, key=lambda gain: gain.low)
+    return largest.low > 0, f"Public score minus the score on newly drawn scenarios: {_signed(largest)}."
+
+
+def public_gain(one: Comparison, comparisons: int = 1) -> Interval | None:
+    """The public score minus the audit's, on the training seeds and cells of both; None where they share none.
+
+    Args:
+        one: an attack on a defended victim.
+        comparisons: number of attacks that were audited; together they raise a false alarm in 2.5 % of audits.
+    """
+    if one.audit is None:
+        return None
+    runs, cells = set(one.own.runs) & set(one.audit.runs), set(one.own.cells) & set(one.audit.cells)
+    if not runs or not cells:
+        return None
+    sides = [side.only(runs=runs, cells=cells).column(one.track.metric) for side in (one.own, one.audit)]
+    return unpaired(sides[0], sides[1], comparisons=comparisons) if min(side.shape[2] for side in sides) > 1 else None
+
+
 FLAGS: dict[str, tuple[str, Callable[[Subject], Finding]]] = {
     "unattacked": ("attacked by noise alone", unattacked),
     "blind": ("no better than a blind policy", blind),
     "unsafe": ("crashes far more often than the traffic's own driver", unsafe),
     "ignores_input": ("the answer does not depend on the input", ignores_input),
+    "public_only": ("higher on the public scenarios than on new ones", public_only),
+    "decoy": ("answers an attack otherwise than it acts", decoy),
     "masked_gradients": ("a black-box attack beats the white-box one", masked_gradients),
     "zero_gradients": ("gradients are zero", zero_gradients),
     "noise": ("random noise lowers the score as much as the attack", noise),

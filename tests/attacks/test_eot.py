@@ -15,6 +15,7 @@ from attacks.grey_patch import GreyPatch
 from attacks.noise_patch import NoisePatch
 from bench.detection import Detector, PatchOracle, PatchThreat, Scenes
 from bench.detection.boxes import confidence
+from bench.detection.enforcer import PatchEnforcer
 from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.vision.drawn_street import DrawnStreet
@@ -27,7 +28,7 @@ def crafted(
 ) -> tuple[Tensor, PatchOracle]:
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    oracle = PatchOracle(detector or RedDetector(), PatchThreat(queries=queries), attack.access, generator)
+    oracle = PatchEnforcer(detector or RedDetector(), PatchThreat(queries=queries), attack.access, generator).oracle
     scenes: Scenes = SCENES if detector is None else DrawnStreet().training_scenes()
     return attack.craft(oracle, scenes, lambda share, text: None), oracle
 
@@ -43,7 +44,7 @@ def test_the_patch_is_close_to_the_optimum() -> None:
     patch, oracle = crafted(EOT(texels=16, steps=40, batch=4, window=32))
     assert patch.shape == (3, 16, 16)
     assert 0 <= patch.min() <= patch.max() <= 1
-    assert (oracle.spent, oracle.backwards) == (160, 160)
+    assert (oracle.spent, oracle._door.backwards) == (160, 160)
     best = red(torch.tensor([0.0, 1.0, 1.0])[:, None, None].expand(3, 8, 8))
     controls = [red(crafted(control)[0]) for control in (NoisePatch(texels=16), GreyPatch())]
     assert best <= red(patch) < best + 0.1 * (min(controls) - best)

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from attacks.pessimist import Outlook, Pessimist
-from bench.driving import Features, ObservationThreat, Oracle
+from bench.driving import Features, ObservationThreat
+from bench.driving.enforcer import Enforcer
+from bench.driving.victim import CountedPolicy
 from tests.attacks.victims import FEATURES, observations, perturb, victim
 
 THREAT = ObservationThreat(budget=0.1)
@@ -42,7 +44,7 @@ def test_the_error_is_the_same_share_at_every_step() -> None:
 def test_a_world_without_distances_is_refused_in_one_line() -> None:
     features = Features(names=("gap",), low=(0.0,), high=(1.0,), units=("m",))
     attack = Pessimist()
-    oracle = Oracle(victim("discrete"), THREAT, attack.access, features, torch.Generator())
-    oracle.begin_step(torch.ones(1, 2, 2))
+    enforcer = Enforcer(CountedPolicy(victim("discrete")), THREAT, attack.access, features, torch.Generator())
+    oracle = enforcer.begin(torch.ones(1, 2, 2))
     with pytest.raises(ValueError, match="needs the features x and vx, the world measures gap"):
         attack.perturb(torch.ones(1, 2, 2), oracle)

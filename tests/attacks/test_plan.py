@@ -11,6 +11,7 @@ from torch import Tensor
 from attacks.plan import Plan
 from bench.driving import ActionType, ObservationThreat, Policy
 from bench.driving.attacker import Attacker
+from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
 from bench.plugins.pair import choose
 from envs.highway.axes import AXES
@@ -34,7 +35,9 @@ def started(batch: int, action_type: ActionType = "discrete") -> tuple[BatchedHi
 
 def attacker(policy: Policy, attack: Plan | None = None, threat: ObservationThreat = THREAT) -> Attacker:
     dynamics = WORLD.dynamics(CELL, policy.action_type)
-    return Attacker(attack or Plan(horizon=1.0), policy, threat, WORLD.features, seed=0, dynamics=dynamics)
+    return Attacker(
+        attack or Plan(horizon=1.0), CountedPolicy(policy), threat, WORLD.features, seed=0, dynamics=dynamics
+    )
 
 
 @pytest.mark.parametrize("action_type", ["discrete", "continuous"])
@@ -72,15 +75,20 @@ def test_it_is_given_nothing_that_belongs_to_an_episode() -> None:
 def test_access_to_the_dynamics_must_be_declared_and_allowed() -> None:
     with pytest.raises(UserError, match="needs access 'dynamics', the threat model allows 'gradients'"):
         attacker(victim("discrete"), threat=ObservationThreat())
-    none = Attacker(Plan(), victim("discrete"), THREAT, WORLD.features, seed=0)
+    none = Attacker(Plan(), CountedPolicy(victim("discrete")), THREAT, WORLD.features, seed=0)
     with pytest.raises(UserError, match="dynamics of the world, which this world does not offer"):
         none.show(started(1)[1], torch.ones(1, dtype=torch.bool), None)
     pair = choose("attack", "pgd").component
     weaker = Attacker(
-        pair, victim("discrete"), THREAT, WORLD.features, seed=0, dynamics=WORLD.dynamics(CELL, "discrete")
+        pair,
+        CountedPolicy(victim("discrete")),
+        THREAT,
+        WORLD.features,
+        seed=0,
+        dynamics=WORLD.dynamics(CELL, "discrete"),
     )
     with pytest.raises(UserError, match="used access 'dynamics', but declares only 'gradients'"):
-        _ = weaker.oracle.dynamics
+        _ = weaker.enforcer.begin(started(1)[1]).dynamics
 
 
 def test_the_belief_follows_the_traffic() -> None:

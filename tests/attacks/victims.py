@@ -7,6 +7,8 @@ from torch import Tensor, nn
 
 from attacks.objectives import DiscreteLoss, Objective
 from bench.driving import ActionType, DrivingAttack, Features, ObservationThreat, Oracle, Policy
+from bench.driving.enforcer import Enforcer
+from bench.driving.victim import CountedPolicy
 from bench.victims.drivers.networks import ActorPolicy, QPolicy
 
 FEATURES = Features(
@@ -57,9 +59,8 @@ def open_oracle(
 ) -> Oracle:
     """An oracle with a step begun on `observation`."""
     threat = threat or ObservationThreat(budget=0.2)
-    oracle = Oracle(policy, threat, attack.access, FEATURES, torch.Generator().manual_seed(seed))
-    oracle.begin_step(observation)
-    return oracle
+    generator = torch.Generator().manual_seed(seed)
+    return Enforcer(CountedPolicy(policy), threat, attack.access, FEATURES, generator).begin(observation)
 
 
 def perturb(

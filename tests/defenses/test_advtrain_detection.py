@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from attacks.eot import EOT
-from bench.detection import STOP_SIGN, Detector, PatchOracle, PatchThreat
+from bench.detection import STOP_SIGN, Detector, PatchThreat
 from bench.detection.boxes import confidence
+from bench.detection.enforcer import PatchEnforcer
 from bench.errors import UserError
 from bench.run.config import component, run_config
 from bench.victims import zoo
@@ -111,7 +112,7 @@ def test_the_shipped_detector_withstands_patches_that_hide_the_sign_from_the_und
     left = {}
     for name, detector in (("undefended", published), ("hardened", hardened)):
         torch.manual_seed(0)
-        oracle = PatchOracle(detector, PatchThreat(), "gradients", torch.Generator().manual_seed(0))
+        oracle = PatchEnforcer(detector, PatchThreat(), "gradients", torch.Generator().manual_seed(0)).oracle
         attack = EOT(steps=30, batch=4, window=224, learning_rate=0.1)
         left[name] = seen(detector, attack.craft(oracle, scenes, lambda share, text: None))
     assert left["hardened"] > 0.8 > 0.5 > left["undefended"]

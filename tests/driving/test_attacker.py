@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bench.driving import DrivingAttack, ObservationThreat, Oracle, State
 from bench.driving.attacker import Attacker
+from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
 from bench.plugins.contracts import Access
 from tests.attacks.victims import FEATURES, Linear, observations
@@ -52,7 +53,7 @@ class Forgetful(Delay):
 
 
 def attacker(attack: DrivingAttack) -> Attacker:
-    return Attacker(attack, Linear(0), ObservationThreat(norm="linf", budget=2.0), FEATURES, seed=0)
+    return Attacker(attack, CountedPolicy(Linear(0)), ObservationThreat(norm="linf", budget=2.0), FEATURES, seed=0)
 
 
 def test_each_episode_keeps_its_own_memory_when_others_have_ended() -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 from attacks.bias import Bias
 from bench.driving import ObservationThreat
 from bench.driving.attacker import Attacker
+from bench.driving.victim import CountedPolicy
 from tests.attacks.victims import FEATURES, Linear, observations
 
 EPISODES, STEPS = 5, 6
@@ -24,7 +25,7 @@ def inside(step: int) -> Tensor:
 
 def episodes(scale: float = 1.0, seed: int = 0, gone: dict[int, int] | None = None) -> tuple[list[Tensor], Attacker]:
     """What is shown at each step; `gone` says from which step on an episode is not running any more."""
-    attacker = Attacker(Bias(scale=scale), Linear(0), THREAT, FEATURES, seed=seed)
+    attacker = Attacker(Bias(scale=scale), CountedPolicy(Linear(0)), THREAT, FEATURES, seed=seed)
     ends = torch.tensor([(gone or {}).get(episode, STEPS) for episode in range(EPISODES)])
     found = []
     for step in range(STEPS):
@@ -83,7 +84,7 @@ def test_every_seed_and_every_episode_has_another_offset() -> None:
 )
 def test_it_stays_in_the_set_of_any_threat_model(scale: float, norm: str, budget: float, seed: int) -> None:
     threat = ObservationThreat(norm=norm, budget=budget, access="oblivious", queries=0)  # type: ignore[arg-type]
-    attacker = Attacker(Bias(scale=scale), Linear(0), threat, FEATURES, seed=seed)
+    attacker = Attacker(Bias(scale=scale), CountedPolicy(Linear(0)), threat, FEATURES, seed=seed)
     for step in range(3):
         truth = observations(EPISODES, step)
         shown = attacker.show(truth, torch.ones(EPISODES, dtype=torch.bool), None)

@@ -13,7 +13,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from bench.driving import ObservationThreat, Oracle, Policy
-from bench.driving.oracle import CHUNK
+from bench.driving.enforcer import Enforcer
+from bench.driving.victim import CHUNK, CountedPolicy
 from tests.attacks.victims import FEATURES, observations, victim
 from tests.driving.policies import STATEFUL, remembered, stacked
 
@@ -30,9 +31,14 @@ at_any_size = settings(max_examples=15, deadline=None)
 
 def opened(policy: Policy, state: TensorDictBase) -> Oracle:
     """An oracle that allows everything, in a step of the state's episodes."""
-    oracle = Oracle(policy, ObservationThreat(queries=10**6), "gradients", FEATURES, torch.Generator().manual_seed(0))
-    oracle.begin_step(observations(len(state), 99), state)
-    return oracle
+    return started(policy, state)[1]
+
+
+def started(policy: Policy, state: TensorDictBase) -> tuple[Enforcer, Oracle]:
+    """The same, and the run's side of it."""
+    generator = torch.Generator().manual_seed(0)
+    enforcer = Enforcer(CountedPolicy(policy), ObservationThreat(queries=10**6), "gradients", FEATURES, generator)
+    return enforcer, enforcer.begin(observations(len(state), 99), state)
 
 
 def asked_about(leading: Sequence[int], episodes: int) -> Tensor:
@@ -118,7 +124,7 @@ def test_the_critic_answers_from_the_same_state(leading: tuple[int, ...], steps:
         assert_same(values[index], alone.detach()[0])
         assert_same(gradients[index], torch.autograd.grad(alone.sum(), leaf)[0][0])
     assert bool((state == before).all())
-    assert not oracle.spent.any()
+    assert oracle.spent.tolist() == [question.shape[:-3].numel()] * BATCH
 
 
 @every_policy
@@ -146,8 +152,10 @@ def test_the_answer_depends_on_the_state() -> None:
 
 def test_queries_are_counted_for_their_episodes() -> None:
     policy = stacked(victim("discrete"))
-    oracle = opened(policy, remembered(policy, BATCH, 4))
+    enforcer, oracle = started(policy, remembered(policy, BATCH, 4))
     oracle.scores(asked_about((3,), 2), torch.tensor([4, 1]))
     oracle.gradient(asked_about((2, 2), 1), weighed, torch.tensor([4]))
     assert oracle.spent.tolist() == [0, 3, 0, 0, 7, 0]
-    assert oracle.gradients.tolist() == [0, 0, 0, 0, 4, 0]
+    spent, gradients, _ = enforcer.counts
+    assert spent.tolist() == oracle.spent.tolist()
+    assert gradients.tolist() == [0, 0, 0, 0, 4, 0]

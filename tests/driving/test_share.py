@@ -11,6 +11,7 @@ from attacks.noise import Noise
 from attacks.pgd import PGD, preference_gap
 from bench.driving import DrivingAttack, ObservationThreat
 from bench.driving.attacker import Attacker
+from bench.driving.victim import CountedPolicy
 from tests.attacks.victims import FEATURES, observations, victim
 
 STEPS = 12
@@ -18,7 +19,9 @@ STEPS = 12
 
 def shown_frames(attack: DrivingAttack, threat: ObservationThreat, seed: int = 0) -> Tensor:
     """[STEPS, B] whether the observation of a frame was changed."""
-    at_work = Attacker(attack, victim("discrete"), threat, FEATURES, seed=seed, frames=threat.frames(STEPS))
+    at_work = Attacker(
+        attack, CountedPolicy(victim("discrete")), threat, FEATURES, seed=seed, frames=threat.frames(STEPS)
+    )
     running, changed = torch.ones(3, dtype=torch.bool), []
     for step in range(STEPS):
         truth = observations(3, 10 * seed + step)
@@ -61,7 +64,7 @@ def test_frames_in_which_the_truth_is_shown_do_not_count() -> None:
 
 def test_an_ended_episode_keeps_its_count() -> None:
     threat = ObservationThreat(share=0.5)
-    at_work = Attacker(Noise(), victim("discrete"), threat, FEATURES, seed=0, frames=2)
+    at_work = Attacker(Noise(), CountedPolicy(victim("discrete")), threat, FEATURES, seed=0, frames=2)
     for step, running in enumerate(torch.tensor([[1, 1], [1, 0], [1, 1], [1, 1]]).bool()):
         truth = observations(2, step)
         changed = (at_work.show(truth, running, None).observation != truth).flatten(1).any(1)

@@ -180,7 +180,7 @@ def test_scoring_and_crafting_have_separate_code_digests() -> None:
     [
         ("crooked", "a patch must be [3, P, P] with P from 8 to 512, the attack made one of [3, 7, 8]"),
         ("greedy", "the attack asked about 20004 images, the threat model allows 20000"),
-        ("tamper", "the attack changed the detector's weights"),
+        ("tamper", "the weights of the detector changed"),
         ("raise", "ZeroDivisionError: the attack is at a loss"),
     ],
 )

@@ -179,7 +179,7 @@ def test_records_without_a_share_of_frames_read_as_all_frames(written: Path, uni
 def test_records_of_format_1_are_converted(written: Path, units: list[Unit]) -> None:
     """Format 1 had one column each for lanes, density and weather, and no facts of the world."""
     today = read(written)
-    _, _, second, first = generations(TRACK)
+    second, *_, first = [one for one in generations(TRACK) if "lanes" in one.names]
     for number, unit in enumerate(units):
         path = results.path_of(written, unit.fingerprint)
         older = []

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pyarrow as pa
 import pytest
 
 from bench.errors import UserError
+from bench.plugins import registry
 from bench.plugins.track import track
 from bench.records import reading
+from bench.records.schema import PROBES
 from bench.run import runner
 from bench.run.config import run_config
 from bench.run.plan import plan
 from bench.run.unit import Preparation, Unit
+from tests.framework.conftest import Said
+from tests.framework.distributions import install
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
 SMALL = "attack=nudge victim=toy world=toy lanes=3,4 density=1 weather=clear,fog episodes=4 seeds=0,1"
 Work = Unit | Preparation
-BESIDE = ("attack_ms", "created_at", "wall_s")
-"""Columns in which two runs of the same unit may differ."""
+BESIDE = ("attack_ms", "created_at", "wall_s", *(field.name for field in PROBES))
+"""Columns in which two runs of the same unit may differ; nobody can foresee which moments are probed."""
 
 
 class Silent:
@@ -169,3 +173,46 @@ def test_a_record_names_its_grid_only_if_cell_and_seeds_match() -> None:
     as_few_as_approaches = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=3"]))
     assert {unit.grid for unit in whole} == {"toy-v1"}
     assert {unit.grid for unit in (*short, *other, *as_few_as_approaches)} == {"custom"}
+
+
+def test_a_unit_in_which_an_attack_changed_the_victim_is_refused_with_its_package(
+    bench: Callable[..., Said], plugins: Path, tmp_path: Path
+) -> None:
+    code = """
+import gc
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bench.driving import DrivingAttack, Policy
+
+
+@dataclass(frozen=True, kw_only=True)
+class Poison(DrivingAttack):
+    access: ClassVar[str] = "oblivious"
+
+    def perturb(self, observation, oracle):
+        for one in gc.get_objects():
+            if isinstance(one, Policy):
+                for buffer in one.buffers():
+                    buffer.mul_(0.5)
+        return observation
+"""
+    install(plugins, "cavbench-poison", {"cavbench.attacks": {"poison": "poison:Poison"}}, {"poison": code}, "2.1")
+    registry.entries.cache_clear()
+    out = tmp_path / "results"
+    words = (
+        "attack=poison",
+        "victim=toy",
+        "world=toy",
+        "lanes=3",
+        "density=1",
+        "weather=clear",
+        "episodes=2",
+        "seeds=0",
+    )
+    said = bench("run", *words, "executor=serial", "reference=false", f"out={out}")
+    assert said.code == 2
+    last = said.err.strip().splitlines()[-1]
+    assert "is refused: the attack changed the victim's weights (attack 'poison' of cavbench-poison 2.1)" in last
+    kept = reading.read_all(out)["driving"] if list(out.glob("episodes/*.parquet")) else None
+    assert kept is None or set(kept["attack"].to_pylist()) == {"none"}

@@ -59,6 +59,8 @@ FIRES: dict[str, tuple[pa.Table, ...]] = {
         zo(0.2, attack_params={"steps": 40}, queries=400.0),
         zo(0.5, attack_params={"steps": 4}, queries=40.0),
     ),
+    "public_only": (clean(), zo(0.6), zo(0.2, grid="audit")),
+    "decoy": (clean(inconsistent=0.2), probed(zo(), inconsistent=0.2)),
     "too_little": (probed(drive(skill=0.8, cells=HALF), **SEEN), zo(cells=HALF)),
 }
 FIRES_NOT: dict[str, tuple[pa.Table, ...]] = {
@@ -76,6 +78,8 @@ FIRES_NOT: dict[str, tuple[pa.Table, ...]] = {
         zo(0.3, attack_params={"steps": 40}, queries=400.0),
         zo(0.3, attack_params={"steps": 4}, queries=40.0),
     ),
+    "public_only": (clean(), zo(0.4), zo(0.4, grid="audit")),
+    "decoy": (clean(inconsistent=0.0), probed(zo(), inconsistent=0.0)),
     "too_little": (clean(), zo()),
 }
 NOT_MEASURED: dict[str, tuple[pa.Table, ...]] = {
@@ -88,6 +92,8 @@ NOT_MEASURED: dict[str, tuple[pa.Table, ...]] = {
     "one_draw": (drive(), drive(attack="zo", queries=44.0)),
     "no_fall": (clean(), zo()),
     "not_flattened": (clean(), zo()),
+    "public_only": (clean(), zo()),
+    "decoy": (drive(), drive(attack="zo", queries=44.0)),
 }
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bench.detection import PatchOracle, PatchThreat
+from bench.detection.enforcer import PatchEnforcer
 from bench.detection.patch import MOMENTS
 from bench.detection.threat import GREY
 from bench.errors import UserError
@@ -17,7 +18,7 @@ from tests.framework.toy_camera import RedDetector
 
 
 def oracle(access: Access = "gradients", queries: int = 100) -> PatchOracle:
-    return PatchOracle(RedDetector(), PatchThreat(queries=queries), access, torch.Generator())
+    return PatchEnforcer(RedDetector(), PatchThreat(queries=queries), access, torch.Generator()).oracle
 
 
 def pictures(count: int) -> Tensor:
@@ -52,12 +53,13 @@ def test_calls_above_the_access_level_are_refused(access: Access, allowed: int) 
 
 
 def test_gradients_reach_the_pixels_and_are_counted() -> None:
-    door, shown = oracle(), pictures(3).requires_grad_(True)
+    enforcer = PatchEnforcer(RedDetector(), PatchThreat(), "gradients", torch.Generator())
+    door, shown = enforcer.oracle, pictures(3).requires_grad_(True)
     assert not door.predict(shown).scores.requires_grad
     door.differentiable(shown).scores[..., door.label].sum().backward()
     assert shown.grad is not None
     assert shown.grad.abs().sum() > 0
-    assert (door.spent, door.backwards) == (6, 3)
+    assert (door.spent, enforcer.backwards) == (6, 3)
 
 
 TEXELS = st.one_of(st.floats(-3, 4, width=32), st.sampled_from([torch.nan, torch.inf, -torch.inf]))

@@ -11,6 +11,7 @@ from bench.conformance.check import BrokenRuleError, Check, NotApplicableError, 
 from bench.conformance.detection.street import SignDetector, Street
 from bench.conformance.randomness import stir_others
 from bench.detection import PatchAttack, PatchOracle, PatchThreat
+from bench.detection.enforcer import PatchEnforcer
 from bench.errors import UserError
 from bench.plugins.contracts import QueryBudgetError
 from bench.plugins.fingerprint import state_digest
@@ -122,7 +123,7 @@ class PatchSuite(Suite):
         threat = threat or PatchThreat(queries=QUERIES)
         shares = [] if shares is None else shares
         generator = torch.Generator().manual_seed(seed)
-        oracle = PatchOracle(detector or SignDetector(), threat, self.component.access, generator)
+        oracle = PatchEnforcer(detector or SignDetector(), threat, self.component.access, generator).oracle
         with torch.random.fork_rng(devices=[]):
             # Before crafting, a run seeds torch and no other library.
             torch.manual_seed(seed)

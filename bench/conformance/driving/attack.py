@@ -12,7 +12,9 @@ from torch import Tensor
 from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
 from bench.conformance.driving.traffic import observations, victim
 from bench.conformance.randomness import stir_others
-from bench.driving import ActionType, DrivingAttack, ObservationThreat, Oracle, Policy
+from bench.driving import ActionType, DrivingAttack, ObservationThreat, Policy
+from bench.driving.enforcer import Enforcer
+from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
 from bench.plugins.contracts import QueryBudgetError
 from bench.plugins.fingerprint import state_digest
@@ -110,12 +112,12 @@ class AttackSuite(Suite):
         for action_type in self.component.action_types:
             for threat in (self._threat(), self._threat(norm="linf", budget=0.2), self._threat(budget=0.0)):
                 policy, observation = self._victim(action_type), self._observations()
-                answer, oracle = self._answer(policy, observation, threat)
-                shown = oracle.project(answer)
+                answer, enforcer = self._answer(policy, observation, threat)
+                shown, _ = enforcer.project(answer)
                 radius = threat.radius(observation, self.subject.world.features)
                 require(
                     bool(((shown - observation).abs() <= radius + WITHIN).all()),
-                    "the projected answer is outside the perturbation set: the attack must not change oracle.radius",
+                    "the projected answer is outside the perturbation set",
                 )
                 outside = max(outside, float((answer - shown).abs().max()))
         if outside > WITHIN:
@@ -129,12 +131,12 @@ class AttackSuite(Suite):
             policy, observation = self._victim(action_type), self._observations()
             for queries in BUDGETS:
                 try:
-                    _, oracle = self._answer(policy, observation, self._threat(queries=queries))
+                    _, enforcer = self._answer(policy, observation, self._threat(queries=queries))
                 except QueryBudgetError as error:
                     raise BrokenRuleError(
                         f"{one_line(error)}: check oracle.remaining before a query, and return the best answer so far"
                     ) from None
-                most = max(most, int(oracle.spent.max()))
+                most = max(most, int(enforcer.counts[0].max()))
         return f"{most} of 1000 queries a step"
 
     def leaves_the_victim(self) -> None:
@@ -168,16 +170,20 @@ class AttackSuite(Suite):
 
     def _answer(
         self, policy: Policy, observation: Tensor, threat: ObservationThreat | None = None
-    ) -> tuple[Tensor, Oracle]:
-        threat = threat or self._threat()
-        oracle = Oracle(
-            policy, threat, self.component.access, self.subject.world.features, torch.Generator().manual_seed(0)
+    ) -> tuple[Tensor, Enforcer]:
+        generator = torch.Generator().manual_seed(0)
+        enforcer = Enforcer(
+            CountedPolicy(policy),
+            threat or self._threat(),
+            self.component.access,
+            self.subject.world.features,
+            generator,
         )
-        oracle.begin_step(observation)
+        oracle = enforcer.begin(observation)
         try:
             with torch.no_grad():
                 state = self.component.initial(observation, oracle)
-                return self.component.step(observation, oracle, state)[0], oracle
+                return self.component.step(observation, oracle, state)[0], enforcer
         except QueryBudgetError:
             raise
         except UserError as error:

@@ -13,6 +13,7 @@ from bench.conformance.driving.state import check_state, named
 from bench.conformance.driving.traffic import observations, victim
 from bench.driving import ActionType, DrivingAttack, ObservationThreat
 from bench.driving.attacker import Attacker
+from bench.driving.victim import CountedPolicy
 
 EPISODES, STEPS = 6, 4
 ENDING, ENDED_AT = (1, 4), 2
@@ -35,8 +36,7 @@ class AttackMemorySuite(Suite):
         """The state is a TensorDict with one row per episode, from the first step on; creating it costs no query."""
         for action_type in self.component.action_types:
             observation = self._observations()[0]
-            oracle = self._attacker(action_type).oracle
-            oracle.begin_step(observation)
+            oracle = self._attacker(action_type).enforcer.begin(observation)
             with torch.no_grad(), refusals_are_broken_rules():
                 first = self.component.initial(observation, oracle)
                 require(
@@ -95,7 +95,7 @@ class AttackMemorySuite(Suite):
     def _attacker(self, action_type: ActionType, seed: int = 0) -> Attacker:
         facts = self.subject.world.facts
         policy = victim(action_type, facts).double()
-        return Attacker(self.component, policy, ObservationThreat(), facts.features, seed=seed)
+        return Attacker(self.component, CountedPolicy(policy), ObservationThreat(), facts.features, seed=seed)
 
     def _observations(self, seed: int = 0) -> Tensor:
         """Observations [STEPS, B, V, F] in double precision, so that rounding changes no sign."""

@@ -11,9 +11,10 @@ from bench.conformance.check import Check, NotApplicableError, Subject, Suite, o
 from bench.conformance.driving.remembering import Remembering
 from bench.conformance.driving.state import ATOL, RTOL, check_state, close, named, same
 from bench.conformance.driving.traffic import observations, rows_of_observation
-from bench.driving import ObservationThreat, Oracle, Policy, State
-from bench.driving.oracle import CHUNK
+from bench.driving import ObservationThreat, Policy, State
+from bench.driving.enforcer import Enforcer
 from bench.driving.policy import rows_of
+from bench.driving.victim import CHUNK, CountedPolicy
 from bench.errors import UserError
 from bench.scenarios import SeedBlock
 
@@ -97,8 +98,7 @@ class PolicyMemorySuite(Suite):
         observation = self._observations(STEPS)
         generator = torch.Generator().manual_seed(0)
         threat = ObservationThreat(queries=POINTS)
-        oracle = Oracle(policy, threat, "scores", self.features, generator)
-        oracle.begin_step(observation, state)
+        oracle = Enforcer(CountedPolicy(policy), threat, "scores", self.features, generator).begin(observation, state)
         share = 2 * torch.rand(POINTS, *observation[rows].shape, generator=generator) - 1
         points = oracle.project(observation[rows] + share * oracle.radius[rows], rows)
         answered = oracle.scores(points, rows)

@@ -134,6 +134,7 @@ class IDMDriver(DrivingVictim):
     """
 
     sees: ClassVar[bool] = False
+    driver: ClassVar[Driver] = "idm"
 
     @property
     def action_type(self) -> ActionType:

@@ -1,0 +1,104 @@
+"""The run's side of a patch attack: the detector, the threat model and the counters, which no attack is given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+
+import torch
+from torch import Tensor
+
+from bench.detection.detector import STOP_SIGN, Detector, Predictions
+from bench.detection.oracle import PatchOracle
+from bench.detection.threat import PatchThreat
+from bench.plugins.contracts import Access, QueryBudgetError, permit
+from bench.trust.streams import Stream
+from bench.trust.watch import TamperError, Watch
+
+
+class PatchEnforcer:
+    """Enforces the access level and the query budget of a patch attack; `oracle` is what the attack is given.
+
+    `spent` counts the queries, `backwards` the images whose gradient was computed, `zeros` the gradients that were 0 everywhere.
+
+    Args:
+        detector: the victim.
+        threat: the threat model.
+        access: the access level that the attack declares; calls above it are refused.
+        generator: the attack's random generator.
+        watch: a watch on the detector; None in trainings and checks.
+        stream: random numbers of the attack; None for those of the process.
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        threat: PatchThreat,
+        access: Access,
+        generator: torch.Generator,
+        watch: Watch | None = None,
+        stream: Stream | None = None,
+    ) -> None:
+        self.detector, self.access = detector, access
+        self.threat = deepcopy(threat)
+        self.watch, self.stream = watch, stream
+        self.spent = self.backwards = self.zeros = self._evaluated = 0
+        self.oracle = PatchOracle(self, threat, generator, label=detector.index(STOP_SIGN), stride=detector.stride)
+
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Let the attack craft: with its own random numbers, and with an eye on the detector.
+
+        Raises:
+            TamperError: if it reached the detector past the oracle, or changed the counts.
+        """
+        self._switch(True)
+        try:
+            yield
+        finally:
+            self._switch(False)
+        if self.spent != self._evaluated:
+            raise TamperError("the attack changed the count of its queries", "attack")
+        if self.watch and self.watch.strays:
+            raise TamperError("the attack evaluated the detector past the oracle", "attack")
+
+    def _switch(self, foreign: bool) -> None:
+        if self.watch:
+            self.watch.away = foreign
+        if self.stream:
+            self.stream.swap()
+
+    def ask(self, pictures: Tensor, access: Access) -> Predictions:
+        """The detector's predictions on images [N, 3, H, W]; counted first.
+
+        Raises:
+            UserError: if the attack declares less access.
+            QueryBudgetError: if too few queries are left.
+        """
+        permit(access, self.access)
+        if self.spent + len(pictures) > self.threat.queries:
+            raise QueryBudgetError(
+                f"the attack asked about {self.spent + len(pictures)} images, the threat model allows {self.threat.queries}"
+            )
+        self.spent += len(pictures)
+        away = self.watch is not None and self.watch.away
+        if away:
+            self._switch(False)
+        try:
+            self._evaluated += len(pictures)
+            if access == "scores":
+                with torch.no_grad():
+                    # The detector gets a copy: one that writes to its input would change the attack's images.
+                    return self.detector(pictures.clone())
+            asked = pictures.clone()
+            if asked.requires_grad:
+                asked.register_hook(self._came_back)
+            return self.detector(asked)
+        finally:
+            if away:
+                self._switch(True)
+
+    def _came_back(self, gradient: Tensor) -> None:
+        self.backwards += len(gradient)
+        self.zeros += int((gradient == 0).flatten(1).all(1).sum())

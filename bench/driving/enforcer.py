@@ -1,0 +1,228 @@
+"""The run's side of an attack: its own truth, perturbation set and counters, which no attack is given."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bench.driving.dynamics import Dynamics
+from bench.driving.features import Features
+from bench.driving.oracle import Loss, Oracle
+from bench.driving.policy import State, repeated, rows_of
+from bench.driving.threat import ObservationThreat, bounds
+from bench.driving.victim import CountedPolicy
+from bench.errors import UserError
+from bench.plugins.contracts import Access, QueryBudgetError, permit
+from bench.trust.watch import TamperError
+
+Array = NDArray[Any]
+
+
+class Enforcer:
+    """Enforces the access level, the perturbation set and the query budget of an attack.
+
+    `begin` gives the attack an oracle for one step. `project` brings its answer into the perturbation set, from copies of the
+    truth and the bounds that cannot be written to. `counts` are the queries and gradients of the step; `close` compares them
+    with the evaluations that the victim itself was seen to make. `asked`, if it is a list, collects the queries.
+
+    Args:
+        subject: the victim.
+        threat: the threat model.
+        access: the access level that the attack declares; calls above it are refused.
+        features: features of the observation.
+        generator: the attack's random generator.
+        dynamics: the world's rules of motion; None if the world does not offer them.
+
+    Raises:
+        UserError: if the threat model does not allow the access.
+    """
+
+    def __init__(
+        self,
+        subject: CountedPolicy,
+        threat: ObservationThreat,
+        access: Access,
+        features: Features,
+        generator: torch.Generator,
+        dynamics: Dynamics | None = None,
+    ) -> None:
+        if not threat.allows(access):
+            raise UserError(f"the attack needs access {access!r}, the threat model allows {threat.access!r} at most")
+        self.subject, self.access, self.generator, self.dynamics = subject, access, generator, dynamics
+        self.threat, self.features = deepcopy(threat), deepcopy(features)
+        self._shown = threat, features
+        self.asked: list[tuple[Tensor | None, Tensor]] | None = None
+        self._step = 0
+        self.spent = self.gradients = self.zero_gradients = torch.empty(0, dtype=torch.int64)
+
+    def begin(self, observation: Tensor, state: State = None, scale: float = 1.0) -> Oracle:
+        """The oracle of a step, with counters at 0; the oracle of the step before answers no more.
+
+        Args:
+            observation: the true observation, [B, V, F].
+            state: the victim's state for these B episodes.
+            scale: multiplies the budget.
+        """
+        radius = self.threat.radius(observation, self.features, scale)
+        low, high = bounds(observation, radius)
+        self._truth, self._low, self._high = map(_fixed, (observation, low, high))
+        self._state = state
+        self._evaluations, self._step = self.subject.evaluations, self._step + 1
+        self.spent, self.gradients, self.zero_gradients = torch.zeros(3, observation.shape[0], dtype=torch.int64)
+        threat, features = self._shown
+        return Oracle(
+            _Door(self, self._step),
+            (observation.clone(), radius, low, high),
+            threat=threat,
+            features=features,
+            generator=self.generator,
+            action_type=self.subject.action_type,
+        )
+
+    def project(self, answer: Tensor) -> tuple[Tensor, Tensor]:
+        """The answer [B, V, F] projected onto the perturbation set, and its L-inf distance [B] to the set before.
+
+        The distance of an answer with NaN or infinity is not finite.
+        """
+        given = answer.detach().cpu().numpy()
+        inside = np.clip(given, self._low, self._high)
+        inside = np.where(np.isnan(inside), np.clip(self._truth, -1.0, 1.0), inside)
+        excess = np.abs(given - inside).reshape(len(given), -1).max(1, initial=0.0)
+        return torch.from_numpy(inside).to(answer), torch.from_numpy(excess)
+
+    def close(self) -> None:
+        """End the step, and check what the attack did.
+
+        Raises:
+            QueryBudgetError: if the attack asked for more than its budget.
+            TamperError: if it reached the victim past the oracle, or changed counters or weights.
+        """
+        self._step += 1
+        if int(self.spent.sum()) != self.subject.evaluations - self._evaluations:
+            raise TamperError("the attack changed the counts of its queries", "attack")
+        if self.subject.watch and self.subject.watch.strays:
+            raise TamperError("the attack evaluated the victim's network past the oracle", "attack")
+
+    @property
+    def counts(self) -> tuple[Tensor, Tensor, Tensor]:
+        """int64 [B] each: queries, gradients, and gradients that were 0 everywhere, of this step."""
+        return self.spent, self.gradients, self.zero_gradients
+
+    def remembered(self, observation: Tensor, rows: Tensor | None) -> State:
+        """The victim's state for each observation of [..., B, V, F], flattened to [N]."""
+        state = self._state if rows is None else rows_of(self._state, rows)
+        return repeated(state, observation.shape[:-3])
+
+    def spend(self, access: Access, step: int, observation: Tensor, rows: Tensor | None) -> None:
+        """Count queries [..., B, V, F] before they are answered.
+
+        Raises:
+            UserError: if the attack declares less access.
+            QueryBudgetError: if an episode has too few queries left.
+            TamperError: if the step is over.
+        """
+        permit(access, self.access)
+        if step != self._step:
+            raise TamperError("the attack used the oracle of another step", "attack")
+        if self.asked is not None:
+            self.asked.append((rows, observation.detach()))
+        queries = observation.shape[:-3].numel()
+        wanted = self.spent + queries if rows is None else self.spent.index_add(0, rows, torch.full_like(rows, queries))
+        worst = int(wanted.max()) if wanted.numel() else 0
+        if worst > self.threat.queries:
+            raise QueryBudgetError(
+                f"the attack asked for {worst} queries in a step, the threat model allows {self.threat.queries}"
+            )
+        self.spent = wanted
+
+    def count(self, gradient: Tensor, rows: Tensor | None) -> None:
+        """Count the gradients [..., B, n], and those that are 0 everywhere."""
+        zero = (gradient == 0).all(-1)
+        places = torch.arange(len(self.spent)) if rows is None else rows
+        for counter, counted in ((self.gradients, torch.ones_like(zero)), (self.zero_gradients, zero)):
+            counts = counted.long().flatten(0, -2).sum(0) if counted.ndim > 1 else counted.long()
+            counter.index_add_(0, places, counts)
+
+
+class _Door:
+    """The queries of one step (`bench.driving.oracle.Door`)."""
+
+    def __init__(self, enforcer: Enforcer, step: int) -> None:
+        self._enforcer, self._step = enforcer, step
+
+    def spent(self) -> Tensor:
+        return self._enforcer.spent.clone()
+
+    def dynamics(self) -> Dynamics:
+        permit("dynamics", self._enforcer.access)
+        if self._enforcer.dynamics is None:
+            raise UserError("the attack needs the dynamics of the world, which this world does not offer")
+        return self._enforcer.dynamics
+
+    def decide(self, observation: Tensor, rows: Tensor | None) -> Tensor:
+        return self._enforcer.subject.policy.choose(self._answered("decisions", observation, rows))
+
+    def scores(self, observation: Tensor, rows: Tensor | None) -> Tensor:
+        return self._answered("scores", observation, rows)
+
+    def _answered(self, access: Access, observation: Tensor, rows: Tensor | None) -> Tensor:
+        enforcer = self._enforcer
+        enforcer.spend(access, self._step, observation, rows)
+        state = enforcer.remembered(observation, rows)
+        with enforcer.subject.asked():
+            scores = enforcer.subject.answered(observation.flatten(0, -3), state)
+        return scores.unflatten(0, observation.shape[:-2])
+
+    def gradient(self, observation: Tensor, loss: Loss, rows: Tensor | None) -> tuple[Tensor, Tensor]:
+        enforcer = self._enforcer
+        enforcer.spend("gradients", self._step, observation, rows)
+        state = enforcer.remembered(observation, rows)
+
+        def shaped(scores: Tensor) -> Tensor:
+            with enforcer.subject.asked(foreign=True):
+                return loss(scores.unflatten(0, observation.shape[:-2]))
+
+        with enforcer.subject.asked():
+            value, gradient = enforcer.subject.differentiated(observation.flatten(0, -3), state, shaped)
+        gradient = gradient.reshape(observation.shape)
+        enforcer.count(gradient.flatten(-2), rows)
+        return value, gradient
+
+    def value(self, observation: Tensor, action: Tensor, rows: Tensor | None) -> Tensor:
+        enforcer = self._enforcer
+        enforcer.spend("gradients", self._step, observation, rows)
+        state = enforcer.remembered(observation, rows)
+        flat = action.flatten(0, observation.ndim - 3)
+        with enforcer.subject.asked():
+            value, gradient = enforcer.subject.valued(observation.flatten(0, -3), flat, state)
+        value = value.reshape(observation.shape[:-2])
+        if gradient is None:
+            return value
+        gradient = gradient.reshape(action.shape)
+        enforcer.count(gradient, rows)
+        return _Tangent.apply(action, value, gradient)
+
+
+class _Tangent(torch.autograd.Function):
+    """A value [...] with a known gradient [..., n] in its first input [..., n], and no graph behind it."""
+
+    @staticmethod
+    def forward(ctx: Any, point: Tensor, value: Tensor, gradient: Tensor) -> Tensor:
+        ctx.save_for_backward(gradient)
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return outer.unsqueeze(-1) * gradient, None, None
+
+
+def _fixed(values: Tensor) -> Array:
+    """A copy that cannot be written to: an array on immutable bytes."""
+    found = values.detach().cpu().contiguous().numpy()
+    return np.frombuffer(found.tobytes(), found.dtype).reshape(found.shape)

@@ -1,0 +1,159 @@
+"""The run's own access to the victim: every evaluation is counted, whoever asked for it, and every answer is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from bench.driving.policy import Policy, State
+from bench.errors import UserError
+from bench.trust.streams import Stream
+from bench.trust.watch import Side, TamperError, Watch
+
+CHUNK = 1024
+"""Queries per batch: a larger batch does not fit into the processor's cache and takes twice as long per query."""
+
+
+class CountedPolicy:
+    """A victim as the run holds it; neither attacks nor policies are given this object.
+
+    Driving, queries and probes use the same methods, so that a policy sees the same kind of call. Actions are always `choose` of
+    `scores`: a policy cannot drive otherwise than it answers.
+
+    Args:
+        policy: the (defended) victim.
+        watch: a watch on it; None in trainings and checks.
+        stream: random numbers of the attack; None for those of the process.
+
+    `draws` says whether the victim was seen to draw from a global generator; the generators are then exchanged around every
+    query, which takes time.
+    """
+
+    def __init__(self, policy: Policy, watch: Watch | None = None, stream: Stream | None = None) -> None:
+        self.policy, self.watch, self.stream = policy, watch, stream
+        self.action_type = policy.action_type
+        self.evaluations = 0
+        self.draws = False
+        self._foreign = False
+
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Run an attack: with its own random numbers, and with an eye on evaluations that it does not ask the oracle for."""
+        settings = torch.is_grad_enabled(), torch.get_default_dtype()
+        self._switch(True, self.stream)
+        try:
+            yield
+        finally:
+            self._switch(False, self.stream)
+            torch.set_grad_enabled(settings[0])
+            torch.set_default_dtype(settings[1])
+
+    @contextmanager
+    def asked(self, foreign: bool = False) -> Iterator[None]:
+        """Answer a query in the middle of an attack's turn, with the victim's random numbers; `foreign` goes back to the attack.
+
+        Raises:
+            TamperError: if the attack has written to the victim's weights, or the victim does so while it answers.
+        """
+        before = self._foreign
+        if before == foreign:
+            yield
+            return
+        self._switch(foreign, self.stream if self.draws else None)
+        try:
+            yield
+        finally:
+            self._switch(before, self.stream if self.draws else None)
+
+    def _switch(self, foreign: bool, stream: Stream | None) -> None:
+        self._foreign = foreign
+        if self.watch is not None:
+            if self.watch.touched():
+                side: Side = "defense" if foreign else "attack"
+                raise TamperError(f"the {side} changed the victim's weights", side)
+            self.watch.away = foreign
+        if stream is not None:
+            stream.swap()
+
+    def initial(self, episodes: Tensor) -> State:
+        """The policy's state before the first step; `episodes` are opaque numbers."""
+        return self.policy.initial(episodes)
+
+    def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
+        """The policy's state after a step."""
+        return self.policy.advance(observation, action, state)
+
+    def aside(self, observation: Tensor, state: State) -> Tensor:
+        """The scores [B, A], from random numbers of their own; notes in `draws` whether they took any."""
+        own = Stream("aside")
+        with own.in_use():
+            before = own.marks()
+            scores = self._scores(observation, state)
+            self.draws = self.draws or own.marks() != before
+        return scores
+
+    def driven(self, observation: Tensor, state: State) -> tuple[Tensor, Tensor]:
+        """The scores [B, A] (or [B, 2]) and the actions with which the victim drives.
+
+        Raises:
+            UserError: if the scores are NaN or infinite.
+        """
+        scores = self._scores(observation, state)
+        if not bool(scores.sum().isfinite()) and not bool(scores.isfinite().all()):
+            raise UserError(f"the victim ({type(self.policy).__name__}) answered NaN or infinite scores while driving")
+        return scores, self.policy.choose(scores)
+
+    def decided(self, observation: Tensor, state: State) -> Tensor:
+        """The actions [B] for observations [B, V, F], as in `driven`."""
+        return self.policy.choose(self._scores(observation, state))
+
+    @torch.no_grad()
+    def answered(self, observation: Tensor, state: State) -> Tensor:
+        """The scores of observations [N, V, F], evaluated in batches of at most `CHUNK`."""
+        # The policy gets a copy: one that writes to its input would change the attack's points.
+        flat = observation.clone()
+        if len(flat) <= CHUNK:
+            return self._scores(flat, state).clone()
+        states = [None] * -(-len(flat) // CHUNK) if state is None else state.split(CHUNK)
+        return torch.cat(list(map(self._scores, flat.split(CHUNK), states)))
+
+    def differentiated(
+        self, observation: Tensor, state: State, loss: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """The value of `loss` [...] of the scores of observations [N, V, F], and its gradient [N, V, F].
+
+        `loss` gets a copy of the scores as a leaf, so it has no graph that leads into the victim. The gradient of a
+        non-differentiable victim is 0.
+        """
+        asked = observation.detach().clone().requires_grad_(True)
+        with torch.enable_grad():
+            scores = self._scores(asked, state)
+            shown = scores.detach().clone().requires_grad_(True)
+            value = loss(shown)
+            outer = torch.autograd.grad(value.sum(), shown, allow_unused=True)[0] if value.requires_grad else None
+        gradient = None
+        if outer is not None and scores.requires_grad:
+            (gradient,) = torch.autograd.grad(scores, asked, outer, allow_unused=True)
+        return value.detach(), torch.zeros_like(asked).detach() if gradient is None else gradient
+
+    def valued(self, observation: Tensor, action: Tensor, state: State) -> tuple[Tensor, Tensor | None]:
+        """The critic Q(observation, action) [N], and its gradient [N, 2] in the action; None for discrete actions."""
+        self.evaluations += len(observation)
+        asked = action.detach().clone()
+        if not asked.is_floating_point():
+            return self.policy.value(observation.clone(), asked, state).detach(), None
+        asked.requires_grad_(True)
+        with torch.enable_grad():
+            value = self.policy.value(observation.clone(), asked, state)
+            found = torch.autograd.grad(value.sum(), asked, allow_unused=True) if value.requires_grad else (None,)
+        return value.detach(), torch.zeros_like(asked).detach() if found[0] is None else found[0]
+
+    def _scores(self, observation: Tensor, state: State) -> Tensor:
+        self.evaluations += len(observation)
+        scores = self.policy.scores(observation, state)
+        if type(scores) is not Tensor:
+            raise TamperError(f"the victim's scores are a {type(scores).__name__}, not a torch.Tensor", "defense")
+        return scores

@@ -1,0 +1,57 @@
+"""Separate streams of random numbers: what foreign code draws or seeds does not reach the rest of the run."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from numpy.random import mtrand
+
+from bench.plugins.fingerprint import digest
+
+
+class Stream:
+    """States of the global random generators of torch, numpy and Python's `random` that are not in use at the moment.
+
+    Args:
+        seed: any values; the same values give the same numbers.
+    """
+
+    def __init__(self, *seed: object) -> None:
+        number = int(digest(["stream", *seed])[:15], 16)
+        self._torch = torch.Generator().manual_seed(number).get_state()
+        self._python = random.Random(number).getstate()
+        self._numpy: np.random.BitGenerator = np.random.MT19937(number)
+
+    def swap(self) -> None:
+        """Exchange these states with those of the global generators; a second call changes them back."""
+        in_use = torch.get_rng_state(), random.getstate(), mtrand.get_bit_generator()
+        torch.set_rng_state(self._torch)
+        random.setstate(self._python)
+        mtrand.set_bit_generator(self._numpy)
+        self._torch, self._python, self._numpy = in_use
+
+    @contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Draw from this stream; it goes on where it ended the last time."""
+        self.swap()
+        try:
+            yield
+        finally:
+            self.swap()
+
+    def marks(self) -> tuple[bytes, object, bytes]:
+        """What tells whether anything was drawn from the global generators."""
+        return torch.get_rng_state().numpy().tobytes(), random.getstate(), _drawn(mtrand.get_bit_generator())
+
+
+def _drawn(generator: np.random.BitGenerator) -> bytes:
+    state = generator.state["state"]
+    return (
+        state["key"].tobytes() + bytes([state["pos"] % 256, state["pos"] // 256])
+        if "key" in state
+        else repr(state).encode()
+    )

@@ -1,0 +1,249 @@
+"""What an attack may not do: nothing it does to its oracle counts, and what it does to the victim or the run is named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from bench.driving import Oracle, enforcer
+from bench.driving.drive import SEAL
+from bench.errors import UserError
+from bench.plugins.contracts import QueryBudgetError
+from bench.trust.watch import TamperError
+from tests.driving.cheats import Noisy, Victim, drive
+
+FAR = 5.0
+
+
+def widen(observation: Tensor, oracle: Oracle) -> Tensor:
+    oracle.radius.fill_(FAR)
+    oracle.observation.fill_(FAR)
+    observation.fill_(FAR)
+    oracle._set = (observation, observation - FAR, observation + FAR)
+    object.__setattr__(oracle.threat, "budget", 2.0)
+    object.__setattr__(oracle.threat, "queries", 10**6)
+    return oracle.project(observation)
+
+
+def test_widening_everything_on_the_oracle_leaves_the_perturbation_set_as_it_is() -> None:
+    assert drive(widen)["linf_max"].max() <= 0.1 + 1e-6
+
+
+def test_the_oracle_cannot_begin_a_step() -> None:
+    with pytest.raises(AttributeError, match="begin_step"):
+        drive(lambda observation, oracle: oracle.begin_step(observation, scale=30))
+
+
+def test_zeroing_the_counter_forgets_no_query() -> None:
+    def forget(observation: Tensor, oracle: Oracle) -> None:
+        for _ in range(3):
+            oracle.scores(observation)
+            oracle.spent.zero_()
+
+    assert set(drive(forget)["queries"].tolist()) == {3.0}
+
+
+def test_the_budget_holds_however_the_attack_changes_its_oracle() -> None:
+    def overspend(observation: Tensor, oracle: Oracle) -> None:
+        object.__setattr__(oracle.threat, "queries", 10**6)
+        for _ in range(51):
+            oracle.scores(observation)
+
+    with pytest.raises(QueryBudgetError, match="allows 50"):
+        drive(overspend)
+
+
+def test_catching_the_refusal_gives_no_answer_and_no_query() -> None:
+    answers: list[Tensor] = []
+
+    def insist(observation: Tensor, oracle: Oracle) -> None:
+        for _ in range(5):
+            try:
+                answers.append(oracle.scores(observation.expand(20, *observation.shape)))
+            except QueryBudgetError:
+                continue
+
+    assert drive(insist)["queries_max"].max() == 40
+    assert len(answers) == 2 * 90
+
+
+def test_a_value_of_the_critic_is_a_query() -> None:
+    def ask(observation: Tensor, oracle: Oracle) -> None:
+        oracle.value(observation, torch.zeros(len(observation), dtype=torch.int64))
+
+    class Critic(Victim):
+        def value(self, observation: Tensor, action: Tensor, state: Any = None) -> Tensor:
+            return self.scores(observation).gather(-1, action.unsqueeze(-1)).squeeze(-1)
+
+    assert set(drive(ask, Critic())["queries"].tolist()) == {1.0}
+
+
+def test_a_loss_gets_no_graph_that_leads_into_the_victim() -> None:
+    leaves: list[object] = []
+
+    def look(observation: Tensor, oracle: Oracle) -> None:
+        def loss(scores: Tensor) -> Tensor:
+            assert scores.grad_fn is not None
+            leaves.append([type(one).__name__ for one, _ in scores.grad_fn.next_functions])
+            return scores.sum(-1)
+
+        oracle.gradient(observation, loss)
+
+    drive(look)
+    assert all(leaf == ["AccumulateGrad"] for leaf in leaves)
+    assert leaves
+
+
+def refused(deed: Callable[[Victim], object], match: str) -> TamperError:
+    """Why a run was refused in which the attack got hold of the victim."""
+    policy = Victim()
+    with pytest.raises(TamperError, match=match) as raised:
+        drive(lambda observation, oracle: (deed(policy), None)[1], policy)
+    return raised.value
+
+
+def test_asking_the_network_past_the_oracle_is_refused() -> None:
+    refused(lambda policy: policy(torch.zeros(1, 2, 3)), "past the oracle")
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_changing_the_weights_is_refused_and_the_attack_is_named(hidden: bool) -> None:
+    error = refused(lambda policy: (policy.weights.data if hidden else policy.weights).mul_(0.5), "weights")
+    assert error.sides == (("attack", "defense") if hidden else ("attack",))
+
+
+def test_a_hook_on_the_victim_is_refused() -> None:
+    refused(lambda policy: policy.register_forward_hook(lambda module, inputs, output: -output), "hooks")
+
+
+def test_removing_the_watch_is_refused() -> None:
+    refused(lambda policy: policy._forward_pre_hooks.clear(), "hooks")
+
+
+def test_changing_the_mode_of_the_victim_is_refused() -> None:
+    refused(lambda policy: policy.train(), "mode")
+
+
+def test_changing_a_method_of_the_victim_is_refused() -> None:
+    refused(lambda policy: setattr(policy, "forward", lambda shown: torch.zeros(len(shown), 5)), "methods")
+
+
+def test_changing_the_runs_own_counters_is_refused() -> None:
+    def dig(observation: Tensor, oracle: Oracle) -> None:
+        oracle.scores(observation)
+        oracle._door._enforcer.spent.zero_()  # type: ignore[attr-defined]
+
+    with pytest.raises(TamperError, match="changed the counts"):
+        drive(dig)
+
+
+def test_the_runs_own_truth_and_set_cannot_be_written_to() -> None:
+    def dig(observation: Tensor, oracle: Oracle) -> None:
+        own = oracle._door._enforcer  # type: ignore[attr-defined]
+        for values in (own._truth, own._low, own._high):
+            with pytest.raises(ValueError):
+                values[:] = FAR
+            with pytest.raises(ValueError):
+                values.flags.writeable = True
+
+    drive(dig)
+
+
+def test_an_oracle_of_another_step_is_refused() -> None:
+    kept: list[Oracle] = []
+
+    def hoard(observation: Tensor, oracle: Oracle) -> None:
+        kept.append(oracle)
+        kept[0].scores(observation)
+
+    with pytest.raises(TamperError, match="oracle of another step"):
+        drive(hoard)
+
+
+@pytest.mark.parametrize("library", ["torch", "numpy", "python"])
+def test_seeding_the_process_does_not_fix_a_randomised_defences_draw(library: str) -> None:
+    import random
+
+    seed = {"torch": torch.manual_seed, "numpy": np.random.seed, "python": random.seed}[library]
+
+    class Random(Victim):
+        def forward(self, observation: Tensor) -> Tensor:
+            draw = {
+                "torch": lambda: torch.rand(5),
+                "numpy": lambda: torch.from_numpy(np.random.rand(5)).float(),  # noqa: NPY002
+                "python": lambda: torch.tensor([random.random() for _ in range(5)]),
+            }[library]()
+            return super().forward(observation) + draw
+
+    def fix(observation: Tensor, oracle: Oracle) -> None:
+        seed(0)
+        oracle.scores(observation)
+
+    def ask(observation: Tensor, oracle: Oracle) -> None:
+        oracle.scores(observation)
+
+    fixed, free = (drive(deed, Random())["action_counts"] for deed in (fix, ask))
+    assert np.array_equal(fixed, free)
+    answers: list[Tensor] = []
+    drive(lambda observation, oracle: (seed(0), answers.append(oracle.scores(observation)))[0] and None, Random())
+    assert len({tuple(answer[0].tolist()) for answer in answers}) > 1
+
+
+def test_a_run_leaves_the_random_generators_of_the_process_alone() -> None:
+    torch.manual_seed(5)
+    np.random.seed(5)  # noqa: NPY002
+    expected = torch.rand(1).item(), np.random.rand()  # noqa: NPY002
+    torch.manual_seed(5)
+    np.random.seed(5)  # noqa: NPY002
+    drive(lambda observation, oracle: torch.rand(9).sum() and np.random.seed(0), Noisy())  # noqa: NPY002
+    assert (torch.rand(1).item(), np.random.rand()) == expected  # noqa: NPY002
+
+
+def test_a_tensor_that_answers_for_itself_is_refused() -> None:
+    with pytest.raises(UserError, match=r"returned a Parameter, not a torch\.Tensor"):
+        drive(lambda observation, oracle: nn.Parameter(observation, requires_grad=False))
+
+
+def test_an_answer_that_is_changed_later_changes_nothing() -> None:
+    kept: list[Tensor] = []
+
+    def change(observation: Tensor, oracle: Oracle) -> Tensor:
+        for answer in kept:
+            answer.fill_(FAR)
+        kept.append(observation.clone())
+        return kept[-1]
+
+    assert drive(change)["linf_max"].max() == 0
+
+
+def test_not_a_number_is_refused() -> None:
+    with pytest.raises(UserError, match="NaN or infinite"):
+        drive(lambda observation, oracle: observation * torch.nan)
+
+
+def test_changing_the_settings_of_torch_reaches_nobody() -> None:
+    class Sees(Victim):
+        kinds: set[tuple[torch.dtype, bool]] = set()  # noqa: RUF012
+
+        def forward(self, observation: Tensor) -> Tensor:
+            self.kinds.add((torch.get_default_dtype(), torch.is_grad_enabled()))
+            return super().forward(observation)
+
+    def unsettle(observation: Tensor, oracle: Oracle) -> None:
+        torch.set_default_dtype(torch.float64)
+        torch.set_grad_enabled(True)
+
+    drive(unsettle, Sees(), entropy=3)
+    assert {kind for kind, _ in Sees.kinds} == {torch.float32}
+
+
+def test_replacing_a_function_that_enforces_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    SEAL.check()
+    monkeypatch.setattr(enforcer.Enforcer, "project", lambda self, answer: (answer, torch.zeros(len(answer))))
+    with pytest.raises(TamperError, match=r"bench\.driving\.enforcer\.Enforcer\.project was replaced"):
+        SEAL.check()

@@ -1,0 +1,112 @@
+"""An audit drives drawn scenarios, finds a defence that knows the public ones, and tells the leaderboard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.compute as pc
+import pytest
+
+from bench.errors import UserError
+from bench.plugins import registry
+from bench.records import reading
+from bench.records.schema import AUDIT
+from bench.run.audit import audit_config
+from bench.scenarios import SeedBlock
+from bench.statistics.unpaired import unpaired
+from leaderboard.ranking.boards import read_boards
+from tests.framework.conftest import Said
+from tests.framework.distributions import install
+
+KNOWING = Path(__file__).with_name("knowing.py")
+ROW = (
+    *("attack=pgd", "attack.restarts=1", "attack.steps=5", "victim=dqn", "defense=none,knows"),
+    *(
+        "lanes=3",
+        "density=1",
+        "weather=clear",
+        "episodes=20",
+        "seeds=0",
+        "reference=false",
+        "executor=serial",
+        "record=0",
+    ),
+)
+
+
+@pytest.mark.slow
+def test_a_defence_that_knows_the_public_scenarios_is_caught_and_the_honest_victim_is_not(
+    bench: Callable[..., Said], plugins: Path, tmp_path: Path
+) -> None:
+    install(
+        plugins,
+        "cavbench-knows",
+        {"cavbench.defenses": {"knows": "knowing_plugin:Knows"}},
+        {"knowing_plugin": KNOWING.read_text()},
+    )
+    registry.entries.cache_clear()
+    out = tmp_path / "results"
+    said = bench("audit", *ROW, f"out={out}", "salt=7")
+    assert said.code == 1, said.err
+    assert "salt=7 repeats or continues this audit" in said.out
+    verdict = said.out.strip().splitlines()[-1]
+    assert verdict.startswith("public_only: ")
+    assert "knows" in verdict
+    assert "none + dqn" not in verdict
+    records = reading.read_all(out)
+    driving = records["driving"]
+    drawn = driving.filter(pc.equal(driving["grid"], AUDIT))
+    assert min(drawn["seed"].to_pylist()) == SeedBlock.AUDIT + 7
+    assert drawn.num_rows * 2 == driving.num_rows
+    (board,), _ = read_boards(records)
+    fired = {row.identity["defense"]: {flag.name: flag.fired for flag in row.flags} for row in board.rows}
+    assert fired["knows"]["public_only"] is True
+    assert fired["none"]["public_only"] is False
+    assert all(set(row.worst.scores.shape) == {1, 20} for row in board.rows)
+
+
+def test_every_audit_draws_other_scenarios_and_can_be_repeated() -> None:
+    words = ["attack=noise", "victim=dqn", "episodes=5"]
+    first, second = audit_config(words), audit_config(words)
+    assert first.drawn.grid.seeds() != second.drawn.grid.seeds()
+    again = audit_config([*words, f"salt={first.salt}"])
+    assert again.drawn.grid.seeds() == first.drawn.grid.seeds()
+    assert again.drawn.grid.cells() == first.public.grid.cells()
+    assert first.public.grid.seeds() == range(SeedBlock.REPORT, SeedBlock.REPORT + 5)
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["attack=noise", "salt=abc"], "salt must be one whole number"),
+        (["attack=noise", "salt=1", "salt=2"], "salt must be one whole number"),
+        (["attack=noise", "episodes=1"], "at least 2 episodes"),
+        (["attack=noise_patch", "victim=yolov3_tiny"], "fixed set of scenarios"),
+    ],
+)
+def test_an_audit_that_says_nothing_is_refused(words: list[str], why: str) -> None:
+    with pytest.raises(UserError, match=why):
+        audit_config(words)
+
+
+@pytest.mark.parametrize("comparisons", [1, 4])
+def test_honest_scores_raise_a_false_alarm_in_2_5_percent_of_audits(comparisons: int) -> None:
+    """Scores as on the highway: most episodes crash and score 0, cells and training seeds share the traffic."""
+    generator = np.random.default_rng(0)
+    alarms = []
+    for _ in range(4000):
+        traffic = generator.normal(size=(1, 1, 200))
+        own = generator.normal(size=(3, 2, 200))
+        score = np.clip(0.5 + 0.3 * (traffic + own), 0, 1) * (traffic + own > 0)
+        alarms.append(unpaired(score[..., :100], score[..., 100:], comparisons=comparisons).low > 0)
+    assert np.mean(alarms) == pytest.approx(0.025 / comparisons, abs=0.008)
+
+
+def test_a_difference_needs_the_same_cells_and_two_scenarios() -> None:
+    with pytest.raises(ValueError, match="differ in training seeds or cells"):
+        unpaired(np.zeros((1, 2, 5)), np.zeros((1, 3, 5)))
+    with pytest.raises(ValueError, match="two scenarios"):
+        unpaired(np.zeros((1, 2, 5)), np.zeros((1, 2, 1)))
+    assert unpaired(np.ones((1, 1, 3)), np.zeros((1, 1, 3))).low == 1
