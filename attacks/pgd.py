@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -15,9 +16,10 @@ from bench.plugins.contracts import Access
 from bench.plugins.ranges import Count, Natural, Positive
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from bench.driving import Oracle
+
+Loss = Callable[[Tensor], Tensor]
+Key = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,14 +73,24 @@ class PGD(DrivingAttack):
     braking_action: Natural = 4
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
-        if not len(observation):
+        if not len(observation) or int(oracle.remaining.min()) < 3:
             return observation
-        affordable = int(oracle.remaining.min()) - 1
+        return self.descend(observation, oracle, *self._loss(observation, oracle))
+
+    def descend(self, observation: Tensor, oracle: Oracle, loss: Loss, key: Key) -> Tensor:
+        """The descent on any loss of the victim's scores: the point with the lowest key of all restarts, [B, V, F].
+
+        Args:
+            observation: the true observation [B, V, F].
+            oracle: the oracle; a budget that is too small for all restarts gets the first ones.
+            loss: the loss [R, B] to descend on, of scores [R, B, A]; R is the number of restarts.
+            key: the key [R, B] to compare points by, of their scores and losses.
+        """
+        affordable = int(oracle.remaining.min())
         restarts = min(self.restarts, affordable // 2)
         if restarts < 1:
             return observation
         steps = min(self.steps, affordable // restarts - 1)
-        loss, key = self._loss(observation, oracle)
         x = observation.expand(restarts, *observation.shape)
         if self.random_start:
             share = torch.rand((restarts, 1, *observation.shape[1:]), generator=oracle.generator) * 2 - 1
@@ -95,9 +107,7 @@ class PGD(DrivingAttack):
         best, lowest = _better(best, lowest, x, key(scores, loss(scores)))
         return best[lowest.argmin(0), torch.arange(len(observation))]
 
-    def _loss(
-        self, observation: Tensor, oracle: Oracle
-    ) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], Tensor]]:
+    def _loss(self, observation: Tensor, oracle: Oracle) -> tuple[Loss, Key]:
         """The loss to minimise, from scores, and the key to compare iterates, from scores and loss; [..., B] each."""
         clean = oracle.scores(observation)
         if oracle.action_type == "discrete":
@@ -123,9 +133,7 @@ class PGD(DrivingAttack):
         return critic, lambda _, loss: loss
 
 
-def _ask(
-    x: Tensor, loss: Callable[[Tensor], Tensor], key: Callable[[Tensor, Tensor], Tensor], oracle: Oracle
-) -> tuple[Tensor, Tensor]:
+def _ask(x: Tensor, loss: Loss, key: Key, oracle: Oracle) -> tuple[Tensor, Tensor]:
     """The keys of the iterates [R, B] and the gradient of the loss [R, B, V, F], from one query."""
     keys: list[Tensor] = []
 

@@ -19,12 +19,12 @@ def drive(job: Job, traced: Sequence[int]) -> Driven:
         job: the job.
         traced: scenario seeds of the episodes to record.
     """
-    pair, world, attack = job.pair, job.pair.world.component, job.pair.attack.component
+    pair, world = job.pair, job.pair.world.component
     assert isinstance(world, DrivingWorld)
     assert isinstance(pair.threat, ObservationThreat)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(job.attack_seed)
-        policy = pair.load(job.training_seed)
+        policy, attack = pair.load(job.training_seed), pair.armed(job.training_seed)
         env = world.make([job.cell] * len(job.seeds), action_type=policy.action_type, driver=policy.driver)
         trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
         try:

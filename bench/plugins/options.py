@@ -44,7 +44,7 @@ class Options:
         words: options, each `key=value`.
         kinds: kinds of components that may be chosen.
         settings: dataclass of the other keys.
-        axes: names of the axes of all worlds.
+        axes: names of the axes of all worlds; empty for a training, which has neither cells nor a threat model.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Options:
 
     def _check_key(self, key: str) -> None:
         head, _, parameter = key.partition(".")
-        threats = [f"threat.{item.name}" for item in fields(ThreatModel)] if "attack" in self.kinds else []
+        threats = [f"threat.{item.name}" for item in fields(ThreatModel)] if self.axes else []
         known = [*self.kinds, *(item.name for item in fields(self.schema)), *self.axes, *threats]
         if key not in known and not (head in self.kinds and parameter):
             raise UserError(registry.unknown(f"key {key!r}", key, known))

@@ -130,6 +130,7 @@ def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
         training_seed=record["training_seed"],
         seeds=range(min(seeds), max(seeds) + 1),
         weights_sha256=pair.weights_sha256(record["training_seed"]),
+        adversary_sha256=pair.adversary_sha256(record["training_seed"]),
     )
     return unit, before
 
