@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +20,8 @@ from attacks.pgd import PGD
 from attacks.sarsa import RobustSarsa, Value
 from attacks.targets import Controls, EveryAction
 from attacks.two_stage import TwoStage
+from bench.conformance.check import Subject
+from bench.conformance.driving.attack import AttackSuite
 from bench.driving import DrivingAttack, DrivingWorld, ObservationThreat, Oracle, Policy
 from bench.errors import UserError
 from bench.plugins.contracts import Trained
@@ -289,3 +294,24 @@ def test_directed_attacks_keep_to_small_query_budgets() -> None:
         oracle = Oracle(policy, threat, "oblivious", choose("world", "highway").component.features, torch.Generator())
         oracle.begin_step(seen)
         torch.testing.assert_close(oracle.project(shown), shown)
+
+
+def test_the_attack_that_learns_on_the_page_of_plug_ins_works(world: DrivingWorld, tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text()
+    (code,) = re.findall(r"```python\n(\"\"\"Universal:.*?)```", page, re.DOTALL)
+    (tmp_path / "universal.py").write_text(code)
+    spec = importlib.util.spec_from_file_location("universal", tmp_path / "universal.py")
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["universal"] = module
+    try:
+        spec.loader.exec_module(module)
+        attack = module.Universal(candidates=20)
+        made = trained(attack, world)
+        recipe = zoo.Recipe.of(DQN(), NoDefense(), attack)
+        zoo.save(made.network, recipe, seed=0, world=world, card=made.card)
+        armed = attack.armed(attack.load(DQN(), NoDefense(), 0, world.facts))
+        subject = Subject(kind="attack", name="universal", component=armed, world=world, victim=DQN())
+        assert [one for one in AttackSuite(subject).outcomes() if one.status != "pass"] == []
+    finally:
+        del sys.modules["universal"]
