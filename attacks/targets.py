@@ -26,29 +26,13 @@ class Targets(ABC):
         """How far the victim is from the targets `target` [..., B], from its scores; lower is closer."""
 
     @abstractmethod
-    def reached(self, scores: Tensor) -> Tensor:
-        """The target that the victim takes with these scores, or the nearest one: int64 [..., B]."""
-
     def pursuit(self, values: Tensor, starts: int) -> tuple[int, Loss, Key]:
         """Restarts, loss and key of a descent that induces the best target that can be induced.
-
-        Every target is descended on from `starts` starts. The key is the rank of the target that the victim takes at a point.
 
         Args:
             values: the value of each target for the attacker [B, T].
             starts: starts for each target.
         """
-        order = values.argsort(dim=-1, descending=True)
-        rank, wanted = order.argsort(-1), order.T.repeat(starts, 1)
-
-        def loss(scores: Tensor) -> Tensor:
-            return self.loss(scores, wanted[: len(scores)])
-
-        def key(scores: Tensor, loss: Tensor) -> Tensor:
-            taken = self.reached(scores).unsqueeze(-1)
-            return rank.expand(*taken.shape[:-1], -1).gather(-1, taken).squeeze(-1) + TIE_BREAK * loss.tanh()
-
-        return len(wanted), loss, key
 
 
 class EveryAction(Targets):
@@ -67,8 +51,19 @@ class EveryAction(Targets):
     def loss(self, scores: Tensor, target: Tensor) -> Tensor:
         return -margin(scores, target)
 
-    def reached(self, scores: Tensor) -> Tensor:
-        return scores.argmax(-1)
+    def pursuit(self, values: Tensor, starts: int) -> tuple[int, Loss, Key]:
+        """Restarts descend towards every action; the key of a point is the rank of the action that the victim takes there."""
+        order = values.argsort(dim=-1, descending=True)
+        rank, wanted = order.argsort(-1), order.T.repeat(starts, 1)
+
+        def loss(scores: Tensor) -> Tensor:
+            return self.loss(scores, wanted[: len(scores)])
+
+        def key(scores: Tensor, loss: Tensor) -> Tensor:
+            taken = scores.argmax(-1, keepdim=True)
+            return rank.expand(scores.shape).gather(-1, taken).squeeze(-1) + TIE_BREAK * loss.tanh()
+
+        return len(wanted), loss, key
 
 
 class EveryActionAndWorst(EveryAction):
@@ -118,6 +113,11 @@ class Controls(Targets):
     def loss(self, scores: Tensor, target: Tensor) -> Tensor:
         return (scores / self.unit.to(scores) - self.grid.to(scores)[target]).square().sum(-1)
 
-    def reached(self, scores: Tensor) -> Tensor:
-        away = (scores / self.unit.to(scores)).unsqueeze(-2) - self.grid.to(scores)
-        return away.square().sum(-1).argmin(-1)
+    def pursuit(self, values: Tensor, starts: int) -> tuple[int, Loss, Key]:
+        """All restarts descend towards the best target: a continuous action can always be induced in part."""
+        wanted = values.argmax(-1).expand(starts * self.count, -1)
+
+        def loss(scores: Tensor) -> Tensor:
+            return self.loss(scores, wanted[: len(scores)])
+
+        return len(wanted), loss, lambda _, loss: loss
