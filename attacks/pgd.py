@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -15,9 +16,10 @@ from bench.plugins.contracts import Access
 from bench.plugins.ranges import Count, Natural, Positive, Share
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from bench.driving import DrivingVictim, Oracle
+
+Loss = Callable[[Tensor], Tensor]
+Key = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +56,9 @@ class PGD(DrivingAttack):
         gap_temperature: temperature T of the softmax over the Q-values in the gap, above 0.
         draw: number of the random draw: another number is the same attack with other random starts.
 
-    Shapes: observation [B, V, F] in, the same out. Queries per step: 1 + restarts * (steps + 1), where an iterate
-    counts twice if the loss asks the critic of a continuous victim. With a smaller query budget it uses fewer restarts, then
-    fewer steps.
+    Shapes: observation [B, V, F] in, the same out. Queries per step: 1 + restarts * (steps + 1). If the loss asks the critic of a
+    continuous victim, every point counts twice: 2 + 2 * restarts * (steps + 1). With a smaller query budget it uses fewer
+    restarts, then fewer steps.
 
     Example:
         >>> from attacks.pgd import PGD
@@ -90,43 +92,66 @@ class PGD(DrivingAttack):
             return observation
         clean = oracle.scores(observation)
         if self.gap == 0:
-            return self._descend(observation, clean, oracle)
+            return self._attacked(observation, clean, oracle)
         rows = (preference_gap(clean, self.gap_temperature) >= self.gap).nonzero().squeeze(-1)
         shown = observation.clone()
         if len(rows):
-            shown[rows] = self._descend(observation[rows], clean[rows], oracle, rows)
+            shown[rows] = self._attacked(observation[rows], clean[rows], oracle, rows)
         return shown
 
-    def _descend(self, observation: Tensor, clean: Tensor, oracle: Oracle, rows: Tensor | None = None) -> Tensor:
-        """The attacked observations of all episodes, or of `rows`."""
+    def _attacked(self, observation: Tensor, clean: Tensor, oracle: Oracle, rows: Tensor | None = None) -> Tensor:
+        """The attacked observations of all episodes, or of `rows`, whose clean scores are known."""
         price = self._price(oracle)
-        left = int((oracle.remaining if rows is None else oracle.remaining[rows]).min())
-        # The value of the true observation costs the critic's query alone.
-        affordable = (left - (price - 1)) // price
+        if _left(oracle, rows) < 3 * price - 1:
+            return observation
+        loss, key = self._loss(observation, clean, oracle)
+        # The scores on the true observation are known: it is the first candidate.
+        return self.descend(observation, oracle, loss, key, rows, price=price, known=key(clean, loss(clean)))
+
+    def descend(
+        self,
+        observation: Tensor,
+        oracle: Oracle,
+        loss: Loss,
+        key: Key,
+        rows: Tensor | None = None,
+        *,
+        price: int = 1,
+        known: Tensor | None = None,
+    ) -> Tensor:
+        """The descent on any loss of the victim's scores: the point with the lowest key of all restarts, [B, V, F].
+
+        Args:
+            observation: the true observation [B, V, F] of all episodes, or of `rows`.
+            oracle: the oracle; a budget that is too small for all restarts gets the first ones.
+            loss: the loss [R, B] to descend on, of scores [R, B, A]; R is the number of restarts.
+            key: the key [R, B] to compare points by, of their scores and losses.
+            rows: the episodes.
+            price: queries for one point.
+            known: the key of the true observation [B], which is then a candidate, too.
+        """
+        affordable = _left(oracle, rows) // price
         restarts = min(self.restarts, affordable // 2)
         if restarts < 1:
             return observation
         steps = min(self.steps, affordable // restarts - 1)
-        loss, key = self._loss(observation, clean, oracle)
         start = (
             random_starts(observation, restarts, oracle, rows)
             if self.random_start
             else observation.expand(restarts, *observation.shape)
         )
-        # The scores on the true observation are known: it is the first candidate.
-        known = key(clean, loss(clean))
         best, lowest = descend(
             start, loss, key, oracle, rows, steps=steps, step_size=self.step_size, momentum=self.momentum
         )
+        if known is None:
+            return best[lowest.argmin(0), torch.arange(len(observation))]
         return better(observation, known, best, lowest)
 
     def _price(self, oracle: Oracle) -> int:
         """Queries per iterate: one, and one more where the loss asks the victim's critic."""
         return 2 if oracle.action_type == "continuous" and self.objective not in ("margin", "target") else 1
 
-    def _loss(
-        self, observation: Tensor, clean: Tensor, oracle: Oracle
-    ) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], Tensor]]:
+    def _loss(self, observation: Tensor, clean: Tensor, oracle: Oracle) -> tuple[Loss, Key]:
         """The loss to minimise, from scores, and the key to compare iterates, from scores and loss; [..., B] each."""
         if oracle.action_type == "discrete":
             discrete = DiscreteLoss(
@@ -212,6 +237,12 @@ def preference_gap(scores: Tensor, temperature: float) -> Tensor:
     """
     preferred = torch.softmax(scores / temperature, -1)
     return preferred.amax(-1) - preferred.amin(-1)
+
+
+def _left(oracle: Oracle, rows: Tensor | None) -> int:
+    """Queries that are left for every episode, or for every one of `rows`."""
+    left = oracle.remaining if rows is None else oracle.remaining[rows]
+    return int(left.min()) if len(left) else 0
 
 
 def _radius(oracle: Oracle, rows: Tensor | None) -> Tensor:

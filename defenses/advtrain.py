@@ -102,6 +102,10 @@ class AdversarialTraining(DrivingDefense):
             raise UserError(
                 f"adversarial training needs a stateless attack on driving policies, {self.attack!r} is not one"
             )
+        if attack.learns:
+            raise UserError(
+                f"attack {self.attack!r} needs a trained victim: adversarial training takes attacks that do not learn"
+            )
         if misfit := attack.misfit(victim):
             raise UserError(f"attack {self.attack!r} does not fit the victim, {misfit}")
         start = victim.load(seed, world.facts) if self.start == "trained" else None

@@ -1,4 +1,4 @@
-"""`bench train`: trains a victim, with or without a defence, and saves every training seed to the zoo."""
+"""`bench train`: trains a victim, a defence of it or an attack on it, and saves every training seed to the zoo."""
 
 from __future__ import annotations
 
@@ -29,21 +29,19 @@ def train(words: Sequence[str], console: Console) -> None:
     """
     settle()
     config = train_config(words)
-    defends = config.defense.name != "none"
-    if not defends and not config.victim.component.learns:
-        raise UserError(f"there is nothing to train: {config.victim.name} does not learn")
-    trained = config.defense if defends else config.victim
+    trained = config.trained
+    if trained.kind != "defense" and not trained.component.learns:
+        raise UserError(f"there is nothing to train: {trained.kind} {trained.name!r} does not learn")
     component = _placed(trained, config.world.component)
-    parts = (config.victim.component, component) if defends else (component,)
     try:
-        recipe = zoo.Recipe.of(*parts)
+        recipe = zoo.Recipe.of(**{part.kind: part.component for part in _parts(config)} | {trained.kind: component})
     except NotImplementedError as error:
         raise UserError(f"there is nothing to train: {error}") from error
     _check_writable(config.out or zoo.own())
     for seed in config.seeds:
         start = time.perf_counter()
         with TrainingProgress(Console(stderr=True), f"{recipe.name}, seed {seed}") as progress:
-            made = _trained(config, component, defends, seed, progress)
+            made = _trained(config, component, seed, progress)
         path = zoo.save(made.network, recipe, seed=seed, world=config.world.component, card=made.card, root=config.out)
         seconds = time.perf_counter() - start
         line = f"{recipe.name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"
@@ -51,14 +49,23 @@ def train(words: Sequence[str], console: Console) -> None:
     console.print(Text(f"To use it: {recipe.use}"), soft_wrap=True)
 
 
-def _trained(config: TrainConfig, component: Any, defends: bool, seed: int, progress: TrainingProgress) -> Trained[Any]:
+def _parts(config: TrainConfig) -> list[Chosen[Any]]:
+    """The victim, then the defence and the attack if there are any."""
+    return [config.victim, *(part for part in (config.defense, config.attack) if part.name != "none")]
+
+
+def _trained(config: TrainConfig, component: Any, seed: int, progress: TrainingProgress) -> Trained[Any]:
     victim, world = config.victim.component, config.world.component
-    if not defends:
-        return component.train(world, seed=seed, progress=progress)
-    made = component.train(victim, world, seed=seed, progress=progress)
-    if made is None:
-        raise UserError(f"there is nothing to train: defense {config.defense.name!r} works at run time only")
-    return made
+    match config.trained.kind:
+        case "attack":
+            return component.train(victim, config.defense.component, world, seed=seed, progress=progress)
+        case "defense":
+            made = component.train(victim, world, seed=seed, progress=progress)
+            if made is None:
+                raise UserError(f"there is nothing to train: defense {config.defense.name!r} works at run time only")
+            return made
+        case _:
+            return component.train(world, seed=seed, progress=progress)
 
 
 def _placed(trained: Chosen[Any], world: World) -> Any:

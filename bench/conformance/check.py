@@ -51,7 +51,7 @@ class Subject:
         name: registered name.
         component: the instance to check.
         world: world to check in; None if a world is checked, and for checks that need none.
-        victim: victim of a defence, or the checked victim itself; None for attacks and worlds.
+        victim: victim of a defence or of an attack that learns, or the checked victim itself; None for worlds and other attacks.
     """
 
     kind: Kind

@@ -28,7 +28,7 @@ def examine(
         kind: attack, defense, victim or world.
         name: registered name.
         values: its parameters, as on the command line.
-        victim: name of the victim for a defence; empty for the first that it can be loaded for.
+        victim: name of the victim for a defence or an attack that learns; empty for the first that it can be loaded for.
         world: name of the world to check in; empty for the default world of the track.
 
     Raises:
@@ -93,6 +93,8 @@ def _suites(subject: Subject, track_name: str, victim: str, world: str) -> Itera
         _require_loadable(subject)
     if subject.kind == "defense":
         subject = _with_victim(subject, victim, track_name)
+    if subject.kind == "attack" and subject.component.learns:
+        subject = _with_adversary(subject, victim, track_name)
     yield from kit.suites[subject.kind](subject)
 
 
@@ -114,6 +116,21 @@ def _with_victim(subject: Subject, name: str, track_name: str) -> Subject:
         try:
             tried.load()
             return tried
+        except UserError as error:
+            reasons.append(one_line(error))
+    raise NotApplicableError(f"it cannot be loaded for any victim: {reasons[0] if reasons else 'none is installed'}")
+
+
+def _with_adversary(subject: Subject, name: str, track_name: str) -> Subject:
+    """The subject with the network of an attack that learns, for the named victim or the first that it is trained for."""
+    nothing = choose("defense", "none").component
+    reasons = []
+    for victim in [choose("victim", name).component] if name else _victims(track_name):
+        if subject.component.misfit(victim):
+            continue
+        try:
+            adversary = subject.component.load(victim, nothing, 0, subject.world.facts)
+            return replace(subject, component=subject.component.armed(adversary), victim=victim)
         except UserError as error:
             reasons.append(one_line(error))
     raise NotApplicableError(f"it cannot be loaded for any victim: {reasons[0] if reasons else 'none is installed'}")

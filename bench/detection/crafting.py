@@ -67,7 +67,7 @@ def craft(
 def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
     """Craft the patch of a job's pair and training seed; return the content of its file (`bench.detection.patch`)."""
     pair = job.pair
-    attack, world, threat = pair.attack.component, pair.world.component, pair.threat
+    attack, world, threat = pair.armed(job.training_seed), pair.world.component, pair.threat
     assert isinstance(attack, PatchAttack)
     assert isinstance(world, CameraWorld)
     assert isinstance(threat, PatchThreat)

@@ -26,12 +26,12 @@ def drive(job: Job, traced: Sequence[int]) -> Driven:
         job: the job.
         traced: scenario seeds of the episodes to record.
     """
-    pair, world, attack = job.pair, job.pair.world.component, job.pair.attack.component
+    pair, world = job.pair, job.pair.world.component
     assert isinstance(world, DrivingWorld)
     assert isinstance(pair.threat, ObservationThreat)
     SEAL.check()
     with Stream("load", job.attack_seed).in_use():
-        policy = _checked(pair.load(job.training_seed), pair)
+        policy, attack = _checked(pair.load(job.training_seed), pair), pair.armed(job.training_seed)
         env = world.make([job.cell] * len(job.seeds), action_type=policy.action_type, driver=policy.driver)
         trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
         try:

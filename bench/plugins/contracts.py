@@ -9,6 +9,7 @@ that derives from both works on both tracks.
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -159,12 +160,53 @@ class Attack(Component):
 
     A random attack may have a parameter `draw: Natural = 0`. The run then seeds the attack's generator with it, too: another
     number is the same attack with other random numbers.
+
+    An attack that learns has a network of its own, the adversary. `bench train attack=NAME victim=NAME` calls `train` and keeps
+    the network in the zoo; a run calls `load`, and the attack finds the network in `self.adversary`.
     """
 
     access: ClassVar[Access]
     """The access that it needs: oblivious, decisions, scores, gradients or dynamics."""
     seeded: ClassVar[bool] = False
     """Whether it prepares something once for each training seed, such as a patch."""
+    learns: ClassVar[bool] = False
+    """Whether it has a network that `train` trains and `load` loads, once for each training seed."""
+    adapts: ClassVar[bool] = True
+    """Whether `train` depends on the defended victim; if not, one network serves all victims with the same `zoo_name`."""
+    at_run_time: ClassVar[tuple[str, ...]] = ()
+    """Names of the parameters that `train` does not use; they may be changed without another training."""
+    adversary: Any = None
+    """The network of an attack that learns, in a run; otherwise None. It is no parameter."""
+
+    def zoo_name(self, victim: Any) -> str:
+        """The name of its entries in the zoo; the names of victim and defence follow if it `adapts` to them."""
+        raise NotImplementedError(f"{type(self).__name__} does not learn")
+
+    def train(self, victim: Any, defense: Any, world: Any, *, seed: int, progress: Progress) -> Trained[Any]:
+        """Train the adversary of training seed `seed`.
+
+        Args:
+            victim: the victim to attack.
+            defense: its defence, possibly `none`; `defense.load(victim, seed, world.facts)` is the network to attack.
+            world: the training world.
+            seed: training seed of the adversary and of the victim.
+            progress: called with the progress.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not learn")
+
+    def load(self, victim: Any, defense: Any, seed: int, facts: Any) -> nn.Module:
+        """The adversary of training seed `seed`, in eval mode; arguments as in `train`.
+
+        Raises:
+            UserError: if the zoo has no such adversary; the message has the command that trains it.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not learn")
+
+    def armed(self, adversary: nn.Module) -> Self:
+        """A copy of this attack that has the network `adversary`."""
+        other = copy.copy(self)
+        object.__setattr__(other, "adversary", adversary)
+        return other
 
     def misfit(self, victim: Any) -> str:
         """Why it cannot attack a victim of its track, as the end of a sentence; empty if it can attack it."""

@@ -45,7 +45,7 @@ class Options:
         words: options, each `key=value`.
         kinds: kinds of components that may be chosen.
         settings: dataclass of the other keys.
-        axes: names of the axes of all worlds.
+        axes: names of the axes of all worlds; empty for a training, which has neither cells nor a threat model.
     """
 
     def __init__(
@@ -65,7 +65,8 @@ class Options:
 
     def _check_key(self, key: str) -> None:
         head, _, parameter = key.partition(".")
-        threats = [f"threat.{item.name}" for item in fields(ThreatModel)] if "attack" in self.kinds else []
+        # Only `bench run` has axes; `bench train` takes no threat model.
+        threats = [f"threat.{item.name}" for item in fields(ThreatModel)] if self.axes else []
         if threats and head == "threat" and parameter:
             # `threats` checks it against the threat model of the victim's track.
             return

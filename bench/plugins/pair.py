@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -119,8 +120,9 @@ class Pair:
 
     @property
     def is_seeded(self) -> bool:
-        """Whether the victim, its defence or the attack's preparation depends on the training seed."""
-        return self.victim.component.seeded or self.defense.component.trains or self.attack.component.seeded
+        """Whether the victim, its defence, the attack's preparation or its network depends on the training seed."""
+        attack = self.attack.component
+        return self.victim.component.seeded or self.defense.component.trains or attack.seeded or attack.learns
 
     @property
     def is_clean(self) -> bool:
@@ -148,28 +150,53 @@ class Pair:
         facts = self.world.component.facts
         return self.defense.component.load(self.victim.component, training_seed, facts)
 
+    def armed(self, training_seed: int) -> Attack:
+        """The attack, with its network of a training seed if it learns."""
+        attack = self.attack.component
+        if not attack.learns:
+            return attack
+        facts = self.world.component.facts
+        return attack.armed(attack.load(self.victim.component, self.defense.component, training_seed, facts))
+
+    def adversary_sha256(self, training_seed: int) -> str:
+        """The hash of the weights of an attack that learns; otherwise empty.
+
+        Raises:
+            UserError: if the network cannot be loaded.
+        """
+        adversary = _loaded(str(self.attack), lambda: self.armed(training_seed).adversary)
+        return "" if adversary is None else _weights(adversary)
+
     def weights_sha256(self, training_seed: int) -> str:
         """The network's own `weights_sha256`; if it has none, the hash of its state.
 
         Raises:
             UserError: if it cannot be loaded, or is not a network of the track.
         """
-        try:
-            network = self.load(training_seed)
-        except UserError:
-            raise
-        # Third-party code may raise anything: name the component that failed.
-        except Exception as error:
-            raise UserError(
-                f"{self.defense} + {self.victim} cannot be loaded: {reason(error)} (--debug shows the traceback)"
-            ) from error
+        network = _loaded(f"{self.defense} + {self.victim}", lambda: self.load(training_seed))
         wanted = self.victim.component.network
         if not isinstance(network, wanted):
             raise UserError(
                 f"{self.defense} + {self.victim} loads a {type(network).__name__}, but a {wanted.__name__} is needed"
             )
-        carried = str(getattr(network, "weights_sha256", ""))
-        return carried if carried or not network.state_dict() else state_digest(network)
+        return _weights(network)
 
     def __str__(self) -> str:
         return f"{self.attack} + {self.defense} + {self.victim}"
+
+
+def _loaded(named: str, load: Callable[[], Any]) -> Any:
+    """What `load` returns; a UserError that names the component if it fails."""
+    try:
+        return load()
+    except UserError:
+        raise
+    # Third-party code may raise anything: name the component that failed.
+    except Exception as error:
+        raise UserError(f"{named} cannot be loaded: {reason(error)} (--debug shows the traceback)") from error
+
+
+def _weights(network: Any) -> str:
+    """The network's own `weights_sha256`; if it has none, the hash of its state, which is empty without weights."""
+    carried = str(getattr(network, "weights_sha256", ""))
+    return carried if carried or not network.state_dict() else state_digest(network)

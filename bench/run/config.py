@@ -65,6 +65,7 @@ class TrainConfig:
     Args:
         victim: victim to train.
         defense: defence to train it with; `none` trains the victim itself.
+        attack: attack to train against the victim and its defence; `none` trains these.
         world: world to train in.
         seeds: training seeds.
         out: zoo to save to; None for the user's zoo.
@@ -72,13 +73,22 @@ class TrainConfig:
 
     victim: Chosen[Any]
     defense: Chosen[Any]
+    attack: Chosen[Any]
     world: Chosen[Any]
     seeds: tuple[int, ...] = (0,)
     out: Path | None = None
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
-        check_track(self.victim, self.defense, self.world)
+        check_track(self.victim, self.defense, self.attack, self.world)
+        # A pair checks that the attack fits the victim.
+        threat = self.victim.component.threat()
+        Pair(attack=self.attack, defense=self.defense, victim=self.victim, world=self.world, threat=threat)
+
+    @property
+    def trained(self) -> Chosen[Any]:
+        """The component to train: the attack if there is one, else the defence if there is one, else the victim."""
+        return next((part for part in (self.attack, self.defense) if part.name != "none"), self.victim)
 
 
 def check_seeds(seeds: tuple[int, ...]) -> None:
@@ -190,7 +200,7 @@ def train_config(words: Sequence[str]) -> TrainConfig:
         UserError: if an option cannot be parsed or is not allowed.
     """
     words = [f"seeds={word.removeprefix('seed=')}" if word.startswith("seed=") else word for word in words]
-    given = Options(words, kinds=("defense", "victim", "world"), settings=TrainOptions)
+    given = Options(words, kinds=("attack", "defense", "victim", "world"), settings=TrainOptions)
     settings = given.settings()
     one: dict[Kind, Chosen[Any]] = {}
     for kind in given.kinds:
@@ -204,6 +214,7 @@ def train_config(words: Sequence[str]) -> TrainConfig:
         return TrainConfig(
             victim=one["victim"],
             defense=one["defense"],
+            attack=one["attack"],
             world=one["world"],
             seeds=tuple(settings["seeds"]),
             out=Path(settings["out"]).expanduser() if settings["out"] else None,

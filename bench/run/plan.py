@@ -16,10 +16,10 @@ from bench.scenarios import Axes, Cell
 def plan(config: RunConfig) -> list[Unit]:
     """The distinct units of a run: of the pairs, their clean controls and, if `reference`, their baselines.
 
-    Loads every victim once, so that a missing one is reported before any work is done.
+    Loads every victim once, and every adversary, so that a missing one is reported before any work is done.
 
     Raises:
-        UserError: if a victim cannot be loaded.
+        UserError: if a victim or an adversary cannot be loaded.
     """
     clean = [pair.clean() for pair in config.pairs]
     baselines = [other for pair in config.pairs for other in track_of(pair).baselines(pair)] if config.reference else []
@@ -38,6 +38,7 @@ def plan(config: RunConfig) -> list[Unit]:
                 training_seed=training_seed,
                 seeds=config.grid.seeds(),
                 weights_sha256=weights[key],
+                adversary_sha256=pair.adversary_sha256(training_seed),
             )
             units += [replace(first, cell=cell) for cell in _cells(pair, config.grid.cells(), config.grid.axes)]
     return units

@@ -31,7 +31,7 @@ class Replay:
 
     Args:
         path: path of the recording.
-        changed: names of what has changed since the record (weights, code, libraries, machine); empty if nothing has.
+        changed: names of what has changed since the record (weights, code, libraries, machine, adversary); empty if nothing has.
         differences: the measurements that differ from the record.
     """
 
@@ -108,6 +108,8 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     now = after.slice(0, 1).to_pylist()[0]
     origin = ("weights_sha256", "code_digest", "libraries", "machine")
     changed = ", ".join(name for name in origin if now[name] != record[name])
+    if not changed and unit.adversary_sha256 and now["unit"] != record["unit"]:
+        changed = "adversary"
     return Replay(saved, changed, differences)
 
 
@@ -130,6 +132,7 @@ def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
         training_seed=record["training_seed"],
         seeds=range(min(seeds), max(seeds) + 1),
         weights_sha256=pair.weights_sha256(record["training_seed"]),
+        adversary_sha256=pair.adversary_sha256(record["training_seed"]),
     )
     return unit, before
 

@@ -24,6 +24,7 @@ class Work:
         pair: attack, defence, victim, world, threat model.
         training_seed: seed of the victim and of the preparation.
         weights_sha256: hash of the defended victim's weights.
+        adversary_sha256: hash of the weights of an attack that learns; otherwise empty.
         cell: one value on each axis of the world.
         seeds: the scenario seed of each episode.
     """
@@ -33,6 +34,7 @@ class Work:
     weights_sha256: str
     cell: Cell
     seeds: range
+    adversary_sha256: str = ""
 
     @property
     def track(self) -> Track:
@@ -89,6 +91,7 @@ class Work:
             "training_seed": self.training_seed,
             "attack_seed": self.attack_seed,
             "weights": self.weights_sha256,
+            **({"adversary": self.adversary_sha256} if self.adversary_sha256 else {}),
             "code": self.code_digest,
             "shipped_by": [shipped_by(part) for part in self.pair.parts],
             "libraries": self.libraries,
@@ -147,6 +150,7 @@ class Unit(Work):
             weights_sha256=self.weights_sha256,
             cell=self.cell,
             seeds=self.seeds,
+            adversary_sha256=self.adversary_sha256,
         )
 
     @property

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from bench.driving import DrivingAttack
 from bench.plugins.pair import choose
 from docs.figures import road, style
 from docs.figures.driving import FACTS, FEATURES, Moment, attacked, episode, physical, policy
@@ -47,14 +48,22 @@ def art() -> Figure:
 
 def pgd() -> Figure:
     """Projected gradient descent: the steps of the best restart."""
-    moment = attacked(choose("attack", "pgd").component, _moment())
-    clean, *restarts = moment.asked
-    steps = torch.stack(restarts)[:, :, 0]
-    winner = (steps == moment.shown).flatten(2).all(-1).any(0).int().argmax()
-    taken = torch.cat((clean, steps[:, winner]))
-    queries = sum(points.shape[:-2].numel() for points in moment.asked)
-    title = f"pgd: ten gradient steps turn {_turned(moment)}"
-    return _figure(moment, taken, title, f"gradient step of the best of 4 restarts\n({queries} queries in all)")
+    return _descent("pgd", choose("attack", "pgd").component, "ten")
+
+
+def two_stage() -> Figure:
+    """The two-stage attack: the steps of the best restart."""
+    return _descent("two_stage", _learned("two_stage"), "eight")
+
+
+def paad() -> Figure:
+    """PA-AD: the steps of the best restart."""
+    return _descent("paad", _learned("paad"), "eight")
+
+
+def sarsa() -> Figure:
+    """Robust Sarsa: the steps of the best restart."""
+    return _descent("sarsa", _learned("sarsa"), "ten")
 
 
 def none() -> Figure:
@@ -78,8 +87,31 @@ def none() -> Figure:
     return made
 
 
-def _moment() -> Tensor:
-    return torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"][STEP])
+def _moment(step: int = STEP) -> Tensor:
+    return torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"][step])
+
+
+def _learned(name: str) -> DrivingAttack:
+    """An attack that learns, with its network against the undefended `dqn` of training seed 0."""
+    attack = choose("attack", name).component
+    adversary = attack.load(choose("victim", "dqn").component, choose("defense", "none").component, 0, FACTS)
+    return attack.armed(adversary)
+
+
+def _descent(name: str, attack: DrivingAttack, count: str) -> Figure:
+    """A descent from several starts: the steps of the best one."""
+    # The first moment at which the attack changes the decision.
+    moments = (attacked(attack, _moment(step)) for step in range(STEP, STEP + 100))
+    moment = next(each for each in moments if bool((_decisions(each.shown) != _decisions(each.true)).all()))
+    restarts = [points for points in moment.asked if points.ndim == 4]
+    steps = torch.stack(restarts)[:, :, 0]
+    winner = (steps == moment.shown).flatten(2).all(-1).any(0).int().argmax()
+    taken = torch.cat((moment.true[None], steps[:, winner]))
+    queries = sum(points.shape[:-2].numel() for points in moment.asked)
+    title = f"{name}: {count} gradient steps turn {_turned(moment)}"
+    return _figure(
+        moment, taken, title, f"gradient step of the best of {steps.shape[1]} restarts\n({queries} queries in all)"
+    )
 
 
 def _decisions(observations: Tensor) -> Tensor:

@@ -84,7 +84,7 @@ def test_more_work_makes_a_stronger_attack(weak: PGD, strong: PGD) -> None:
 def test_queries_are_one_clean_and_one_per_iterate(steps: int, restarts: int, action_type: ActionType) -> None:
     _, spent = perturb(PGD(steps=steps, restarts=restarts), victim(action_type), observations(3))
     price = 1 if action_type == "discrete" else 2  # the loss of a continuous victim asks its critic
-    assert spent.tolist() == [1 + price * restarts * (steps + 1)] * 3
+    assert spent.tolist() == [price * (1 + restarts * (steps + 1))] * 3
 
 
 @pytest.mark.parametrize("queries", [0, 1, 2])

@@ -133,5 +133,5 @@ def test_a_training_takes_one_component_of_each_kind_and_several_seeds() -> None
     assert (config.victim.component.batch, config.defense.name, config.seeds) == (64, "none", (3,))
     with pytest.raises(UserError, match="one network per seed"):
         train_config(["victim=dqn,ddpg"])
-    with pytest.raises(UserError, match="unknown key 'attack'"):
-        train_config(["attack=zo"])
+    with pytest.raises(UserError, match=r"unknown key 'threat\.budget'"):
+        train_config(["attack=paad", "threat.budget=0.2"])

@@ -39,6 +39,7 @@ def test_the_commands_of_the_page_work_from_top_to_bottom(tmp_path: Path, monkey
     # The effect of `pip install -e`, beside the environment of the tests: the package's own files are found first.
     monkeypatch.setenv("PYTHONPATH", import_path(package, site))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
     for language, block, file in blocks():
         match language:
             case "python":
@@ -57,6 +58,8 @@ def test_the_commands_of_the_page_work_from_top_to_bottom(tmp_path: Path, monkey
     assert {row["attack_shipped_by"] for row in own} == {"cavbench-my-attack 0.1.0"}
     stacked = [row for row in rows if (row["attack"], row["defense"]) == ("held_offset", "frame_mean")]
     assert len(stacked) == 20
+    learned = [row for row in rows if row["attack"] == "universal"]
+    assert len(learned) == 20
     followed = [row for row in rows if row["world"] == "car_following" and row["attack"] == "noise"]
     assert {json.dumps(json.loads(row["cell"])) for row in followed} == {
         '{"gap": 20.0, "braking": 2.0}',

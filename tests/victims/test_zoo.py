@@ -218,11 +218,13 @@ def made_by(command: str) -> zoo.Recipe:
     program, train, *options = shlex.split(command)
     assert (program, train) == ("bench", "train")
     config = train_config(options)
-    hardens = config.defense.name != "none"
-    trained = config.defense.component if hardens else config.victim.component
     world = config.world.component
-    placed = replace(trained, trained_in=zoo.trained_in(world, default=track(world.tracks()[0]).world))
-    return zoo.Recipe.of(*((config.victim.component, placed) if hardens else (placed,)))
+    trained_in = zoo.trained_in(world, default=track(world.tracks()[0]).world)
+    parts = {
+        part.kind: part.component for part in (config.victim, config.defense, config.attack) if part.name != "none"
+    }
+    kind = config.trained.kind
+    return zoo.Recipe.of(**parts | {kind: replace(parts[kind], trained_in=trained_in)})
 
 
 def test_a_card_is_enough_to_train_the_policy_again(home: Path, highway: DrivingWorld) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
-from bench.conformance.driving.traffic import observations, victim
+from bench.conformance.driving.traffic import action_types, observations, victim
 from bench.conformance.randomness import stir_others
 from bench.driving import ActionType, DrivingAttack, ObservationThreat, Policy
 from bench.driving.enforcer import Enforcer
@@ -45,7 +45,7 @@ class AttackSuite(Suite):
 
     def same_shape(self) -> None:
         """The perturbed observation has the shape, dtype and device of the input [B, V, F]."""
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             for dtype in (torch.float32, torch.float64):
                 policy, observation = self._victim(action_type).to(dtype), self._observations().to(dtype)
                 answer, _ = self._answer(policy, observation)
@@ -63,14 +63,14 @@ class AttackSuite(Suite):
 
     def finite(self) -> None:
         """The answer contains neither NaN nor infinity."""
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             answer, _ = self._answer(self._victim(action_type), self._observations())
             broken = int((~answer.isfinite()).sum())
             require(not broken, f"{broken} of {answer.numel()} values of the answer are NaN or infinite")
 
     def nothing_to_do(self) -> None:
         """It accepts an empty batch: no episode is running any more."""
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             answer, _ = self._answer(self._victim(action_type), self._observations()[:0])
             require(
                 answer.shape[0] == 0,
@@ -79,7 +79,7 @@ class AttackSuite(Suite):
 
     def neighbours_do_not_matter(self) -> None:
         """The answer for an episode does not depend on the others; in double precision, so that rounding changes no sign."""
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             policy = self._victim(action_type).double()
             among, others = self._observations(0).double(), self._observations(1).double()
             others[0] = among[0]
@@ -93,7 +93,7 @@ class AttackSuite(Suite):
 
     def same_seed_same_answer(self) -> None:
         """All random numbers come from the generator of the run."""
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             policy, observation = self._victim(action_type), self._observations()
             answers = []
             for seed in (1, 2):
@@ -109,7 +109,7 @@ class AttackSuite(Suite):
     def within_the_set(self) -> str:
         """The oracle projects answers to the perturbation set; records contain how far outside they were."""
         outside = 0.0
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             for threat in (self._threat(), self._threat(norm="linf", budget=0.2), self._threat(budget=0.0)):
                 policy, observation = self._victim(action_type), self._observations()
                 answer, enforcer = self._answer(policy, observation, threat)
@@ -127,7 +127,7 @@ class AttackSuite(Suite):
     def within_the_budget(self) -> str:
         """It works within any query budget."""
         most = 0
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             policy, observation = self._victim(action_type), self._observations()
             for queries in BUDGETS:
                 try:
@@ -141,7 +141,7 @@ class AttackSuite(Suite):
 
     def leaves_the_victim(self) -> None:
         """It changes neither the weights, mode or gradients of the victim nor the true observation."""
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             policy, observation = self._victim(action_type), self._observations()
             before, truth = (state_digest(policy), _marks(policy)), observation.clone()
             self._answer(policy, observation)

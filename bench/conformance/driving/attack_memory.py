@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.conformance.check import Check, Suite, refusals_are_broken_rules, require
 from bench.conformance.driving.state import check_state, named
-from bench.conformance.driving.traffic import observations, victim
+from bench.conformance.driving.traffic import action_types, observations, victim
 from bench.driving import ActionType, DrivingAttack, ObservationThreat
 from bench.driving.attacker import Attacker
 from bench.driving.victim import CountedPolicy
@@ -34,7 +34,7 @@ class AttackMemorySuite(Suite):
 
     def state_of_the_episodes(self) -> str:
         """The state is a TensorDict with one row per episode, from the first step on; creating it costs no query."""
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             observation = self._observations()[0]
             oracle = self._attacker(action_type).enforcer.begin(observation)
             with torch.no_grad(), refusals_are_broken_rules():
@@ -56,7 +56,7 @@ class AttackMemorySuite(Suite):
         changed = self._observations()
         changed[:ENDED_AT, list(ENDING)] = self._observations(seed=100)[:ENDED_AT, list(ENDING)]
         kept = [episode for episode in range(EPISODES) if episode not in ENDING]
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             first, second = (
                 torch.stack(self._shown(action_type, batch))[:, kept] for batch in (self._observations(), changed)
             )
@@ -68,7 +68,7 @@ class AttackMemorySuite(Suite):
 
     def keeps_nothing(self) -> None:
         """The attack object stores no memory: many runs use it at once."""
-        for action_type in self.component.action_types:
+        for action_type in action_types(self.subject):
             alone = self._shown(action_type, self._observations())
             beside = self._shown(action_type, self._observations(), beside=self._observations(seed=100))
             require(

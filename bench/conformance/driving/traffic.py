@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
+from bench.conformance.check import Subject
 from bench.conformance.scenarios import first_cell
 from bench.driving import ActionType, DrivingFacts, DrivingWorld, Features, Policy
 
@@ -38,6 +41,11 @@ def victim(action_type: ActionType, facts: DrivingFacts) -> Policy:
         for weight in policy.parameters():
             weight.mul_(3.0)
     return policy.requires_grad_(False).eval()
+
+
+def action_types(attack: Subject) -> Sequence[ActionType]:
+    """The action types to check an attack with: all of its own, or that of the victim that its network was trained for."""
+    return (attack.victim.action_type,) if attack.victim else attack.component.action_types
 
 
 def rows_of_observation(world: DrivingWorld) -> int:

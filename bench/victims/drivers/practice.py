@@ -36,12 +36,22 @@ class Practice:
         crash_penalty: cost of a crash or of leaving the road, in frames of perfect driving.
         memory: size of the replay buffer in transitions.
         batch: size of a sample in transitions.
+        sign: 1 for a driver; -1 for an adversary, whose reward is minus the driver's.
     """
 
     def __init__(
-        self, env: EnvBase, learner: Learner, phase: Phase, *, crash_penalty: float, memory: int, batch: int
+        self,
+        env: EnvBase,
+        learner: Learner,
+        phase: Phase,
+        *,
+        crash_penalty: float,
+        memory: int,
+        batch: int,
+        sign: float = 1.0,
     ) -> None:
         self.env, self.learner, self.phase, self.crash_penalty = env, learner, phase, crash_penalty
+        self.sign = sign
         self.buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(memory), batch_size=batch)
         # Without done_keys=[] the transform keeps `terminated` of the first step and bootstraps through crashes.
         self.multi_step = MultiStepTransform(n_steps=phase.n_step, gamma=phase.gamma, done_keys=[])
@@ -75,7 +85,7 @@ class Practice:
     def _transition(self, step: TensorDictBase) -> TensorDict:
         after, phase = step["next"], self.phase
         failed = after["info", "crashed"] | after["info", "offroad"]
-        reward = after["info", "progress"] - self.crash_penalty * failed.float()
+        reward = self.sign * (after["info", "progress"] - self.crash_penalty * failed.float())
         after = after.select("observation", "terminated", "done")
         after.set("reward", reward * ((1 - phase.gamma) / phase.repeat))
         return TensorDict(

@@ -59,12 +59,14 @@ class Best:
         hooks: hooks of the training.
         episodes: number of episodes per road on true observations; a third of it on perturbed ones, which may cost ten times
             as much.
+        sign: 1 keeps the highest score; -1 the lowest, for an adversary.
     """
 
     world: DrivingWorld
     hooks: TrainingHooks
     episodes: int
-    score: float = -1.0
+    sign: float = 1.0
+    score: float | None = None
     scores: dict[str, dict[str, float]] = field(default_factory=dict)
     share: float = 0.0
     weights: dict[str, Tensor] = field(default_factory=dict)
@@ -77,7 +79,7 @@ class Best:
             scores[name] = selection_score(policy, self.world, self.episodes // 3, show)
         score = sum(by_road["mean"] for by_road in scores.values()) / len(scores)
         self.history.append((round(share, 3), round(score, 4)))
-        if score > self.score:
+        if self.score is None or self.sign * score > self.sign * self.score:
             self.score, self.scores, self.share = score, scores, share
             self.weights = copy.deepcopy(policy.state_dict())
 

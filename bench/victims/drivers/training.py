@@ -52,6 +52,10 @@ class LearningDriver(DrivingVictim):
 
     learns: ClassVar[bool] = True
     policy_type: ClassVar[type[Policy]]
+    sign: ClassVar[float] = 1.0
+    """-1 for an adversary: its reward is minus the driver's, and its best checkpoint has the lowest `safe_progress`."""
+    selection_episodes: ClassVar[int] = 60
+    """Episodes per road for which a checkpoint is scored."""
 
     decisions: Count = 36_000
     fine: Share = 0.45
@@ -103,7 +107,7 @@ class LearningDriver(DrivingVictim):
         torch.manual_seed(seed)
         started = time.process_time()
         hooks = hooks or TrainingHooks()
-        best, learner, done = Best(world, hooks, episodes=60), None, 0
+        best, learner, done = Best(world, hooks, self.selection_episodes, self.sign), None, 0
         phases = self.phases(hooks)
         total = sum(phase.decisions for phase in phases)
         for number, phase in enumerate(phases):
@@ -111,8 +115,15 @@ class LearningDriver(DrivingVictim):
             env.set_seed(SeedBlock.TRAIN * (seed + 1) + number * SeedBlock.REPORT)
             learner = learner or self.learner(env, hooks)
             learner.enter(phase)
-            recall = {"memory": self.memory, "batch": self.batch}
-            practice = Practice(env, learner, phase, crash_penalty=self.crash_penalty, **recall)
+            practice = Practice(
+                env,
+                learner,
+                phase,
+                crash_penalty=self.crash_penalty,
+                memory=self.memory,
+                batch=self.batch,
+                sign=self.sign,
+            )
             for taken in range(CHUNK, phase.decisions + 1, CHUNK):
                 share = done / total
                 practice.drive(CHUNK, share)
@@ -124,7 +135,7 @@ class LearningDriver(DrivingVictim):
                         learner.update(practice.sample(share), rate)
                 if phase.repeat == 1 and self._due(done / total, len(best.history), hooks):
                     best.offer(learner.averaged(), done / total)
-                progress(done / total, f"safe_progress {best.score:.2f}" if best.history else "")
+                progress(done / total, f"safe_progress {best.score:.2f}" if best.score is not None else "")
         assert learner is not None
         card = {**best.card(), "cpu_seconds": round(time.process_time() - started, 1)}
         return Trained(best.restore(learner.averaged()), card)

@@ -1,9 +1,10 @@
 """Recipes: everything that determines the result of a training, except the seed. Entries of the zoo are named by their recipe.
 
 Only non-default parameters are part of a recipe, so a new parameter with a default changes no recipe. Code is represented by
-`training`, a version number on the class of a victim or defence; its author raises it when the training changes.
+`training`, a version number on the class of a victim, defence or attack; its author raises it when the training changes.
 
-Two parameter names are special. `trained` selects a training seed of the zoo and is not part of the component's own recipe.
+The parameters that an attack lists in `at_run_time` are no part of its recipe. Two parameter names are special. `trained`
+selects a training seed of the zoo and is not part of the component's own recipe.
 `trained_in` names the training world if it is not the default.
 """
 
@@ -17,7 +18,7 @@ from typing import Any
 
 from bench.errors import UserError
 from bench.plugins import registry
-from bench.plugins.contracts import Component, Defense, Victim, World
+from bench.plugins.contracts import Attack, Component, Defense, Victim, World
 from bench.plugins.fingerprint import digest
 from bench.plugins.parameters import Parameter, parameters
 from bench.plugins.registry import GROUPS, Kind
@@ -33,7 +34,7 @@ class Part:
     """The properties of a component that influence a training.
 
     Args:
-        kind: victim, defense or world.
+        kind: victim, defense, attack or world.
         name: name on the command line; the class name if it is not installed.
         source: top-level package and class, for instance `bench.DQN`; it does not change when a class moves within its package.
         module: module of the class.
@@ -53,10 +54,10 @@ class Part:
     changed: Mapping[str, Any]
 
     @classmethod
-    def of(cls, kind: Kind, component: Component, *, without: str = "") -> Part:
-        """The part of a component, without the parameter `without`."""
+    def of(cls, kind: Kind, component: Component, *, without: Sequence[str] = ()) -> Part:
+        """The part of a component, without the parameters `without`."""
         component_type = type(component)
-        declared = {name: each for name, each in parameters(component_type).items() if name != without}
+        declared = {name: each for name, each in parameters(component_type).items() if name not in without}
         values = {name: _value(component, parameter) for name, parameter in declared.items()}
         return cls(
             kind=kind,
@@ -87,31 +88,45 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Everything that determines a training: the victim and, if there is one, the defence.
+    """Everything that determines a training: the victim and, if there are any, the defence and the attack.
 
     Args:
-        name: readable name, shared by all variants: `dqn`, `dqn-advtrain-pgd-skip0.3`.
-        parts: the victim, then the defence, if there is one.
+        name: readable name, shared by all variants: `dqn`, `dqn-advtrain-pgd-skip0.3`, `paad-dqn-advtrain`.
+        parts: the victim, the defence, the attack; the last one is trained, and those that do not matter to it are absent.
+        beside: the victim and the defence if they do not matter to the training of the attack; commands name them.
     """
 
     name: str
     parts: tuple[Part, ...]
+    beside: tuple[Part, ...] = ()
 
     @classmethod
-    def of(cls, victim: Victim, defense: Defense | None = None) -> Recipe:
-        """The recipe of a victim's training, or of a defence's training of the victim.
+    def of(cls, victim: Victim, defense: Defense | None = None, attack: Attack | None = None) -> Recipe:
+        """The recipe of a victim's training, of a defence's training of the victim, or of an attack's training against both.
 
         Raises:
             NotImplementedError: if the component has no training.
         """
+        if attack is not None:
+            return cls._of_adversary(victim, defense, attack)
         if defense is None:
-            return cls(name=_safe(victim.zoo_name()), parts=(Part.of("victim", victim, without="trained"),))
-        hardened = Part.of("defense", defense, without="trained")
+            return cls(name=_safe(victim.zoo_name()), parts=(Part.of("victim", victim, without=("trained",)),))
+        hardened = Part.of("defense", defense, without=("trained",))
         return cls(name=_safe(defense.zoo_name(victim)), parts=(Part.of("victim", victim), hardened))
+
+    @classmethod
+    def _of_adversary(cls, victim: Victim, defense: Defense | None, attack: Attack) -> Recipe:
+        defended = [Part.of("victim", victim)]
+        if defense is not None and (part := Part.of("defense", defense)).name != "none":
+            defended.append(part)
+        name, adversary = attack.zoo_name(victim), Part.of("attack", attack, without=attack.at_run_time)
+        if not attack.adapts:
+            return cls(name=_safe(name), parts=(adversary,), beside=tuple(defended))
+        return cls(name=_safe("-".join([name, *(part.name for part in defended)])), parts=(*defended, adversary))
 
     @property
     def trained(self) -> Part:
-        """The part that is trained: the defence if there is one, otherwise the victim."""
+        """The part that is trained: the last one."""
         return self.parts[-1]
 
     @property
@@ -127,7 +142,7 @@ class Recipe:
     @property
     def options(self) -> list[str]:
         """The non-default parameters, as on the command line."""
-        return [option for part in self.parts for option in part.options]
+        return [option for part in (*self.beside, *self.parts) for option in part.options]
 
     @property
     def trained_in(self) -> str:
@@ -151,7 +166,7 @@ class Recipe:
         return {"digest": self.digest, **{part.kind: part.described() for part in self.parts}}
 
     def _components(self) -> list[str]:
-        return [f"{part.kind}={part.name}" for part in self.parts]
+        return [f"{part.kind}={part.name}" for part in (*self.beside, *self.parts)]
 
 
 def trained_in(world: World, *, default: str) -> str:

@@ -116,19 +116,26 @@ def card(recipe: Recipe, seed: int) -> dict[str, Any]:
         raise UserError(f"the card {path} cannot be read: {error}") from None
 
 
-def load(recipe: Recipe, seed: int, build: Callable[..., N]) -> N:
+def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "") -> N:
     """The network of an entry, frozen and in eval mode.
 
     Args:
         recipe: its recipe.
         seed: training seed.
         build: builds the network from the card's `shape` before the weights are loaded; usually its class.
+        against: for an adversary, the hash of the weights of its victim; empty if they do not matter.
 
     Raises:
-        UserError: if there is no such entry, a default has changed since, or the weights do not match the card.
+        UserError: if there is no such entry, a default has changed since, the weights do not match the card, or an adversary
+            was trained against other weights.
     """
     path, entry = _find(recipe, seed), card(recipe, seed)
     _check_parameters(recipe, seed, entry)
+    if against and (before := entry.get("against")) != against:
+        raise UserError(
+            f"the zoo's {recipe.name!r} of training seed {seed} was trained against a victim with weights {str(before)[:12]}…, "
+            f"and the victim has {against[:12]}… now; `{recipe.train(seed)}` trains it again"
+        )
     blob = path.read_bytes()
     sha256 = hashlib.sha256(blob).hexdigest()
     if sha256 != entry.get("sha256"):
