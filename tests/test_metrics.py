@@ -64,7 +64,7 @@ def test_an_interval_holds_its_estimate(values: np.ndarray) -> None:
     for result in (interval(values), share_interval(values)):
         assert np.isnan(result.low) or result.low <= result.estimate <= result.high
         assert result.estimate == pytest.approx(values.mean())
-    assert np.isnan(result.low) or 0 <= result.low < result.high <= 1
+    assert np.isnan(result.low) or 0 <= result.low <= result.high <= 1
 
 
 def test_one_number_has_no_interval() -> None:

@@ -1,7 +1,7 @@
 """Means with 95 % intervals over two crossed random factors: the training (runs) and the scenario.
 
 Pure functions on arrays; `bench.statistics.episodes` says what the arrays mean. docs/metrics.md derives the intervals and has the
-table of their coverage (`python benchmarks/coverage.py`).
+table of their coverage (`python -m tests.leaderboard.simulated_studies`).
 """
 
 from __future__ import annotations
@@ -173,15 +173,12 @@ def _symmetric(estimate: float, margin: float) -> Interval:
 
 
 def _wilson(share: float, margin: float, episodes: int) -> Interval:
-    """Wilson's interval of a share whose symmetric interval is share +- margin.
-
-    If the margin is no wider than that of independent episodes without a success (0 where all are equal), that one counts.
-    """
+    """Wilson's interval of a share whose symmetric interval is share +- margin; of independent episodes if all are 0 or 1."""
     if math.isnan(margin):
         return Interval(share, np.nan, np.nan)
     share = min(max(share, 0.0), 1.0)
     spread = share * (1 - share)
-    ratio = max(margin**2 / spread if spread > 0 else 0.0, _Z2 / episodes)
+    ratio = margin**2 / spread if spread > 0 else _Z2 / episodes
     centre = (share + ratio / 2) / (1 + ratio)
     half = math.sqrt(ratio * spread + ratio**2 / 4) / (1 + ratio)
     return Interval(share, min(max(centre - half, 0.0), share), max(min(centre + half, 1.0), share))

@@ -12,6 +12,8 @@ FIGURES = {
     "attack_none.svg": "attacks:none",
     "attack_noise.svg": "attacks:noise",
     "attack_bias.svg": "memory:bias",
+    "attack_pessimist.svg": "attacks:pessimist",
+    "attack_plan.svg": "attacks:plan",
     "attack_zo.svg": "attacks:zo",
     "attack_pgd.svg": "attacks:pgd",
     "attack_two_stage.svg": "attacks:two_stage",

@@ -32,6 +32,22 @@ def noise() -> Figure:
     return _figure(moment, torch.cat((moment.true[None], moment.shown)), title, "random draw")
 
 
+def pessimist() -> Figure:
+    """The pessimist: every car nearer and closing faster."""
+    moment = attacked(choose("attack", "pessimist").component, _moment())
+    points = torch.cat((moment.true[None], moment.shown))
+    return _figure(moment, points, "pessimist: every car nearer and closing faster", "true and shown observation")
+
+
+def plan() -> Figure:
+    """The planning attack: all of its queries."""
+    attack = choose("attack", "plan").component
+    moments = (attacked(attack, _moment(step)) for step in range(STEP, STEP + 100))
+    moment = next(each for each in moments if bool((_decisions(each.shown) != _decisions(each.true)).all()))
+    asked = torch.cat([points.flatten(0, -3) for points in moment.asked])
+    return _figure(moment, asked, f"plan: {len(asked)} queries turn {_turned(moment)}", "query")
+
+
 def zo() -> Figure:
     """ZO-SignSGD: all of its queries."""
     moment = attacked(choose("attack", "zo").component, _moment())

@@ -20,11 +20,13 @@ from bench.plugins.pair import choose
 from bench.plugins.track import Columns, Driven
 from bench.run.config import run_config
 from bench.run.plan import plan
+from envs.highway.axes import AXES
 from envs.highway.world import HighwayWorld
 
 Array = NDArray[Any]
 
-FACTS = HighwayWorld().facts
+WORLD = HighwayWorld()
+FACTS = WORLD.facts
 FEATURES = FACTS.features
 ROAD = "lanes=3 density=1 weather=clear seeds=0 reference=false"
 """Options of the episodes in the figures."""
@@ -71,7 +73,8 @@ class Moment:
 
 def attacked(attack: DrivingAttack, observation: Tensor, trials: int = 1) -> Moment:
     """Attack the undefended `dqn` at one moment [V, F], under the default threat model."""
-    attacker = Attacker(attack, CountedPolicy(policy()), ObservationThreat(), FEATURES, seed=0)
+    threat, moves = ObservationThreat(access="dynamics"), WORLD.dynamics(AXES.cell(lanes=3, density=1.0), "discrete")
+    attacker = Attacker(attack, CountedPolicy(policy()), threat, FEATURES, seed=0, dynamics=moves)
     asked: list[tuple[Tensor | None, Tensor]] = []
     attacker.enforcer.asked = asked
     shown = attacker.show(observation.repeat(trials, 1, 1), torch.ones(trials, dtype=torch.bool), None).observation

@@ -43,8 +43,8 @@ def measure_columns(
 
 
 def _heading(measure: Measure, table: str) -> str:
-    """In a table of cells with the unit of a share, which the overview has behind every number."""
-    if table == "overview" or measure.unit != "share" or measure.of_attack:
+    """With the unit of a share, unless the overview has it behind every number."""
+    if (table == "overview" and not measure.with_interval) or measure.unit != "share" or measure.of_attack:
         return measure.heading
     return f"{measure.heading[1:]}\n%" if measure.heading.startswith("\n") else f"{measure.heading} %"
 

@@ -22,7 +22,9 @@ from attacks.targets import Controls, EveryAction
 from attacks.two_stage import TwoStage
 from bench.conformance.check import Subject
 from bench.conformance.driving.attack import AttackSuite
-from bench.driving import DrivingAttack, DrivingWorld, ObservationThreat, Oracle, Policy
+from bench.driving import DrivingAttack, DrivingWorld, ObservationThreat, Policy
+from bench.driving.enforcer import Enforcer
+from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
 from bench.plugins.contracts import Trained
 from bench.plugins.pair import Pair, choose
@@ -290,9 +292,9 @@ def test_directed_attacks_keep_to_small_query_budgets() -> None:
         threat = ObservationThreat(queries=queries)
         shown, spent = perturb(PAAD().armed(director), policy, seen, threat)
         assert int(spent.max()) <= queries
-        oracle = Oracle(policy, threat, "oblivious", choose("world", "highway").component.features, torch.Generator())
-        oracle.begin_step(seen)
-        torch.testing.assert_close(oracle.project(shown), shown)
+        features = choose("world", "highway").component.features
+        enforcer = Enforcer(CountedPolicy(policy), threat, "oblivious", features, torch.Generator())
+        torch.testing.assert_close(enforcer.begin(seen).project(shown), shown)
 
 
 def test_the_attack_that_learns_on_the_page_of_plug_ins_works(world: DrivingWorld, tmp_path: Path) -> None:

@@ -104,8 +104,14 @@ def test_a_name_shipped_by_two_packages_is_reported_with_both(bench: Bench, plug
 
 
 FAILS_AT_WORK = {
-    ("attack=crooked", "attack.rule=shape"): "Crooked.perturb returned shape (2, 2, 2), not (2, 2, 3)",
-    ("attack=crooked", "attack.rule=nothing"): "Crooked.perturb returned a NoneType, not (2, 2, 3)",
+    (
+        "attack=crooked",
+        "attack.rule=shape",
+    ): "Crooked.perturb returned shape (2, 2, 2), not a torch.Tensor of shape (2, 2, 3)",
+    (
+        "attack=crooked",
+        "attack.rule=nothing",
+    ): "Crooked.perturb returned a NoneType, not a torch.Tensor of shape (2, 2, 3)",
     ("attack=crooked", "attack.rule=nan"): "Crooked.perturb returned numbers that are NaN or infinite",
     ("attack=crooked", "attack.rule=raise"): "ZeroDivisionError: at a loss (--debug shows the traceback)",
     ("attack=crooked", "attack.rule=access"): "the attack used access 'gradients', but declares only 'scores'",

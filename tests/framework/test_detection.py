@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("toy_folder")
 
 Bench = Callable[..., Said]
 SMALL = "attack=paint victim=red world=red_street lanes=3 density=1 weather=clear,fog seeds=0,1"
-BESIDE = ["created_at", "wall_s", "crafting_s"]
+BESIDE = ["created_at", "wall_s", "crafting_s", "entropy"]
 
 
 def read(line: str) -> RunConfig:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from scipy.stats import binom
 
-from tests.leaderboard.coverage import STUDIES, coverage
+from tests.leaderboard.simulated_studies import STUDIES, coverage
 
 COUNT = 150
 LEAST, MOST = binom.ppf(0.0005, COUNT, 0.94), binom.ppf(0.9995, COUNT, 0.97)

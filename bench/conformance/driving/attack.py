@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,10 +13,12 @@ from torch import Tensor
 from bench.conformance.check import BrokenRuleError, Check, Suite, one_line, require
 from bench.conformance.driving.traffic import action_types, observations, victim
 from bench.conformance.randomness import stir_others
-from bench.driving import ActionType, DrivingAttack, ObservationThreat, Policy
+from bench.driving import ActionType, DrivingAttack, DrivingWorld, ObservationThreat, Policy
+from bench.driving.dynamics import Dynamics
 from bench.driving.enforcer import Enforcer
 from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
+from bench.plugins import registry
 from bench.plugins.contracts import QueryBudgetError
 from bench.plugins.fingerprint import state_digest
 
@@ -166,7 +169,7 @@ class AttackSuite(Suite):
         return observations(EPISODES, features=self.subject.world.features, seed=seed)
 
     def _threat(self, **values: Any) -> ObservationThreat:
-        return ObservationThreat(**values)
+        return allowing(self.component, **values)
 
     def _answer(
         self, policy: Policy, observation: Tensor, threat: ObservationThreat | None = None
@@ -178,6 +181,7 @@ class AttackSuite(Suite):
             self.component.access,
             self.subject.world.features,
             generator,
+            dynamics(self.component, self.subject.world, policy.action_type),
         )
         oracle = enforcer.begin(observation)
         try:
@@ -188,6 +192,17 @@ class AttackSuite(Suite):
             raise
         except UserError as error:
             raise BrokenRuleError(one_line(error)) from None
+
+
+def allowing(attack: DrivingAttack, **values: Any) -> ObservationThreat:
+    """A threat model that allows the attack's access."""
+    threat = ObservationThreat(**values)
+    return threat if threat.allows(attack.access) else replace(threat, access=attack.access)
+
+
+def dynamics(attack: DrivingAttack, world: DrivingWorld, action_type: ActionType) -> Dynamics | None:
+    """The dynamics of the world's first cell, if the attack has access to them."""
+    return world.dynamics(registry.grid(world.grid).cells()[0], action_type) if attack.access == "dynamics" else None
 
 
 def _marks(policy: Policy) -> object:

@@ -9,9 +9,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from bench.conformance.check import Check, Suite, refusals_are_broken_rules, require
+from bench.conformance.driving.attack import allowing, dynamics
 from bench.conformance.driving.state import check_state, named
 from bench.conformance.driving.traffic import action_types, observations, victim
-from bench.driving import ActionType, DrivingAttack, ObservationThreat
+from bench.driving import ActionType, DrivingAttack
 from bench.driving.attacker import Attacker
 from bench.driving.victim import CountedPolicy
 
@@ -95,7 +96,9 @@ class AttackMemorySuite(Suite):
     def _attacker(self, action_type: ActionType, seed: int = 0) -> Attacker:
         facts = self.subject.world.facts
         policy = victim(action_type, facts).double()
-        return Attacker(self.component, CountedPolicy(policy), ObservationThreat(), facts.features, seed=seed)
+        threat = allowing(self.component)
+        moves = dynamics(self.component, self.subject.world, action_type)
+        return Attacker(self.component, CountedPolicy(policy), threat, facts.features, seed=seed, dynamics=moves)
 
     def _observations(self, seed: int = 0) -> Tensor:
         """Observations [STEPS, B, V, F] in double precision, so that rounding changes no sign."""

@@ -14,7 +14,7 @@ function el(tag, attributes = {}, ...children) {
   made.append(...children.filter((child) => child != null));
   return made;
 }
-const fixed = (value, digits = 2) => (value == null ? "—" : value.toFixed(digits).replace("-", "−"));
+const fixed = (value, digits = 2) => (value == null ? "—" : (Math.abs(value) < 0.5 * 10 ** -digits ? 0 : value).toFixed(digits).replace("-", "−"));
 const short = (value) => fixed(value).replace(/^(−?)0\./, "$1.");
 const bounds = (found) => (found && found.low != null ? `${short(found.low)}–${short(found.high)}` : "");
 const signed = (found) => (found == null ? "—" : (found.estimate > 0 ? "+" : "") + fixed(found.estimate));
@@ -44,8 +44,8 @@ function interval(one, places) {
   const freedom = parts.reduce((sum, [part, df]) => sum + part ** 2 / df, 0);
   const joint = variance > 0 ? tQuantile(variance ** 2 / freedom) ** 2 * variance : 0;
   const apart = parts.reduce((sum, [part, df]) => sum + tQuantile(df) ** 2 * part, 0);
-  const spread = share * (1 - share), least = data.t[data.t.length - 1][1] ** 2 / (runs * scenarios * places.length);
-  const ratio = Math.max(spread > 0 ? (joint + apart) / 2 / spread : 0, least);
+  const spread = share * (1 - share), alone = data.t[data.t.length - 1][1] ** 2 / (runs * scenarios * places.length);
+  const ratio = spread > 0 ? (joint + apart) / 2 / spread : alone;
   const centre = (share + ratio / 2) / (1 + ratio), half = Math.sqrt(ratio * spread + ratio ** 2 / 4) / (1 + ratio);
   return { estimate: share, low: Math.max(0, Math.min(centre - half, share)), high: Math.min(1, Math.max(centre + half, share)) };
 }

@@ -1,6 +1,6 @@
 """How often the intervals that a leaderboard prints hold the truth, in simulated studies.
 
-    python -m tests.leaderboard.coverage 2000       # the table in docs/metrics.md, with so many studies a line
+    python -m tests.leaderboard.simulated_studies 2000       # the table in docs/metrics.md, with so many studies a line
 
 A study is a set of records: two defended victims under two attacks each, on the clear roads of the standard grid. Each episode
 crashes with a probability that is the sum of a cell, a training, a scenario and their interaction, cut at 0 and 1; one that does
