@@ -20,6 +20,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
+from bench.archive import Archive
 from bench.detection import Detector
 from bench.errors import UserError
 from bench.files import whole
@@ -83,11 +84,13 @@ def _safetensors(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
 
 
 def _checkpoint(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
-    named = get_unsafe_globals_in_checkpoint(path)
+    copy = Archive.read(path, f"the weights {path}").repacked()
+    named = get_unsafe_globals_in_checkpoint(copy)
     if unexpected := sorted(name for name in named if not EXPECTED.fullmatch(name)):
         raise UserError(f"the weights {path} are refused: they name {shorten(', '.join(unexpected), 200)}")
     with safe_globals([(_Inert, name) for name in named]):
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        copy.seek(0)
+        checkpoint = torch.load(copy, map_location="cpu", weights_only=True)
     model = isinstance(checkpoint, dict) and (checkpoint.get("ema") or checkpoint.get("model"))
     if not isinstance(model, _Inert):
         raise UserError(f"the weights {path} cannot be read: the file is not a checkpoint with a model")
