@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -75,7 +76,7 @@ def refusal(path: Path, name: str = "torch", **values: str) -> str:
 def test_an_honest_program_is_computed_bit_for_bit_as_by_torch(
     honest: Path, program: torch.export.ExportedProgram
 ) -> None:
-    ours, theirs = load(honest), program.module()
+    ours, theirs = load(honest), program.module().requires_grad_(False)
     for batch in (1, 2, 700):
         own = torch.rand(batch, 10, 5, generator=torch.Generator().manual_seed(batch)).requires_grad_()
         other = own.detach().clone().requires_grad_()
@@ -236,7 +237,7 @@ def test_a_crafted_program_executes_nothing_and_is_refused(what: str, honest: Pa
 @pytest.mark.parametrize("what", ["a pickled weight", "a pickled constant", "an opaque object", "sample inputs"])
 def test_the_crafted_programs_do_harm_when_torch_loads_them(what: str, honest: Path, tmp_path: Path) -> None:
     path, harm = rewritten(honest, tmp_path / "crafted.pt2", CRAFTED[what][0], tmp_path / "harm"), tmp_path / "harm"
-    with pytest.raises(Exception):  # noqa: B017, PT011
+    with contextlib.suppress(Exception):
         torch.export.load(path)
     assert harm.exists()
 
@@ -265,7 +266,7 @@ def test_text_that_torch_would_evaluate_is_never_evaluated(honest: Path, tmp_pat
     observation = torch.rand(4, 10, 5)
     assert torch.equal(load(path).scores(observation), load(honest).scores(observation))
     assert not harm.exists()
-    with pytest.raises(Exception):  # noqa: B017, PT011
+    with contextlib.suppress(Exception):
         torch.export.load(path).module()
     assert harm.exists()
 
@@ -286,7 +287,7 @@ def test_a_pickle_and_a_torchscript_archive_are_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "harm").exists()
 
 
-def bomb(path: Path, name: str, size: int = 300_000_000) -> Path:
+def bomb(path: Path, name: str, size: int = 40_000_000) -> Path:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         with archive.open(name, "w", force_zip64=True) as file:
             for _ in range(size // 10**6):
@@ -300,8 +301,8 @@ def bomb(path: Path, name: str, size: int = 300_000_000) -> Path:
 )
 def test_a_bomb_is_refused_before_it_is_unpacked(victim: str, name: str, values: dict[str, str], tmp_path: Path) -> None:
     path = bomb(tmp_path / "bomb.pt", name)
-    assert path.stat().st_size < 400_000
-    with pytest.raises(UserError, match=r"is refused: \d+\.\d kB unpack to 300\.0 MB, more than the \d+\.\d MB allowed"):
+    assert path.stat().st_size < 100_000
+    with pytest.raises(UserError, match=r"is refused: \d+\.\d kB unpack to 40\.0 MB, more than the \d+\.\d MB allowed"):
         if victim == "yolov5":
             from bench.victims.detectors import yolov5_file
 
