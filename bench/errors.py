@@ -8,6 +8,8 @@ import warnings
 
 LONGEST = 60
 """A value of a user in a message is cut to so many characters."""
+LONGEST_WORD, LONGEST_PATH, LONGEST_LINE = 100, 250, 900
+"""The same for the words, the paths and the whole of a message."""
 
 
 class UserError(Exception):
@@ -31,8 +33,18 @@ def notice(line: str) -> None:
 def short(value: str) -> str:
     """A value of a user for a message: on one line, and cut in the middle if it is long."""
     line = " ".join(value.split())
-    half = LONGEST // 2
-    return line if len(line) <= LONGEST else f"{line[:half]}…{line[-half:]} ({len(line)} characters)"
+    return line if len(line) <= LONGEST else f"{_cut(line, LONGEST)} ({len(line)} characters)"
+
+
+def bounded(line: str) -> str:
+    """A message on one line: each word that is longer than a path is cut, and the whole in its middle."""
+    words = (word if len(word) <= (LONGEST_PATH if "/" in word else LONGEST_WORD) else _cut(word, LONGEST) for word in line.split())
+    return _cut(" ".join(words), LONGEST_LINE)
+
+
+def _cut(text: str, longest: int) -> str:
+    half = longest // 2
+    return text if len(text) <= longest else f"{text[:half]}…{text[-half:]}"
 
 
 def plain(text: str) -> str:

@@ -16,6 +16,7 @@ from rich.text import Text
 
 from bench.cli.show import located, pair_named, recordings, records_of
 from bench.errors import UserError
+from bench.files import check_folder
 from bench.scenarios.axes import written
 
 
@@ -84,6 +85,7 @@ def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Conso
     if beginning:
         words = {"pair": pair_named(beginning, records)} | words
     record = find(records, words)
+    check_folder(folder / "recordings", "the folder of recordings")
     made = replay(folder, record)
     if made.differences:
         cause = f"changed since: {made.changed}" if made.changed else "no known change since"

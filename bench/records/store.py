@@ -6,7 +6,6 @@ Files are written atomically, so a killed run leaves only finished units. Whethe
 from __future__ import annotations
 
 import itertools
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
@@ -30,13 +29,8 @@ def prepare(out: Path) -> None:
     Raises:
         UserError: if the folder cannot be written.
     """
-    try:
-        (out / FOLDER).mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out / FOLDER):
-            pass
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise UserError(f"the results folder {out} cannot be written: {reason}; choose another with out=") from None
+    files.check_folder(out, "the results folder")
+    files.check_folder(out / FOLDER, "the results folder")
 
 
 def path_of(out: Path, unit: str) -> Path:

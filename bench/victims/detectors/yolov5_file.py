@@ -32,6 +32,10 @@ EXPECTED = re.compile(
 """Allowed class names in a checkpoint: the model's classes, and classes of the training's options and metrics."""
 
 
+LARGEST_HEADER = 2**24
+"""Most bytes of the JSON at the beginning of a .safetensors file."""
+
+
 @dataclass(frozen=True)
 class Weights:
     """The content of a file: tensors by their names in the state dict, class names, and the sha256 of the file."""
@@ -63,10 +67,11 @@ def read(path: Path) -> Weights:
         return Weights(tensors, names, hashlib.sha256(path.read_bytes()).hexdigest())
     except UserError:
         raise
+    except OSError as error:
+        raise UserError(f"the weights {path} cannot be read: {error.strerror or error}") from error
     # A truncated or malicious file can fail anywhere in the unpickler.
     except Exception as error:
-        reason = shorten(f"{type(error).__name__}: {error}", 200)
-        raise UserError(f"the weights {path} cannot be read: {reason}") from None
+        raise UserError(f"the weights {path} cannot be read: the file is not a checkpoint of YOLOv5, or a damaged one") from error
 
 
 def save(detector: Detector, path: Path) -> None:
@@ -78,6 +83,9 @@ def save(detector: Detector, path: Path) -> None:
 
 
 def _safetensors(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
+    with path.open("rb") as start:
+        if int.from_bytes(start.read(8), "little") > LARGEST_HEADER:
+            raise UserError(f"the weights {path} are refused: their header has more than {LARGEST_HEADER >> 20} MiB")
     with safe_open(path, "pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         return tensors, _names(json.loads((file.metadata() or {})["names"]))
