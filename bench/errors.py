@@ -38,7 +38,10 @@ def short(value: str) -> str:
 
 def bounded(line: str) -> str:
     """A message on one line: each word that is longer than a path is cut, and the whole in its middle."""
-    words = (word if len(word) <= (LONGEST_PATH if "/" in word else LONGEST_WORD) else _cut(word, LONGEST) for word in line.split())
+    words = (
+        word if len(word) <= (LONGEST_PATH if "/" in word else LONGEST_WORD) else _cut(word, LONGEST)
+        for word in line.split()
+    )
     return _cut(" ".join(words), LONGEST_LINE)
 
 
@@ -52,7 +55,9 @@ def plain(text: str) -> str:
 
     Line ends and tabs stay. Every other character of the Unicode categories Cc, Cf, Cs, Zl and Zp becomes a question mark.
     """
-    return _OBEYED.sub(lambda found: found[0] if unicodedata.category(found[0]) not in ("Cc", "Cf", "Cs", "Zl", "Zp") else "?", text)
+    return _OBEYED.sub(
+        lambda found: found[0] if unicodedata.category(found[0]) not in ("Cc", "Cf", "Cs", "Zl", "Zp") else "?", text
+    )
 
 
 _OBEYED = re.compile(r"[^\n\t\x20-\x7e]")

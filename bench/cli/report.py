@@ -35,4 +35,3 @@ def print_report(words: Sequence[str], console: Console) -> None:
     name = names[0] if names else "run"
     function = registry.resolve(registry.REPORTS, name, "report")
     function({} if name != "run" and no_folder else reading.read_all(out), console)
-

@@ -109,7 +109,8 @@ class Options:
         if strange := [key for key in given if key not in axes]:
             raise UserError(registry.unknown(f"axis {strange[0]!r} of the world", strange[0], axes))
         return {
-            key: tuple(_axis_value(axes[key], text) for text in _distinct(key, _listed(self.values[key]))) for key in given
+            key: tuple(_axis_value(axes[key], text) for text in _distinct(key, _listed(self.values[key])))
+            for key in given
         }
 
     @cached_property
@@ -216,7 +217,9 @@ def parameter_words(text: str) -> dict[str, str]:
     for word in text.split():
         name, equals, value = word.partition("=")
         if not equals:
-            raise UserError(f'attack_params takes name=value pairs, for instance "steps=3 restarts=2", got {short(word)!r}')
+            raise UserError(
+                f'attack_params takes name=value pairs, for instance "steps=3 restarts=2", got {short(word)!r}'
+            )
         found[name] = value
     return found
 

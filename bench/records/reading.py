@@ -21,7 +21,6 @@ from bench.records.generations import check, glance, selection
 from bench.records.schema import IDENTITY, PROVENANCE, schema
 from bench.records.store import FOLDER, path_of
 
-
 SKEW = timedelta(hours=1)
 """Clocks of machines may differ so much; a record that is dated further ahead is not believed to be the newest."""
 

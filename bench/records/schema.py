@@ -142,6 +142,13 @@ PROBES: tuple[pa.Field, ...] = (
         "share, 0 to 1",
         nullable=True,
     ),
-    field("entropy", INT, "seed of the moments that were probed, drawn when the unit was driven", nullable=True, low=0, high=2**63),
+    field(
+        "entropy",
+        INT,
+        "seed of the moments that were probed, drawn when the unit was driven",
+        nullable=True,
+        low=0,
+        high=2**63,
+    ),
 )
 """Columns for the flags of a leaderboard; null if not measured. A track that measures them lists them in `probes`."""

@@ -69,7 +69,9 @@ def finished(out: Path, units: Mapping[str, Wanted]) -> set[str]:
         if not path.exists():
             continue
         if why := _incomplete(path, key, unit):
-            notice(f"the record {path} does not count as finished: {why}; its unit is driven again, it is {_aside(out, path)}")
+            notice(
+                f"the record {path} does not count as finished: {why}; its unit is driven again, it is {_aside(out, path)}"
+            )
         else:
             done.add(key)
     return done

@@ -32,7 +32,11 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
     field("detection_rate", FLOAT, "frames with a confidence above 0.25", "share, 0 to 1"),
     field("first_seen_m", FLOAT, "distance at which the sign is first detected; 0 if never", "m", low=0),
     field(
-        "confirmed_m", FLOAT, "distance at which the sign is first detected in 3 of the last 5 frames; 0 if never", "m", low=0
+        "confirmed_m",
+        FLOAT,
+        "distance at which the sign is first detected in 3 of the last 5 frames; 0 if never",
+        "m",
+        low=0,
     ),
     field("overrun_m", FLOAT, "how far beyond the stop line the car stops; 0 if before it", "m", low=0),
     field("ran", pa.bool_(), "whether the car never brakes for the sign, or stops more than 1 m beyond the line"),
@@ -46,7 +50,9 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
     field("queries", FLOAT, "images that the detector was queried with to craft the patch", "images", low=0),
     field("gradients", FLOAT, "images whose gradient was taken to craft the patch", "images", low=0),
     field("crafting_s", FLOAT, "wall time of crafting the patch", "s", low=0),
-    field("excess", FLOAT, "largest distance of the attack's texels outside [0, 1], before clipping", "texel value", low=0),
+    field(
+        "excess", FLOAT, "largest distance of the attack's texels outside [0, 1], before clipping", "texel value", low=0
+    ),
     field("patch", TEXT, "fingerprint of the patch, patches/<fingerprint>.safetensors; empty if there is none"),
     field("patch_sha256", TEXT, "of its texels; empty if the attack makes no patch"),
     field("frame_distance_m", pa.list_(FLOAT), "of each frame: distance from the camera to the sign", "m", low=0),

@@ -33,7 +33,9 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
     field("crashed", pa.bool_(), "the ego hit another vehicle"),
     field("offroad", pa.bool_(), "the ego left the road"),
     field("distance_m", FLOAT, "driven along the road", "m"),
-    field("min_ttc_s", FLOAT, "smallest time to collision with the car ahead; inf if there is none", "s", low=0, high=inf),
+    field(
+        "min_ttc_s", FLOAT, "smallest time to collision with the car ahead; inf if there is none", "s", low=0, high=inf
+    ),
     field("mean_speed", FLOAT, "mean over the steps", "m/s"),
     field("queries", FLOAT, "victim evaluations per step, mean", "queries", low=0),
     field("queries_median", FLOAT, "victim evaluations per step, median", "queries", low=0),

@@ -17,9 +17,7 @@ PROSE = re.compile(
 )
 
 
-def test_bad_inputs_get_one_line(
-    bench: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_inputs_get_one_line(bench: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
     (tmp_path / "files").mkdir()

@@ -216,10 +216,13 @@ def test_a_record_from_the_future_is_not_the_newest(written: Path, units: list[U
     today = read(written)
     rows = read(written, [units[0].fingerprint]).to_pylist()
     future = [
-        row | {"unit": "future", "code_digest": "future", "created_at": row["created_at"].replace(year=2999)} for row in rows
+        row | {"unit": "future", "code_digest": "future", "created_at": row["created_at"].replace(year=2999)}
+        for row in rows
     ]
     results.write(written, pa.Table.from_pylist(future, SCHEMA))
-    with pytest.warns(Notice, match=r"the record .*future\.parquet is dated in the future: such records count as older"):
+    with pytest.warns(
+        Notice, match=r"the record .*future\.parquet is dated in the future: such records count as older"
+    ):
         assert read(written).equals(today)
     with pytest.warns(Notice):
         assert "future" not in reading.read_compact(written, MEASURED)["driving"]["code_digest"].to_pylist()

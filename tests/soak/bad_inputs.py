@@ -12,11 +12,56 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 LONG = "x" * 20_000
-HOSTILE = ("=cmd|' /C calc'!A0", "\x1b[2J\x1b]0;owned\x07", "\u202egnp.exe", "a\nb", "\x9b31m", "../../etc/passwd", "$(id)", "`id`")
-NUMBERS = ("-1", "nan", "inf", "-inf", "1e999", "0x10", "1_0", "ten", "--1", "1.5.2", "٣", "9" * 400, "1e-400x", "true", "null")
-NESTED = ("[[3]]", "{a:1}", "[", "]", "[1,[2]]", "[1,2", "(3)", "a:b:c", "${oc.env:HOME}", "${now:}", "${x", "range(1,10**9)")
+HOSTILE = (
+    "=cmd|' /C calc'!A0",
+    "\x1b[2J\x1b]0;owned\x07",
+    "\u202egnp.exe",
+    "a\nb",
+    "\x9b31m",
+    "../../etc/passwd",
+    "$(id)",
+    "`id`",
+)
+NUMBERS = (
+    "-1",
+    "nan",
+    "inf",
+    "-inf",
+    "1e999",
+    "0x10",
+    "1_0",
+    "ten",
+    "--1",
+    "1.5.2",
+    "٣",
+    "9" * 400,
+    "1e-400x",
+    "true",
+    "null",
+)
+NESTED = (
+    "[[3]]",
+    "{a:1}",
+    "[",
+    "]",
+    "[1,[2]]",
+    "[1,2",
+    "(3)",
+    "a:b:c",
+    "${oc.env:HOME}",
+    "${now:}",
+    "${x",
+    "range(1,10**9)",
+)
 KEYS = ("lanes", "density", "episodes", "seeds", "workers", "record", "threat.budget", "threat.queries", "threat.share")
-KEYS_OF_PARTS = ("attack.steps", "attack.scale", "attack.restarts", "world.max_steps", "world.vehicles", "victim.hidden")
+KEYS_OF_PARTS = (
+    "attack.steps",
+    "attack.scale",
+    "attack.restarts",
+    "world.max_steps",
+    "world.vehicles",
+    "victim.hidden",
+)
 NAMES = ("zo2", "", "None", "dqn ", "torch", "../dqn", "zo:", ":", "art:", "art:nothing", LONG, *HOSTILE)
 COMMANDS = ("run", "train", "audit")
 
@@ -50,7 +95,9 @@ def bad_inputs(count: int, *, seed: int, folder: Path) -> Iterator[list[str]]:
 def _value(draw: random.Random, files: list[Path]) -> list[str]:
     """A value that its option does not take."""
     key = draw.choice(KEYS)
-    values = [value for value in (*NUMBERS, *NESTED, *HOSTILE, LONG) if not (key in ("density", "record") and value == "null")]
+    values = [
+        value for value in (*NUMBERS, *NESTED, *HOSTILE, LONG) if not (key in ("density", "record") and value == "null")
+    ]
     return [draw.choice(("run", "audit")), "attack=noise", f"{key}={draw.choice(values)}x,]"]
 
 
@@ -62,7 +109,9 @@ def _name(draw: random.Random, files: list[Path]) -> list[str]:
 
 def _key(draw: random.Random, files: list[Path]) -> list[str]:
     """An option that there is not."""
-    key = draw.choice((LONG, *HOSTILE, "lane", "attak", "attack.", ".", "a.b.c", "threat.norms", "victim.nothing", "--lanes", "-x"))
+    key = draw.choice(
+        (LONG, *HOSTILE, "lane", "attak", "attack.", ".", "a.b.c", "threat.norms", "victim.nothing", "--lanes", "-x")
+    )
     return [draw.choice(COMMANDS), f"{key}={draw.choice(('1', 'a', LONG))}"]
 
 
@@ -120,7 +169,7 @@ def _other_command(draw: random.Random, files: list[Path]) -> list[str]:
         [
             ["list", word],
             ["new", word, "mine"],
-            ["new", "attack", word],
+            ["new", "attack", word + "?"],
             ["new", "attack", "mine", f"track={word}"],
             ["check", word],
             ["check", "noise", word],
@@ -139,7 +188,10 @@ def _other_command(draw: random.Random, files: list[Path]) -> list[str]:
 
 def _no_option(draw: random.Random, files: list[Path]) -> list[str]:
     """Words that are no key=value."""
-    return [draw.choice(COMMANDS), draw.choice((*HOSTILE, LONG, "=", "==", "=1", "zo", "+attack=zo", "~attack", "a=b=c", "lanes:3"))]
+    return [
+        draw.choice(COMMANDS),
+        draw.choice((*HOSTILE, LONG, "=", "==", "=1", "zo", "+attack=zo", "~attack", "a=b=c", "lanes:3")),
+    ]
 
 
 def _broken_files(folder: Path, draw: random.Random) -> list[Path]:
@@ -154,7 +206,10 @@ def _broken_files(folder: Path, draw: random.Random) -> list[Path]:
         b"\x08\x09" + draw.randbytes(100),
         (2**40).to_bytes(8, "little") + b"{}",
     ]
-    names = [f"broken{number}{end}" for number, end in enumerate((".pt2", ".pt", ".zip", ".onnx", "", ".pkl", ".onnx", ".safetensors"))]
+    names = [
+        f"broken{number}{end}"
+        for number, end in enumerate((".pt2", ".pt", ".zip", ".onnx", "", ".pkl", ".onnx", ".safetensors"))
+    ]
     paths = []
     for name, content in zip(names, contents, strict=True):
         (folder / name).write_bytes(content)

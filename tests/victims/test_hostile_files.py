@@ -24,7 +24,11 @@ from envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts
 Members = dict[str, bytes]
-PROGRAM, WEIGHTS, CONSTANTS = "models/model.json", "data/weights/model_weights_config.json", "data/constants/model_constants_config.json"
+PROGRAM, WEIGHTS, CONSTANTS = (
+    "models/model.json",
+    "data/weights/model_weights_config.json",
+    "data/constants/model_constants_config.json",
+)
 
 
 class Small(nn.Module):
@@ -32,7 +36,9 @@ class Small(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.net = nn.Sequential(nn.Flatten(), nn.Linear(50, 8), nn.LayerNorm(8), nn.ReLU(inplace=True), nn.Linear(8, 5))
+        self.net = nn.Sequential(
+            nn.Flatten(), nn.Linear(50, 8), nn.LayerNorm(8), nn.ReLU(inplace=True), nn.Linear(8, 5)
+        )
         self.mix = nn.MultiheadAttention(5, 1, batch_first=True)
         self.remember = nn.GRU(5, 5, batch_first=True)
         self.scale = torch.linspace(0.5, 1, 5)
@@ -44,7 +50,12 @@ class Small(nn.Module):
         with torch.no_grad():
             best = scores.max(-1, keepdim=True).values
         first, *_ = scores.chunk(2, -1)
-        return scores - best + torch.cat([first, first], -1).sum(-1, keepdim=True) + scores[torch.arange(observation.shape[0]), 0, None]
+        return (
+            scores
+            - best
+            + torch.cat([first, first], -1).sum(-1, keepdim=True)
+            + scores[torch.arange(observation.shape[0]), 0, None]
+        )
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +203,10 @@ CRAFTED: dict[str, tuple[Callable[[Members, Path], None], str]] = {
     "a loader": (calls("torch.load", HARM), "it calls 'torch.load'"),
     "a library": (calls("torch.ops.load_library", HARM), "it calls 'torch.ops.load_library'"),
     "an attribute": (calls("torch.ops.aten.__class__.mro"), "it calls 'torch.ops.aten.__class__.mro'"),
-    "an attribute of an operation": (calls("torch.ops.aten.relu.__class__"), "it calls 'torch.ops.aten.relu.__class__'"),
+    "an attribute of an operation": (
+        calls("torch.ops.aten.relu.__class__"),
+        "it calls 'torch.ops.aten.relu.__class__'",
+    ),
     "an operator": (calls("_operator.methodcaller", HARM), "it calls '_operator.methodcaller'"),
     "a module by name": (
         calls("torch._export.custom_ops._call_custom_autograd_function_in_pre_dispatch", HARM),
@@ -297,9 +311,15 @@ def bomb(path: Path, name: str, size: int = 40_000_000) -> Path:
 
 @pytest.mark.parametrize(
     ("victim", "name", "values"),
-    [("torch", "policy/archive_format", {}), ("sb3", "policy.pth", {"algo": "dqn"}), ("yolov5", "archive/data.pkl", {})],
+    [
+        ("torch", "policy/archive_format", {}),
+        ("sb3", "policy.pth", {"algo": "dqn"}),
+        ("yolov5", "archive/data.pkl", {}),
+    ],
 )
-def test_a_bomb_is_refused_before_it_is_unpacked(victim: str, name: str, values: dict[str, str], tmp_path: Path) -> None:
+def test_a_bomb_is_refused_before_it_is_unpacked(
+    victim: str, name: str, values: dict[str, str], tmp_path: Path
+) -> None:
     path = bomb(tmp_path / "bomb.pt", name)
     assert path.stat().st_size < 100_000
     with pytest.raises(UserError, match=r"is refused: \d+\.\d kB unpack to 40\.0 MB, more than the \d+\.\d MB allowed"):

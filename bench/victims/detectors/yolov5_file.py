@@ -71,7 +71,9 @@ def read(path: Path) -> Weights:
         raise UserError(f"the weights {path} cannot be read: {error.strerror or error}") from error
     # A truncated or malicious file can fail anywhere in the unpickler.
     except Exception as error:
-        raise UserError(f"the weights {path} cannot be read: the file is not a checkpoint of YOLOv5, or a damaged one") from error
+        raise UserError(
+            f"the weights {path} cannot be read: the file is not a checkpoint of YOLOv5, or a damaged one"
+        ) from error
 
 
 def save(detector: Detector, path: Path) -> None:

@@ -62,7 +62,9 @@ class StableBaselines3(FileDriver):
         saved = Archive.read(path, self.path)
         data = json.loads(saved.member("data"))
         weights = torch.load(
-            Archive(saved.member("policy.pth"), f"{self.path}, policy.pth").repacked(), map_location="cpu", weights_only=True
+            Archive(saved.member("policy.pth"), f"{self.path}, policy.pth").repacked(),
+            map_location="cpu",
+            weights_only=True,
         )
         shape = self._observation(data["observation_space"])
         self._check_actions(data["action_space"], width)

@@ -28,9 +28,27 @@ FORMATS = {
 }  # fmt: skip
 STRIDED = 7
 """The number of the only layout that is read."""
-WORDS = ("", "none", "tanh", "floor", "trunc", "lower", "left", "right", "ij", "xy", "mean", "sum", "prod", "amax", "amin")
+WORDS = (
+    "",
+    "none",
+    "tanh",
+    "floor",
+    "trunc",
+    "lower",
+    "left",
+    "right",
+    "ij",
+    "xy",
+    "mean",
+    "sum",
+    "prod",
+    "amax",
+    "amin",
+)
 """Words that may be arguments, for instance how a division is rounded. Others could be names of files."""
-REFUSED = re.compile(r"from_file|set_?|set_data|resize\w*|record_stream|requires_grad_|backward|retain_grad|item|.*_out")
+REFUSED = re.compile(
+    r"from_file|set_?|set_data|resize\w*|record_stream|requires_grad_|backward|retain_grad|item|.*_out"
+)
 """Operations that reach files, or memory beyond their arguments, or are not part of a forward pass."""
 PRIVATE = ("_unsafe_view", "_weight_norm", "_scaled_dot_product_flash_attention_for_cpu", "_trilinear")
 """Operations with an underscore, beside those of ATen's core, that exported programs contain."""
@@ -248,7 +266,9 @@ def _argument(argument: Mapping[str, Any]) -> Any:
             return _symbol(value)
         case "as_optional_tensors" | "as_sym_ints" | "as_sym_floats" | "as_sym_bools":
             return [_symbol(one) for one in value]
-        case "as_int" | "as_float" | "as_bool" | "as_ints" | "as_floats" | "as_bools" | "as_int_lists" | "as_float_lists":
+        case (
+            "as_int" | "as_float" | "as_bool" | "as_ints" | "as_floats" | "as_bools" | "as_int_lists" | "as_float_lists"
+        ):
             return _plain(value)
         case "as_scalar_type" if value in DTYPES:
             return DTYPES[value]

@@ -156,7 +156,9 @@ def _tensor(
     if path not in flat:
         content = members[folder + path]
         # The copy lies in memory as torch's own tensors do; otherwise a product can differ in its last bit.
-        flat[path] = torch.frombuffer(bytearray(content), dtype=dtype).clone() if content else torch.empty(0, dtype=dtype)
+        flat[path] = (
+            torch.frombuffer(bytearray(content), dtype=dtype).clone() if content else torch.empty(0, dtype=dtype)
+        )
     if flat[path].dtype != dtype:
         raise Refused(f"{name!r} shares its bytes with a tensor of another type")
     sizes, strides = (list(_whole(meta[key])) for key in ("sizes", "strides"))
