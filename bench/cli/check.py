@@ -71,6 +71,6 @@ def _read(word: str) -> None:
     key, equals, value = word.partition("=")
     if not (equals and value and (key in TRIED_WITH or "." in key)):
         raise UserError(
-            f"cannot read {short(word)!r}: write, for instance, attack.steps=50 to set a parameter, victim=NAME to choose the victim of "
-            "a defence, or world=NAME to choose the world"
+            f"cannot read {short(word)!r}: write, for instance, attack.steps=50 to set a parameter, victim=NAME to choose the "
+            "victim of a defence, or world=NAME to choose the world"
         )

@@ -9,7 +9,7 @@ import os
 import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
@@ -264,7 +264,7 @@ def _is_full(error: Exception) -> bool:
     return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)
 
 
-def _show(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object) -> None:
+def _show(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any, **__: Any) -> None:
     """Print a warning: a notice as one line, that of a library with its place."""
     text = str(message) if issubclass(category, Notice) else f"{filename}:{lineno}: {category.__name__}: {message}"
     Console(stderr=True).print(Text(f"warning: {bounded(text)}", style="yellow"), soft_wrap=True)

@@ -68,7 +68,7 @@ NUMBERS: Mapping[str, Callable[..., Any]] = {
 """Operations on sizes."""
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """A part of a program that is not carried out. The message completes "the file is refused:"."""
 
 
@@ -103,7 +103,7 @@ class Graph(nn.Module):
         weights: the tensors that the program computes with, by the names of their values.
 
     Raises:
-        Refused: if it contains anything but operations of ATen.
+        RefusedError: if it contains anything but operations of ATen.
     """
 
     def __init__(self, graph: Mapping[str, Any], observation: str, weights: Mapping[str, Tensor]) -> None:
@@ -157,18 +157,20 @@ def _steps(graph: Mapping[str, Any], weights: frozenset[str]) -> tuple[Step, ...
 
 
 def _step(node: Mapping[str, Any], weights: frozenset[str]) -> Step:
-    args, kwargs = [], {}
+    args: list[Any] = []
+    kwargs: dict[str, Any] = {}
     call = _number(node["target"]) or _operation(node["target"])
     for given in node["inputs"]:
         value = _argument(given["arg"])
-        # 2 is KEYWORD; a file of an older torch says nothing, and there every name is that of the schema.
-        if given.get("kind") == 2 or (given.get("kind") is None and given["name"] and kwargs):
+        # 2 is KEYWORD. A file of an older torch says nothing; then every name is one of the operation's schema.
+        if given.get("kind") == 2 or (given.get("kind") is None and isinstance(call, OpOverload)):
             kwargs[str(given["name"])] = value
         else:
             args.append(value)
-    if isinstance(call, OpOverload) and call._schema.is_mutable:
-        if not (args and isinstance(args[0], Value)) or args[0].name in weights:
-            raise Refused(f"{node['target']} changes its own weights: export it in eval mode")
+    changed = args[0] if args else None
+    mutable = isinstance(call, OpOverload) and call._schema.is_mutable
+    if mutable and not (isinstance(changed, Value) and changed.name not in weights):
+        raise RefusedError(f"{node['target']} changes its own weights: export it in eval mode")
     return Step(call, tuple(args), kwargs, _results(node["outputs"]))
 
 
@@ -201,10 +203,10 @@ def _number(target: str) -> Callable[..., Any] | None:
 
     def call(*numbers: Any) -> Any:
         if not all(isinstance(number, int | float) for number in numbers):
-            raise Refused(f"{target} of something that is no number")
+            raise RefusedError(f"{target} of something that is no number")
         found = compute(*numbers)
         if abs(found) >= 2**63:
-            raise Refused(f"{target} makes a number that is too large")
+            raise RefusedError(f"{target} makes a number that is too large")
         return found
 
     return call
@@ -214,16 +216,18 @@ def _operation(target: str) -> OpOverload[..., Any]:
     """The operation of ATen with this name.
 
     Raises:
-        Refused: if there is none, or it is not one of a forward pass.
+        RefusedError: if there is none, or it is not one of a forward pass.
     """
     named = re.fullmatch(r"torch\.ops\.aten\.(\w+)\.(\w+)", target)
     packet = getattr(torch.ops.aten, named[1], None) if named and not named[1].startswith("__") else None
     found = getattr(packet, named[2], None) if named and isinstance(packet, OpOverloadPacket) else None
     if not named or not isinstance(found, OpOverload):
-        raise Refused(f"it calls {target!r}; only the operations of ATen on tensors (torch.ops.aten) are carried out")
+        raise RefusedError(
+            f"it calls {target!r}; only the operations of ATen on tensors (torch.ops.aten) are carried out"
+        )
     private = named[1].startswith("_") and named[1] not in PRIVATE and torch.Tag.core not in found.tags
-    if private or REFUSED.fullmatch(named[1]):
-        raise Refused(f"it calls {target!r}, which is not an operation of a forward pass")
+    if private or REFUSED.fullmatch(named[1]) or named[2].endswith("out"):
+        raise RefusedError(f"it calls {target!r}, which is not an operation of a forward pass")
     return found
 
 
@@ -245,14 +249,14 @@ def _result(output: Mapping[str, Any]) -> Any:
         case "as_none":
             return None
         case _:
-            raise Refused(f"an operation returns something that is no tensor ({kind})")
+            raise RefusedError(f"an operation returns something that is no tensor ({kind})")
 
 
 def _argument(argument: Mapping[str, Any]) -> Any:
     """The value of an argument of the format.
 
     Raises:
-        Refused: if it is not a value of the graph, a number, a type or one of `WORDS`.
+        RefusedError: if it is not a value of the graph, a number, a type or one of `WORDS`.
     """
     ((kind, value),) = argument.items()
     match kind:
@@ -281,7 +285,7 @@ def _argument(argument: Mapping[str, Any]) -> Any:
         case "as_string" if value in WORDS:
             return value
         case _:
-            raise Refused(f"an operation has an argument that is not read ({kind} {str(value)[:40]!r})")
+            raise RefusedError(f"an operation has an argument that is not read ({kind} {str(value)[:40]!r})")
 
 
 def _nested(one: Any) -> Any:
@@ -301,7 +305,7 @@ def _symbol(value: Mapping[str, Any]) -> Any:
         case "as_int" | "as_float" | "as_bool":
             return _plain(found)
         case _:
-            raise Refused(f"an operation has an argument that is not read ({kind})")
+            raise RefusedError(f"an operation has an argument that is not read ({kind})")
 
 
 def _plain(value: Any) -> Any:
@@ -311,5 +315,5 @@ def _plain(value: Any) -> Any:
     if value in ("Infinity", "-Infinity", "NaN"):
         return float(value)
     if not isinstance(value, bool | int | float):
-        raise Refused("an operation has an argument that is no number")
+        raise RefusedError("an operation has an argument that is no number")
     return value

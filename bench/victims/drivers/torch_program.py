@@ -24,7 +24,7 @@ from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from bench.archive import Archive
 from bench.errors import UserError
-from bench.victims.drivers.torch_graph import DTYPES, Graph, Refused
+from bench.victims.drivers.torch_graph import DTYPES, Graph, RefusedError
 
 SCHEMA = 8
 """Major version of the format that is read."""
@@ -66,7 +66,7 @@ def read(path: Path, name: str) -> Program:
     try:
         _check_samples(members, name)
         return _program(members, name)
-    except Refused as error:
+    except RefusedError as error:
         raise UserError(f"{name} is refused: {error}") from error
     # Any part of the JSON may be missing or of another type.
     except (KeyError, ValueError, TypeError, AttributeError, IndexError, RuntimeError, RecursionError) as error:
@@ -102,14 +102,16 @@ def _check_samples(members: Mapping[str, bytes], name: str) -> None:
     copy = Archive(members[SAMPLES], f"{name}, {SAMPLES}").repacked()
     named = sorted(set(get_unsafe_globals_in_checkpoint(io.BytesIO(copy.getvalue()))) - INERT)
     if named:
-        raise Refused(f"its sample inputs name {named[0]}, which is code: export it with tensors as sample inputs")
+        raise RefusedError(f"its sample inputs name {named[0]}, which is code: export it with tensors as sample inputs")
 
 
 def _program(members: Mapping[str, bytes], name: str) -> Program:
     program = json.loads(members["models/model.json"])
     major = program["schema_version"]["major"]
     if major != SCHEMA:
-        raise Refused(f"its format has version {major}, not {SCHEMA}: export it again with torch {torch.__version__}")
+        raise RefusedError(
+            f"its format has version {major}, not {SCHEMA}: export it again with torch {torch.__version__}"
+        )
     weights = _tensors(members, "weights", "weight_") | _tensors(members, "constants", "tensor_")
     module = program["graph_module"]
     inputs, observations = {}, []
@@ -123,10 +125,10 @@ def _program(members: Mapping[str, bytes], name: str) -> Program:
             case "constant_input":
                 pass
             case _:
-                raise Refused(f"it has an input that is no tensor ({kind})")
+                raise RefusedError(f"it has an input that is no tensor ({kind})")
     outputs = [next(iter(spec)) for spec in module["signature"]["output_specs"]]
     if mutations := sorted({kind for kind in outputs if kind != "user_output"}):
-        raise Refused(f"it changes its own state ({', '.join(mutations)}): export it in eval mode")
+        raise RefusedError(f"it changes its own state ({', '.join(mutations)}): export it in eval mode")
     if len(observations) != 1:
         raise UserError(f"{name} takes {len(observations)} inputs, a driver takes one: the observation")
     if len(outputs) != 1:
@@ -149,9 +151,9 @@ def _tensor(
 ) -> Tensor:
     path, meta = entry["path_name"], entry["tensor_meta"]
     if entry["use_pickle"] or not path.startswith(prefix):
-        raise Refused(f"{name!r} is pickled: only plain tensors are loaded")
+        raise RefusedError(f"{name!r} is pickled: only plain tensors are loaded")
     if meta["dtype"] not in DTYPES:
-        raise Refused(f"{name!r} has a type that is not read (number {meta['dtype']})")
+        raise RefusedError(f"{name!r} has a type that is not read (number {meta['dtype']})")
     dtype = DTYPES[meta["dtype"]]
     if path not in flat:
         content = members[folder + path]
@@ -160,7 +162,7 @@ def _tensor(
             torch.frombuffer(bytearray(content), dtype=dtype).clone() if content else torch.empty(0, dtype=dtype)
         )
     if flat[path].dtype != dtype:
-        raise Refused(f"{name!r} shares its bytes with a tensor of another type")
+        raise RefusedError(f"{name!r} shares its bytes with a tensor of another type")
     sizes, strides = (list(_whole(meta[key])) for key in ("sizes", "strides"))
     (offset,) = _whole([meta["storage_offset"]])
     return flat[path].as_strided(sizes, strides, offset)
@@ -171,5 +173,5 @@ def _whole(sides: list[Mapping[str, Any]]) -> Iterator[int]:
     for side in sides:
         number = side["as_int"]
         if type(number) is not int or not 0 <= number < 2**40:
-            raise Refused("a size is not a whole number of at least 0")
+            raise RefusedError("a size is not a whole number of at least 0")
         yield number
