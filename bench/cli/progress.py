@@ -49,7 +49,8 @@ class RunProgress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.bar.stop()
+        if self.console.is_terminal:
+            self.bar.stop()
 
     def begin(self, *, episodes: int, finished: int) -> None:
         self.total, self.done = episodes, finished
@@ -102,7 +103,8 @@ class TrainingProgress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.bar.stop()
+        if self.console.is_terminal:
+            self.bar.stop()
 
     def __call__(self, share: float, text: str) -> None:
         self.bar.update(self.task, completed=share, description=f"{self.label}  {text}")

@@ -17,6 +17,7 @@ PROSE = re.compile(
 )
 
 
+@pytest.mark.slow
 def test_bad_inputs_get_one_line(bench: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
