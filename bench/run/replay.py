@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from bench.errors import UserError
 from bench.plugins import registry
-from bench.plugins.pair import Chosen, Pair, choose
+from bench.plugins.pair import IN_PROCESS, Chosen, Pair, choose
 from bench.plugins.track import track
 from bench.records import reading
 from bench.records.schema import IDENTITY
@@ -138,6 +138,11 @@ def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
 
 
 def _chosen(kind: registry.Kind, record: Mapping[str, Any]) -> Chosen[Any]:
+    if record[f"{kind}_shipped_by"] == IN_PROCESS:
+        raise UserError(
+            f"{kind} {record[kind]!r} was an object of a Python process and cannot be loaded again; record=N of "
+            "cavbench.score records episodes while they are driven"
+        )
     params = json.loads(record[f"{kind}_params"])
     return choose(kind, record[kind], **{k: tuple(v) if isinstance(v, list) else v for k, v in params.items()})
 

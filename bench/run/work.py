@@ -15,7 +15,7 @@ import pyarrow as pa
 from bench.errors import UserError, reason
 from bench.plugins.fingerprint import canonical
 from bench.records.store import table
-from bench.run.unit import Preparation, Unit, shipped_by
+from bench.run.unit import Preparation, Unit
 from bench.trust.watch import TamperError
 
 Tell = Callable[[str, float, str], None]
@@ -70,7 +70,7 @@ def perform(task: Task, tell: Tell) -> Outcome:
     except TamperError as error:
         kinds = {"attack": ("attack",), "defense": ("defense", "victim")}
         parts = [part for part in work.pair.parts if any(part.kind in kinds[side] for side in error.sides)]
-        shipped = " and ".join(f"{part.kind} {part.name!r} of {shipped_by(part)}" for part in parts)
+        shipped = " and ".join(f"{part.kind} {part.name!r} of {part.shipped_by}" for part in parts)
         raise UserError(f"{work} is refused: {error} ({shipped})") from error
     except UserError as error:
         raise UserError(f"{work}: {error}") from error
