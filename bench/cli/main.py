@@ -149,17 +149,31 @@ def show(
 
 @app.command()
 def view(
-    run: Annotated[str, typer.Argument(help="A recording (.rrd), a results folder, or the name of a pair.")],
-    where: Annotated[list[str] | None, typer.Argument(metavar="COLUMN=VALUE...", help="The record to replay.")] = None,
+    runs: Annotated[list[str], typer.Argument(help="A recording (.rrd), a results folder, or the name of a pair.")],
     out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
+    save: Annotated[Path | None, typer.Option(help="Write a film: a .gif, .webp or .mp4 file.")] = None,
+    seconds: Annotated[str | None, typer.Option(metavar="FROM:TO", help="The part of the film to save.")] = None,
+    web: Annotated[bool, typer.Option("--web", help="Open it in a browser on this machine, without a display.")] = False,
 ) -> None:
     """Open a recording in the rerun viewer; with COLUMN=VALUE, replay and record that episode first.
 
-    For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017
+    For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017.
+
+    With --save, replay it and write a film. Two pairs are shown one below the other, on the same scenario:
+    bench view none-none-dqn pgd-none-dqn --save clip.gif
     """
     from bench.cli import view as cli_view
 
-    cli_view.open_recording(run, where or [], out, Console())
+    where = [word for word in runs if "=" in word and not Path(word).exists()]
+    named = [word for word in runs if word not in where]
+    if not named:
+        raise UserError("name a recording, a results folder or a pair to view")
+    if save is not None:
+        cli_view.save_film(named, where, out, Console(), save, seconds)
+        return
+    if len(named) > 1 or seconds is not None:
+        raise UserError("several runs, and --seconds, need --save FILE")
+    cli_view.open_recording(named[0], where, out, Console(), web=web)
 
 
 @app.command()

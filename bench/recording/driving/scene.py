@@ -36,11 +36,11 @@ def log(episode: Episode, columns: Columns) -> None:
 
 def bounds(episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
     """Initial x and y range of the view, in m."""
-    low, high = _edges(episode)
+    low, high = edges(episode)
     return (-45.0, 105.0), (low - 2.5, high + 2.5)
 
 
-def _edges(episode: Episode) -> tuple[float, float]:
+def edges(episode: Episode) -> tuple[float, float]:
     """y of the left and right edge of the road, in m."""
     lanes = json.loads(str(episode.meta.get("cell", "{}"))).get("lanes")
     if lanes is None:
@@ -50,7 +50,7 @@ def _edges(episode: Episode) -> tuple[float, float]:
 
 
 def _road(episode: Episode, columns: Columns) -> None:
-    low, high = _edges(episode)
+    low, high = edges(episode)
     middle = (low + high) / 2
     surface = [[-BEHIND, middle], [AHEAD, middle]]
     columns.fixed(
