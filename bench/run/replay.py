@@ -104,12 +104,49 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     saved = recording_path(out, unit, record["seed"])
     keep_recording(saved, outcome.recordings[record["seed"]])
     differences = _differences(unit, before, after)
+    return Replay(saved, _changed(unit, record, after), differences)
+
+
+def _changed(unit: Unit, record: Mapping[str, Any], after: pa.Table) -> str:
+    """Names of what has changed since the record: weights, code, libraries, machine, adversary."""
     now = after.slice(0, 1).to_pylist()[0]
     origin = ("weights_sha256", "code_digest", "libraries", "machine")
     changed = ", ".join(name for name in origin if now[name] != record[name])
     if not changed and unit.adversary_sha256 and now["unit"] != record["unit"]:
-        changed = "adversary"
-    return Replay(saved, changed, differences)
+        return "adversary"
+    return changed
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """A unit that was driven again.
+
+    Args:
+        unit: the unit.
+        before: its records.
+        after: the records of the repetition.
+        changed: names of what has changed since the record; empty if nothing has.
+        differences: the measurements that differ.
+    """
+
+    unit: Unit
+    before: pa.Table
+    after: pa.Table
+    changed: str
+    differences: tuple[str, ...]
+
+
+def repeat(out: Path, record: Mapping[str, Any]) -> Repeated:
+    """Drive the unit of a record again, without a recording.
+
+    Raises:
+        UserError: if a component, the weights or the artefact is missing.
+    """
+    unit, before = _unit(out, record)
+    task = Task(work=unit, artefact=_artefact(out, unit, record), entropy=record.get("entropy"))
+    after = perform(task, lambda *news: None).records
+    assert after is not None
+    return Repeated(unit, before, after, _changed(unit, record, after), _differences(unit, before, after))
 
 
 def film(out: Path, record: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
@@ -159,19 +196,27 @@ def recorded(out: Path, path: Path, records: pa.Table) -> dict[str, Any]:
     raise UserError(f"{out} has no record of the recording {path}")
 
 
-def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
-    """The unit of a record, and all records of that unit."""
+def pair_of(record: Mapping[str, Any]) -> Pair:
+    """The pair of a record.
+
+    Raises:
+        UserError: if a component is not installed, or a parameter is not allowed any more.
+    """
     victim = _chosen("victim", record)
-    track_of_victim = track(victim.component.tracks()[0])
-    before = reading.read(out, [record["unit"]], track=track_of_victim).sort_by("seed")
-    seeds = before["seed"].to_pylist()
-    pair = Pair(
+    return Pair(
         attack=_chosen("attack", record),
         defense=_chosen("defense", record),
         victim=victim,
         world=_chosen("world", record),
         threat=victim.component.threat.recorded(record),
     )
+
+
+def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
+    """The unit of a record, and all records of that unit."""
+    pair = pair_of(record)
+    before = reading.read(out, [record["unit"]], track=track(pair.track)).sort_by("seed")
+    seeds = before["seed"].to_pylist()
     unit = Unit(
         pair=pair,
         cell=Cell(**json.loads(record["cell"])),

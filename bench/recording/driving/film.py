@@ -17,10 +17,10 @@ from bench.recording.film.drawing import (
     CYCLE,
     GREEN,
     GREY,
-    ORANGE,
     PALE,
     ROAD,
     SKY,
+    TINT,
     VERMILLION,
     Colour,
     blank,
@@ -35,7 +35,7 @@ BEHIND, AHEAD = 35.0, 85.0
 """Metres of road behind and ahead of the ego that are shown."""
 SCALE = WIDTH / (BEHIND + AHEAD)
 """Pixels a metre."""
-HEADER, MARGIN, BAND, LEGEND, PLOT = 36, 10, 22, 26, 62
+HEADER, MARGIN, KEY, BAND, LEGEND, PLOT = 36, 10, 22, 22, 26, 62
 LEFT = 170
 """Where the time axes begin; their labels are before it."""
 RIGHT = WIDTH - 20
@@ -54,7 +54,8 @@ class EpisodeFilm(Film):
         if self.has_road:
             self.low, self.high = edges(episode)
         self.road_top = HEADER
-        self.bands_top = self.road_top + (round((self.high - self.low) * SCALE) + 2 * MARGIN if self.has_road else 0)
+        self.road_height = round((self.high - self.low) * SCALE) if self.has_road else 0
+        self.bands_top = self.road_top + (self.road_height + MARGIN + KEY if self.has_road else 0)
         self.bands = self._bands()
         self.legend_top = self.bands_top + MARGIN + len(self.bands) * (BAND + 4)
         self.plots_top = self.legend_top + (LEGEND if self.bands else 0)
@@ -85,6 +86,8 @@ class EpisodeFilm(Film):
         """What does not change: title, labels, axes and, if `drawn`, the whole bands and curves."""
         sheet = blank(self.height, WIDTH)
         write(sheet, about.title(self.episode.meta), 12, HEADER / 2, size=18)
+        if self.has_road:
+            self._write_key(sheet)
         for number, (label, values) in enumerate(self.bands.items()):
             top = self.bands_top + MARGIN + number * (BAND + 4)
             write(sheet, label, 12, top + BAND / 2, size=14, colour=BLACK)
@@ -101,6 +104,18 @@ class EpisodeFilm(Film):
             if drawn:
                 self._curve(sheet, top, moved, budget, steps)
         return sheet
+
+    def _write_key(self, sheet: Picture) -> None:
+        """What the boxes on the road are."""
+        y = self.bands_top - KEY / 2 + 3
+        keys: list[tuple[str, Colour, float]] = [("driven by the policy", GREEN, 0), ("other cars", SKY, 0)]
+        if self.episode.attacked:
+            keys.append(("what the attack shows the policy", VERMILLION, 2))
+        x = 12.0
+        for text, colour, outline in keys:
+            box(sheet, x + 12, y, (10, 4), colour, outline)
+            write(sheet, text, x + 30, y, size=13, colour=GREY)
+            x += 60 + 6.6 * len(text)
 
     def _bands(self) -> dict[str, NDArray[np.generic]]:
         if not self.episode.discrete:
@@ -138,7 +153,7 @@ class EpisodeFilm(Film):
         places = [self._place(step + 0.5, steps) for step in range(len(moved))]
         for step, value in enumerate(moved):
             here, after = (round(self._place(place, steps)) for place in (step, step + 1))
-            sheet[top + PLOT - round(PLOT * value / highest) : top + PLOT, here : max(after, here + 1)] = ORANGE
+            sheet[top + PLOT - round(PLOT * value / highest) : top + PLOT, here : max(after, here + 1)] = TINT
         heights = top + PLOT - PLOT * budget / highest
         for (x, y), (x2, y2) in zip(
             zip(places, heights, strict=True), zip(places[1:], heights[1:], strict=True), strict=False
@@ -166,8 +181,7 @@ class EpisodeFilm(Film):
             write(picture, "     ".join(words), 12, self.bands_top + 2, size=14, colour=GREY)
 
     def _road(self, picture: Picture, step: int) -> None:
-        top, bottom = self.road_top + MARGIN, self.bands_top - MARGIN
-        road = picture[top:bottom]
+        road = picture[self.road_top : self.road_top + self.road_height]
         road[:] = ROAD
         x = float(self.episode.steps["x"][step])
         first = -BEHIND - (x - BEHIND) % DASH_EVERY
@@ -197,10 +211,18 @@ class EpisodeFilm(Film):
         crashed = bool(episode.steps["crashed"][step])
         box(road, *self._pixel(0, ego), half, VERMILLION if crashed else GREEN)
         box(road, *self._pixel(0, ego), half, BLACK, 2 if crashed else 1)
-        if not episode.attacked:
-            return
+        if episode.attacked:
+            self._ghosts(road, step, places, ego, half)
+        if crashed:
+            x, y = self._pixel(0, ego)
+            write(road, "CRASH", x - half[0] - 8, y, size=22, colour=VERMILLION, align="right")
+
+    def _ghosts(
+        self, road: Picture, step: int, places: dict[str, Array], ego: float, half: tuple[float, float]
+    ) -> None:
+        """What the attack shows, and how far it is from the truth."""
         for (x, y), (x2, y2) in zip(places["observation"], places["perturbed"], strict=True):
             line(road, self._pixel(x, y + ego), self._pixel(x2, y2 + ego), VERMILLION, 1)
             box(road, *self._pixel(x2, y2 + ego), half, VERMILLION, 2)
-        shown = float(episode.physical("perturbed", "y")[step, 0])
+        shown = float(self.episode.physical("perturbed", "y")[step, 0])
         box(road, *self._pixel(0, shown), half, VERMILLION, 2)

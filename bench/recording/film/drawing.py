@@ -25,7 +25,11 @@ GREEN: Colour = (0, 158, 115)
 BLUE: Colour = (0, 114, 178)
 VERMILLION: Colour = (213, 94, 0)
 PURPLE: Colour = (204, 121, 167)
-CYCLE: tuple[Colour, ...] = (PURPLE, PALE, ORANGE, BLUE, VERMILLION, GREEN, SKY)
+DARK: Colour = (84, 88, 94)
+TINT: Colour = (240, 178, 142)
+"""A light vermillion. Vermillion stands for the attack and for nothing else."""
+CYCLE: tuple[Colour, ...] = (PURPLE, PALE, ORANGE, BLUE, DARK, GREEN, SKY)
+"""Colours of actions, by number."""
 
 SHIFT = 4
 """Bits of OpenCV's subpixel coordinates."""
