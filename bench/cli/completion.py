@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 
-def completed(args: list[str], incomplete: str) -> list[str]:
+def completed(incomplete: str) -> list[str]:
     """The options that begin with what was typed: keys, then the values of a key, also after a comma.
 
     Args:
-        args: the words before; bash splits words at `=`, so the last ones may be a key and `=`.
         incomplete: the word that is being typed, for instance `attack=no` or `attack=noise,p`.
     """
-    if incomplete == "=" or args[-1:] == ["="]:
-        key = args[-1 if incomplete == "=" else -2]
-        typed = f"{key}={incomplete.removeprefix('=')}"
-        return [word.removeprefix(f"{key}=") for word in completed([], typed)]
+    before = _words_before()
+    if incomplete == "=" or before[-1:] == ["="]:
+        # Bash splits words at "=", and replaces only what follows it.
+        key = before[-1 if incomplete == "=" else -2]
+        return [word.removeprefix(f"{key}=") for word in _fitting(f"{key}={incomplete.removeprefix('=')}")]
+    return _fitting(incomplete)
+
+
+def _words_before() -> list[str]:
+    """The words before the one that is being typed, as bash splits them; empty for other shells."""
+    place = os.environ.get("COMP_CWORD", "")
+    return os.environ.get("COMP_WORDS", "").split()[: int(place)] if place.isdecimal() else []
+
+
+def _fitting(incomplete: str) -> list[str]:
     key, equals, value = incomplete.partition("=")
     if not equals:
         return [f"{known}=" for known in _keys() if known.startswith(key)]

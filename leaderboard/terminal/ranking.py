@@ -15,7 +15,18 @@ from leaderboard.comparisons.naming import component, varying
 from leaderboard.ranking.boards import Board, Row, read_boards
 from leaderboard.ranking.flags import FLAGS
 from leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
-from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, estimate, number, share, signed, strip, verdict
+from leaderboard.terminal.text import (
+    ATTACKED,
+    BASELINE,
+    CLEAN,
+    estimate,
+    number,
+    of_frames,
+    share,
+    signed,
+    strip,
+    verdict,
+)
 
 ADDED = 0.01
 """What an attack must add to be named."""
@@ -34,9 +45,8 @@ def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> Non
 def print_boards(boards: Sequence[Board], console: Console) -> None:
     """Print the leaderboard of each threat model."""
     for board in boards:
-        norm, budget, access, queries, share = board.threat
-        frames = "" if share == 1 else f", {100 * share:g} % of the frames"
-        allowed = f"{board.grid}, {norm} {budget:g}, access {access}, {queries} queries{frames}"
+        norm, budget, access, queries, frames = board.threat
+        allowed = f"{board.grid}, {norm} {budget:g}, access {access}, {queries} queries{of_frames(frames)}"
         title = Text.assemble((board.track.name, "bold"), f" in {board.world[0]}, {allowed}")
         console.print(Padding(title, (1, 1)))
         console.print(Padding(fitted(_columns(board), [Section(board.rows)], console), (0, 1)))
