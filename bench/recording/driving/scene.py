@@ -56,8 +56,8 @@ def _road(episode: Episode, columns: Columns) -> None:
     columns.fixed(
         "road/surface", rr.LineStrips2D([surface], radii=[(high - low) / 2], colors=[ASPHALT], draw_order=0.0)
     )
-    edges = [[[-BEHIND, y], [AHEAD, y]] for y in (low, high)]
-    columns.fixed("road/edges", rr.LineStrips2D(edges, radii=[0.12], colors=[PAINT], draw_order=1.0))
+    sides = [[[-BEHIND, y], [AHEAD, y]] for y in (low, high)]
+    columns.fixed("road/edges", rr.LineStrips2D(sides, radii=[0.12], colors=[PAINT], draw_order=1.0))
     between = np.arange(low + LANE_WIDTH, high - 0.1, LANE_WIDTH)
     if not len(between):
         return

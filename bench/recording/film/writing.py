@@ -55,11 +55,12 @@ def _animation(pictures: Iterator[Picture], fps: float, path: Path) -> None:
     """A GIF or WebP that repeats, in real time with every k-th picture."""
     every = max(1, int(np.ceil(fps / GIF_FPS)))
     shown = list(pictures)
-    kept = [Image.fromarray(picture) for picture in (*shown[::every], shown[-1])]
+    # The last picture is kept, because it shows how the episode ended.
+    kept = [Image.fromarray(picture) for picture in shown[::-1][::every][::-1]]
     # Durations of a GIF are in hundredths of a second.
     durations = [round(100 * every / fps) * 10] * (len(kept) - 1) + [round(1000 * HELD_S)]
     if path.suffix.lower() == ".webp":
-        kept[0].save(path, save_all=True, append_images=kept[1:], duration=durations, loop=0, lossless=True, method=4)
+        kept[0].save(path, save_all=True, append_images=kept[1:], duration=durations, loop=0, lossless=True, method=2)
         return
     # One palette for all pictures: of the first, the middle and the last, which have all colours between them.
     sample = np.concatenate([np.asarray(kept[place]) for place in (0, len(kept) // 2, -1)])
@@ -69,7 +70,7 @@ def _animation(pictures: Iterator[Picture], fps: float, path: Path) -> None:
 
 
 def _video(pictures: Iterator[Picture], fps: float, path: Path) -> None:
-    """An MP4 with VP9: the builds of OpenCV on the package index have no H.264."""
+    """An MP4 with VP9, which takes a tenth of a second a picture: the builds of OpenCV on the package index have no H.264."""
     writer = None
     try:
         for picture in pictures:
