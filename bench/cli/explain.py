@@ -98,7 +98,9 @@ def _of_a_parameter(term: str) -> list[Text]:
             if name in known:
                 parameter = known[name]
                 found.append(
-                    Text.assemble((f"{term} of {owner}", "bold"), f"  {parameter.meaning} Default {parameter.default_text}.")
+                    Text.assemble(
+                        (f"{term} of {owner}", "bold"), f"  {parameter.meaning} Default {parameter.default_text}."
+                    )
                 )
     if kind == "threat" and name:
         found += _of_the_glossary(name)

@@ -57,12 +57,16 @@ def _component(kind: Kind, name: str, claims: tuple[registry.Entry, ...]) -> Lis
 def _suite(name: str) -> Listed:
     claims = registry.entries(registry.SUITES)[name]
     try:
-        suite, problem = suites.suite(name), registry.problem(claims)
-        served, meaning = (suite.track,), suite.meaning
+        suite = suites.suite(name)
     except UserError as error:
-        served, meaning, problem = (), "", str(error)
+        return Listed(kind=SUITE, name=name, tracks=(), summary="", shipped_by=claims[0].shipped_by, problem=str(error))
     return Listed(
-        kind=SUITE, name=name, tracks=served, summary=meaning, shipped_by=claims[0].shipped_by, problem=problem
+        kind=SUITE,
+        name=name,
+        tracks=(suite.track,),
+        summary=suite.meaning,
+        shipped_by=claims[0].shipped_by,
+        problem=registry.problem(claims),
     )
 
 
@@ -88,7 +92,12 @@ def print_names(console: Console, kind: str = "", *, as_json: bool = False) -> N
     before = ""
     for one in found:
         said = Text(one.problem, style="red") if one.problem else _with_code(one.summary)
-        row = [Text(one.kind if one.kind != before else ""), Text(one.name, style="bold"), Text(", ".join(one.tracks) or "?"), said]
+        row = [
+            Text(one.kind if one.kind != before else ""),
+            Text(one.name, style="bold"),
+            Text(", ".join(one.tracks) or "?"),
+            said,
+        ]
         table.add_row(*row, *([Text(one.shipped_by)] if foreign else []))
         before = one.kind
     console.print(table)

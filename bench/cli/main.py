@@ -1,4 +1,4 @@
-"""The command line: `bench run | audit | train | list | help | new | check | render | show | view | submit | verify | report | fetch`.
+"""The command line: one function for each command of `bench`.
 
 A command imports what it needs when it is called, so that `bench list` and `--help` do not import torch.
 """
@@ -202,7 +202,9 @@ def view(
     out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
     save: Annotated[Path | None, typer.Option(help="Write a film: a .gif, .webp or .mp4 file.")] = None,
     seconds: Annotated[str | None, typer.Option(metavar="FROM:TO", help="The part of the film to save.")] = None,
-    web: Annotated[bool, typer.Option("--web", help="Open it in a browser on this machine, without a display.")] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Open it in a browser on this machine, without a display.")
+    ] = False,
 ) -> None:
     """Open a recording in the rerun viewer; with COLUMN=VALUE, replay and record that episode first.
 
@@ -227,7 +229,9 @@ def view(
 
 @app.command()
 def submit(
-    words: Annotated[list[str], typer.Argument(metavar="PAIR out=FOLDER [results=FOLDER]", help="A pair of a results folder.")],
+    words: Annotated[
+        list[str], typer.Argument(metavar="PAIR out=FOLDER [results=FOLDER]", help="A pair of a results folder.")
+    ],
 ) -> None:
     """Write everything that others need to check a pair to one folder: records, weights, commands, environment, a card.
 
@@ -244,8 +248,8 @@ def verify(
         list[str],
         typer.Argument(
             metavar="FOLDER [KEY=VALUE]...",
-            help="sample=3 units are replayed (or all); episodes=20 fresh scenarios in each cell are driven (audit=false for none, "
-            "salt=NUMBER to repeat them); out=FOLDER adds the records to a results folder.",
+            help="sample=3 units are replayed (or all); episodes=20 fresh scenarios in each cell are driven (audit=false for "
+            "none, salt=NUMBER to repeat them); out=FOLDER adds the records to a results folder.",
         ),
     ],
 ) -> None:

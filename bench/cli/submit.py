@@ -52,7 +52,9 @@ def submit(words: Sequence[str], console: Console) -> None:
     console.print(Text(f"{made.folder}: {len(made.about['files'])} files of {made.pair}."), soft_wrap=True)
     console.print(Text(f"It was driven by: {made.about['commands']['run']}", style="dim"), soft_wrap=True)
     console.print(
-        Text(f"Fill in {made.folder / submission.CARD}, try `bench verify {made.folder}`, and send the folder (docs/submit.md)."),
+        Text(
+            f"Fill in {made.folder / submission.CARD}, try `bench verify {made.folder}`, and send the folder (docs/submit.md)."
+        ),
         soft_wrap=True,
     )
 
@@ -70,7 +72,10 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
     found = submission.read(Path(name).expanduser())
     packages = submission.installed(found)
     console.print(
-        Text(f"{found.pair}: all files are as described. The next steps execute the code of {', '.join(packages)}, as installed here."),
+        Text(
+            f"{found.pair}: all files are as described. The next steps execute the code of {', '.join(packages)}, "
+            "as installed here."
+        ),
         soft_wrap=True,
     )
     with _zoo_of(found):
@@ -83,7 +88,9 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
         return 1
     if "out" in options:
         _merge(found, Path(options["out"]).expanduser())
-        console.print(Text(f"Its records are in {options['out']}: `bench report html=PAGE out={options['out']}` has its row."))
+        console.print(
+            Text(f"Its records are in {options['out']}: `bench report html=PAGE out={options['out']}` has its row.")
+        )
     console.print(Text("The submission holds.", style="bold green"))
     return 0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -122,7 +123,7 @@ def _record(run: str, out: Path, wanted: Mapping[str, str]) -> tuple[Path, dict[
     known = pc.unique(records["pair"]).to_pylist()
     if not beginning and len(known) > 1:
         raise UserError(f"{folder} has {len(known)} pairs: name one of {', '.join(sorted(known))} with --out {folder}")
-    return folder, find(records, {"pair": pair_named(beginning, records)} | wanted)
+    return folder, find(records, {"pair": pair_named(beginning, records), **wanted})
 
 
 def _seconds(text: str | None) -> tuple[float, float] | None:
@@ -142,7 +143,10 @@ def _serve(path: Path, console: Console) -> None:
     ports = {"grpc": _free_port(), "web": _free_port()}
     command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", LOCAL, "--port", str(ports["grpc"])]
     server = subprocess.Popen(
-        [*command, "--web-viewer-port", str(ports["web"]), str(path)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        [*command, "--web-viewer-port", str(ports["web"]), str(path)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
     )
     source = f"rerun+http://{LOCAL}:{ports['grpc']}/proxy"
     address = f"http://{LOCAL}:{ports['web']}/?url={quote(source, safe='')}"
@@ -153,7 +157,9 @@ def _serve(path: Path, console: Console) -> None:
     except KeyboardInterrupt:
         pass
     finally:
-        server.terminate()
+        # `python -m rerun` starts the viewer as a process of its own.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGTERM)
         server.wait()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -37,7 +37,9 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         action_type: `discrete`: the actions of the world by number; `continuous`: [acceleration, steering] in [-1, 1].
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium has it
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    _td: TensorDictBase
 
     def __init__(self, world: DrivingWorld, cells: Sequence[Cell], action_type: ActionType = "discrete") -> None:
         self.world, self.cells, self.action_type = world, tuple(cells), action_type
@@ -71,7 +73,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         if cell not in self._envs:
             self._envs[cell] = self.world.make([cell], action_type=self.action_type)
         self._env = self._envs[cell]
-        self._td: TensorDictBase = self._env.reset(TensorDict({"seed": torch.tensor([seed])}, batch_size=[1]))
+        self._td = self._env.reset(TensorDict({"seed": torch.tensor([seed])}, batch_size=[1]))
 
     def _info(self) -> dict[str, Any]:
         measured = {name: value.item() for name, value in self._td["info"].items()}

@@ -113,7 +113,7 @@ class _Batch(EnvBase):
 
     def _make_specs(self, size: int) -> None:
         flag, number = Binary(1, (size, 1), dtype=torch.bool), Unbounded((size, 1))
-        info = {name: number for name in ("progress", "speed", "x", "ttc")} | {"crashed": flag, "offroad": flag}
+        info = dict.fromkeys(("progress", "speed", "x", "ttc"), number) | {"crashed": flag, "offroad": flag}
         self.observation_spec = Composite(
             observation=Bounded(-1, 1, self.seen.shape), info=Composite(info, shape=(size,)), shape=(size,)
         )
@@ -133,7 +133,7 @@ class _Batch(EnvBase):
         for values in (*self.numbers.values(), *self.flags.values()):
             values[chosen] = 0
         self.time[chosen] = 0
-        for place in chosen:
+        for place in chosen.tolist():
             observation, info = self.envs[place].reset(seed=int(seeds[place]) % 2**32)
             self._set(place, observation, info)
         return self._output()
@@ -141,14 +141,16 @@ class _Batch(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict["action"].numpy()
         self.numbers["reward"][:] = 0
-        for place in np.flatnonzero(~self.flags["done"][:, 0]):
+        for place in np.flatnonzero(~self.flags["done"][:, 0]).tolist():
             self._advance(place, actions[place])
         return self._output().set("reward", torch.from_numpy(self.numbers["reward"].copy()))
 
     def _advance(self, place: int, action: NDArray[np.generic]) -> None:
         """One step of one environment."""
         world, env = self.world, self.envs[place]
-        observation, reward, terminated, truncated, info = env.step(int(action) if self.discrete else self._scaled(action))
+        observation, reward, terminated, truncated, info = env.step(
+            int(action) if self.discrete else self._scaled(action)
+        )
         self.time[place] += 1
         self.numbers["reward"][place] = reward
         self.numbers["progress"][place] = world.progress(float(reward), info)
@@ -172,7 +174,7 @@ class _Batch(EnvBase):
             self.numbers[name][place] = value
 
     def _output(self) -> TensorDict:
-        info = {name: self.numbers[name] for name in ("progress", "speed", "x", "ttc")}
+        info: dict[str, NDArray[Any]] = {name: self.numbers[name] for name in ("progress", "speed", "x", "ttc")}
         info |= {"crashed": self.flags["crashed"], "offroad": np.zeros_like(self.flags["crashed"])}
         ends = {name: torch.from_numpy(self.flags[name].copy()) for name in ("done", "terminated", "truncated")}
         truth = TensorDict({name: torch.from_numpy(value.copy()) for name, value in info.items()}, self.batch_size)

@@ -165,7 +165,9 @@ def film(out: Path, record: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
     unit, before = _unit(out, record)
     settle()
     driven = unit.track.drive(
-        dataclasses.replace(unit.job, entropy=record.get("entropy") or 0), _artefact(out, unit, record), [record["seed"]]
+        dataclasses.replace(unit.job, entropy=record.get("entropy") or 0),
+        _artefact(out, unit, record),
+        [record["seed"]],
     )
     made = unit.track.film(unit.job, driven.traces[record["seed"]], {**unit.constants(0.0), "seed": record["seed"]})
     after = store.table(unit.constants(0.0), driven.columns, track=unit.track)

@@ -208,7 +208,7 @@ def _copy_weights(pair: Pair, seed: int, out: Path) -> None:
     """Copy the entries of the user's zoo that the pair loads; those of cavbench ship with it."""
     from bench.victims import zoo
 
-    victim, defense, attack = (part.component for part in (pair.victim, pair.defense, pair.attack))
+    victim, defense, attack = pair.victim.component, pair.defense.component, pair.attack.component
     recipes = [zoo.Recipe.of(victim)] if victim.learns else []
     recipes += [zoo.Recipe.of(victim, defense)] if defense.trains else []
     recipes += [zoo.Recipe.of(victim, defense, attack)] if attack.learns else []

@@ -59,7 +59,7 @@ def test_a_vector_environment_drives_like_single_ones() -> None:
     assert observation in envs.observation_space
     starts = 0
     for _ in range(14):
-        observation, reward, terminated, truncated, info = envs.step(np.array([1, 3, 4]))
+        observation, _, terminated, truncated, info = envs.step(np.array([1, 3, 4]))
         assert not (terminated & truncated).any()
         ended = terminated | truncated
         starts += int(ended.sum())
@@ -86,7 +86,9 @@ def test_a_model_trained_in_it_is_scored(tmp_path: Path) -> None:
 @pytest.fixture
 def cartpole(plugins: Path) -> Iterator[Any]:
     """The module of the page, installed as a package."""
-    code = next(block for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if "GymWorld)" in block)
+    code = next(
+        block for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if "GymWorld)" in block
+    )
     points = {
         "cavbench.worlds": {"cartpole": "cartpole:CartPole"},
         "cavbench.grids": {"cartpole-v1": "cartpole:CARTPOLE_V1"},
@@ -110,7 +112,8 @@ def balancing() -> torch.nn.Module:
 
 def test_cartpole_is_scored_under_noise_and_pgd(cartpole: Any, tmp_path: Path) -> None:
     found = cavbench.score(
-        balancing(), ["noise", cavbench.component("attack", "pgd", objective="margin")], world=cartpole.CartPole(max_steps=150), pole=0.5, episodes=3, actions="discrete", out=tmp_path,
+        balancing(), ["noise", cavbench.component("attack", "pgd", objective="margin")], pole=0.5, episodes=3,
+        world=cartpole.CartPole(max_steps=150), actions="discrete", out=tmp_path,
         threat={"norm": "linf", "budget": 0.2},
     )  # fmt: skip
     by_role = found.set_index("attack").safe_progress
@@ -131,8 +134,19 @@ def test_the_command_scores_a_file_in_it(cartpole: Any, bench: Bench, tmp_path: 
     sb3 = pytest.importorskip("stable_baselines3")
     env = cartpole.CartPole().environment(cartpole.CARTPOLE_V1.cells()[0])
     sb3.PPO("MlpPolicy", env, seed=0, device="cpu").save(tmp_path / "model.zip")
-    words = f"attack=pgd attack.objective=margin world=cartpole victim=sb3 victim.path={tmp_path}/model.zip victim.algo=ppo victim.rows=1 victim.features=4"
-    said = bench("run", *words.split(), "pole=0.5", "episodes=2", "world.max_steps=50", "workers=1", f"out={tmp_path / 'results'}")
+    words = (
+        f"attack=pgd attack.objective=margin world=cartpole victim=sb3 victim.path={tmp_path}/model.zip victim.algo=ppo "
+        "victim.rows=1 victim.features=4"
+    )
+    said = bench(
+        "run",
+        *words.split(),
+        "pole=0.5",
+        "episodes=2",
+        "world.max_steps=50",
+        "workers=1",
+        f"out={tmp_path / 'results'}",
+    )
     assert said.code == 0, said.err
     assert "pgd" in said.out
 

@@ -99,7 +99,9 @@ def test_a_missing_plug_in_is_named_before_anything_is_executed(
 ) -> None:
     known = registry.entries
     monkeypatch.setattr(
-        registry, "entries", lambda group: {k: v for k, v in known(group).items() if v[0].distribution != "cavbench-toy"}
+        registry,
+        "entries",
+        lambda group: {k: v for k, v in known(group).items() if v[0].distribution != "cavbench-toy"},
     )
     said = bench("verify", str(submission))
     assert said.code == 2

@@ -48,7 +48,7 @@ def _letters(text: str, size: int) -> NDArray[np.float32]:
     ascent, descent = font.getmetrics()  # type: ignore[union-attr]
     image = Image.new("L", (max(1, round(right - left)) + 2, ascent + descent))
     ImageDraw.Draw(image).text((-left, 0), text, fill=255, font=font)
-    return np.asarray(image, np.float32) / 255
+    return (np.asarray(image) / 255).astype(np.float32)
 
 
 def write(
