@@ -1,4 +1,4 @@
-"""The command line: `bench run | audit | train | list | new | check | render | show | view | report | fetch`.
+"""The command line: one function for each command of `bench`.
 
 A command imports what it needs when it is called, so that `bench list` and `--help` do not import torch.
 """
@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
+from bench import __version__
 from bench.cli.axes_help import AxesHelp
+from bench.cli.completion import completed
 from bench.cli.terminal import Console
 from bench.errors import Notice, UserError, bounded
 
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
     from bench.plugins.track import Track
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(pretty_exceptions_enable=False)
 
 Words = Annotated[
     list[str] | None,
@@ -31,26 +33,73 @@ Words = Annotated[
         metavar="KEY=VALUE...",
         help="Comma lists sweep: attack=zo,noise defense=advtrain victim=dqn attack.steps=50 threat.budget=0.1,0.2. "
         "Training seeds and axes select a part of the grid: seeds=0,1 lanes=3,4 weather=clear,rain episodes=20.",
+        autocompletion=completed,
     ),
 ]
 
 
-@app.callback()
-def bench() -> None:
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"cavbench {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def bench(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
     """A benchmark for the adversarial robustness of driving policies and object detectors.
 
     With --debug, or BENCH_DEBUG=1 in the environment, errors show their traceback.
     """
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@app.command("help")
+def explain(
+    context: typer.Context,
+    term: Annotated[
+        list[str] | None, typer.Argument(help="A term of the tables, a column, a parameter, a component or a command.")
+    ] = None,
+) -> None:
+    """Explain a term, such as a column of the tables; without one, list all terms.
+
+    For instance: bench help kept, bench help "min TTC", bench help threat.budget, or bench help run
+    """
+    from bench.cli import explain as cli_explain
+
+    wanted = " ".join(term or [])
+    commands = getattr(context.find_root().command, "commands", {})
+    if wanted in commands:
+        command = commands[wanted]
+        with type(context)(command, info_name=wanted, parent=context.find_root()) as inner:
+            typer.echo(command.get_help(inner))
+    elif wanted:
+        cli_explain.print_term(wanted, Console())
+    else:
+        cli_explain.print_terms(Console())
 
 
 @app.command("list")
 def list_components(
-    name: Annotated[str, typer.Argument(help="A component to describe, with its parameters.")] = "",
+    name: Annotated[
+        str, typer.Argument(help="A component to describe, or a kind: attack, defense, victim, world, suite.")
+    ] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
-    """List the installed attacks, defences, victims and worlds, or describe one."""
+    """List the installed attacks, defences, victims and worlds with a line on each, or describe one."""
     from bench.cli import listing as cli_list
 
-    cli_list.print_component(name, Console()) if name else cli_list.print_names(Console())
+    if name in ("", "attack", "defense", "victim", "world", "suite"):
+        cli_list.print_names(Console(), name, as_json=as_json)
+    elif as_json:
+        raise UserError(f"--json lists components: bench list --json, or bench list attack --json, not {name}")
+    else:
+        cli_list.print_component(name, Console())
 
 
 @app.command()
@@ -168,23 +217,37 @@ def view(
     words: Annotated[
         list[str],
         typer.Argument(
-            metavar="RUN [COLUMN=VALUE]... [out=…]",
+            metavar="RUN... [COLUMN=VALUE]... [out=…]",
             help="A recording (.rrd), a results folder, or the name of a pair; then the record to replay.",
         ),
     ],
     out: Out = None,
+    save: Annotated[Path | None, typer.Option(help="Write a film: a .gif, .webp or .mp4 file.")] = None,
+    seconds: Annotated[str | None, typer.Option(metavar="FROM:TO", help="The part of the film to save.")] = None,
+    web: Annotated[
+        bool, typer.Option("--web", help="Open it in a browser on this machine, without a display.")
+    ] = False,
 ) -> None:
     """Open a recording in the rerun viewer; with COLUMN=VALUE, replay and record that episode first.
 
     For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017 out=results
+
+    With --save, replay it and write a film. Two pairs are shown one below the other, on the same scenario:
+    bench view none-none-dqn pgd-none-dqn --save clip.gif
     """
     from bench.cli import view as cli_view
     from bench.cli.words import split
 
-    names, values = split(words, (), names=1)
+    names, values = split(words, (), names=1 if save is None else 4)
     folder = _folder(values, out) or Path("results")
     where = [f"{key}={value}" for key, value in values.items() if key != "out"]
-    cli_view.open_recording(names[0] if names else str(folder), where, folder, Console())
+    names = names or [str(folder)]
+    if save is not None:
+        cli_view.save_film(names, where, folder, Console(), save, seconds)
+        return
+    if seconds is not None:
+        raise UserError("--seconds needs --save FILE")
+    cli_view.open_recording(names[0], where, folder, Console(), web=web)
 
 
 def _folder(values: dict[str, str], option: Path | None) -> Path | None:
@@ -193,6 +256,41 @@ def _folder(values: dict[str, str], option: Path | None) -> Path | None:
         raise UserError("out is given twice")
     folder = Path(values["out"]) if "out" in values else option
     return folder.expanduser() if folder else None
+
+
+@app.command()
+def submit(
+    words: Annotated[
+        list[str], typer.Argument(metavar="PAIR out=FOLDER [results=FOLDER]", help="A pair of a results folder.")
+    ],
+) -> None:
+    """Write everything that others need to check a pair to one folder: records, weights, commands, environment, a card.
+
+    For instance: bench submit pgd-my_defense-dqn out=submission
+    """
+    from bench.cli import submit as cli_submit
+
+    cli_submit.submit(words, Console())
+
+
+@app.command()
+def verify(
+    words: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FOLDER [KEY=VALUE]...",
+            help="sample=3 units are replayed (or all); episodes=20 fresh scenarios in each cell are driven (audit=false for "
+            "none, salt=NUMBER to repeat them); out=FOLDER adds the records to a results folder.",
+        ),
+    ],
+) -> None:
+    """Check a submission: replay a sample, drive fresh scenarios, and print its row. Exit code 1 if it does not hold.
+
+    Its components must be installed with pip. Nothing in the folder is executed.
+    """
+    from bench.cli import submit as cli_submit
+
+    raise typer.Exit(cli_submit.verify(words, Console(), _print_report))
 
 
 @app.command()

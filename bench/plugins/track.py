@@ -264,6 +264,14 @@ class Track(ABC):
         """
         raise NotImplementedError(f"the {self.name} track makes no recordings")
 
+    def film(self, job: Job, trace: Any, meta: Mapping[str, object]) -> Any:
+        """The film of an episode, a `bench.recording.film.Film`; arguments as in `record`.
+
+        Raises:
+            UserError: if the track makes no films.
+        """
+        raise UserError(f"the {self.name} track makes no films; leave out --save to look at its recordings")
+
 
 @cache
 def track(name: str) -> Track:

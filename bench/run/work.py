@@ -15,7 +15,7 @@ import pyarrow as pa
 from bench.errors import UserError, reason
 from bench.plugins.fingerprint import canonical
 from bench.records.store import table
-from bench.run.unit import Preparation, Unit, shipped_by
+from bench.run.unit import Preparation, Unit
 from bench.trust.watch import TamperError
 
 Tell = Callable[[str, float, str], None]
@@ -70,7 +70,7 @@ def perform(task: Task, tell: Tell) -> Outcome:
     except TamperError as error:
         kinds = {"attack": ("attack",), "defense": ("defense", "victim")}
         parts = [part for part in work.pair.parts if any(part.kind in kinds[side] for side in error.sides)]
-        shipped = " and ".join(f"{part.kind} {part.name!r} of {shipped_by(part)}" for part in parts)
+        shipped = " and ".join(f"{part.kind} {part.name!r} of {part.shipped_by}" for part in parts)
         raise UserError(f"{work} is refused: {error} ({shipped})") from error
     except UserError as error:
         raise UserError(f"{work}: {error}") from error
@@ -101,7 +101,7 @@ def _driven(unit: Unit, task: Task) -> Outcome:
 
 def _authors(unit: Unit) -> str:
     """The components of a unit that do not ship with cavbench, or all of them, with their packages."""
-    shipped = {part: shipped_by(part) for part in unit.pair.parts}
+    shipped = {part: part.shipped_by for part in unit.pair.parts}
     foreign = {part: by for part, by in shipped.items() if by.partition(" ")[0] != "cavbench"}
     return ", ".join(f"{part.kind} {part.name!r} of {by}" for part, by in (foreign or shipped).items())
 

@@ -18,6 +18,7 @@ from bench.records.schema import FLOAT, PROBES, field
 
 if TYPE_CHECKING:
     from bench.driving import DrivingVictim, DrivingWorld
+    from bench.recording.film import Film
 
 BEST_BLIND, IDM, RANDOM = "best blind", "idm", "random"
 
@@ -193,6 +194,12 @@ class DrivingTrack(Track):
         from bench.recording.driving import save
 
         save(trace, facts=_parts(job.pair)[1].facts, meta=meta, path=path)
+
+    def film(self, job: Job, trace: Any, meta: Mapping[str, object]) -> Film:
+        from bench.recording.driving.episode import Episode
+        from bench.recording.driving.film import EpisodeFilm
+
+        return EpisodeFilm(Episode.of(trace, _parts(job.pair)[1].facts, meta))
 
 
 def _parts(pair: Pair) -> tuple[DrivingVictim, DrivingWorld]:
