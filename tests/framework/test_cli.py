@@ -98,13 +98,17 @@ def test_a_repeated_run_only_prints_the_table(bench: Bench, tmp_path: Path) -> N
     assert again.err.strip() == "36 of 36 episodes are already done"
 
 
-def test_a_truncated_record_stops_every_command_that_reads_it(bench: Bench, tmp_path: Path) -> None:
+def test_a_truncated_record_stops_reports_and_is_driven_again_by_a_run(bench: Bench, tmp_path: Path) -> None:
     run = ("run", *TOY, "workers=1", "record=0", "reference=false", f"out={tmp_path}")
     bench(*run)
     path = sorted((tmp_path / "episodes").glob("*.parquet"))[0]
     path.write_bytes(path.read_bytes()[:100])
-    for words in (run, ("show", str(tmp_path)), ("report", f"out={tmp_path}")):
+    for words in (("show", str(tmp_path)), ("report", f"out={tmp_path}")):
         assert_one_line(bench(*words), f"the record {path} is truncated")
+    again = bench(*run)
+    assert again.code == 0
+    assert f"warning: the record {path} does not count as finished: it is truncated or not Parquet" in again.err
+    assert bench("show", f"out={tmp_path}").code == 0
 
 
 def test_show_prints_the_provenance_of_the_records(bench: Bench, tmp_path: Path) -> None:
