@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from rich.console import Console
 
 from bench.api.choosing import checked_for_workers, chosen, grid_with, pairs_of, victim_of, world_of
 from bench.api.table import Scores, scores_of
 from bench.cli.progress import RunProgress
+from bench.cli.terminal import Console
 from bench.errors import UserError
 from bench.plugins.contracts import Attack, Defense, ThreatModel, Victim, World
 from bench.plugins.pair import Pair

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from bench.cli.progress import RunProgress, show_downloads
+from bench.cli.terminal import Console
 from bench.errors import UserError
 from bench.plugins.pair import Pair
 from bench.plugins.track import Track, track_of

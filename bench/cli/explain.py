@@ -6,9 +6,9 @@ import re
 import tomllib
 from pathlib import Path
 
-from rich.console import Console
 from rich.text import Text
 
+from bench.cli.terminal import Console
 from bench.errors import UserError
 from bench.plugins import registry, suites
 from bench.plugins.registry import GROUPS, KINDS

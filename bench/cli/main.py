@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.text import Text
 
 from bench import __version__
 from bench.cli.axes_help import AxesHelp
 from bench.cli.completion import completed
-from bench.errors import UserError
+from bench.cli.terminal import Console
+from bench.errors import Notice, UserError, bounded
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -169,37 +170,58 @@ def train(words: Words = None) -> None:
     cli_train.train(words or [], Console())
 
 
+Out = Annotated[Path | None, typer.Option(help="The same as out=FOLDER.")]
+
+
 @app.command()
 def render(
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the frames; by default the one that bench run reads.")
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[out=…] [world=…]",
+            help="out=FOLDER for the frames, by default the one that bench run reads; world=NAME for another camera world.",
+        ),
     ] = None,
-    world: Annotated[str, typer.Option(help="The camera world.")] = "camera",
+    out: Out = None,
+    world: Annotated[str, typer.Option(help="The same as world=NAME.")] = "camera",
 ) -> None:
     """Render the frames of a camera world. This takes hours; run the same command again to continue.
 
     It needs the renderer: pip install 'cavbench[render]'. The frames of the standard grid ship with cavbench.
     """
     from bench.cli import render as cli_render
+    from bench.cli.words import split
 
-    cli_render.render(world, out, Console())
+    _, values = split(words or [], ("out", "world"), names=0)
+    cli_render.render(values.get("world", world), _folder(values, out), Console())
 
 
 @app.command()
 def show(
-    run: Annotated[str, typer.Argument(help="A results folder, or the name of a pair.")] = "results",
-    out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
+    words: Annotated[
+        list[str] | None, typer.Argument(metavar="[RUN] [out=…]", help="A results folder, or the name of a pair.")
+    ] = None,
+    out: Out = None,
 ) -> None:
-    """Show a run: its configuration, provenance, table and recordings."""
+    """Show a run: its configuration, provenance, table and recordings. out=FOLDER is the results folder, by default results."""
     from bench.cli import show as cli_show
+    from bench.cli.words import split
 
-    cli_show.print_run(run, out, Console(), _print_report)
+    names, values = split(words or [], ("out",), names=1)
+    folder = _folder(values, out) or Path("results")
+    cli_show.print_run(names[0] if names else str(folder), folder, Console(), _print_report)
 
 
 @app.command()
 def view(
-    runs: Annotated[list[str], typer.Argument(help="A recording (.rrd), a results folder, or the name of a pair.")],
-    out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
+    words: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN... [COLUMN=VALUE]... [out=…]",
+            help="A recording (.rrd), a results folder, or the name of a pair; then the record to replay.",
+        ),
+    ],
+    out: Out = None,
     save: Annotated[Path | None, typer.Option(help="Write a film: a .gif, .webp or .mp4 file.")] = None,
     seconds: Annotated[str | None, typer.Option(metavar="FROM:TO", help="The part of the film to save.")] = None,
     web: Annotated[
@@ -208,23 +230,32 @@ def view(
 ) -> None:
     """Open a recording in the rerun viewer; with COLUMN=VALUE, replay and record that episode first.
 
-    For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017.
+    For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017 out=results
 
     With --save, replay it and write a film. Two pairs are shown one below the other, on the same scenario:
     bench view none-none-dqn pgd-none-dqn --save clip.gif
     """
     from bench.cli import view as cli_view
+    from bench.cli.words import split
 
-    where = [word for word in runs if "=" in word and not Path(word).exists()]
-    named = [word for word in runs if word not in where]
-    if not named:
-        raise UserError("name a recording, a results folder or a pair to view")
+    names, values = split(words, (), names=len(words))
+    folder = _folder(values, out) or Path("results")
+    where = {key: value for key, value in values.items() if key != "out"}
+    runs = names or [str(folder)]
     if save is not None:
-        cli_view.save_film(named, where, out, Console(), save, seconds)
+        cli_view.save_film(runs, where, folder, Console(), save, seconds)
         return
-    if len(named) > 1 or seconds is not None:
+    if len(runs) > 1 or seconds is not None:
         raise UserError("several runs, and --seconds, need --save FILE")
-    cli_view.open_recording(named[0], where, out, Console(), web=web)
+    cli_view.open_recording(runs[0], [f"{key}={value}" for key, value in where.items()], folder, Console(), web=web)
+
+
+def _folder(values: dict[str, str], option: Path | None) -> Path | None:
+    """The folder of out=FOLDER or --out FOLDER."""
+    if "out" in values and option is not None:
+        raise UserError("out is given twice")
+    folder = Path(values["out"]) if "out" in values else option
+    return folder.expanduser() if folder else None
 
 
 @app.command()
@@ -300,23 +331,45 @@ def main() -> None:
     """Run the command line. Bad input prints one line on standard error and exits with code 2."""
     debug = "--debug" in sys.argv or bool(os.environ.get("BENCH_DEBUG"))
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
-    try:
-        status = app(arguments, standalone_mode=False)
-    except (UserError, typer.TyperException) as error:
-        if debug:
-            raise
-        reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
-        sys.exit(_complain(reason))
-    # Unexpected errors are mostly in plug-ins: tell their authors how to see the traceback.
-    except Exception as error:
-        if debug:
-            raise
-        sys.exit(_complain(f"{type(error).__name__}: {error} (--debug shows the traceback)"))
+    with warnings.catch_warnings():
+        if not debug:
+            # Warnings of libraries are for the authors of components.
+            warnings.simplefilter("ignore")
+        warnings.simplefilter("always", Notice)
+        warnings.showwarning = _show
+        try:
+            status = app(arguments, standalone_mode=False)
+        except (UserError, typer.TyperException) as error:
+            if debug:
+                raise
+            reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
+            sys.exit(_complain(reason))
+        # Unexpected errors are mostly in plug-ins: tell their authors how to see the traceback.
+        except Exception as error:
+            if debug:
+                raise
+            full = "there is not enough memory for this: choose smaller numbers"
+            if isinstance(error, OSError) and error.strerror:
+                reason = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+            else:
+                reason = full if _is_full(error) else f"{type(error).__name__}: {error}"
+            sys.exit(_complain(f"{reason} (--debug shows the traceback)"))
     sys.exit(status or 0)
 
 
+def _is_full(error: Exception) -> bool:
+    """Whether an error says that memory is used up: Python's own, or that of torch, which has no type."""
+    return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)
+
+
+def _show(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any, **__: Any) -> None:
+    """Print a warning: a notice as one line, that of a library with its place."""
+    text = str(message) if issubclass(category, Notice) else f"{filename}:{lineno}: {category.__name__}: {message}"
+    Console(stderr=True).print(Text(f"warning: {bounded(text)}", style="yellow"), soft_wrap=True)
+
+
 def _complain(reason: str) -> int:
-    line = " ".join(reason.split())
+    line = bounded(reason)
     Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
     return 2
 

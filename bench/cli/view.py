@@ -17,11 +17,12 @@ from urllib.parse import quote
 
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.console import Console
 from rich.text import Text
 
 from bench.cli.show import located, pair_named, recordings, records_of
+from bench.cli.terminal import Console
 from bench.errors import UserError
+from bench.files import check_folder
 from bench.scenarios.axes import written
 
 LOCAL = "127.0.0.1"
@@ -70,7 +71,7 @@ def open_recording(run: str, where: Sequence[str], out: Path, console: Console, 
 
 def save_film(
     runs: Sequence[str],
-    where: Sequence[str],
+    where: Mapping[str, str],
     out: Path,
     console: Console,
     path: Path,
@@ -80,7 +81,7 @@ def save_film(
 
     Args:
         runs: recordings, or beginnings of the names of pairs in `out`.
-        where: `column=value` options of the first record; the others are of the same cell, scenario and training seed.
+        where: values by column of the first record; the others are of the same cell, scenario and training seed.
         out: results folder of the pairs.
         console: console to print to.
         path: file of the film.
@@ -95,7 +96,7 @@ def save_film(
     if path.suffix.lower() not in KINDS:
         raise UserError(f"--save {path}: the name must end in {', '.join(KINDS)}")
     part = _seconds(seconds)
-    films, wanted = [], dict(word.partition("=")[::2] for word in where)
+    films, wanted = [], dict(where)
     for run in runs:
         folder, record = _record(run, out, wanted)
         made, differences = film(folder, record)
@@ -222,6 +223,7 @@ def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Conso
     if beginning:
         words = {"pair": pair_named(beginning, records)} | words
     record = find(records, words)
+    check_folder(folder / "recordings", "the folder of recordings")
     made = replay(folder, record)
     if made.differences:
         cause = f"changed since: {made.changed}" if made.changed else "no known change since"

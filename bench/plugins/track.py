@@ -151,6 +151,8 @@ class Track(ABC):
     """The columns of its records, in addition to those of all tracks (`bench.records.schema`)."""
     probes: ClassVar[tuple[pa.Field, ...]] = ()
     """Further columns, which may be null, for the flags of a leaderboard."""
+    norms: ClassVar[tuple[str, ...]] = ()
+    """The norms of its threat models; records with another one are refused. Empty: any name."""
     facts_of_v1: ClassVar[Mapping[str, object]] = {}
     """Facts of its world for records of format 1, which do not contain them; empty for a newer track."""
     metric: ClassVar[str]

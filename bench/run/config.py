@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.errors import UserError
+from bench.errors import UserError, short
 from bench.plugins import registry
 from bench.plugins.options import Options, configured
 from bench.plugins.pair import Chosen, Pair, check_track
@@ -96,7 +96,7 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
     """Raise ValueError unless there is at least one training seed, and all are distinct and not negative."""
     if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
         raise ValueError(
-            f"seeds must be distinct whole numbers of at least 0, got {','.join(map(str, seeds)) or 'none'}"
+            f"seeds must be distinct whole numbers of at least 0, got {short(','.join(map(str, seeds))) or 'none'}"
         )
 
 

@@ -12,6 +12,7 @@ from rich.text import Text
 from bench.plugins.track import Track
 from bench.statistics.estimates import share_interval
 from leaderboard.comparisons.naming import component, varying
+from leaderboard.published import every_track
 from leaderboard.ranking.boards import Board, Row, read_boards
 from leaderboard.ranking.flags import FLAGS
 from leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
@@ -36,10 +37,10 @@ def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> Non
     """Print the ranking of every threat model, with the flags that have fired.
 
     Args:
-        records: by track (`bench.records.schema`).
+        records: by track (`bench.records.schema`); where there are none, the published records count.
         console: where to print.
     """
-    print_boards(read_boards(records)[0], console)
+    print_boards(read_boards(records or every_track())[0], console)
 
 
 def print_boards(boards: Sequence[Board], console: Console) -> None:

@@ -7,13 +7,13 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from bench.errors import UserError, reason
+from bench.errors import UserError
 from bench.plugins.ranges import Count
 
 CONTROLS = 2
@@ -87,6 +87,9 @@ class FileDriver(DrivingVictim):
             values of that environment's observation.
     """
 
+    format: ClassVar[str]
+    """What the file must be, for errors."""
+
     path: str
     actions: Literal["discrete", "continuous"] = "discrete"
     rows: Count = 10
@@ -112,7 +115,7 @@ class FileDriver(DrivingVictim):
             raise
         # A truncated file, or one in another format, can fail anywhere in the library that reads it.
         except Exception as error:
-            raise UserError(f"{self.path} cannot be read: {reason(error)}") from error
+            raise UserError(f"{self.path} cannot be read: it is not {self.format}, or a damaged one") from error
         policy.native = facts.native if facts.flat else None
         self._try(policy, [self.rows, self.features + facts.flat])
         return policy
@@ -146,7 +149,7 @@ class FileDriver(DrivingVictim):
                     scores = policy.scores(torch.zeros(batch, *observation))
             except Exception as error:
                 raise UserError(
-                    f"{self.path} fails on a batch of {batch}: export it with a dynamic batch size ({reason(error)})"
+                    f"{self.path} fails on {batch} observations: export it with a dynamic batch size"
                 ) from error
             wanted = [batch, policy.width]
             if list(scores.shape) != wanted:
