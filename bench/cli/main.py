@@ -238,16 +238,16 @@ def view(
     from bench.cli import view as cli_view
     from bench.cli.words import split
 
-    names, values = split(words, (), names=1 if save is None else 4)
+    names, values = split(words, (), names=len(words))
     folder = _folder(values, out) or Path("results")
-    where = [f"{key}={value}" for key, value in values.items() if key != "out"]
-    names = names or [str(folder)]
+    where = {key: value for key, value in values.items() if key != "out"}
+    runs = names or [str(folder)]
     if save is not None:
-        cli_view.save_film(names, where, folder, Console(), save, seconds)
+        cli_view.save_film(runs, where, folder, Console(), save, seconds)
         return
-    if seconds is not None:
-        raise UserError("--seconds needs --save FILE")
-    cli_view.open_recording(names[0], where, folder, Console(), web=web)
+    if len(runs) > 1 or seconds is not None:
+        raise UserError("several runs, and --seconds, need --save FILE")
+    cli_view.open_recording(runs[0], [f"{key}={value}" for key, value in where.items()], folder, Console(), web=web)
 
 
 def _folder(values: dict[str, str], option: Path | None) -> Path | None:
