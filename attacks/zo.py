@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import torch
@@ -11,7 +13,7 @@ from annotated_types import Interval
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion
-from bench.driving import DrivingAttack
+from bench.driving import DrivingAttack, Part
 from bench.plugins.contracts import Access
 from bench.plugins.ranges import Count, Natural, NotNegative, Positive
 
@@ -65,6 +67,7 @@ class ZOSignSGD(DrivingAttack):
     """
 
     access: ClassVar[Access] = "scores"
+    joint: ClassVar[bool] = True
 
     steps: Count = 4
     directions: Count = 10
@@ -86,15 +89,16 @@ class ZOSignSGD(DrivingAttack):
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if not len(observation) or (left := int(oracle.remaining.min())) < 1:
             return observation
-        generator = _generator(oracle)
+        parts = [Part(part.rows, _generator(part.generator)) for part in oracle.parts]
         shape = observation.shape[1:]
         clean, left = oracle.scores(observation), left - 1
         loss = self._loss(clean, oracle)
         _, lowest, met = self._judge(loss, clean, observation, observation)
         x = observation
         if self.random_start:
-            x = oracle.project(x + oracle.radius * (2 * torch.rand(shape, generator=generator) - 1))
-        run = _Run(torch.arange(len(observation)), observation, oracle.radius, x, observation, lowest, loss)
+            share = torch.cat([torch.rand(shape, generator=part.generator).expand_as(x[part.rows]) for part in parts])
+            x = oracle.project(x + oracle.radius * (2 * share - 1))
+        run = _Run(torch.arange(len(observation)), observation, oracle.radius, x, observation, lowest, loss, parts)
         answer = observation.clone()
         if self.early_stop:
             run = run.without(met, answer)
@@ -105,15 +109,15 @@ class ZOSignSGD(DrivingAttack):
             count = min(self.directions, left - base) if len(run.rows) else 0
             if count < 1:
                 break
-            directions, left = _directions(count, shape, generator).to(observation), left - base - count
-            # A direction of zeros before the others is x itself.
-            around = torch.cat((torch.zeros_like(directions[:1]), directions)).unsqueeze(1)
-            points = oracle.project(torch.addcmul(run.x, self.smoothing * run.radius, around), run.rows)
+            directions = [_directions(count, shape, part.generator).to(observation) for part in run.parts]
+            left -= base + count
+            points = oracle.project(run.around(directions, self.smoothing), run.rows)
             scores = oracle.scores(points[1 - base :], run.rows)
             scores, known = scores if known is None else torch.cat((known.unsqueeze(0), scores)), None
             value, key, met = self._judge(run.loss, scores, points, run.truth)
             run.keep_best(points, key)
-            sign = _gradient(value, directions).sign_()
+            slopes = [_gradient(value[:, part.rows], own) for part, own in zip(run.parts, directions, strict=True)]
+            sign = torch.cat(slopes).sign_()
             run.x = oracle.project(torch.addcmul(run.x, self.step_size * run.radius, sign, value=-1), run.rows)
             if self.early_stop:
                 run = run.without(met.any(0), answer)
@@ -154,6 +158,7 @@ class _Run:
         truth, radius, x, best: [R, V, F] true observation, radius, current point, and best point so far.
         lowest: [R] key of the best point.
         loss: the objective.
+        parts: the units of these episodes, with the generator of each unit for this step.
     """
 
     rows: Tensor
@@ -163,6 +168,15 @@ class _Run:
     best: Tensor
     lowest: Tensor
     loss: Loss
+    parts: Sequence[Part]
+
+    def around(self, directions: Sequence[Tensor], smoothing: float) -> Tensor:
+        """[q + 1, R, V, F] the current points, and the points along the directions [q, V, F] of each part."""
+        reach, points = smoothing * self.radius, self.x.new_empty(len(directions[0]) + 1, *self.x.shape)
+        points[0] = self.x
+        for part, own in zip(self.parts, directions, strict=True):
+            torch.addcmul(self.x[part.rows], reach[part.rows], own.unsqueeze(1), out=points[1:, part.rows])
+        return points
 
     def keep_best(self, points: Tensor, key: Tensor) -> None:
         """Compare queried points [q + 1, R, V, F] by their keys [q + 1, R]."""
@@ -178,7 +192,16 @@ class _Run:
         answer[self.rows] = self.best
         on = (~met).nonzero().squeeze(-1)
         state = (self.rows, self.truth, self.radius, self.x, self.best, self.lowest)
-        return _Run(*(values[on] for values in state), self.loss.of(on))
+        return _Run(*(values[on] for values in state), self.loss.of(on), _left(self.parts, on))
+
+
+def _left(parts: Sequence[Part], on: Tensor) -> Sequence[Part]:
+    """The units without the episodes that are not in `on`, in ascending order; without those that have none."""
+    if len(parts) == 1:
+        return [Part(slice(0, len(on)), parts[0].generator)]
+    ends = torch.searchsorted(on, torch.tensor([0, *(part.rows.stop for part in parts)])).tolist()
+    found = [Part(slice(a, b), part.generator) for part, (a, b) in zip(parts, pairwise(ends), strict=True)]
+    return [part for part in found if part.rows.stop > part.rows.start]
 
 
 def _gradient(value: Tensor, directions: Tensor) -> Tensor:
@@ -189,9 +212,9 @@ def _gradient(value: Tensor, directions: Tensor) -> Tensor:
     return ((value[1:] - value.mean(0)).T @ directions.flatten(1)).view(-1, *directions.shape[1:])
 
 
-def _generator(oracle: Oracle) -> torch.Generator:
+def _generator(of_run: torch.Generator) -> torch.Generator:
     """A generator for this step, seeded by one draw from the run's, whatever the number of iterations."""
-    seed = torch.randint(2**62, (1,), generator=oracle.generator)
+    seed = torch.randint(2**62, (1,), generator=of_run)
     return torch.Generator().manual_seed(int(seed))
 
 

@@ -3,7 +3,7 @@
 from bench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, DrivingWorld, TrainingHooks
 from bench.driving.dynamics import Dynamics, Forecast
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features
-from bench.driving.oracle import Oracle
+from bench.driving.oracle import Oracle, Part
 from bench.driving.policy import Policy, PolicyWrapper, State
 from bench.driving.threat import ObservationThreat
 
@@ -20,6 +20,7 @@ __all__ = [
     "Forecast",
     "ObservationThreat",
     "Oracle",
+    "Part",
     "Policy",
     "PolicyWrapper",
     "State",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from bench.driving.dynamics import Dynamics
 from bench.driving.features import Features
-from bench.driving.oracle import Loss, Oracle
+from bench.driving.oracle import Loss, Oracle, Part
 from bench.driving.policy import State, repeated, rows_of
 from bench.driving.threat import ObservationThreat, bounds
 from bench.driving.victim import CountedPolicy
@@ -60,13 +61,16 @@ class Enforcer:
         self._step = 0
         self.spent = self.gradients = self.zero_gradients = torch.empty(0, dtype=torch.int64)
 
-    def begin(self, observation: Tensor, state: State = None, scale: float = 1.0) -> Oracle:
+    def begin(
+        self, observation: Tensor, state: State = None, scale: float = 1.0, parts: Sequence[Part] = ()
+    ) -> Oracle:
         """The oracle of a step, with counters at 0; the oracle of the step before answers no more.
 
         Args:
             observation: the true observation, [B, V, F].
             state: the victim's state for these B episodes.
             scale: multiplies the budget.
+            parts: the units of these episodes; by default they are one unit, with the generator of the enforcer.
         """
         radius = self.threat.radius(observation, self.features, scale)
         low, high = bounds(observation, radius)
@@ -80,7 +84,7 @@ class Enforcer:
             (observation.clone(), radius, low, high),
             threat=threat,
             features=features,
-            generator=self.generator,
+            parts=parts or (Part(slice(0, len(observation)), self.generator),),
             action_type=self.subject.action_type,
         )
 

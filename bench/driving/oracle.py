@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -13,6 +13,13 @@ from bench.driving.features import ActionType, Features
 from bench.driving.threat import ObservationThreat, within
 
 Loss = Callable[[Tensor], Tensor]
+
+
+class Part(NamedTuple):
+    """The episodes of one unit among those of a step, and the random generator of its attack."""
+
+    rows: slice
+    generator: torch.Generator
 
 
 class Door(Protocol):
@@ -58,6 +65,8 @@ class Oracle:
         threat: the threat model.
         features: features of the observation.
         generator: the attack's random generator.
+        parts: the units of the episodes, one after the other, each with a generator of its own; one unit, unless the attack is
+            `joint`.
         action_type: whether the victim decides discretely or continuously.
     """
 
@@ -68,11 +77,12 @@ class Oracle:
         *,
         threat: ObservationThreat,
         features: Features,
-        generator: torch.Generator,
+        parts: Sequence[Part],
         action_type: ActionType,
     ) -> None:
         self._door = door
-        self.threat, self.features, self.generator, self.action_type = threat, features, generator, action_type
+        self.threat, self.features, self.parts, self.action_type = threat, features, parts, action_type
+        self.generator = parts[0].generator
         self.observation, self.radius, low, high = limits
         self._set = self._subset = (self.observation, low, high)
         self._rows: Tensor | None = None

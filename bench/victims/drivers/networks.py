@@ -48,6 +48,25 @@ class QNetwork(nn.Module):
         return value + advantage - advantage.mean(-1, keepdim=True)
 
 
+FEW = 16
+"""A matrix product of fewer rows than this may differ in the last bit from the same rows in a product of many."""
+
+
+def whatever_the_batch(network: nn.Module, observation: Tensor) -> Tensor:
+    """The output [..., A] of a network for observations [..., V, F], to the last bit the same in every batch.
+
+    Fewer than `FEW` observations are filled up. Units that are driven together thus have the results that each has alone.
+    """
+    leading = observation.shape[:-2]
+    missing = FEW - leading.numel()
+    if missing <= 0 or missing == FEW:
+        alone: Tensor = network(observation)
+        return alone
+    rows = observation.reshape(-1, *observation.shape[-2:])
+    answer: Tensor = network(torch.cat((rows, rows[:1].expand(missing, *rows.shape[1:]))))[: len(rows)]
+    return answer.reshape(*leading, -1)
+
+
 class QPolicy(Policy):
     """The greedy policy of a Q-network.
 
@@ -65,7 +84,7 @@ class QPolicy(Policy):
         self.network = QNetwork(features, actions, hidden)
 
     def forward(self, observation: Tensor) -> Tensor:
-        return self.network(observation)
+        return whatever_the_batch(self.network, observation)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         return self.scores(observation).gather(-1, action.unsqueeze(-1)).squeeze(-1)
@@ -123,7 +142,7 @@ class ActorPolicy(Policy):
         self.critic = Critic(features, hidden, limit)
 
     def forward(self, observation: Tensor) -> Tensor:
-        return self.actor(observation)
+        return whatever_the_batch(self.actor, observation)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         return self.critic(observation, action).squeeze(-1)
