@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import torch
@@ -13,7 +12,7 @@ from annotated_types import Interval
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion
-from bench.driving import DrivingAttack, Part
+from bench.driving import DrivingAttack, Part, parts_of
 from bench.plugins.contracts import Access
 from bench.plugins.ranges import Count, Natural, NotNegative, Positive
 
@@ -192,16 +191,7 @@ class _Run:
         answer[self.rows] = self.best
         on = (~met).nonzero().squeeze(-1)
         state = (self.rows, self.truth, self.radius, self.x, self.best, self.lowest)
-        return _Run(*(values[on] for values in state), self.loss.of(on), _left(self.parts, on))
-
-
-def _left(parts: Sequence[Part], on: Tensor) -> Sequence[Part]:
-    """The units without the episodes that are not in `on`, in ascending order; without those that have none."""
-    if len(parts) == 1:
-        return [Part(slice(0, len(on)), parts[0].generator)]
-    ends = torch.searchsorted(on, torch.tensor([0, *(part.rows.stop for part in parts)])).tolist()
-    found = [Part(slice(a, b), part.generator) for part, (a, b) in zip(parts, pairwise(ends), strict=True)]
-    return [part for part in found if part.rows.stop > part.rows.start]
+        return _Run(*(values[on] for values in state), self.loss.of(on), parts_of(self.parts, on))
 
 
 def _gradient(value: Tensor, directions: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from bench.driving.contracts import DrivingAttack
 from bench.driving.dynamics import Dynamics
 from bench.driving.enforcer import Enforcer
 from bench.driving.features import Features
-from bench.driving.oracle import Part
+from bench.driving.oracle import Part, parts_of
 from bench.driving.policy import State, rows_of
 from bench.driving.threat import ObservationThreat
 from bench.driving.victim import CountedPolicy
@@ -69,10 +69,12 @@ class Attacker:
         self.attack, self.subject = attack, subject
         access = attack.access if attack else "oblivious"
         seeds = [seed] if isinstance(seed, int) else list(seed)
-        self.generators = {one: torch.Generator().manual_seed(one) for one in dict.fromkeys(seeds)}
-        # The first episode of each unit, and the end of the last one.
-        self.bounds = torch.tensor([*(seeds.index(one) for one in self.generators), len(seeds)])
-        self.enforcer = Enforcer(subject, threat, access, features, self.generators[seeds[0]], dynamics)
+        starts = [place for place, one in enumerate(seeds) if place == 0 or one != seeds[place - 1]]
+        self.parts = [
+            Part(slice(start, end), torch.Generator().manual_seed(seeds[start]))
+            for start, end in pairwise([*starts, len(seeds)])
+        ]
+        self.enforcer = Enforcer(subject, threat, access, features, self.parts[0].generator, dynamics)
         self.frames = frames
         self.changed = torch.zeros(0, dtype=torch.int64)
         self.state: State = None
@@ -115,7 +117,9 @@ class Attacker:
         The run keeps its own copy of the state and updates it in place.
         """
         self.changed = torch.zeros(len(observation), dtype=torch.int64)
-        oracle = self.enforcer.begin(observation, policy_state, parts=self._parts(torch.arange(len(observation))))
+        oracle = self.enforcer.begin(
+            observation, policy_state, parts=parts_of(self.parts, torch.arange(len(observation)))
+        )
         with self.subject.turn():
             state = attack.initial(observation.clone(), oracle)
         self.enforcer.close()
@@ -123,19 +127,11 @@ class Attacker:
             raise UserError(f"{type(attack).__name__}.initial asked the victim: ask in step, where queries are counted")
         self.state, self.begun = None if state is None else state.detach().clone(), True
 
-    def _parts(self, rows: Tensor) -> Sequence[Part]:
-        """The units of the episodes `rows`, in ascending order; without those that have none."""
-        if len(self.generators) == 1:
-            return ()
-        ends = torch.searchsorted(rows, self.bounds).tolist()
-        spans = zip(pairwise(ends), self.generators.values(), strict=True)
-        return [Part(slice(start, end), generator) for (start, end), generator in spans if end > start]
-
     def _answer(
         self, attack: DrivingAttack, observation: Tensor, rows: Tensor, policy_state: State
     ) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and its distance to the perturbation set."""
-        oracle = self.enforcer.begin(observation, policy_state, parts=self._parts(rows))
+        oracle = self.enforcer.begin(observation, policy_state, parts=parts_of(self.parts, rows))
         name = type(attack).__name__
         with self.subject.turn():
             answer, state = attack.step(observation, oracle, rows_of(self.state, rows))

@@ -10,7 +10,7 @@ from bench.driving import rollout as rollouts
 from bench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
 from bench.driving.meter import Columns
 from bench.driving.policy import Policy
-from bench.driving.rollout import NotJointError, Trace, rollout
+from bench.driving.rollout import Trace, rollout
 from bench.driving.threat import ObservationThreat
 from bench.errors import UserError
 from bench.plugins.pair import Pair
@@ -35,7 +35,7 @@ def drive(job: Job, traced: Sequence[int]) -> Driven:
 def joint(pair: Pair) -> bool:
     """Whether `drive_jointly` can drive several jobs of a pair in one batch."""
     attack = pair.attack.component
-    return pair.is_clean or (isinstance(attack, DrivingAttack) and attack.joint)
+    return pair.is_clean or bool(vars(type(attack)).get("joint"))
 
 
 def drive_jointly(jobs: Sequence[Job]) -> Sequence[Driven] | None:
@@ -51,7 +51,8 @@ def drive_jointly(jobs: Sequence[Job]) -> Sequence[Driven] | None:
     """
     try:
         columns = _columns(jobs)
-    except (NotJointError, UserError):
+    # Whatever went wrong is found again, and named, where the jobs are driven one by one.
+    except Exception:
         return None
     ends = list(accumulate((len(job.seeds) for job in jobs), initial=0))
     return [Driven({name: values[a:b] for name, values in columns.items()}) for a, b in pairwise(ends)]

@@ -61,9 +61,7 @@ class Enforcer:
         self._step = 0
         self.spent = self.gradients = self.zero_gradients = torch.empty(0, dtype=torch.int64)
 
-    def begin(
-        self, observation: Tensor, state: State = None, scale: float = 1.0, parts: Sequence[Part] = ()
-    ) -> Oracle:
+    def begin(self, observation: Tensor, state: State = None, scale: float = 1.0, parts: Sequence[Part] = ()) -> Oracle:
         """The oracle of a step, with counters at 0; the oracle of the step before answers no more.
 
         Args:

@@ -146,10 +146,19 @@ def _check_rows(subject: CountedPolicy, observation: Tensor, state: State) -> No
     whole = subject.aside(observation, state)
     if subject.draws:
         raise NotJointError
+    slope = _slope(subject, observation, state)
     for size in BATCHES:
         rows = torch.arange(len(observation))[-size:]
         if not torch.equal(subject.aside(observation[rows], rows_of(state, rows)), whole[rows]):
             raise NotJointError
+        if not torch.equal(_slope(subject, observation[rows], rows_of(state, rows)), slope[rows]):
+            raise NotJointError
+
+
+def _slope(subject: CountedPolicy, observation: Tensor, state: State) -> Tensor:
+    """[B, V, F] the gradient of the summed scores."""
+    with Stream("aside").in_use():
+        return subject.differentiated(observation, state, lambda scores: scores.sum(-1))[1]
 
 
 def _traced(
