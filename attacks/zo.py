@@ -190,8 +190,9 @@ class _Run:
             return self
         answer[self.rows] = self.best
         on = (~met).nonzero().squeeze(-1)
-        state = (self.rows, self.truth, self.radius, self.x, self.best, self.lowest)
-        return _Run(*(values[on] for values in state), self.loss.of(on), parts_of(self.parts, on))
+        rows, truth, radius, x = self.rows[on], self.truth[on], self.radius[on], self.x[on]
+        loss, parts = self.loss.of(on), parts_of(self.parts, on)
+        return _Run(rows, truth, radius, x, self.best[on], self.lowest[on], loss, parts)
 
 
 def _gradient(value: Tensor, directions: Tensor) -> Tensor:
