@@ -93,19 +93,24 @@ def _prepared(work: Preparation, tell: Tell) -> Outcome:
 
 def _together(unit: Unit, task: Task, tell: Tell) -> Outcome:
     """The outcomes of a task with several units: one after the other, if one batch gives no results."""
-    start = time.perf_counter()
-    units, entropy = (unit, *task.others), secrets.randbits(62)
-    driven = unit.track.drive_jointly([replace(one.job, entropy=entropy) for one in units])
-    if driven is None:
-        first, *others = (perform(Task(work=one), tell) for one in units)
-        return replace(first, others=others)
-    per_episode = (time.perf_counter() - start) / sum(len(one.seeds) for one in units)
-    outcomes = []
-    for one, result in zip(units, driven, strict=True):
-        wall_s = per_episode * len(one.seeds)
-        records = table(one.constants(wall_s), result.columns, track=one.track)
-        outcomes.append(Outcome(wall_s=wall_s, records=records))
+    units = (unit, *task.others)
+    outcomes = _in_one_batch(units) or [perform(Task(work=one), tell) for one in units]
     return replace(outcomes[0], others=outcomes[1:])
+
+
+def _in_one_batch(units: Sequence[Unit]) -> list[Outcome]:
+    """The outcomes of units that are driven together; none if they must be driven one by one."""
+    start, entropy = time.perf_counter(), secrets.randbits(62)
+    driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units])
+    if driven is None:
+        return []
+    per_episode = (time.perf_counter() - start) / sum(len(unit.seeds) for unit in units)
+    outcomes = []
+    for unit, result in zip(units, driven, strict=True):
+        wall_s = per_episode * len(unit.seeds)
+        records = table(unit.constants(wall_s), result.columns, track=unit.track)
+        outcomes.append(Outcome(wall_s=wall_s, records=records))
+    return outcomes
 
 
 def _driven(unit: Unit, task: Task) -> Outcome:

@@ -22,6 +22,7 @@ from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Columns
 from bench.run.batches import EPISODES, batches
 from bench.run.unit import Unit
+from bench.run.work import Task, perform
 from bench.scenarios import Cell
 from bench.victims.drivers.ddpg import DDPG
 from bench.victims.drivers.dqn import DQN
@@ -146,3 +147,16 @@ def test_a_batch_is_not_larger_than_the_cache_and_holds_no_recorded_unit() -> No
     few = units("zo", 6, seeds=range(10)) * 2
     sizes = [len(batch) for batch in batches(few, {few[0].fingerprint}, workers=1)]
     assert sorted(sizes) == [1, 1, 1, 3, 3, 3]
+
+
+def test_a_task_of_several_units_has_the_outcome_of_each() -> None:
+    works = units("noise", 3, seeds=range(1_000_000, 1_000_002))
+    task = Task(work=works[0], others=works[1:])
+    outcome = perform(task, lambda *news: None)
+    alone = [perform(Task(work=unit), lambda *news: None) for unit in works]
+    timed = {"attack_ms", "wall_s", "created_at", "entropy"}
+    for one, other in zip((outcome, *outcome.others), alone, strict=True):
+        assert one.records is not None
+        assert other.records is not None
+        same = [name for name in one.records.column_names if name not in PROBES | timed]
+        assert one.records.select(same).to_pylist() == other.records.select(same).to_pylist()
