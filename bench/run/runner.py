@@ -21,6 +21,7 @@ from bench.run.executors import Executor, Watcher, executor
 from bench.run.plan import plan
 from bench.run.unit import Preparation, Unit
 from bench.run.work import Outcome, Task
+from bench.scenarios import Cell
 from bench.scenarios.axes import written
 
 
@@ -118,8 +119,12 @@ def keep_recording(path: Path, content: bytes) -> None:
 
 def recording_path(out: Path, unit: Unit, seed: int) -> Path:
     """The file of an episode's recording."""
-    cell = "-".join(f"{name}-{written(value)}" for name, value in unit.cell.items())
-    return out / "recordings" / unit.pair.id / f"{cell}-{seed}.rrd"
+    return out / "recordings" / unit.pair.id / f"{stem(unit.cell, seed)}.rrd"
+
+
+def stem(cell: Cell, seed: int) -> str:
+    """The name of an episode in the names of files: `lanes-3-density-1-weather-clear-1000000`."""
+    return "-".join([*(f"{name}-{written(value)}" for name, value in cell.items()), str(seed)])
 
 
 def _recorded(config: RunConfig, units: Iterable[Unit]) -> dict[str, Sequence[int]]:

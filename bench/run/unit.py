@@ -6,11 +6,10 @@ import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
-from typing import Any
 
 from bench.plugins import registry
 from bench.plugins.fingerprint import canonical, code_digest, digest, libraries, machine
-from bench.plugins.pair import Chosen, Pair
+from bench.plugins.pair import Pair
 from bench.plugins.track import Job, Track, track_of
 from bench.records.schema import AUDIT
 from bench.scenarios import Cell, SeedBlock
@@ -49,12 +48,14 @@ class Work:
     @property
     def modules(self) -> tuple[str, ...]:
         """Modules hashed into the code digest, with their imports."""
-        return (self.module, *sorted(type(part.component).__module__ for part in self.pair.parts))
+        shipped = (part for part in self.pair.parts if not part.code)
+        return (self.module, *sorted(type(part.component).__module__ for part in shipped))
 
     @property
     def code_digest(self) -> str:
         """Hash of the source code that computes it: the track's and the components' modules, with their imports."""
-        return code_digest(self.modules)
+        own = [part.code for part in self.pair.parts if part.code]
+        return digest([code_digest(self.modules), *own]) if own else code_digest(self.modules)
 
     @property
     def libraries(self) -> dict[str, str]:
@@ -93,7 +94,7 @@ class Work:
             "weights": self.weights_sha256,
             **({"adversary": self.adversary_sha256} if self.adversary_sha256 else {}),
             "code": self.code_digest,
-            "shipped_by": [shipped_by(part) for part in self.pair.parts],
+            "shipped_by": [part.shipped_by for part in self.pair.parts],
             "libraries": self.libraries,
         }
 
@@ -190,7 +191,7 @@ class Unit(Work):
             "grid": self.grid,
             "cell": json.dumps(dict(self.cell), separators=(",", ":")),
             "world_facts": json.dumps(pair.world.component.facts.written(), separators=(",", ":")),
-            **{f"{part.kind}_shipped_by": shipped_by(part) for part in pair.parts},
+            **{f"{part.kind}_shipped_by": part.shipped_by for part in pair.parts},
             "weights_sha256": self.weights_sha256,
             "code_digest": self.code_digest,
             "libraries": canonical(self.libraries),
@@ -202,8 +203,3 @@ class Unit(Work):
     def __str__(self) -> str:
         seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""
         return f"{self.pair} | {self.cell}{seed}"
-
-
-def shipped_by(part: Chosen[Any]) -> str:
-    """The distribution and version that ship a component."""
-    return registry.find(registry.GROUPS[part.kind], part.name, part.kind).shipped_by

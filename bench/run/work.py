@@ -15,7 +15,7 @@ import pyarrow as pa
 from bench.errors import UserError, reason
 from bench.plugins.fingerprint import canonical
 from bench.records.store import table
-from bench.run.unit import Preparation, Unit, shipped_by
+from bench.run.unit import Preparation, Unit
 from bench.trust.watch import TamperError
 
 Tell = Callable[[str, float, str], None]
@@ -76,7 +76,7 @@ def perform(task: Task, tell: Tell) -> Outcome:
     except TamperError as error:
         kinds = {"attack": ("attack",), "defense": ("defense", "victim")}
         parts = [part for part in work.pair.parts if any(part.kind in kinds[side] for side in error.sides)]
-        shipped = " and ".join(f"{part.kind} {part.name!r} of {shipped_by(part)}" for part in parts)
+        shipped = " and ".join(f"{part.kind} {part.name!r} of {part.shipped_by}" for part in parts)
         raise UserError(f"{work} is refused: {error} ({shipped})") from error
     except UserError as error:
         raise UserError(f"{work}: {error}") from error
@@ -119,9 +119,19 @@ def _driven(unit: Unit, task: Task) -> Outcome:
     driven = unit.track.drive(replace(unit.job, entropy=entropy), task.artefact, task.recorded)
     wall_s = time.perf_counter() - start
     constants = unit.constants(wall_s)
-    records = table(constants, driven.columns, track=unit.track)
+    try:
+        records = table(constants, driven.columns, track=unit.track)
+    except ValueError as error:
+        raise UserError(f"its measurements cannot be: {error} ({_authors(unit)})") from error
     recordings, warnings = _recordings(unit, driven.traces, constants)
     return Outcome(wall_s=wall_s, records=records, recordings=recordings, warnings=warnings)
+
+
+def _authors(unit: Unit) -> str:
+    """The components of a unit that do not ship with cavbench, or all of them, with their packages."""
+    shipped = {part: part.shipped_by for part in unit.pair.parts}
+    foreign = {part: by for part, by in shipped.items() if by.partition(" ")[0] != "cavbench"}
+    return ", ".join(f"{part.kind} {part.name!r} of {by}" for part, by in (foreign or shipped).items())
 
 
 def _recordings(

@@ -72,7 +72,7 @@ def test_an_unknown_component_has_no_page(bench: Bench) -> None:
     ("words", "part"),
     [
         (("attack=nugde",), "unknown attack 'nugde'; did you mean 'nudge'?"),
-        (("attack=nudge", "attack.pause=long"), "cannot read attack.pause=long"),
+        (("attack=nudge", "attack.pause=long"), "attack.pause must be a number, got long"),
         (("threat.budget=-1",), "threat.budget must be between 0 and 2, got -1"),
         (("attack=steer", "victim=toy"), "attack 'steer' does not fit victim 'toy'"),
         (("--fast",), "No such option"),
