@@ -15,6 +15,7 @@ from typing import Protocol
 from bench import files
 from bench.records import store
 from bench.run import artefacts
+from bench.run.batches import batches
 from bench.run.config import RunConfig
 from bench.run.executors import Executor, Watcher, executor
 from bench.run.plan import plan
@@ -60,12 +61,12 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
     back_end = executor(config.executor, config.workers, len(missing) + len(absent))
     first: list[Preparation | Unit] = [*absent.values(), *sorted(ready, key=_longest_first)]
     for works in (first, sorted(waits, key=_longest_first)):
-        _carry_out(works, config.out, recorded, back_end, watcher)
+        _carry_out(batches(works, recorded, config.workers), config.out, recorded, back_end, watcher)
     return list(units)
 
 
 def _carry_out(
-    works: Sequence[Preparation | Unit],
+    batches: Sequence[Sequence[Preparation | Unit]],
     out: Path,
     recorded: Mapping[str, Sequence[int]],
     back_end: Executor,
@@ -73,32 +74,38 @@ def _carry_out(
 ) -> None:
     """Pass work to the executor, and write each outcome as soon as it is finished."""
     read = cache(artefacts.read)
-    tasks = [_task(work, out, recorded, read) for work in works]
+    tasks = [_task(batch, out, recorded, read) for batch in batches]
     with closing(back_end.map(tasks, watcher)) as finished:
         for task, outcome in finished:
-            _keep(task, outcome, out)
-            watcher.finished(task.work, outcome.wall_s)
-            for warning in outcome.warnings:
-                watcher.warn(warning)
+            for work, one in zip((task.work, *task.others), (outcome, *outcome.others), strict=True):
+                _keep(work, one, out)
+                watcher.finished(work, one.wall_s)
+                for warning in one.warnings:
+                    watcher.warn(warning)
 
 
 def _task(
-    work: Preparation | Unit, out: Path, recorded: Mapping[str, Sequence[int]], read: Callable[[Path], bytes]
+    batch: Sequence[Preparation | Unit],
+    out: Path,
+    recorded: Mapping[str, Sequence[int]],
+    read: Callable[[Path], bytes],
 ) -> Task:
+    work, *others = batch
     if isinstance(work, Preparation):
         return Task(work=work)
     artefact = read(artefacts.path_of(out, work.preparation)) if work.preparation else None
-    return Task(work=work, artefact=artefact, recorded=recorded.get(work.fingerprint, ()))
+    units = [other for other in others if isinstance(other, Unit)]
+    return Task(work=work, artefact=artefact, recorded=recorded.get(work.fingerprint, ()), others=units)
 
 
-def _keep(task: Task, outcome: Outcome, out: Path) -> None:
-    """Write the outcome of a task: the records last, because they mark it as finished."""
-    if isinstance(task.work, Preparation):
+def _keep(work: Preparation | Unit, outcome: Outcome, out: Path) -> None:
+    """Write the outcome of a work: the records last, because they mark it as finished."""
+    if isinstance(work, Preparation):
         assert outcome.artefact is not None
-        artefacts.write(out, task.work, outcome.artefact)
+        artefacts.write(out, work, outcome.artefact)
         return
     for seed, recording in outcome.recordings.items():
-        keep_recording(recording_path(out, task.work, seed), recording)
+        keep_recording(recording_path(out, work, seed), recording)
     assert outcome.records is not None
     store.write(out, outcome.records)
 

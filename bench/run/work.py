@@ -31,12 +31,14 @@ class Task:
         artefact: content of the file of the unit's preparation; None if it has none.
         recorded: scenario seeds of the episodes to record.
         entropy: seed of the probes of a replay; None draws one, which nobody can foresee.
+        others: units to drive in the same batch (`bench.run.batches`).
     """
 
     work: Unit | Preparation
     artefact: bytes | None = None
     recorded: Sequence[int] = ()
     entropy: int | None = None
+    others: Sequence[Unit] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,11 +46,12 @@ class Outcome:
     """The results of a task.
 
     Args:
-        wall_s: wall time in seconds.
+        wall_s: wall time in seconds; of several units in one batch, each has its share.
         records: records of a unit, with their provenance; None for a preparation.
         artefact: content of the file of a preparation; None for a unit.
         recordings: contents of the `.rrd` files of a unit, by scenario seed.
         warnings: problems that do not affect the records.
+        others: the results of the task's other units, in their order.
     """
 
     wall_s: float
@@ -56,6 +59,7 @@ class Outcome:
     artefact: bytes | None = None
     recordings: Mapping[int, bytes] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    others: Sequence[Outcome] = ()
 
 
 def perform(task: Task, tell: Tell) -> Outcome:
@@ -65,6 +69,8 @@ def perform(task: Task, tell: Tell) -> Outcome:
         UserError: if a component fails; the message names the work.
     """
     work = task.work
+    if task.others and isinstance(work, Unit):
+        return _together(work, task, tell)
     try:
         return _prepared(work, tell) if isinstance(work, Preparation) else _driven(work, task)
     except TamperError as error:
@@ -83,6 +89,28 @@ def _prepared(work: Preparation, tell: Tell) -> Outcome:
     start = time.perf_counter()
     artefact = work.track.prepare(work.job, canonical(work.origin), partial(tell, str(work)))
     return Outcome(wall_s=time.perf_counter() - start, artefact=artefact)
+
+
+def _together(unit: Unit, task: Task, tell: Tell) -> Outcome:
+    """The outcomes of a task with several units: one after the other, if one batch gives no results."""
+    units = (unit, *task.others)
+    outcomes = _in_one_batch(units) or [perform(Task(work=one), tell) for one in units]
+    return replace(outcomes[0], others=outcomes[1:])
+
+
+def _in_one_batch(units: Sequence[Unit]) -> list[Outcome]:
+    """The outcomes of units that are driven together; none if they must be driven one by one."""
+    start, entropy = time.perf_counter(), secrets.randbits(62)
+    driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units])
+    if driven is None:
+        return []
+    per_episode = (time.perf_counter() - start) / sum(len(unit.seeds) for unit in units)
+    outcomes = []
+    for unit, result in zip(units, driven, strict=True):
+        wall_s = per_episode * len(unit.seeds)
+        records = table(unit.constants(wall_s), result.columns, track=unit.track)
+        outcomes.append(Outcome(wall_s=wall_s, records=records))
+    return outcomes
 
 
 def _driven(unit: Unit, task: Task) -> Outcome:
