@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.text import Text
 
 from bench.cli.axes_help import AxesHelp
-from bench.errors import UserError
+from bench.errors import UnfinishedError, UserError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -202,6 +202,10 @@ def main() -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     try:
         status = app(arguments, standalone_mode=False)
+    except UnfinishedError as error:
+        if debug:
+            raise
+        sys.exit(_complain(*error.lines))
     except (UserError, typer.TyperException) as error:
         if debug:
             raise
@@ -215,9 +219,10 @@ def main() -> None:
     sys.exit(status or 0)
 
 
-def _complain(reason: str) -> int:
-    line = " ".join(reason.split())
-    Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
+def _complain(*reasons: str) -> int:
+    for reason in reasons:
+        line = " ".join(reason.split())
+        Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
     return 2
 
 

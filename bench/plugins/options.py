@@ -10,7 +10,8 @@ import copy
 import itertools
 import re
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import field, fields, is_dataclass, make_dataclass
 from enum import Enum
 from functools import cached_property, partial
@@ -25,7 +26,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.errors import UserError
+from bench.errors import PluginError, UserError
 from bench.plugins import registry, suites
 from bench.plugins.contracts import Access, ThreatModel
 from bench.plugins.pair import Chosen, choose
@@ -46,6 +47,8 @@ class Options:
         kinds: kinds of components that may be chosen.
         settings: dataclass of the other keys.
         axes: names of the axes of all worlds; empty for a training, which has neither cells nor a threat model.
+
+    `broken` says of each component that was left out of a sweep what is wrong with it.
     """
 
     def __init__(
@@ -56,6 +59,7 @@ class Options:
         # Paths bypass hydra: its grammar gives a meaning to many characters that occur in them.
         self.out = [word.partition("=")[2] for word in words if word.startswith("out=")]
         self.values: dict[str, tuple[str, ...]] = {}
+        self.broken: dict[str, str] = {}
         for override in _parsed([word for word in words if not word.startswith("out=")]):
             key = override.key_or_group
             if key in self.values or len(self.out) > 1:
@@ -118,7 +122,13 @@ class Options:
         return next(iter(found))
 
     def chosen(self, kind: Kind) -> list[Chosen[Any]]:
-        """The chosen components of a kind, with every combination of their parameter values."""
+        """The chosen components of a kind, with every combination of their parameter values.
+
+        Broken plug-ins are left out, if there is another component: see `broken`.
+
+        Raises:
+            UserError: if a component or a parameter is unknown, a value is not allowed, or every component is broken.
+        """
         names = self.values.get(kind) or (track(self.track).world if kind == "world" else DEFAULTS[kind],)
         # Hydra's grammar escapes the colon of NAME:CHOICE.
         names = tuple(name.replace("\\:", ":") for name in names)
@@ -126,13 +136,15 @@ class Options:
             names = tuple(name for name in names if name not in suites.names())
         if kind != "victim":
             names = tuple(registry.on_track(kind, name, self.track) for name in names)
-        known = {name: parameters(registry.load(kind, name)) for name in names}
+        known = self._parameters(kind, names)
         swept = {key.partition(".")[2]: v for key, v in self.values.items() if key.startswith(f"{kind}.")}
         if swept and not names:
             fixed = " and ".join(suite.name for suite in self.suites)
             raise UserError(f"the attacks of the suite {fixed} have fixed parameters, got {kind}.{next(iter(swept))}")
         for key in swept:
             if not any(key.partition(".")[0] in owned for owned in known.values()):
+                if lost := [why for name, why in self.broken.items() if name in names]:
+                    raise PluginError(lost[0])
                 what = f"parameter {kind}.{key} of {', '.join(names)}"
                 raise UserError(
                     registry.unknown(what, key, dict.fromkeys(p for owned in known.values() for p in owned))
@@ -141,9 +153,28 @@ class Options:
         for name, owned in known.items():
             keys = [key for key in swept if key.partition(".")[0] in owned]
             for values in itertools.product(*(swept[key] for key in keys)):
-                one = configured(kind, name, dict(zip(keys, values, strict=True)))
-                found[f"{name} {one.params}"] = one
+                with self._left_out(name):
+                    one = configured(kind, name, dict(zip(keys, values, strict=True)))
+                    found[f"{name} {one.params}"] = one
+        if names and not found:
+            raise PluginError(self.broken[names[0]])
         return list(found.values())
+
+    def _parameters(self, kind: Kind, names: Sequence[str]) -> dict[str, dict[str, Parameter]]:
+        """The parameters of the components that can be loaded."""
+        found = {}
+        for name in names:
+            with self._left_out(name):
+                found[name] = parameters(registry.load(kind, name))
+        return found
+
+    @contextmanager
+    def _left_out(self, name: str) -> Iterator[None]:
+        """Note in `broken` that a component is broken."""
+        try:
+            yield
+        except PluginError as error:
+            self.broken[name] = str(error)
 
     @cached_property
     def suites(self) -> list[Suite]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from bench.plugins.options import Options, configured
 from bench.plugins.pair import Chosen, Pair, check_track
 from bench.plugins.registry import KINDS, Kind
 from bench.run.executors import EXECUTORS
+from bench.run.process import machine_bytes
 from bench.scenarios import Grid
 
 
@@ -33,6 +35,9 @@ class RunConfig:
         record: episodes to record in every cell of each pair; None records one episode of the first cell.
         reference: whether to run the baselines of the pairs, too.
         skipped: members of suites that do not fit a victim, one line each.
+        broken: plug-ins that were chosen but cannot be used, one line each.
+        unit_timeout: seconds that a unit or preparation may take; 0 for no limit.
+        unit_memory: GB of memory that a worker process may use; 0 for no limit.
 
     Raises:
         ValueError: if a number is out of range.
@@ -47,6 +52,9 @@ class RunConfig:
     record: int | None = None
     reference: bool = True
     skipped: tuple[str, ...] = ()
+    broken: tuple[str, ...] = ()
+    unit_timeout: float = 3600.0
+    unit_memory: float = field(default_factory=lambda: half_of_memory())
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
@@ -54,6 +62,9 @@ class RunConfig:
             raise ValueError(registry.unknown(f"executor {self.executor!r}", self.executor, EXECUTORS))
         if self.workers < 1:
             raise ValueError(f"workers must be at least 1, got {self.workers}")
+        for name in ("unit_timeout", "unit_memory"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be a number of at least 0 (0: no limit), got {getattr(self, name):g}")
         if self.record is not None and not 0 <= self.record <= self.grid.episodes:
             raise ValueError(f"record must be between 0 and the {self.grid.episodes} episodes, got {self.record}")
 
@@ -104,6 +115,11 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def half_of_memory() -> float:
+    """Half of the machine's memory in GB; 0 if it cannot be read."""
+    return machine_bytes() / 2e9
+
+
 @dataclass
 class RunOptions:
     """The options of `bench run` that choose neither a component nor a cell, with types and defaults."""
@@ -116,6 +132,8 @@ class RunOptions:
     out: str = "results"
     record: int | None = None
     reference: bool = True
+    unit_timeout: float = 3600.0
+    unit_memory: float = field(default_factory=half_of_memory)
 
 
 @dataclass
@@ -149,6 +167,9 @@ def run_config(words: Sequence[str]) -> RunConfig:
             record=settings["record"],
             reference=settings["reference"],
             skipped=tuple(dict.fromkeys(skipped)),
+            broken=tuple(given.broken.values()),
+            unit_timeout=settings["unit_timeout"],
+            unit_memory=settings["unit_memory"],
         )
 
 

@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 
 from bench.errors import UserError
 from bench.plugins import registry
+from bench.plugins.framework import Snapshot
 from bench.plugins.pair import Chosen, Pair, choose
 from bench.plugins.track import track
 from bench.records import reading
@@ -21,7 +22,7 @@ from bench.records.schema import IDENTITY
 from bench.run import artefacts
 from bench.run.runner import keep_recording, recording_path
 from bench.run.unit import Unit
-from bench.run.work import Task, perform
+from bench.run.work import Failure, Task, attempt
 from bench.scenarios import Cell
 
 
@@ -96,7 +97,9 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
         recorded=[record["seed"]],
         entropy=record.get("entropy"),
     )
-    outcome = perform(task, lambda *news: None)
+    outcome = attempt(task, lambda *news: None, Snapshot())
+    if isinstance(outcome, Failure):
+        raise UserError(f"{unit} {outcome.why}")
     after = outcome.records
     assert after is not None
     if not outcome.recordings:

@@ -17,6 +17,31 @@ from bench.scenarios import Cell, SeedBlock
 
 
 @dataclass(frozen=True, kw_only=True)
+class Loading:
+    """Loads the networks of a pair once, before anything is driven, to hash their weights.
+
+    Args:
+        pair: attack, defence, victim, world, threat model.
+        training_seed: seed of the victim.
+    """
+
+    pair: Pair
+    training_seed: int
+
+    def weights(self) -> tuple[str, str]:
+        """The hashes of the weights of the defended victim, and of an attack that learns (otherwise empty).
+
+        Raises:
+            UserError: if a network cannot be loaded.
+        """
+        return self.pair.weights_sha256(self.training_seed), self.pair.adversary_sha256(self.training_seed)
+
+    def __str__(self) -> str:
+        seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""
+        return f"{self.pair}{seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Work:
     """The common part of units and preparations.
 
@@ -202,6 +227,11 @@ class Unit(Work):
     def __str__(self) -> str:
         seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""
         return f"{self.pair} | {self.cell}{seed}"
+
+
+def is_foreign(part: Chosen[Any]) -> bool:
+    """Whether a plug-in ships a component."""
+    return registry.find(registry.GROUPS[part.kind], part.name, part.kind).distribution != registry.OWN
 
 
 def shipped_by(part: Chosen[Any]) -> str:

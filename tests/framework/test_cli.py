@@ -89,7 +89,7 @@ def test_a_results_folder_that_cannot_be_written_is_refused(bench: Bench, tmp_pa
 
 
 def test_a_repeated_run_only_prints_the_table(bench: Bench, tmp_path: Path) -> None:
-    words = ("run", *TOY, "workers=1", "record=0", f"out={tmp_path}")
+    words = ("run", *TOY, "executor=serial", "record=0", f"out={tmp_path}")
     first, again = bench(*words), bench(*words)
     assert (first.code, again.code) == (0, 0), first.err
     assert "nudge" in first.out
@@ -99,7 +99,7 @@ def test_a_repeated_run_only_prints_the_table(bench: Bench, tmp_path: Path) -> N
 
 
 def test_a_truncated_record_stops_every_command_that_reads_it(bench: Bench, tmp_path: Path) -> None:
-    run = ("run", *TOY, "workers=1", "record=0", "reference=false", f"out={tmp_path}")
+    run = ("run", *TOY, "executor=serial", "record=0", "reference=false", f"out={tmp_path}")
     bench(*run)
     path = sorted((tmp_path / "episodes").glob("*.parquet"))[0]
     path.write_bytes(path.read_bytes()[:100])
@@ -108,7 +108,7 @@ def test_a_truncated_record_stops_every_command_that_reads_it(bench: Bench, tmp_
 
 
 def test_show_prints_the_provenance_of_the_records(bench: Bench, tmp_path: Path) -> None:
-    bench("run", *TOY, "workers=1", "record=0", "attack.scale=0.5", f"out={tmp_path}")
+    bench("run", *TOY, "executor=serial", "record=0", "attack.scale=0.5", f"out={tmp_path}")
     whole = bench("show", str(tmp_path))
     pair = next(line for line in whole.out.splitlines() if line.startswith("nudge-none-toy-")).strip()
     one = bench("show", "nudge", "--out", str(tmp_path))
@@ -121,7 +121,7 @@ def test_show_prints_the_provenance_of_the_records(bench: Bench, tmp_path: Path)
 
 
 def test_report_prints_a_report_by_name(bench: Bench, tmp_path: Path) -> None:
-    bench("run", *TOY, "workers=1", "record=0", f"out={tmp_path}")
+    bench("run", *TOY, "executor=serial", "record=0", f"out={tmp_path}")
     assert "nudge" in bench("report", f"out={tmp_path}").out
     assert_one_line(bench("report", "theses", f"out={tmp_path}"), "unknown report 'theses'; did you mean 'thesis'?")
     assert_one_line(bench("report", f"out={tmp_path / 'none'}"), "there are no records")
