@@ -39,5 +39,7 @@ class EscapeError(Exception):
 
 def reason(error: BaseException) -> str:
     """The type and the first line of an exception: why something failed, in one line."""
-    text = str(error) if isinstance(error, EscapeError) else f"{type(error).__name__}: {error}"
-    return (text.splitlines() or [""])[0]
+    if isinstance(error, EscapeError):
+        return str(error)
+    text = str(error).strip()
+    return f"{type(error).__name__}: {text}".splitlines()[0] if text else type(error).__name__

@@ -87,7 +87,10 @@ def _of_library(name: str, library: ModuleType, owner: str) -> Iterator[tuple[st
     place: object = library
     for part in filter(None, owner.split(".")):
         place = getattr(place, part)
-    for inner, value in list(vars(place).items()):
+    found: dict[str, object] = {}
+    for base in reversed(place.__mro__ if isinstance(place, type) else (place,)):
+        found |= vars(base)
+    for inner, value in found.items():
         # The methods of a class call each other by private names; private functions of a module are its own business.
         if callable(value) and (owner or not inner.startswith("_")) and not inner.startswith(SETTINGS):
             yield ".".join(filter(None, (name, owner, inner))), code_of(value)

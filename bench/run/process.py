@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+from multiprocessing.context import BaseContext
 from pathlib import Path
 
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
@@ -38,7 +39,7 @@ def follow_parent() -> None:
     """End this child process, made by `multiprocessing`, when its parent ends, however that ends; and ignore Ctrl-C.
 
     On Linux the kernel kills it, even in the middle of a computation. The kernel watches the thread that started this process:
-    start it from a thread that lives as long as its parent. Elsewhere a thread watches.
+    start it from a thread that lives as long as its parent. Elsewhere, and for a process of a fork server, a thread watches, too.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -46,14 +47,26 @@ def follow_parent() -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        if os.getppid() != parent.pid:
-            os._exit(1)
+    if not parent.is_alive():
+        os._exit(1)
 
     def follow() -> None:
         parent.join()
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
+
+
+def context(*modules: str) -> BaseContext:
+    """How new processes are made: forked from a server that has imported `modules`, and so at once; or else from nothing.
+
+    The server has one thread and ends with this process.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    made = multiprocessing.get_context("forkserver")
+    made.set_forkserver_preload(list(modules))
+    return made
 
 
 def resident_bytes(process: int) -> int:

@@ -13,6 +13,7 @@ import signal
 import time
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -22,10 +23,13 @@ from bench.plugins.foreign import contained, ended
 from bench.plugins.framework import Snapshot
 from bench.plugins.track import track
 from bench.run.blame import blamed
-from bench.run.process import follow_parent, resident_bytes, settle
+from bench.run.process import context, follow_parent, resident_bytes, settle
 from bench.run.work import Failure, Outcome, Task, Tell, attempt
 
 GB = 1e9
+READY = "ready"
+START_S = 600.0
+"""Seconds that a worker may take to start: on a busy machine its imports take long."""
 KEPT_BYTES = 8192
 """Bytes that are kept of what a task prints."""
 
@@ -51,14 +55,17 @@ class Worker:
     """
 
     def __init__(self, limits: Limits) -> None:
-        context = multiprocessing.get_context("spawn")
+        own = context(__name__, *_framework())
         self.limits = limits
         self.task: Task | None = None
+        self.ready = False
         self.printed = b""
-        self.connection, far = context.Pipe()
-        self.output, end = context.Pipe(duplex=False)
-        self.process = context.Process(target=_serve, args=(far, end), daemon=False)
+        self.connection, far = multiprocessing.Pipe()
+        self.output, end = multiprocessing.Pipe(duplex=False)
+        # Not daemonic: components may start processes of their own.
+        self.process = own.Process(target=_serve, args=(far, end, dict(os.environ)), daemon=False)  # type: ignore[attr-defined]
         self.process.start()
+        self.born = time.monotonic()
         far.close()
         end.close()
 
@@ -91,6 +98,10 @@ class Worker:
         except (EOFError, OSError):
             died = True
         self._listen()
+        if READY in found:
+            # Its imports do not count.
+            found.remove(READY)
+            self.ready, self.started = True, time.monotonic()
         if any(isinstance(item, Outcome | Failure) for item in found):
             self.task = None
         if self.task is not None and (why := self._death() if died else self._excess()):
@@ -142,6 +153,9 @@ class Worker:
 
     def _excess(self) -> str:
         """What the task used too much of; empty if nothing."""
+        if not self.ready:
+            late = time.monotonic() - self.born > START_S
+            return f"its worker process did not start within {START_S:g} seconds" if late else ""
         if self.limits.seconds and time.monotonic() - self.started > self.limits.seconds:
             return f"it took longer than unit_timeout={self.limits.seconds:g} seconds"
         used = resident_bytes(self.process.pid or 0) / GB if self.limits.memory_gb else 0
@@ -150,9 +164,12 @@ class Worker:
         return ""
 
 
-def _serve(connection: Connection, output: Connection) -> None:
+def _serve(connection: Connection, output: Connection, environment: dict[str, str]) -> None:
     """The worker process: carry out tasks until the parent hangs up."""
     follow_parent()
+    # A fork server has the environment of its own start.
+    os.environ.clear()
+    os.environ.update(environment)
     # Components may start processes of their own: the group ends with the worker.
     with suppress(OSError):
         os.setpgid(0, 0)
@@ -160,7 +177,11 @@ def _serve(connection: Connection, output: Connection) -> None:
         os.dup2(output.fileno(), stream)
     output.close()
     settle()
-    framework = _framework()
+    for module in _framework():
+        importlib.import_module(module)
+    # Before any plug-in is imported.
+    framework = Snapshot()
+    connection.send_bytes(pickle.dumps(READY))
 
     def tell(work: str, share: float, text: str) -> None:
         connection.send_bytes(pickle.dumps((work, share, text)))
@@ -174,13 +195,11 @@ def _serve(connection: Connection, output: Connection) -> None:
         connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
 
 
-def _framework() -> Snapshot:
-    """The functions of the framework before any plug-in is imported, with the modules that do the work."""
-    for name, claims in registry.entries(registry.TRACKS).items():
-        if claims[0].distribution == registry.OWN:
-            for module in filter(None, (track(name).work, track(name).preparation)):
-                importlib.import_module(module)
-    return Snapshot()
+@cache
+def _framework() -> tuple[str, ...]:
+    """The modules that do the work of the built-in tracks."""
+    names = [name for name, claims in registry.entries(registry.TRACKS).items() if claims[0].distribution == registry.OWN]
+    return tuple(module for name in names for module in (track(name).work, track(name).preparation) if module)
 
 
 def _carried_out(content: bytes, tell: Tell, framework: Snapshot) -> Outcome | Failure:
