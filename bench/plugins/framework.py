@@ -27,10 +27,7 @@ LIBRARIES = {
 """Modules of libraries that scores are computed with; the names are their classes, "" is the module itself."""
 SETTINGS = ("manual_seed", "seed", "set_", "load", "save", "compile")
 """Beginnings of the names of library functions that no score depends on, and that other libraries wrap."""
-BUILTINS = (
-    "abs all any bool dict enumerate filter float frozenset getattr hash int isinstance iter len list map max min next range "
-    "repr reversed round set setattr sorted str sum super tuple type zip"
-).split()
+BUILTINS = ["abs", "all", "any", "bool", "dict", "enumerate", "filter", "float", "frozenset", "getattr", "hash", "int", "isinstance", "iter", "len", "list", "map", "max", "min", "next", "range", "repr", "reversed", "round", "set", "setattr", "sorted", "str", "sum", "super", "tuple", "type", "zip"]
 Code = tuple[object, CodeType | None]
 """A function and its code; the reference keeps the function alive, so that no other gets its address."""
 

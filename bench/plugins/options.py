@@ -12,7 +12,7 @@ import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import field, fields, is_dataclass, make_dataclass
+from dataclasses import Field, field, fields, is_dataclass, make_dataclass
 from enum import Enum
 from functools import cached_property, partial
 from pathlib import Path
@@ -74,7 +74,8 @@ class Options:
         if threats and head == "threat" and parameter:
             # `threats` checks it against the threat model of the victim's track.
             return
-        known = [*self.kinds, *(item.name for item in fields(self.schema)), *self.axes, *threats]
+        settings = [name for item in fields(self.schema) for name in _setting_names(item)]
+        known = [*self.kinds, *settings, *self.axes, *threats]
         if key not in known and not (head in self.kinds and parameter):
             raise UserError(registry.unknown(f"key {key!r}", key, known))
 
@@ -240,6 +241,14 @@ def parameter_words(text: str) -> dict[str, str]:
             raise UserError(f'attack_params takes name=value pairs, for instance "steps=3 restarts=2", got {word!r}')
         found[name] = value
     return found
+
+
+def _setting_names(setting: Field[Any]) -> list[str]:
+    """The keys of a setting: its name or, if it is a group, those of its members."""
+    group = setting.default_factory
+    if isinstance(group, type) and is_dataclass(group):
+        return [f"{setting.name}.{item.name}" for item in fields(group)]
+    return [setting.name]
 
 
 def _parsed(words: Sequence[str]) -> list[Override]:

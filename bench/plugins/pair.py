@@ -57,7 +57,9 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
         raise UserError(f"{kind} {name!r}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
     # The checks of a plug-in may raise anything else.
     except Exception as error:
-        raise PluginError(f"{kind} {name!r} cannot be created: {reason(error)} (--debug shows the traceback)") from error
+        raise PluginError(
+            f"{kind} {name!r} cannot be created: {reason(error)} (--debug shows the traceback)"
+        ) from error
 
 
 def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:

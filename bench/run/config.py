@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -30,7 +29,9 @@ class RunConfig:
         grid: cells and scenario seeds.
         seeds: training seeds of the victims, and seeds of the patches.
         executor: back end that carries out the work, a name in `bench.run.executors.EXECUTORS`.
-        workers: number of worker processes; results do not depend on it.
+        workers: number of worker processes; results do not depend on it. None takes every core, of this machine or of the
+            Ray cluster.
+        ray_address: of the Ray cluster: `local` starts one on this machine, `auto` finds the running one.
         out: results folder.
         record: episodes to record in every cell of each pair; None records one episode of the first cell.
         reference: whether to run the baselines of the pairs, too.
@@ -47,7 +48,8 @@ class RunConfig:
     grid: Grid
     seeds: tuple[int, ...] = (0, 1, 2)
     executor: str = "processes"
-    workers: int = field(default_factory=lambda: cores())
+    workers: int | None = None
+    ray_address: str = "local"
     out: Path = Path("results")
     record: int | None = None
     reference: bool = True
@@ -60,7 +62,7 @@ class RunConfig:
         check_seeds(self.seeds)
         if self.executor not in EXECUTORS:
             raise ValueError(registry.unknown(f"executor {self.executor!r}", self.executor, EXECUTORS))
-        if self.workers < 1:
+        if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers must be at least 1, got {self.workers}")
         for name in ("unit_timeout", "unit_memory"):
             if not 0 <= getattr(self, name) < math.inf:
@@ -110,14 +112,16 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
         )
 
 
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def half_of_memory() -> float:
     """Half of the machine's memory in GB; 0 if it cannot be read."""
     return machine_bytes() / 2e9
+
+
+@dataclass
+class RayOptions:
+    """The options of `executor=ray`."""
+
+    address: str = "local"
 
 
 @dataclass
@@ -128,7 +132,8 @@ class RunOptions:
     episodes: int | None = None
     seeds: list[int] | None = None
     executor: str = "processes"
-    workers: int = field(default_factory=cores)
+    workers: int | None = None
+    ray: RayOptions = field(default_factory=RayOptions)
     out: str = "results"
     record: int | None = None
     reference: bool = True
@@ -163,6 +168,7 @@ def run_config(words: Sequence[str]) -> RunConfig:
             seeds=tuple(range(standard.training_seeds) if settings["seeds"] is None else settings["seeds"]),
             executor=settings["executor"],
             workers=settings["workers"],
+            ray_address=settings["ray"]["address"],
             out=Path(settings["out"]).expanduser(),
             record=settings["record"],
             reference=settings["reference"],

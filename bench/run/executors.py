@@ -9,6 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from multiprocessing.connection import wait
 from types import FrameType
 from typing import Protocol
@@ -16,10 +17,10 @@ from typing import Protocol
 from bench.plugins.foreign import StopUnitError
 from bench.plugins.framework import Snapshot
 from bench.run.blame import blamed
-from bench.run.process import settle
+from bench.run.process import cores, settle
 from bench.run.unit import Loading, Preparation, Unit
 from bench.run.work import Failure, Outcome, Task, attempt
-from bench.run.worker import Limits, Worker
+from bench.run.worker import Limits, Worker, packed
 
 NEWS_S = 1.0
 """Seconds between two looks at the workers' time and memory."""
@@ -126,69 +127,96 @@ class ProcessExecutor:
 
     def __init__(self, workers: int, limits: Limits) -> None:
         self.count, self.limits = workers, limits
-        self.workers: list[Worker] = []
+        self.idle: list[Worker] = []
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
-        waiting, again = iter(tasks), deque[Task]()
-        died: set[int] = set()
+        waiting, retries = iter(tasks), Retries()
+        busy: dict[Worker, Task] = {}
         try:
             while True:
-                yield from self._give(waiting, again)
-                busy = [worker for worker in self.workers if worker.task is not None]
+                while len(busy) < self.count and (task := retries.next(waiting)) is not None:
+                    content = packed(task)
+                    if isinstance(content, Failure):
+                        yield task, content
+                        continue
+                    worker = self.idle.pop() if self.idle else Worker(self.limits)
+                    worker.give(content)
+                    busy[worker] = task
                 if not busy:
                     return
-                watcher.working([worker.task.work for worker in busy if worker.task is not None])
+                watcher.working([task.work for task in busy.values()])
                 wait([item for worker in busy for item in (worker.connection, worker.process.sentinel)], NEWS_S)
-                for worker in busy:
-                    for task, outcome in self._news(worker, watcher):
-                        if isinstance(outcome, Failure) and outcome.died and id(task) not in died:
-                            died.add(id(task))
-                            again.append(task)
+                for worker in list(busy):
+                    for item in worker.news():
+                        if not isinstance(item, Outcome | Failure):
+                            watcher.preparing(*item)
+                            continue
+                        task, lines = busy.pop(worker), worker.lines()
+                        if worker.spent:
+                            worker.close()
                         else:
-                            died.discard(id(task))
-                            yield task, outcome
+                            self.idle.append(worker)
+                        yield from retries.ended(task, item, lines, watcher)
         finally:
-            # A worker that is still busy was stopped by the caller.
-            self._dismiss(worker for worker in list(self.workers) if worker.task is not None)
-
-    def _give(self, waiting: Iterator[Task], again: deque[Task]) -> Iterator[Finished]:
-        """Give every idle worker a task, and start workers as long as there are tasks."""
-        while len([worker for worker in self.workers if worker.task is not None]) < self.count:
-            task = again.popleft() if again else next(waiting, None)
-            if task is None:
-                return
-            idle = next((worker for worker in self.workers if worker.task is None), None)
-            if idle is None:
-                idle = Worker(self.limits)
-                self.workers.append(idle)
-            if failure := idle.give(task):
-                yield task, failure
-
-    def _news(self, worker: Worker, watcher: Watcher) -> Iterator[Finished]:
-        """Pass on a worker's news; the outcome of its task if it has one."""
-        task = worker.task
-        assert task is not None
-        for item in worker.news():
-            if not isinstance(item, Outcome | Failure):
-                watcher.preparing(*item)
-                continue
-            if lines := worker.lines():
-                watcher.printed(task.work, lines)
-            if not worker.alive or (isinstance(item, Failure) and item.tampered):
-                self._dismiss([worker])
-            yield task, item
-
-    def _dismiss(self, workers: Iterable[Worker]) -> None:
-        for worker in workers:
-            self.workers.remove(worker)
-            worker.close()
+            # Those still busy were stopped by the caller.
+            for worker in busy:
+                worker.close()
 
     def close(self) -> None:
-        self._dismiss(list(self.workers))
+        for worker in self.idle:
+            worker.close()
 
 
-EXECUTORS: dict[str, Callable[[int, Limits], Executor]] = {
-    "serial": lambda workers, limits: SerialExecutor(limits),
-    "processes": ProcessExecutor,
+class Retries:
+    """Tries a task whose process died a second time, and passes on the outcomes of all others."""
+
+    def __init__(self) -> None:
+        self._again: deque[Task] = deque()
+        self._died: set[int] = set()
+
+    def next(self, waiting: Iterator[Task]) -> Task | None:
+        """The next task; None if there is none at the moment."""
+        return self._again.popleft() if self._again else next(waiting, None)
+
+    def put_back(self, task: Task) -> None:
+        """A task that was interrupted by no fault of its own."""
+        self._again.append(task)
+
+    def ended(
+        self, task: Task, outcome: Outcome | Failure, lines: Sequence[str], watcher: Watcher
+    ) -> Iterator[Finished]:
+        """The task with its outcome, unless it is tried again.
+
+        Args:
+            task: the task.
+            outcome: its outcome.
+            lines: what it printed.
+            watcher: is told.
+        """
+        if isinstance(outcome, Failure) and outcome.died and id(task) not in self._died:
+            self._died.add(id(task))
+            self._again.append(task)
+            return
+        self._died.discard(id(task))
+        if lines:
+            watcher.printed(task.work, lines)
+        if isinstance(outcome, Failure) and outcome.lost:
+            outcome = replace(outcome, why=outcome.why + blamed(task.work.pair))
+        yield task, outcome
+
+
+def _ray(workers: int | None, limits: Limits, address: str) -> Executor:
+    from bench.run.ray_executor import RayExecutor
+
+    return RayExecutor(workers, limits, address)
+
+
+EXECUTORS: dict[str, Callable[[int | None, Limits, str], Executor]] = {
+    "serial": lambda workers, limits, address: SerialExecutor(limits),
+    "processes": lambda workers, limits, address: ProcessExecutor(workers or cores(), limits),
+    "ray": _ray,
 }
-"""Every back end by the name that `executor=` has on the command line; made with the number of workers and the limits."""
+"""Every back end by the name that `executor=` has on the command line.
+
+Each is made with the number of workers (None: as many as there are cores), the limits, and the address of the Ray cluster.
+"""

@@ -6,7 +6,7 @@ do not depend on the executor, the number of workers or the order of work.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cache
 from pathlib import Path
@@ -54,7 +54,7 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
     for line in config.broken:
         watcher.failed(line)
     limits = Limits(seconds=config.unit_timeout, memory_gb=config.unit_memory)
-    with closing(EXECUTORS[config.executor](config.workers, limits)) as back_end:
+    with closing(EXECUTORS[config.executor](config.workers, limits, config.ray_address)) as back_end:
         units = {unit.fingerprint: unit for unit in units_of(config, _loaded(config, back_end, watcher, failures))}
         requested = {pair.id for pair in config.pairs}
         if not any(unit.pair.id in requested for unit in units.values()):

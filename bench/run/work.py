@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import secrets
-import tempfile
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 
 import pyarrow as pa
 
+from bench import files
 from bench.errors import PluginError, UserError, reason
 from bench.plugins.fingerprint import canonical
 from bench.plugins.foreign import contained
@@ -144,9 +143,9 @@ def _recordings(
 ) -> tuple[dict[int, bytes], tuple[str, ...]]:
     """The recordings of a unit, and why one failed: a failed recording must not lose the records."""
     found: dict[int, bytes] = {}
-    with tempfile.TemporaryDirectory(prefix="cavbench-") as folder:
+    with files.scratch() as folder:
         for seed, trace in traces.items():
-            path = Path(folder) / f"{seed}.rrd"
+            path = folder / f"{seed}.rrd"
             try:
                 unit.track.record(unit.job, trace, {**constants, "seed": seed}, path)
                 found[seed] = path.read_bytes()

@@ -14,7 +14,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from bench.errors import reason
@@ -52,13 +52,14 @@ class Worker:
 
     Args:
         limits: of each task.
+
+    `busy` says whether it has a task, `spent` whether it can do no other work: it is dead, hangs, or was changed.
     """
 
     def __init__(self, limits: Limits) -> None:
         own = context(__name__, *_framework())
         self.limits = limits
-        self.task: Task | None = None
-        self.ready = False
+        self.busy = self.ready = self.spent = False
         self.printed = b""
         self.connection, far = multiprocessing.Pipe()
         self.output, end = multiprocessing.Pipe(duplex=False)
@@ -69,25 +70,21 @@ class Worker:
         far.close()
         end.close()
 
-    def give(self, task: Task) -> Failure | None:
-        """Start a task; a failure if it cannot be sent."""
-        self.task, self.started, self.printed = task, time.monotonic(), b""
-        try:
-            with contained():
-                content = pickle.dumps(task, pickle.HIGHEST_PROTOCOL)
-        # A plug-in's own way of being pickled may raise anything.
-        except Exception as error:
-            self.task = None
-            return Failure(why=f"failed: it cannot be sent to a worker: {reason(error)}{blamed(task.work.pair, error)}")
+    def give(self, content: bytes) -> None:
+        """Start a task, from `packed`."""
+        self.busy, self.started, self.printed = True, time.monotonic(), b""
         # A worker that died meanwhile is noticed when it is asked for news.
         with suppress(OSError):
             self.connection.send_bytes(content)
-        return None
+
+    def wait(self, seconds: float) -> None:
+        """Wait until there is news, or for so long."""
+        wait([self.connection, self.process.sentinel], seconds)
 
     def news(self) -> list[Any]:
         """What the worker sent since: progress as (work, share, text), and at the end of a task an outcome or a failure.
 
-        A worker that died, or used more time or memory than allowed, has failed its task; see `alive`.
+        A worker that died, or used more time or memory than allowed, has failed its task, and is `spent`.
         """
         found: list[Any] = []
         # Ask before reading: what it sent before it died is still there.
@@ -102,17 +99,14 @@ class Worker:
             # Its imports do not count.
             found.remove(READY)
             self.ready, self.started = True, time.monotonic()
-        if any(isinstance(item, Outcome | Failure) for item in found):
-            self.task = None
-        if self.task is not None and (why := self._death() if died else self._excess()):
-            found.append(Failure(why=f"failed: {why}{blamed(self.task.work.pair)}", lost=True, died=died))
-            self.kill()
+        ends = [item for item in found if isinstance(item, Outcome | Failure)]
+        if self.busy and not ends and (why := self._death() if died else self._excess()):
+            ends = [Failure(why=f"failed: {why}", lost=True, died=died)]
+            found += ends
+        if ends:
+            self.busy = False
+            self.spent = died or any(isinstance(item, Failure) and (item.lost or item.tampered) for item in ends)
         return found
-
-    @property
-    def alive(self) -> bool:
-        """Whether it can be given a task."""
-        return self.process.is_alive()
 
     def lines(self) -> list[str]:
         """The lines that its task printed; only the first `KEPT_BYTES` are kept."""
@@ -126,7 +120,6 @@ class Worker:
             os.killpg(self.process.pid or 0, signal.SIGKILL)
         self.process.kill()
         self.process.join()
-        self.task = None
 
     def close(self) -> None:
         """End the process, and close the connections."""
@@ -164,6 +157,16 @@ class Worker:
         return ""
 
 
+def packed(task: Task) -> bytes | Failure:
+    """A task as a worker is sent it; a failure if a component does not survive pickling."""
+    try:
+        with contained():
+            return pickle.dumps(task, pickle.HIGHEST_PROTOCOL)
+    # A plug-in's own way of being pickled may raise anything.
+    except Exception as error:
+        return Failure(why=f"failed: it cannot be sent to a worker: {reason(error)}{blamed(task.work.pair, error)}")
+
+
 def _serve(connection: Connection, output: Connection, environment: dict[str, str]) -> None:
     """The worker process: carry out tasks until the parent hangs up."""
     follow_parent()
@@ -198,7 +201,9 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
 @cache
 def _framework() -> tuple[str, ...]:
     """The modules that do the work of the built-in tracks."""
-    names = [name for name, claims in registry.entries(registry.TRACKS).items() if claims[0].distribution == registry.OWN]
+    names = [
+        name for name, claims in registry.entries(registry.TRACKS).items() if claims[0].distribution == registry.OWN
+    ]
     return tuple(module for name in names for module in (track(name).work, track(name).preparation) if module)
 
 

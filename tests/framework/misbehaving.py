@@ -13,8 +13,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import torch
-from toy_plugin import ToyPolicy, ToyVictim
 from torch import Tensor
+from toy_plugin import ToyPolicy, ToyVictim
 
 import bench.driving.meter
 from bench.driving import DrivingAttack, DrivingFacts, Oracle, Policy, State
@@ -88,9 +88,9 @@ class Rogue(DrivingAttack):
                 for _ in range(5):
                     oracle.scores(observation)
             case "print":
-                print("hello from rogue")
+                print("hello from rogue")  # noqa: T201
                 os.write(1, b"and from below\n")
-                print("complaint", file=sys.stderr)
+                print("complaint", file=sys.stderr)  # noqa: T201
             case "patch torch":
                 torch.Tensor.tanh = lambda tensor: tensor  # type: ignore[method-assign,assignment]
             case "patch bench":

@@ -226,3 +226,22 @@ def test_ctrl_c_ends_a_run_in_one_line_and_with_its_workers(toy_folder: Path, tm
     assert "Traceback" not in err
     assert not psutil.wait_procs(children, timeout=60)[1]
     assert reading.read(tmp_path, track=track("driving")).num_rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["run", "report"])
+def test_kill_9_leaves_no_process_and_no_temporary_file(toy_folder: Path, tmp_path: Path, command: str) -> None:
+    run = ("run", *TOY, "attack.pause=600", "workers=2", "reference=false", "record=0", f"out={tmp_path}")
+    words = run if command == "run" else ("report", f"html={tmp_path / 'page.html'}")
+    process = started(toy_folder, *words)
+    started_by = psutil.Process(process.pid)
+    until = time.monotonic() + 240
+    # A run has a fork server with two workers, a report one worker; each has Python's own tracker of resources, too.
+    while len(children := started_by.children(recursive=True)) < {"run": 4, "report": 2}[command]:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    process.kill()
+    process.communicate(timeout=60)
+    assert not psutil.wait_procs(children, timeout=60)[1]
+    assert not list(tmp_path.rglob(".*.tmp"))

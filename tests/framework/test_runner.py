@@ -160,7 +160,9 @@ def test_a_failing_attack_is_reported_with_its_cell_in_one_line(tmp_path: Path) 
 def test_a_worker_that_is_killed_is_reported_and_loses_no_finished_unit(tmp_path: Path) -> None:
     calm, _ = run(tmp_path, "reference=false")
     deadly = ("attack.mood=calm,kill", "executor=processes", "workers=2", "reference=false")
-    with pytest.raises(UnfinishedError, match=r"ended its worker process \(SIGKILL.*of cavbench-toy 1.0.* more were not driven"):
+    with pytest.raises(
+        UnfinishedError, match=r"ended its worker process \(SIGKILL.*of cavbench-toy 1.0.* more were not driven"
+    ):
         run(tmp_path, *deadly)
     kept, watcher = run(tmp_path, "reference=false")
     assert watcher.done == []
