@@ -32,6 +32,17 @@ def expected(scores: Tensor, worth: Tensor, tau: Tensor) -> Tensor:
     return (torch.softmax(scores / tau, -1) * worth).sum(-1)
 
 
+def temperature(scores: Tensor, share: float) -> Tensor:
+    """[B, 1] the temperature of an expectation: a share of the standard deviation of the values [B, A]."""
+    spread = scores.std(-1, keepdim=True)
+    return (share * spread).clamp(min=torch.finfo(spread.dtype).tiny)
+
+
+def taken(scores: Tensor, worth: Tensor) -> Tensor:
+    """The worth [..., B] of the greedy action of `scores` [..., B, A], from the worth of each action [B, A]."""
+    return worth.expand(scores.shape).gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
+
+
 def spared(clean: Tensor, braking_action: int) -> Tensor:
     """Q(x) [B, A] with the value of braking raised to that of the best action, so that no attack aims for braking.
 
@@ -126,8 +137,7 @@ class DiscreteLoss:
     @cached_property
     def _tau(self) -> Tensor:
         """Temperature of the expectation, [B, 1]."""
-        spread = self._worth.std(-1, keepdim=True)
-        return (self.temperature * spread).clamp(min=torch.finfo(spread.dtype).tiny)
+        return temperature(self._worth, self.temperature)
 
     @cached_property
     def _goal(self) -> Tensor:
@@ -137,7 +147,7 @@ class DiscreteLoss:
 
     def _given(self, scores: Tensor) -> Tensor:
         """Worth of the greedy action, [..., B]."""
-        return self._worth.expand(scores.shape).gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
+        return taken(scores, self._worth)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from bench.run.process import follow_parent
 from leaderboard.comparisons.reading import measurements
 from leaderboard.page.document import document
 from leaderboard.page.table import table
-from leaderboard.published import published
+from leaderboard.published import every_track
 from leaderboard.ranking.boards import read_boards
 from leaderboard.ranking.flags import FLAGS
 from leaderboard.terminal.ranking import print_boards
@@ -73,8 +73,7 @@ def write(out: Path | None, page: Path, console: Console) -> None:
 def _read(out: Path | None) -> dict[str, pa.Table]:
     """The records of a folder, or the published ones."""
     if out is None:
-        every = {track.name: published(track) for track in tracks()}
-        return {name: records for name, records in every.items() if records.num_rows}
+        return every_track()
     return reading.read_compact(out, {name for track in tracks() for name in measurements(track)})
 
 

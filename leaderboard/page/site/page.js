@@ -154,7 +154,7 @@ for (const place of document.querySelectorAll(".copy")) {
 const boards = () => data.boards.filter((board) => board.track === state.track);
 const current = () => boards()[state.board];
 const said = () => data.tracks[state.track];
-const threatText = (t) => `${t.norm} ${t.budget}${t.allowed ? `: ${t.allowed};` : ","} access ${t.access}, ${t.queries} queries`;
+const threatText = (t) => `${t.norm} ${t.budget}${t.allowed ? `: ${t.allowed};` : ","} access ${t.access}, ${t.queries} queries${t.share === 1 ? "" : `, ${+(100 * t.share).toPrecision(3)} % of the frames`}`;
 const threatName = (t) => threatText({ ...t, allowed: "" });
 const threatShort = (t) => (t.budget ? `${t.norm} ${t.budget}, ${t.access}` : "none");
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
