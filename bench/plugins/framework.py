@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import builtins
 import sys
-from collections.abc import Iterator
+from collections.abc import Mapping
+from dataclasses import dataclass
 from types import CodeType, FunctionType, ModuleType
 
 OWN = ("bench", "attacks", "defenses", "envs", "leaderboard")
@@ -27,75 +28,99 @@ LIBRARIES = {
 """Modules of libraries that scores are computed with; the names are their classes, "" is the module itself."""
 SETTINGS = ("manual_seed", "seed", "set_", "load", "save", "compile")
 """Beginnings of the names of library functions that no score depends on, and that other libraries wrap."""
-BUILTINS = ["abs", "all", "any", "bool", "dict", "enumerate", "filter", "float", "frozenset", "getattr", "hash", "int", "isinstance", "iter", "len", "list", "map", "max", "min", "next", "range", "repr", "reversed", "round", "set", "setattr", "sorted", "str", "sum", "super", "tuple", "type", "zip"]
-Code = tuple[object, CodeType | None]
-"""A function and its code; the reference keeps the function alive, so that no other gets its address."""
+BUILTINS = (
+    *("abs", "all", "any", "bool", "dict", "enumerate", "filter", "float", "frozenset", "getattr", "hash", "int"),
+    *("isinstance", "iter", "len", "list", "map", "max", "min", "next", "range", "repr", "reversed", "round", "set"),
+    *("setattr", "sorted", "str", "sum", "super", "tuple", "type", "zip"),
+)
 
 
 class Snapshot:
     """The functions and methods of the framework, of all its modules that are imported when the snapshot is made."""
 
     def __init__(self) -> None:
-        self._modules = [module for name, module in sorted(sys.modules.items()) if _belongs(name, module)]
-        self._found = dict(self._functions())
+        self._functions: list[_Function] = []
+        self._classes: list[tuple[str, type, frozenset[str]]] = []
+        for name, module in sorted(sys.modules.items()):
+            if name.partition(".")[0] in OWN and isinstance(module, ModuleType):
+                self._add_module(module)
+        for name, owners in LIBRARIES.items():
+            if name in sys.modules:
+                self._add_library(name, sys.modules[name], owners)
+        self._functions += [_Function.of("builtins", vars(builtins), name) for name in BUILTINS]
 
     def changed(self) -> str:
         """The names of at most three functions that were replaced or removed since, or added to a class; empty for none."""
-        now = dict(self._functions())
-        names = [name for name, code in self._found.items() if not _same(code, now.get(name))]
-        # Modules may gain functions (submodules that are imported late), classes of the framework may not.
-        names += [name for name in now if name not in self._found and name.partition(".")[0] in OWN and ":" in name]
-        shown = [name.replace(":", ".") for name in sorted(names)]
-        more = f" and {len(shown) - 3} more" if len(shown) > 3 else ""
-        return ", ".join(shown[:3]) + more
+        names = [known.name for known in self._functions if known.is_other()]
+        for name, owner, keys in self._classes:
+            if len(vars(owner)) != len(keys):
+                names += _added(name, owner, keys)
+        names = sorted(set(names))
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        return ", ".join(names[:3]) + more
 
-    def _functions(self) -> Iterator[tuple[str, Code]]:
-        for module in self._modules:
-            yield from functions(module)
-        for name, owners in LIBRARIES.items():
-            library = sys.modules.get(name)
-            if library is not None:
-                for owner in owners:
-                    yield from _of_library(name, library, owner)
-        for name in BUILTINS:
-            yield f"builtins.{name}", code_of(getattr(builtins, name))
+    def _add_module(self, module: ModuleType) -> None:
+        for name, value in list(vars(module).items()):
+            if callable(value):
+                self._functions.append(_Function.of(module.__name__, vars(module), name))
+            if isinstance(value, type) and value.__module__ == module.__name__:
+                self._add_class(f"{module.__name__}.{name}", value)
+
+    def _add_library(self, name: str, library: ModuleType, owners: tuple[str, ...]) -> None:
+        for owner in owners:
+            place: object = library
+            for part in filter(None, owner.split(".")):
+                place = getattr(place, part)
+            if isinstance(place, type):
+                for base in place.__mro__[:-1]:
+                    self._add_class(f"{name}.{owner}", base, SETTINGS)
+                continue
+            # The private functions of a library's module are its own business.
+            keys = [
+                key for key, value in vars(place).items() if callable(value) and not key.startswith(("_", *SETTINGS))
+            ]
+            self._functions += [_Function.of(name, vars(place), key) for key in keys]
+
+    def _add_class(self, name: str, owner: type, without: tuple[str, ...] = ()) -> None:
+        self._classes.append((name, owner, frozenset(vars(owner))))
+        for key, value in list(vars(owner).items()):
+            if (callable(value) or hasattr(value, "__get__")) and not (without and key.startswith(without)):
+                self._functions.append(_Function.of(name, vars(owner), key))
 
 
-def functions(module: ModuleType) -> Iterator[tuple[str, Code]]:
-    """The functions of a module, and the methods of its classes as `module.Class:method`."""
-    for name, value in list(vars(module).items()):
-        if callable(value):
-            yield f"{module.__name__}.{name}", code_of(value)
-        if isinstance(value, type) and value.__module__ == module.__name__:
-            for inner, method in list(vars(value).items()):
-                if callable(method) or hasattr(method, "__get__"):
-                    yield f"{module.__name__}.{name}:{inner}", code_of(method)
+@dataclass(slots=True, frozen=True)
+class _Function:
+    """A function where it is kept, and its code if it is Python's. The reference keeps it alive: no other gets its address."""
+
+    name: str
+    place: Mapping[str, object]
+    key: str
+    value: object
+    function: FunctionType | None
+    code: CodeType | None
+
+    @classmethod
+    def of(cls, where: str, place: Mapping[str, object], key: str) -> _Function:
+        value = place[key]
+        inner = plain(value)
+        function = inner if isinstance(inner, FunctionType) else None
+        return cls(f"{where}.{key}", place, key, value, function, function.__code__ if function else None)
+
+    def is_other(self) -> bool:
+        now = self.place.get(self.key)
+        return now is not self.value or (self.function is not None and self.function.__code__ is not self.code)
 
 
-def code_of(value: object) -> Code:
-    """A function, method or property, and its code if it is Python's."""
-    inner = (
+def _added(name: str, owner: type, keys: frozenset[str]) -> list[str]:
+    """The functions that a class had not; a library's class may gain what it does not inherit."""
+    own = name.partition(".")[0] in OWN
+    inherited = {key for base in owner.__mro__[1:] for key in vars(base)}
+    added = [key for key, value in vars(owner).items() if key not in keys and callable(value)]
+    return [f"{name}.{key}" for key in added if own or (key in inherited and not key.startswith(SETTINGS))]
+
+
+def plain(value: object) -> object:
+    """The function in a property, a class method, a static method or a decorated function."""
+    return (
         getattr(value, "fget", None) or getattr(value, "__func__", None) or getattr(value, "__wrapped__", None) or value
     )
-    return value, inner.__code__ if isinstance(inner, FunctionType) else None
-
-
-def _of_library(name: str, library: ModuleType, owner: str) -> Iterator[tuple[str, Code]]:
-    place: object = library
-    for part in filter(None, owner.split(".")):
-        place = getattr(place, part)
-    found: dict[str, object] = {}
-    for base in reversed(place.__mro__ if isinstance(place, type) else (place,)):
-        found |= vars(base)
-    for inner, value in found.items():
-        # The methods of a class call each other by private names; private functions of a module are its own business.
-        if callable(value) and (owner or not inner.startswith("_")) and not inner.startswith(SETTINGS):
-            yield ".".join(filter(None, (name, owner, inner))), code_of(value)
-
-
-def _belongs(name: str, module: ModuleType | None) -> bool:
-    return isinstance(module, ModuleType) and name.partition(".")[0] in OWN
-
-
-def _same(before: Code, now: Code | None) -> bool:
-    return now is not None and before[0] is now[0] and before[1] is now[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -37,6 +38,7 @@ class RunConfig:
         reference: whether to run the baselines of the pairs, too.
         skipped: members of suites that do not fit a victim, one line each.
         broken: plug-ins that were chosen but cannot be used, one line each.
+        shard: (3, 10) drives the third of ten equal parts of the units.
         unit_timeout: seconds that a unit or preparation may take; 0 for no limit.
         unit_memory: GB of memory that a worker process may use; 0 for no limit.
 
@@ -55,6 +57,7 @@ class RunConfig:
     reference: bool = True
     skipped: tuple[str, ...] = ()
     broken: tuple[str, ...] = ()
+    shard: tuple[int, int] = (1, 1)
     unit_timeout: float = 3600.0
     unit_memory: float = field(default_factory=lambda: half_of_memory())
 
@@ -137,6 +140,7 @@ class RunOptions:
     out: str = "results"
     record: int | None = None
     reference: bool = True
+    shard: str = "1/1"
     unit_timeout: float = 3600.0
     unit_memory: float = field(default_factory=half_of_memory)
 
@@ -174,9 +178,17 @@ def run_config(words: Sequence[str]) -> RunConfig:
             reference=settings["reference"],
             skipped=tuple(dict.fromkeys(skipped)),
             broken=tuple(given.broken.values()),
+            shard=_shard(settings["shard"]),
             unit_timeout=settings["unit_timeout"],
             unit_memory=settings["unit_memory"],
         )
+
+
+def _shard(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", text)
+    if match is None or int(match[1]) > int(match[2]):
+        raise UserError(f"shard must be PART/PARTS, for instance shard=3/10, got {text}")
+    return int(match[1]), int(match[2])
 
 
 def _pairs(given: Options) -> tuple[list[Pair], list[str]]:

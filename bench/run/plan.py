@@ -28,10 +28,10 @@ def plan(config: RunConfig) -> list[Unit]:
     return units_of(config, {key_of(loading): loading.weights() for loading in loadings(config)})
 
 
-def loadings(config: RunConfig) -> list[Loading]:
-    """The networks of a run, each once: of all its pairs and training seeds."""
+def loadings(config: RunConfig, *, baselines: bool = True) -> list[Loading]:
+    """The networks of a run, each once: of all its pairs and training seeds; without `baselines`, of the requested pairs only."""
     found: dict[str, Loading] = {}
-    for pair in _pairs(config):
+    for pair in _pairs(config) if baselines else config.pairs:
         for training_seed in _training_seeds(pair, config):
             loading = Loading(pair=pair, training_seed=training_seed)
             found.setdefault(key_of(loading), loading)
@@ -39,15 +39,21 @@ def loadings(config: RunConfig) -> list[Loading]:
 
 
 def units_of(config: RunConfig, weights: Weights) -> list[Unit]:
-    """The distinct units of a run whose networks could be loaded.
+    """The distinct units of a run, or of its shard, whose networks could be loaded.
+
+    Every shard has every `shards`th unit, whatever could be loaded where it is driven.
 
     Args:
         config: the run.
         weights: by the key of the loading, the hashes of the networks.
     """
-    units = []
+    units, place = [], 0
+    own, shards = config.shard
     for pair in _pairs(config):
         for training_seed in _training_seeds(pair, config):
+            cells = cells_of(pair, config)
+            mine = [cell for number, cell in enumerate(cells, place) if number % shards == own - 1]
+            place += len(cells)
             loaded = weights.get(key_of(Loading(pair=pair, training_seed=training_seed)))
             if loaded is None:
                 continue
@@ -59,7 +65,7 @@ def units_of(config: RunConfig, weights: Weights) -> list[Unit]:
                 weights_sha256=loaded[0],
                 adversary_sha256=loaded[1],
             )
-            units += [replace(first, cell=cell) for cell in cells_of(pair, config)]
+            units += [replace(first, cell=cell) for cell in mine]
     return units
 
 

@@ -55,10 +55,10 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
         watcher.failed(line)
     limits = Limits(seconds=config.unit_timeout, memory_gb=config.unit_memory)
     with closing(EXECUTORS[config.executor](config.workers, limits, config.ray_address)) as back_end:
-        units = {unit.fingerprint: unit for unit in units_of(config, _loaded(config, back_end, watcher, failures))}
-        requested = {pair.id for pair in config.pairs}
-        if not any(unit.pair.id in requested for unit in units.values()):
+        weights = _loaded(config, back_end, watcher, failures)
+        if not any(key_of(loading) in weights for loading in loadings(config, baselines=False)):
             raise failures.error((), 0)
+        units = {unit.fingerprint: unit for unit in units_of(config, weights)}
         done = store.finished(config.out, units)
         missing = [unit for key, unit in units.items() if key not in done]
         episodes = len(config.grid.seeds())

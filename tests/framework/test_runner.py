@@ -227,3 +227,19 @@ class Poison(DrivingAttack):
     assert "is refused: the attack changed the victim's weights (attack 'poison' of cavbench-poison 2.1)" in last
     kept = reading.read_all(out)["driving"] if list(out.glob("episodes/*.parquet")) else None
     assert kept is None or set(kept["attack"].to_pylist()) == {"none"}
+
+
+def test_shards_drive_every_unit_once(tmp_path: Path) -> None:
+    whole, _ = run(tmp_path / "whole")
+    parts = [run(tmp_path / "parts", f"shard={part}/3")[1].done for part in (1, 2, 3)]
+    units = [work.fingerprint for done in parts for work in done]
+    assert sorted(units) == sorted(set(whole["unit"].to_pylist()))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    merged = reading.read(tmp_path / "parts", set(units), track=track("driving"))
+    assert comparable(merged).equals(comparable(whole))
+
+
+@pytest.mark.parametrize("shard", ["0/3", "4/3", "1", "a/b"])
+def test_a_shard_that_there_is_not_is_refused(shard: str) -> None:
+    with pytest.raises(UserError, match="shard must be PART/PARTS"):
+        run_config([*SMALL.split(), f"shard={shard}"])
