@@ -68,7 +68,7 @@ class Subject:
 
 def _values(path: Path) -> object:
     """The values of a record that do not depend on when it was driven."""
-    beside = {"created_at", "wall_s", *(field.name for track in tracks() for field in track.probes)}
+    beside = {"created_at", "wall_s", "crafting_s", *(field.name for track in tracks() for field in track.probes)}
     beside |= {name for track in tracks() for name in track.unrepeatable}
     records = pq.read_table(path)
     return records.select([name for name in records.column_names if name not in beside]).to_pydict().__repr__()
