@@ -18,7 +18,7 @@ from bench import __version__
 from bench.cli.axes_help import AxesHelp
 from bench.cli.completion import completed
 from bench.cli.terminal import Console
-from bench.errors import Notice, UserError, bounded
+from bench.errors import Notice, UnfinishedError, UserError, bounded
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -339,6 +339,10 @@ def main() -> None:
         warnings.showwarning = _show
         try:
             status = app(arguments, standalone_mode=False)
+        except UnfinishedError as error:
+            if debug:
+                raise
+            sys.exit(_complain(*error.lines))
         except (UserError, typer.TyperException) as error:
             if debug:
                 raise
@@ -368,9 +372,10 @@ def _show(message: Warning | str, category: type[Warning], filename: str, lineno
     Console(stderr=True).print(Text(f"warning: {bounded(text)}", style="yellow"), soft_wrap=True)
 
 
-def _complain(reason: str) -> int:
-    line = bounded(reason)
-    Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
+def _complain(*reasons: str) -> int:
+    for reason in reasons:
+        line = bounded(reason)
+        Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
     return 2
 
 

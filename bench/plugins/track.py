@@ -253,6 +253,18 @@ class Track(ABC):
             traced: scenario seeds of the episodes to record.
         """
 
+    def joint(self, pair: Pair) -> bool:
+        """Whether jobs of this pair in several cells may be given to `drive_jointly`."""
+        return False
+
+    def drive_jointly(self, jobs: Sequence[Job]) -> Sequence[Driven] | None:
+        """Carry out jobs of one pair and training seed in one batch, which is faster, with the results that each has alone.
+
+        Returns:
+            None if they must be carried out one by one.
+        """
+        return None
+
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         """Write the recording of an episode.
 

@@ -190,6 +190,16 @@ class DrivingTrack(Track):
 
         return drive(job, traced)
 
+    def joint(self, pair: Pair) -> bool:
+        from bench.driving.drive import joint
+
+        return joint(pair)
+
+    def drive_jointly(self, jobs: Sequence[Job]) -> Sequence[Driven] | None:
+        from bench.driving.drive import drive_jointly
+
+        return drive_jointly(jobs)
+
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         from bench.recording.driving import save
 
