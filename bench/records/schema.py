@@ -68,7 +68,7 @@ IDENTITY: tuple[pa.Field, ...] = (
     field("grid", TEXT, "name of the grid; `audit` for scenarios that an audit drew"),
     field("cell", TEXT, "JSON: the value on each axis of the world"),
     field("world_facts", TEXT, "JSON: axes, decision rate, episode length and actions of the world"),
-    field("seed", INT, "scenario seed of the episode", low=0),
+    field("seed", INT, "scenario seed of the episode", low=0, high=2**53),
 )
 """What was evaluated."""
 

@@ -12,8 +12,8 @@ import pytest
 from bench.errors import UserError
 from bench.plugins import registry
 from bench.records import reading
-from bench.records.schema import AUDIT
-from bench.run.audit import audit_config
+from bench.records.schema import AUDIT, IDENTITY
+from bench.run.audit import SALTS, audit_config
 from bench.scenarios import SeedBlock
 from bench.statistics.unpaired import unpaired
 from leaderboard.ranking.boards import read_boards
@@ -110,3 +110,9 @@ def test_a_difference_needs_the_same_cells_and_two_scenarios() -> None:
     with pytest.raises(ValueError, match="two scenarios"):
         unpaired(np.zeros((1, 2, 5)), np.zeros((1, 2, 1)))
     assert unpaired(np.ones((1, 1, 3)), np.zeros((1, 1, 3))).low == 1
+
+
+def test_every_drawn_seed_can_be_recorded() -> None:
+    (seed,) = (column for column in IDENTITY if column.name == "seed")
+    assert seed.metadata is not None
+    assert float(seed.metadata[b"high"]) > SeedBlock.AUDIT + SALTS
