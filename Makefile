@@ -7,7 +7,7 @@ BROWSERS := chromium chromium-browser google-chrome
 RUN_STAMP := $(VENV)/installed-to-run
 DEV_STAMP := $(VENV)/installed-to-develop
 
-.PHONY: run test lint docs bench wheel-check install install-dev browser clean
+.PHONY: run test lint docs bench soak wheel-check install install-dev browser clean
 
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
@@ -58,3 +58,7 @@ browser: install-dev
 
 clean:
 	rm -rf $(VENV) build dist docs/_build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+# Random kills, bad places and a long run, with a table of figures for docs/reliability.md; an hour and a half. Not part of `test`.
+soak: install-dev
+	$(BIN)/python -m tests.soak kills=100 minutes=60

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from bench import shadow
 
 if TYPE_CHECKING:
-    from bench import gym
+    import bench.gym as gym
     from bench.api import component, load, score
     from bench.errors import UserError
 

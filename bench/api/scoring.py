@@ -99,6 +99,7 @@ def score(
             pairs=tuple(pairs),
             grid=asked,
             seeds=tuple(range(count) if seeds is None else seeds),
+            executor="serial" if workers == 1 else "processes",
             workers=workers,
             out=Path(out).expanduser(),
             record=record,
@@ -139,6 +140,12 @@ class _Silent:
 
     def finished(self, work: object, wall_s: float) -> None:
         pass
+
+    def printed(self, work: object, lines: Sequence[str]) -> None:
+        pass
+
+    def failed(self, line: str) -> None:
+        """The error at the end of the run says it."""
 
     def warn(self, line: str) -> None:
         warnings.warn(line, stacklevel=4)

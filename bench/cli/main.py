@@ -18,7 +18,7 @@ from bench import __version__
 from bench.cli.axes_help import AxesHelp
 from bench.cli.completion import completed
 from bench.cli.terminal import Console
-from bench.errors import Notice, UserError, bounded
+from bench.errors import Notice, UnfinishedError, UserError, bounded
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -238,16 +238,16 @@ def view(
     from bench.cli import view as cli_view
     from bench.cli.words import split
 
-    names, values = split(words, (), names=1 if save is None else 4)
+    names, values = split(words, (), names=len(words))
     folder = _folder(values, out) or Path("results")
-    where = [f"{key}={value}" for key, value in values.items() if key != "out"]
-    names = names or [str(folder)]
+    where = {key: value for key, value in values.items() if key != "out"}
+    runs = names or [str(folder)]
     if save is not None:
-        cli_view.save_film(names, where, folder, Console(), save, seconds)
+        cli_view.save_film(runs, where, folder, Console(), save, seconds)
         return
-    if seconds is not None:
-        raise UserError("--seconds needs --save FILE")
-    cli_view.open_recording(names[0], where, folder, Console(), web=web)
+    if len(runs) > 1 or seconds is not None:
+        raise UserError("several runs, and --seconds, need --save FILE")
+    cli_view.open_recording(runs[0], [f"{key}={value}" for key, value in where.items()], folder, Console(), web=web)
 
 
 def _folder(values: dict[str, str], option: Path | None) -> Path | None:
@@ -339,6 +339,10 @@ def main() -> None:
         warnings.showwarning = _show
         try:
             status = app(arguments, standalone_mode=False)
+        except UnfinishedError as error:
+            if debug:
+                raise
+            sys.exit(_complain(*error.lines))
         except (UserError, typer.TyperException) as error:
             if debug:
                 raise
@@ -368,9 +372,10 @@ def _show(message: Warning | str, category: type[Warning], filename: str, lineno
     Console(stderr=True).print(Text(f"warning: {bounded(text)}", style="yellow"), soft_wrap=True)
 
 
-def _complain(reason: str) -> int:
-    line = bounded(reason)
-    Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
+def _complain(*reasons: str) -> int:
+    for reason in reasons:
+        line = bounded(reason)
+        Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
     return 2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import shutil
@@ -20,8 +21,8 @@ from bench.cli.audit import differences, verdict
 from bench.cli.progress import RunProgress
 from bench.cli.show import Report, pair_named, records_of
 from bench.cli.terminal import Console
-from bench.errors import UserError
-from bench.plugins import registry
+from bench.cli.words import split
+from bench.errors import UserError, short
 from bench.records import reading, store
 from bench.records.schema import AUDIT
 from bench.run import runner, submission
@@ -43,9 +44,10 @@ def submit(words: Sequence[str], console: Console) -> None:
     Raises:
         UserError: if the pair is unknown or cannot be checked by others, or the folder cannot be written.
     """
-    (pair,), options = _read(words, ("out", "results"), "bench submit PAIR out=FOLDER")
-    if "out" not in options:
-        raise UserError("say where to write it: bench submit PAIR out=FOLDER")
+    names, options = split(words, ("out", "results"), names=1)
+    if not names or "out" not in options:
+        raise UserError("name the pair and the folder: bench submit PAIR out=FOLDER")
+    (pair,) = names
     results = Path(options.get("results", "results")).expanduser()
     (own, records), *_ = records_of(results, pair)
     made = submission.write(results, pair_named(pair, records), Path(options["out"]).expanduser(), own=own)
@@ -68,8 +70,11 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
     Raises:
         UserError: if it is no submission, a component is not installed, or an option is not allowed.
     """
-    (name,), options = _read(words, ("sample", "episodes", "salt", "audit", "out"), "bench verify FOLDER")
-    found = submission.read(Path(name).expanduser())
+    names, options = split(words, ("sample", "episodes", "salt", "audit", "out"), names=1)
+    if not names:
+        raise UserError("name the folder of the submission: bench verify FOLDER")
+    salt, episodes = (_number(options, key) for key in ("salt", "episodes"))
+    found = submission.read(Path(names[0]).expanduser())
     packages = submission.installed(found)
     console.print(
         Text(
@@ -81,7 +86,7 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
     with _zoo_of(found):
         holds = _replayed(found, _sample(options.get("sample", str(SAMPLE))), console)
         if options.get("audit", "true") != "false":
-            holds = _audited(found, options, console) and holds
+            holds = _audited(found, salt, episodes or EPISODES, console) and holds
     report(found.track, found.records)
     if not holds:
         console.print(Text("The submission does not hold.", style="bold red"))
@@ -95,15 +100,11 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
     return 0
 
 
-def _read(words: Sequence[str], known: Sequence[str], usage: str) -> tuple[list[str], dict[str, str]]:
-    """The one plain word, and the options."""
-    plain = [word for word in words if "=" not in word]
-    options = dict(word.partition("=")[::2] for word in words if "=" in word)
-    if strange := [key for key in options if key not in known]:
-        raise UserError(registry.unknown(f"key {strange[0]!r}", strange[0], known))
-    if len(plain) != 1 or not all(options.values()):
-        raise UserError(f"write {usage} {' '.join(f'{key}=…' for key in known)}")
-    return plain, options
+def _number(options: dict[str, str], key: str) -> int | None:
+    """A whole number; None if it is not given."""
+    if key in options and not (options[key].isdecimal() and int(options[key]) < SALTS):
+        raise UserError(f"{key} must be a whole number, got {short(options[key])}")
+    return int(options[key]) if key in options else None
 
 
 def _sample(text: str) -> int | None:
@@ -154,7 +155,7 @@ def _said(again: Repeated, metric: str) -> tuple[str, bool]:
     return f"{scores}, though nothing has changed", False
 
 
-def _audited(found: Submission, options: dict[str, str], console: Console) -> bool:
+def _audited(found: Submission, salt: int | None, episodes: int, console: Console) -> bool:
     """Drive the pair on scenarios drawn now, and compare them with the submitted ones."""
     pair = pair_of(found.own.slice(0, 1).to_pylist()[0])
     world = pair.world.component
@@ -164,13 +165,13 @@ def _audited(found: Submission, options: dict[str, str], console: Console) -> bo
     seeds = sorted(set(found.own["training_seed"].to_pylist()))
     cells = [Cell(**cell) for cell in _cells(found.own)]
     values = {axis: tuple(dict.fromkeys(cell[axis] for cell in cells)) for axis in world.axes}
-    salt = int(options.get("salt", secrets.randbelow(SALTS)))
+    salt = secrets.randbelow(SALTS) if salt is None else salt
     drawn = Grid(
         name=AUDIT,
         world=pair.world.name,
         axes=world.axes,
         values=values,
-        episodes=int(options.get("episodes", EPISODES)),
+        episodes=episodes,
         first_seed=SeedBlock.AUDIT + salt,
     )
     with tempfile.TemporaryDirectory(prefix="cavbench-") as folder:
@@ -184,8 +185,6 @@ def _audited(found: Submission, options: dict[str, str], console: Console) -> bo
 
 
 def _cells(records: pa.Table) -> list[dict[str, Any]]:
-    import json
-
     return [json.loads(text) for text in pc.unique(records["cell"]).to_pylist()]
 
 

@@ -71,7 +71,7 @@ def open_recording(run: str, where: Sequence[str], out: Path, console: Console, 
 
 def save_film(
     runs: Sequence[str],
-    where: Sequence[str],
+    where: Mapping[str, str],
     out: Path,
     console: Console,
     path: Path,
@@ -81,7 +81,7 @@ def save_film(
 
     Args:
         runs: recordings, or beginnings of the names of pairs in `out`.
-        where: `column=value` options of the first record; the others are of the same cell, scenario and training seed.
+        where: values by column of the first record; the others are of the same cell, scenario and training seed.
         out: results folder of the pairs.
         console: console to print to.
         path: file of the film.
@@ -96,7 +96,7 @@ def save_film(
     if path.suffix.lower() not in KINDS:
         raise UserError(f"--save {path}: the name must end in {', '.join(KINDS)}")
     part = _seconds(seconds)
-    films, wanted = [], dict(word.partition("=")[::2] for word in where)
+    films, wanted = [], dict(where)
     for run in runs:
         folder, record = _record(run, out, wanted)
         made, differences = film(folder, record)

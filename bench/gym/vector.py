@@ -17,11 +17,10 @@ from bench.scenarios import Cell
 
 
 class DrivingVectorEnv(VectorEnv[Observation, Any, NDArray[Any]]):
-    """B episodes in one batch of the world's engine, which on the highway is many times faster than B environments.
+    """B episodes in one batch of the engine, which on the highway is many times faster than B environments.
 
     Observations, rewards and `info` are those of `bench.gym.DrivingEnv`, in arrays [B, ...]. Episode b is on cell b, counted
-    around. An episode that has ended is reset in the next step (gymnasium's `NEXT_STEP`); this needs a world with partial
-    resets.
+    around. An episode that has ended is reset in the next step (gymnasium's `NEXT_STEP`): the world must support partial resets.
 
     Args:
         world: the world.

@@ -10,8 +10,9 @@ import copy
 import itertools
 import re
 import types
-from collections.abc import Mapping, Sequence
-from dataclasses import field, fields, is_dataclass, make_dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import Field, field, fields, is_dataclass, make_dataclass
 from enum import Enum
 from functools import cached_property, partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.errors import UserError, short
+from bench.errors import PluginError, UserError, short
 from bench.plugins import registry, suites
 from bench.plugins.contracts import Access, ThreatModel
 from bench.plugins.pair import Chosen, choose
@@ -50,6 +51,8 @@ class Options:
         kinds: kinds of components that may be chosen.
         settings: dataclass of the other keys.
         axes: names of the axes of all worlds; empty for a training, which has neither cells nor a threat model.
+
+    `broken` says of each component that was left out of a sweep what is wrong with it.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class Options:
         if self.out == "":
             raise UserError("out has an empty value; write out=FOLDER")
         self.values: dict[str, tuple[str, ...]] = {}
+        self.broken: dict[str, str] = {}
         for override in _parsed([word for word in words if not word.startswith("out=")]):
             key = override.key_or_group
             self._check_key(key)
@@ -78,7 +82,8 @@ class Options:
         if threats and head == "threat" and parameter:
             # `threats` checks it against the threat model of the victim's track.
             return
-        known = [*self.kinds, *(item.name for item in fields(self.schema)), *self.axes, *threats]
+        settings = [name for item in fields(self.schema) for name in _setting_names(item)]
+        known = [*self.kinds, *settings, *self.axes, *threats]
         if key not in known and not (head in self.kinds and parameter):
             raise UserError(registry.unknown(f"key {short(key)!r}", key, known))
 
@@ -129,7 +134,13 @@ class Options:
         return next(iter(found))
 
     def chosen(self, kind: Kind) -> list[Chosen[Any]]:
-        """The chosen components of a kind, with every combination of their parameter values."""
+        """The chosen components of a kind, with every combination of their parameter values.
+
+        Broken plug-ins are left out, if there is another component: see `broken`.
+
+        Raises:
+            UserError: if a component or a parameter is unknown, a value is not allowed, or every component is broken.
+        """
         names = self.values.get(kind) or (track(self.track).world if kind == "world" else DEFAULTS[kind],)
         # Hydra's grammar escapes the colon of NAME:CHOICE.
         names = tuple(name.replace("\\:", ":") for name in names)
@@ -137,13 +148,15 @@ class Options:
             names = tuple(name for name in names if name not in suites.names())
         if kind != "victim":
             names = tuple(registry.on_track(kind, name, self.track) for name in names)
-        known = {name: parameters(registry.load(kind, name)) for name in names}
+        known = self._parameters(kind, names)
         swept = {key.partition(".")[2]: v for key, v in self.values.items() if key.startswith(f"{kind}.")}
         if swept and not names:
             fixed = " and ".join(suite.name for suite in self.suites)
             raise UserError(f"the attacks of the suite {fixed} have fixed parameters, got {kind}.{next(iter(swept))}")
         for key in swept:
             if not any(key.partition(".")[0] in owned for owned in known.values()):
+                if lost := [why for name, why in self.broken.items() if name in names]:
+                    raise PluginError(lost[0])
                 what = f"parameter {kind}.{key} of {', '.join(names)}"
                 raise UserError(
                     registry.unknown(what, key, dict.fromkeys(p for owned in known.values() for p in owned))
@@ -152,9 +165,28 @@ class Options:
         for name, owned in known.items():
             keys = [key for key in swept if key.partition(".")[0] in owned]
             for values in itertools.product(*(swept[key] for key in keys)):
-                one = configured(kind, name, dict(zip(keys, values, strict=True)))
-                found[f"{name} {one.params}"] = one
+                with self._left_out(name):
+                    one = configured(kind, name, dict(zip(keys, values, strict=True)))
+                    found[f"{name} {one.params}"] = one
+        if names and not found:
+            raise PluginError(self.broken[names[0]])
         return list(found.values())
+
+    def _parameters(self, kind: Kind, names: Sequence[str]) -> dict[str, dict[str, Parameter]]:
+        """The parameters of the components that can be loaded."""
+        found = {}
+        for name in names:
+            with self._left_out(name):
+                found[name] = parameters(registry.load(kind, name))
+        return found
+
+    @contextmanager
+    def _left_out(self, name: str) -> Iterator[None]:
+        """Note in `broken` that a component is broken."""
+        try:
+            yield
+        except PluginError as error:
+            self.broken[name] = str(error)
 
     @cached_property
     def suites(self) -> list[Suite]:
@@ -222,6 +254,14 @@ def parameter_words(text: str) -> dict[str, str]:
             )
         found[name] = value
     return found
+
+
+def _setting_names(setting: Field[Any]) -> list[str]:
+    """The keys of a setting: its name or, if it is a group, those of its members."""
+    group = setting.default_factory
+    if isinstance(group, type) and is_dataclass(group):
+        return [f"{setting.name}.{item.name}" for item in fields(group)]
+    return [setting.name]
 
 
 def _parsed(words: Sequence[str]) -> list[Override]:

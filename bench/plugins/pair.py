@@ -6,10 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from bench.errors import UserError, reason
+from bench.errors import PluginError, UserError, reason
 from bench.plugins import registry, sources
 from bench.plugins.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
 from bench.plugins.fingerprint import canonical, digest, state_digest
+from bench.plugins.foreign import contained
 from bench.plugins.parameters import parameters
 from bench.plugins.registry import Kind
 
@@ -62,12 +63,15 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
     """
     component = registry.load(kind, name)
     try:
-        return Chosen(kind=kind, name=name, component=component(**params))
+        with contained():
+            return Chosen(kind=kind, name=name, component=component(**params))
     except (ValueError, TypeError) as error:
         raise UserError(f"{kind} {name!r}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
     # The checks of a plug-in may raise anything else.
     except Exception as error:
-        raise UserError(f"{kind} {name!r} cannot be created: {reason(error)} (--debug shows the traceback)") from error
+        raise PluginError(
+            f"{kind} {name!r} cannot be created: {reason(error)} (--debug shows the traceback)"
+        ) from error
 
 
 def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:
@@ -188,7 +192,7 @@ class Pair:
         network = _loaded(f"{self.defense} + {self.victim}", lambda: self.load(training_seed))
         wanted = self.victim.component.network
         if not isinstance(network, wanted):
-            raise UserError(
+            raise PluginError(
                 f"{self.defense} + {self.victim} loads a {type(network).__name__}, but a {wanted.__name__} is needed"
             )
         return _weights(network)
@@ -200,12 +204,13 @@ class Pair:
 def _loaded(named: str, load: Callable[[], Any]) -> Any:
     """What `load` returns; a UserError that names the component if it fails."""
     try:
-        return load()
+        with contained():
+            return load()
     except UserError:
         raise
     # Third-party code may raise anything: name the component that failed.
     except Exception as error:
-        raise UserError(f"{named} cannot be loaded: {reason(error)} (--debug shows the traceback)") from error
+        raise PluginError(f"{named} cannot be loaded: {reason(error)} (--debug shows the traceback)") from error
 
 
 def _weights(network: Any) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import os
+import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from bench.plugins.pair import Chosen, Pair, check_track
 from bench.plugins.registry import KINDS, Kind
 from bench.plugins.suites import Suite
 from bench.run.executors import EXECUTORS
+from bench.run.process import machine_bytes
 from bench.scenarios import Grid
 
 
@@ -29,11 +31,17 @@ class RunConfig:
         grid: cells and scenario seeds.
         seeds: training seeds of the victims, and seeds of the patches.
         executor: back end that carries out the work, a name in `bench.run.executors.EXECUTORS`.
-        workers: number of worker processes; results do not depend on it.
+        workers: number of worker processes; results do not depend on it. None takes every core, of this machine or of the
+            Ray cluster.
+        ray_address: of the Ray cluster: `local` starts one on this machine, `auto` finds the running one.
         out: results folder.
         record: episodes to record in every cell of each pair; None records one episode of the first cell.
         reference: whether to run the baselines of the pairs, too.
         skipped: members of suites that do not fit a victim, one line each.
+        broken: plug-ins that were chosen but cannot be used, one line each.
+        shard: (3, 10) drives the third of ten equal parts of the units.
+        unit_timeout: seconds that a unit or preparation may take; 0 for no limit.
+        unit_memory: GB of memory that a worker process may use; 0 for no limit.
 
     Raises:
         ValueError: if a number is out of range.
@@ -43,18 +51,26 @@ class RunConfig:
     grid: Grid
     seeds: tuple[int, ...] = (0, 1, 2)
     executor: str = "processes"
-    workers: int = field(default_factory=lambda: cores())
+    workers: int | None = None
+    ray_address: str = "local"
     out: Path = Path("results")
     record: int | None = None
     reference: bool = True
     skipped: tuple[str, ...] = ()
+    broken: tuple[str, ...] = ()
+    shard: tuple[int, int] = (1, 1)
+    unit_timeout: float = 3600.0
+    unit_memory: float = field(default_factory=lambda: half_of_memory())
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
         if self.executor not in EXECUTORS:
             raise ValueError(registry.unknown(f"executor {self.executor!r}", self.executor, EXECUTORS))
-        if self.workers < 1:
+        if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers must be at least 1, got {self.workers}")
+        for name in ("unit_timeout", "unit_memory"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be a number of at least 0 (0: no limit), got {getattr(self, name):g}")
         if self.record is not None and not 0 <= self.record <= self.grid.episodes:
             raise ValueError(f"record must be between 0 and the {self.grid.episodes} episodes, got {self.record}")
 
@@ -100,9 +116,16 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
         )
 
 
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def half_of_memory() -> float:
+    """Half of the machine's memory in GB; 0 if it cannot be read."""
+    return machine_bytes() / 2e9
+
+
+@dataclass
+class RayOptions:
+    """The options of `executor=ray`."""
+
+    address: str = "local"
 
 
 @dataclass
@@ -113,10 +136,14 @@ class RunOptions:
     episodes: int | None = None
     seeds: list[int] | None = None
     executor: str = "processes"
-    workers: int = field(default_factory=cores)
+    workers: int | None = None
+    ray: RayOptions = field(default_factory=RayOptions)
     out: str = "results"
     record: int | None = None
     reference: bool = True
+    shard: str = "1/1"
+    unit_timeout: float = 3600.0
+    unit_memory: float = field(default_factory=half_of_memory)
 
 
 @dataclass
@@ -146,11 +173,23 @@ def run_config(words: Sequence[str]) -> RunConfig:
             seeds=tuple(range(standard.training_seeds) if settings["seeds"] is None else settings["seeds"]),
             executor=settings["executor"],
             workers=settings["workers"],
+            ray_address=settings["ray"]["address"],
             out=Path(settings["out"]).expanduser(),
             record=settings["record"],
             reference=settings["reference"],
             skipped=tuple(skipped),
+            broken=tuple(given.broken.values()),
+            shard=_shard(settings["shard"]),
+            unit_timeout=settings["unit_timeout"],
+            unit_memory=settings["unit_memory"],
         )
+
+
+def _shard(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", text)
+    if match is None or int(match[1]) > int(match[2]):
+        raise UserError(f"shard must be PART/PARTS, for instance shard=3/10, got {text}")
+    return int(match[1]), int(match[2])
 
 
 def combined(

@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 
 from bench.errors import UserError
 from bench.plugins import registry
+from bench.plugins.framework import Snapshot
 from bench.plugins.pair import IN_PROCESS, Chosen, Pair, choose
 from bench.plugins.track import track
 from bench.records import reading, store
@@ -23,7 +24,7 @@ from bench.run import artefacts
 from bench.run.process import settle
 from bench.run.runner import keep_recording, recording_path, stem
 from bench.run.unit import Unit
-from bench.run.work import Task, perform
+from bench.run.work import Failure, Outcome, Task, attempt
 from bench.scenarios import Cell
 
 
@@ -96,7 +97,7 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
         recorded=[record["seed"]],
         entropy=record.get("entropy"),
     )
-    outcome = perform(task, lambda *news: None)
+    outcome = _repeated(task)
     after = outcome.records
     assert after is not None
     if not outcome.recordings:
@@ -105,6 +106,18 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     keep_recording(saved, outcome.recordings[record["seed"]])
     differences = _differences(unit, before, after)
     return Replay(saved, _changed(unit, record, after), differences)
+
+
+def _repeated(task: Task) -> Outcome:
+    """The outcome of a task.
+
+    Raises:
+        UserError: if it fails.
+    """
+    outcome = attempt(task, lambda *news: None, Snapshot())
+    if isinstance(outcome, Failure):
+        raise UserError(f"{task.work} {outcome.why}")
+    return outcome
 
 
 def _changed(unit: Unit, record: Mapping[str, Any], after: pa.Table) -> str:
@@ -144,7 +157,7 @@ def repeat(out: Path, record: Mapping[str, Any]) -> Repeated:
     """
     unit, before = _unit(out, record)
     task = Task(work=unit, artefact=_artefact(out, unit, record), entropy=record.get("entropy"))
-    after = perform(task, lambda *news: None).records
+    after = _repeated(task).records
     assert after is not None
     return Repeated(unit, before, after, _changed(unit, record, after), _differences(unit, before, after))
 

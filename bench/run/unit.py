@@ -6,13 +6,39 @@ import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
+from typing import Any
 
 from bench.plugins import registry
 from bench.plugins.fingerprint import canonical, code_digest, digest, libraries, machine
-from bench.plugins.pair import Pair
+from bench.plugins.pair import Chosen, Pair
 from bench.plugins.track import Job, Track, track_of
 from bench.records.schema import AUDIT
 from bench.scenarios import Cell, SeedBlock
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loading:
+    """Loads the networks of a pair once, before anything is driven, to hash their weights.
+
+    Args:
+        pair: attack, defence, victim, world, threat model.
+        training_seed: seed of the victim.
+    """
+
+    pair: Pair
+    training_seed: int
+
+    def weights(self) -> tuple[str, str]:
+        """The hashes of the weights of the defended victim, and of an attack that learns (otherwise empty).
+
+        Raises:
+            UserError: if a network cannot be loaded.
+        """
+        return self.pair.weights_sha256(self.training_seed), self.pair.adversary_sha256(self.training_seed)
+
+    def __str__(self) -> str:
+        seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""
+        return f"{self.pair}{seed}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,3 +229,10 @@ class Unit(Work):
     def __str__(self) -> str:
         seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""
         return f"{self.pair} | {self.cell}{seed}"
+
+
+def is_foreign(part: Chosen[Any]) -> bool:
+    """Whether a plug-in ships a component; an object of the caller's own process is not foreign to it."""
+    return (
+        not part.code and registry.find(registry.GROUPS[part.kind], part.name, part.kind).distribution != registry.OWN
+    )

@@ -12,7 +12,6 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from platformdirs import user_cache_path
 
 from bench.archive import Archive
 from bench.errors import UserError
-from bench.files import whole
+from bench.files import scratch, whole
 from bench.plugins.registry import unknown
 
 Report = Callable[[int, int], None]
@@ -117,8 +116,8 @@ def weights(name: str) -> Path:
         if cached(name):
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            _unpack(DOWNLOADS[name], _download(name, Path(folder)), path)
+        with scratch(path.parent) as folder:
+            _unpack(DOWNLOADS[name], _download(name, folder), path)
     except OSError as error:
         raise UserError(f"{path} cannot be read or written: {error}; set CAVBENCH_CACHE to another folder") from None
     return path

@@ -21,6 +21,7 @@ from bench.errors import UserError
 from bench.files import check_folder, whole
 from bench.plugins.track import tracks
 from bench.records import reading
+from bench.run.process import follow_parent
 from leaderboard.comparisons.reading import measurements
 from leaderboard.page.document import document
 from leaderboard.page.table import table
@@ -49,7 +50,7 @@ def write(out: Path | None, page: Path, console: Console) -> None:
     if folders := [target for target in _files(page) if target.is_dir()]:
         raise UserError(f"the page {page} cannot be written: {folders[0]} is a folder; choose another with html=")
     # The thesis' tables are made of other records, and so in a process of their own meanwhile.
-    with ProcessPoolExecutor(1, get_context("spawn")) as beside:
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=follow_parent) as beside:
         beside.submit(chapters.prepare)
         records = _read(out)
         thesis = beside.submit(chapters.chapters, chapters.needed(records))

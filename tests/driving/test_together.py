@@ -18,11 +18,12 @@ from bench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
 from bench.driving.drive import joint
 from bench.driving.rollout import NotJointError, rollout
 from bench.plugins.contracts import Access
+from bench.plugins.framework import Snapshot
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Columns
 from bench.run.batches import EPISODES, batches
 from bench.run.unit import Unit
-from bench.run.work import Task, perform
+from bench.run.work import Outcome, Task, attempt
 from bench.scenarios import Cell
 from bench.victims.drivers.networks import ActorPolicy, QPolicy
 from envs.highway.axes import AXES
@@ -147,13 +148,20 @@ def test_a_batch_is_not_larger_than_the_cache_and_holds_no_recorded_unit() -> No
     assert sorted(sizes) == [1, 1, 1, 3, 3, 3]
 
 
+def carried_out(task: Task) -> Outcome:
+    outcome = attempt(task, lambda *news: None, Snapshot())
+    assert isinstance(outcome, Outcome)
+    return outcome
+
+
 def test_a_task_of_several_units_has_the_outcome_of_each() -> None:
     works = units("noise", 3, seeds=range(1_000_000, 1_000_002))
     task = Task(work=works[0], others=works[1:])
-    outcome = perform(task, lambda *news: None)
-    alone = [perform(Task(work=unit), lambda *news: None) for unit in works]
+    outcome = carried_out(task)
+    alone = [carried_out(Task(work=unit)) for unit in works]
     timed = {"attack_ms", "wall_s", "created_at", "entropy"}
     for one, other in zip((outcome, *outcome.others), alone, strict=True):
+        assert isinstance(one, Outcome)
         assert one.records is not None
         assert other.records is not None
         same = [name for name in one.records.column_names if name not in PROBES | timed]
