@@ -35,7 +35,13 @@ def drive(job: Job, traced: Sequence[int]) -> Driven:
 def joint(pair: Pair) -> bool:
     """Whether `drive_jointly` can drive several jobs of a pair in one batch."""
     attack = pair.attack.component
-    return pair.is_clean or bool(vars(type(attack)).get("joint"))
+    if pair.is_clean:
+        return True
+    victim = pair.victim.component
+    assert isinstance(victim, DrivingVictim)
+    # A critic has one output: the last bit of such a product of a matrix and a vector depends on the rest of the batch.
+    critic = victim.action_type == "continuous" and attack.access in ("gradients", "dynamics")
+    return bool(vars(type(attack)).get("joint")) and not critic
 
 
 def drive_jointly(jobs: Sequence[Job]) -> Sequence[Driven] | None:

@@ -52,18 +52,18 @@ FEW = 16
 """A matrix product of fewer rows than this may differ in the last bit from the same rows in a product of many."""
 
 
-def whatever_the_batch(network: nn.Module, *inputs: Tensor) -> Tensor:
-    """The output [..., A] of a network for observations [..., V, F] (and actions), to the last bit the same in every batch.
+def whatever_the_batch(network: nn.Module, observation: Tensor) -> Tensor:
+    """The output [..., A] of a network for observations [..., V, F], to the last bit the same in every batch.
 
     Fewer than `FEW` observations are filled up. Units that are driven together thus have the results that each has alone.
     """
-    leading = inputs[0].shape[:-2]
+    leading = observation.shape[:-2]
     missing = FEW - leading.numel()
     if 0 < missing < FEW:
-        rows = [values.reshape(-1, *values.shape[len(leading) :]) for values in inputs]
-        full = [torch.cat((values, values[:1].expand(missing, *values.shape[1:]))) for values in rows]
-        return whatever_the_batch(network, *full)[: leading.numel()].reshape(*leading, -1)
-    answer: Tensor = network(*inputs)
+        rows = observation.reshape(-1, *observation.shape[-2:])
+        full = torch.cat((rows, rows[:1].expand(missing, *rows.shape[1:])))
+        return whatever_the_batch(network, full)[: len(rows)].reshape(*leading, -1)
+    answer: Tensor = network(observation)
     return answer
 
 
@@ -145,4 +145,4 @@ class ActorPolicy(Policy):
         return whatever_the_batch(self.actor, observation)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
-        return whatever_the_batch(self.critic, observation, action).squeeze(-1)
+        return self.critic(observation, action).squeeze(-1)
