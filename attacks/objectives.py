@@ -125,9 +125,21 @@ class DiscreteLoss:
             return self(scores) < 0
         return self._given(scores) <= self._goal
 
+    def judge(self, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The loss, the key and whether the goal is met, [..., B] each: as one call each, without computing anything twice."""
+        value = self(scores)
+        if self.objective in ("margin", "target"):
+            return value, value, value < 0
+        given = self._given(scores)
+        return value, given + TIE_BREAK * value, given <= self._goal
+
     def of(self, rows: Tensor) -> DiscreteLoss:
         """This loss for the episodes `rows`."""
-        return replace(self, clean=self.clean[rows])
+        part = replace(self, clean=self.clean[rows])
+        for name in ("_worth", "_tau", "_goal"):
+            if name in self.__dict__:
+                part.__dict__[name] = self.__dict__[name][rows]
+        return part
 
     @cached_property
     def _worth(self) -> Tensor:
@@ -179,6 +191,11 @@ class ContinuousLoss:
         if self.target is None:
             return torch.zeros(scores.shape[:-1], dtype=torch.bool)
         return self(scores) <= self.tolerance
+
+    def judge(self, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The loss, the key and whether the goal is met, [..., B] each."""
+        value = self(scores)
+        return value, value, self.met(scores) if self.target is None else value <= self.tolerance
 
     def of(self, rows: Tensor) -> ContinuousLoss:
         """This loss for the episodes `rows`."""

@@ -27,7 +27,7 @@ from bench.driving import (
 )
 from bench.errors import UserError
 from bench.plugins.contracts import Access, Progress, Trained
-from bench.plugins.ranges import Count, NotNegative, Positive, Share
+from bench.plugins.ranges import Count, NotNegative, Positive, Share, Width
 from bench.scenarios import SeedBlock
 from bench.victims import zoo
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
@@ -106,7 +106,7 @@ class RobustSarsa(DrivingAttack):
     exploration: Share = 0.3
     robustness: NotNegative = 0.1
     around: Positive = 0.3
-    hidden: Count = 128
+    hidden: Width = 128
     steering: Annotated[float, Interval(gt=0, le=1)] = 0.1
     gamma: Share = 0.97
     crash_penalty: float = 200.0

@@ -14,6 +14,23 @@ from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
+from bench.errors import UserError
+
+
+def check_folder(folder: Path, what: str) -> None:
+    """Create a folder, and check that files can be written to it; call it before the work whose results go there.
+
+    Raises:
+        UserError: if it is a file, or cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = "it is a file" if folder.is_file() else error.strerror or str(error)
+        raise UserError(f"{what} {folder} cannot be written: {reason}; choose another with out=") from None
+
 
 @contextmanager
 def whole(path: Path) -> Iterator[BinaryIO]:

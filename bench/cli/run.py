@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import pyarrow as pa
-from rich.console import Console
 from rich.text import Text
 
 from bench.cli.progress import RunProgress, show_downloads
+from bench.cli.terminal import Console
 from bench.errors import UnfinishedError, UserError
 from bench.plugins.track import Track, track_of
 from bench.records import reading

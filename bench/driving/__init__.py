@@ -3,7 +3,7 @@
 from bench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, DrivingWorld, TrainingHooks
 from bench.driving.dynamics import Dynamics, Forecast
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features
-from bench.driving.oracle import Oracle
+from bench.driving.oracle import Oracle, Part, parts_of
 from bench.driving.policy import Policy, PolicyWrapper, State
 from bench.driving.threat import ObservationThreat
 
@@ -20,8 +20,10 @@ __all__ = [
     "Forecast",
     "ObservationThreat",
     "Oracle",
+    "Part",
     "Policy",
     "PolicyWrapper",
     "State",
     "TrainingHooks",
+    "parts_of",
 ]

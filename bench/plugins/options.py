@@ -26,7 +26,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.errors import PluginError, UserError
+from bench.errors import PluginError, UserError, short
 from bench.plugins import registry, suites
 from bench.plugins.contracts import Access, ThreatModel
 from bench.plugins.pair import Chosen, choose
@@ -36,6 +36,10 @@ from bench.plugins.suites import Suite
 from bench.plugins.track import track
 from bench.scenarios import Axes, Axis, Value
 
+LONGEST_VALUE, MOST_VALUES = 5_000, 1_000
+"""Limits of what is parsed: the characters of a value, and the values of a list."""
+NESTED = re.compile(r"\[[^\]]*\[|\(.*\(.*\(")
+"""A list in a list, which no option takes. A parser of deep nesting is slow."""
 DEFAULTS: dict[Kind, str] = {"attack": "none", "defense": "none", "victim": "dqn"}
 
 
@@ -56,14 +60,18 @@ class Options:
     ) -> None:
         self.kinds, self.axes = tuple(kinds), tuple(axes)
         self.schema = settings
+        keys = [word.partition("=")[0] for word in words]
+        if twice := [key for key in keys if keys.count(key) > 1]:
+            hint = "" if twice[0] == "out" else f"; separate its values with commas: {short(twice[0])}=a,b"
+            raise UserError(f"{short(twice[0])} is given twice{hint}")
         # Paths bypass hydra: its grammar gives a meaning to many characters that occur in them.
-        self.out = [word.partition("=")[2] for word in words if word.startswith("out=")]
+        self.out = next((word.partition("=")[2] for word in words if word.startswith("out=")), None)
+        if self.out == "":
+            raise UserError("out has an empty value; write out=FOLDER")
         self.values: dict[str, tuple[str, ...]] = {}
         self.broken: dict[str, str] = {}
         for override in _parsed([word for word in words if not word.startswith("out=")]):
             key = override.key_or_group
-            if key in self.values or len(self.out) > 1:
-                raise UserError(f"{key} is given twice; separate its values with commas: {key}=a,b")
             self._check_key(key)
             self.values[key] = _elements(override)
 
@@ -77,7 +85,7 @@ class Options:
         settings = [name for item in fields(self.schema) for name in _setting_names(item)]
         known = [*self.kinds, *settings, *self.axes, *threats]
         if key not in known and not (head in self.kinds and parameter):
-            raise UserError(registry.unknown(f"key {key!r}", key, known))
+            raise UserError(registry.unknown(f"key {short(key)!r}", key, known))
 
     def settings(self) -> dict[str, Any]:
         """The values of the keys that choose neither a component nor a cell."""
@@ -89,12 +97,12 @@ class Options:
             if key.partition(".")[0] in (*self.kinds, *self.axes, "threat"):
                 continue
             if key not in lists and len(values) > 1:
-                raise UserError(f"{key} takes one value, got {','.join(values)}")
+                raise UserError(f"{key} takes one value, got {short(','.join(values))}")
             whole = values[0] if len(values) == 1 and values[0].startswith("[") else f"[{','.join(values)}]"
             overrides.append(f"{key}={whole if key in lists else values[0]}")
-        found = OmegaConf.to_container(_composed(overrides, config_name="settings"))
+        found = OmegaConf.to_container(_composed(overrides, self.schema, config_name="settings"))
         assert isinstance(found, dict)
-        return {str(key): value for key, value in found.items()} | ({"out": self.out[0]} if self.out else {})
+        return {str(key): value for key, value in found.items()} | ({"out": self.out} if self.out else {})
 
     def cell_values(self, axes: Axes) -> dict[str, tuple[Value, ...]]:
         """The given values on the axes of the world of the run.
@@ -105,7 +113,10 @@ class Options:
         given = [key for key in self.values if key in self.axes]
         if strange := [key for key in given if key not in axes]:
             raise UserError(registry.unknown(f"axis {strange[0]!r} of the world", strange[0], axes))
-        return {key: tuple(_axis_value(axes[key], text) for text in _listed(self.values[key])) for key in given}
+        return {
+            key: tuple(_axis_value(axes[key], text) for text in _distinct(key, _listed(self.values[key])))
+            for key in given
+        }
 
     @cached_property
     def track(self) -> str:
@@ -238,7 +249,9 @@ def parameter_words(text: str) -> dict[str, str]:
     for word in text.split():
         name, equals, value = word.partition("=")
         if not equals:
-            raise UserError(f'attack_params takes name=value pairs, for instance "steps=3 restarts=2", got {word!r}')
+            raise UserError(
+                f'attack_params takes name=value pairs, for instance "steps=3 restarts=2", got {short(word)!r}'
+            )
         found[name] = value
     return found
 
@@ -257,23 +270,46 @@ def _parsed(words: Sequence[str]) -> list[Override]:
     for word in words:
         key, equals, value = word.partition("=")
         if not (equals and re.fullmatch(r"\w+(\.\w+)*", key)):
-            raise UserError(f"cannot read {word!r}: write key=value, for instance attack=zo or lanes=3,4")
+            raise UserError(f"cannot read {short(word)!r}: write key=value, for instance attack=zo or lanes=3,4")
+        if not value:
+            raise UserError(f"{key} has an empty value; write {key}=value")
+        if "${" in value or not value.isprintable():
+            raise UserError(f"cannot read {short(word)!r}: a value is plain text on one line, without ${{…}}")
+        if len(value) > LONGEST_VALUE or NESTED.search(value):
+            raise UserError(f"cannot read {short(word)!r}: a value is one word, or a list a,b,c of them")
         try:
             (override,) = parser.parse_overrides([word])
         except HydraException:
             # The value is outside of hydra's grammar: quote it as plain text.
             escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-            (override,) = parser.parse_overrides([f'{key}="{escaped}"'])
+            try:
+                (override,) = parser.parse_overrides([f'{key}="{escaped}"'])
+            except HydraException as error:
+                raise UserError(f"cannot read {short(word)!r}") from error
         overrides.append(override)
     return overrides
 
 
 def _elements(override: Override) -> tuple[str, ...]:
     swept = override.is_sweep_override()
-    values = list(override.sweep_string_iterator()) if swept else [override.get_value_element_as_str()]
+    key = override.key_or_group
+    try:
+        every = override.sweep_string_iterator() if swept else iter([override.get_value_element_as_str()])
+        values = list(itertools.islice(every, MOST_VALUES + 1))
+    except (HydraException, ValueError, TypeError) as error:
+        raise UserError(f"cannot read {short(str(override.input_line))!r}") from error
+    if len(values) > MOST_VALUES:
+        raise UserError(f"{key} has more than {MOST_VALUES} values")
+    return _distinct(key, values)
+
+
+def _distinct(key: str, values: Sequence[str]) -> tuple[str, ...]:
+    """The values, none of which is empty or given twice."""
     if "" in values:
-        raise UserError(f"{override.key_or_group} has an empty value; write {override.key_or_group}=value")
-    return tuple(dict.fromkeys(values))
+        raise UserError(f"{key} has an empty value; write {key}=value")
+    if twice := [value for value in values if values.count(value) > 1]:
+        raise UserError(f"{key} has the value {short(twice[0])!r} twice")
+    return tuple(values)
 
 
 def _listed(values: Sequence[str]) -> Sequence[str]:
@@ -288,20 +324,36 @@ def _axis_value(axis: Axis, text: str) -> Value:
         return axis.read(text)
     except ValueError as error:
         if axis.kind == "str" and axis.choices:
-            raise UserError(registry.unknown(f"{axis.name} {text!r}", text, map(str, axis.choices))) from error
+            raise UserError(registry.unknown(f"{axis.name} {short(text)!r}", text, map(str, axis.choices))) from error
         raise UserError(str(error)) from error
 
 
-def _composed(overrides: list[str], config_name: str | None = None) -> DictConfig:
+NOUNS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "text"}
+
+
+def _composed(overrides: list[str], schema: type[Any], config_name: str | None = None) -> DictConfig:
+    """The values of a structured config.
+
+    Raises:
+        UserError: if one of them has another type than its field.
+    """
     try:
         with initialize(version_base="1.3", config_path=None):
-            return compose(config_name, overrides=overrides)
+            found = compose(config_name, overrides=overrides)
+            OmegaConf.resolve(found)
+            return found
     except (HydraException, OmegaConfBaseException) as error:
         cause = error if error.__cause__ is None else error.__cause__
-        key = str(getattr(cause, "full_key", "") or "").partition("[")[0]
-        word = next((word for word in overrides if key and word.startswith(f"{key}=")), " ".join(overrides))
-        reason = str(cause).splitlines()[0]
-        raise UserError(f"cannot read {word}: {reason[:1].lower()}{reason[1:]}") from error
+        full = str(getattr(cause, "full_key", "") or "").partition("[")[0]
+        word = next((word for word in overrides if full and word.startswith(f"{full}=")), " ".join(overrides))
+        key, _, value = word.partition("=")
+        names = {item.name for item in fields(schema)}
+        wanted = re.search(r"could not be converted to (\w+)", str(cause))
+        noun = NOUNS.get(wanted[1]) if wanted else None
+        if key.rpartition(".")[2] in names and noun:
+            listed = "whole numbers, for instance 0,1,2" if "[" in value and noun == NOUNS["Integer"] else noun
+            raise UserError(f"{key} must be {listed}, got {short(value)}") from error
+        raise UserError(f"cannot read {short(word)}: its value is not of the type that {short(key)} takes") from error
 
 
 def _schema(owned: dict[str, Parameter]) -> type[Any]:
@@ -338,13 +390,14 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
     except OmegaConfBaseException as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"the parameters of {kind} {name!r} cannot be set on the command line: {reason}") from error
-    composed = _composed([f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())])[kind]
+    overrides = [f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())]
+    composed = _composed(overrides, _schema(owned))[kind]
     arguments = OmegaConf.to_object(composed)
     values = {item: getattr(arguments, item) for item in owned}
     for key, value in values.items():
         choices = owned[key].choices
         if choices and value is not None and value not in choices:
-            raise UserError(registry.unknown(f"{kind}.{key} {value!r}", str(value), map(str, choices)))
+            raise UserError(registry.unknown(f"{kind}.{key} {short(str(value))!r}", str(value), map(str, choices)))
         if isinstance(value, list):
             values[key] = tuple(value)
     return values

@@ -14,6 +14,8 @@ from bench.plugins.foreign import contained
 from bench.plugins.parameters import parameters
 from bench.plugins.registry import Kind
 
+IN_PROCESS = "a Python process"
+"""What records say of a component that no package ships."""
 C = TypeVar("C", Attack, Defense, Victim, World)
 
 
@@ -25,19 +27,29 @@ class Chosen(Generic[C]):
         kind: attack, defense, victim or world.
         name: name of the entry point.
         component: the instance; its fields are its parameters.
+        code: hash of its code, for an object of Python that no package ships; otherwise empty.
     """
 
     kind: Kind
     name: str
     component: C
+    code: str = ""
 
     @property
     def params(self) -> str:
         """The parameters as canonical JSON."""
         return canonical(self.component)
 
+    @property
+    def shipped_by(self) -> str:
+        """The distribution and version that ship it; `IN_PROCESS` for an object of Python."""
+        return IN_PROCESS if self.code else registry.find(registry.GROUPS[self.kind], self.name, self.kind).shipped_by
+
     def __str__(self) -> str:
         """The name, with the parameters that differ from their defaults: `pgd(steps=20)`."""
+        if self.code and self.kind == "victim":
+            # Its parameters only say what the object was.
+            return self.name
         values = {p.name: (getattr(self.component, p.name), p) for p in parameters(type(self.component)).values()}
         changed = [f"{name}={value}" for name, (value, p) in values.items() if p.required or value != p.default]
         return f"{self.name}({', '.join(changed)})" if changed else self.name

@@ -6,7 +6,7 @@ import traceback
 from typing import Any
 
 from bench.plugins.pair import Chosen, Pair
-from bench.run.unit import is_foreign, shipped_by
+from bench.run.unit import is_foreign
 
 SIDES = {"attack": ("attack",), "defense": ("defense", "victim")}
 """The kinds of component on each side of a `bench.trust.watch.TamperError`."""
@@ -25,7 +25,7 @@ def blamed(pair: Pair, error: BaseException | None = None) -> str:
     parts = parts or (_raised_by(pair, error) if error else []) or [part for part in pair.parts if is_foreign(part)]
     packages: dict[str, list[str]] = {}
     for part in parts:
-        packages.setdefault(shipped_by(part), []).append(f"{part.kind} {part.name!r}")
+        packages.setdefault(part.shipped_by, []).append(f"{part.kind} {part.name!r}")
     named = " and ".join(f"{', '.join(components)} of {package}" for package, components in packages.items())
     return f" ({named})" if named else ""
 

@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.errors import UserError
+from bench.errors import UserError, short
 from bench.plugins import registry
 from bench.plugins.options import Options, configured
 from bench.plugins.pair import Chosen, Pair, check_track
 from bench.plugins.registry import KINDS, Kind
+from bench.plugins.suites import Suite
 from bench.run.executors import EXECUTORS
 from bench.run.process import machine_bytes
 from bench.scenarios import Grid
@@ -111,7 +112,7 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
     """Raise ValueError unless there is at least one training seed, and all are distinct and not negative."""
     if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
         raise ValueError(
-            f"seeds must be distinct whole numbers of at least 0, got {','.join(map(str, seeds)) or 'none'}"
+            f"seeds must be distinct whole numbers of at least 0, got {short(','.join(map(str, seeds))) or 'none'}"
         )
 
 
@@ -167,7 +168,7 @@ def run_config(words: Sequence[str]) -> RunConfig:
         grid = standard.with_(episodes=settings["episodes"], **given.cell_values(standard.axes))
         pairs, skipped = _pairs(given)
         return RunConfig(
-            pairs=tuple({pair.id: pair for pair in pairs}.values()),
+            pairs=tuple(pairs),
             grid=grid,
             seeds=tuple(range(standard.training_seeds) if settings["seeds"] is None else settings["seeds"]),
             executor=settings["executor"],
@@ -176,7 +177,7 @@ def run_config(words: Sequence[str]) -> RunConfig:
             out=Path(settings["out"]).expanduser(),
             record=settings["record"],
             reference=settings["reference"],
-            skipped=tuple(dict.fromkeys(skipped)),
+            skipped=tuple(skipped),
             broken=tuple(given.broken.values()),
             shard=_shard(settings["shard"]),
             unit_timeout=settings["unit_timeout"],
@@ -187,49 +188,75 @@ def run_config(words: Sequence[str]) -> RunConfig:
 def _shard(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", text)
     if match is None or int(match[1]) > int(match[2]):
-        raise UserError(f"shard must be PART/PARTS, for instance shard=3/10, got {text}")
+        raise UserError(f"shard must be PART/PARTS, for instance shard=3/10, got {short(text)}")
     return int(match[1]), int(match[2])
 
 
-def _pairs(given: Options) -> tuple[list[Pair], list[str]]:
-    """Every combination of the chosen components and threat models, and the members of suites that are skipped.
+def combined(
+    attacks: Sequence[Chosen[Any]],
+    suites: Sequence[Suite],
+    others: Sequence[Mapping[str, Any]],
+) -> tuple[list[Pair], list[str]]:
+    """The pairs of every attack, and of every member of the suites, with every combination of the other parts.
+
+    Args:
+        attacks: attacks chosen by name.
+        suites: suites of attacks.
+        others: combinations of `defense`, `victim`, `world` and `threat`, as keywords of `Pair`.
+
+    Returns:
+        The distinct pairs, and why members of suites are skipped, one line each.
 
     Raises:
         UserError: if an attack that was chosen by its name does not fit, or no member of a suite does.
     """
-    attacks = given.chosen("attack")
     pairs, skipped = [], []
-    others: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS if kind != "attack"]
-    for defense, victim, world, threat in itertools.product(*others, given.threats()):
-        parts = {"defense": defense, "victim": victim, "world": world, "threat": threat}
+    for parts in others:
         own = [Pair(attack=attack, **parts) for attack in attacks]
         pairs += [pair.clean() if pair.is_clean else pair for pair in own]
-        for suite in given.suites:
+        for suite in suites:
             made, left = suite.pairs(**parts)
             pairs += made
             skipped += left
     if not pairs:
-        raise UserError(skipped[0] if skipped else f"no member of {given.suites[0].name} is meant for the victim")
-    return pairs, skipped
+        raise UserError(skipped[0] if skipped else f"no member of {suites[0].name} is meant for the victim")
+    return list({pair.id: pair for pair in pairs}.values()), list(dict.fromkeys(skipped))
+
+
+def _pairs(given: Options) -> tuple[list[Pair], list[str]]:
+    """Every combination of the chosen components and threat models, and the members of suites that are skipped."""
+    attacks = given.chosen("attack")
+    choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS if kind != "attack"]
+    names = ("defense", "victim", "world", "threat")
+    others = [dict(zip(names, parts, strict=True)) for parts in itertools.product(*choices, given.threats())]
+    return combined(attacks, given.suites, others)
 
 
 def _grid(given: Options, name: str | None) -> Grid:
     """The grid of this name, or the default grid of the world.
 
     Raises:
-        UserError: if the world has no such grid, or several worlds are chosen.
+        UserError: if there is no such grid, or several worlds are chosen.
     """
     worlds = {world.name: world.component for world in given.chosen("world")}
     if len(worlds) > 1:
         raise UserError(f"a run uses one world, got {' and '.join(worlds)}: start one run for each")
     ((world_name, world),) = worlds.items()
-    known = [grid.name for grid in registry.grids(world_name)]
-    wanted = name or world.grid
-    if wanted not in known:
-        if wanted in registry.entries(registry.GRIDS):
-            registry.grid(wanted)  # raises the reason if the grid is broken
-        raise UserError(registry.unknown(f"grid {wanted!r} of the world {world_name!r}", wanted, known))
-    return registry.grid(wanted)
+    return grid_of(world_name, name or world.grid)
+
+
+def grid_of(world: str, name: str) -> Grid:
+    """The grid of this name of a world.
+
+    Raises:
+        UserError: if there is no such grid.
+    """
+    known = [grid.name for grid in registry.grids(world)]
+    if name not in known:
+        if name in registry.entries(registry.GRIDS):
+            registry.grid(name)  # raises the reason if the grid is broken
+        raise UserError(registry.unknown(f"grid {name!r} of the world {world!r}", name, known))
+    return registry.grid(name)
 
 
 def train_config(words: Sequence[str]) -> TrainConfig:

@@ -119,6 +119,7 @@ class RayExecutor:
             except Exception as error:
                 line = str(error).strip().splitlines()[0]
                 raise UserError(f"there is no Ray cluster at ray.address={address}: {line}") from error
+        self.size = self._cores()
         self.make = ray.remote(num_cpus=1, max_concurrency=2, max_restarts=0)(Host)
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
@@ -138,7 +139,7 @@ class RayExecutor:
                             actor.task = following
                             actor.pending = actor.handle.carry_out.remote(content)
                         following = retries.next(waiting)
-                watcher.working([actor.task.work for actor in self.actors if actor.task])
+                watcher.working([work for a in self.actors if a.task for work in (a.task.work, *a.task.others)])
                 for actor, answer in self._answers(watcher):
                     alive = time.monotonic()
                     task, actor.task = actor.task, None
@@ -162,10 +163,13 @@ class RayExecutor:
             for actor in [actor for actor in self.actors if actor.task]:
                 self._kill(actor)
 
+    def _cores(self) -> int:
+        there = int(self.ray.cluster_resources().get("CPU", 0))
+        return min(self.most or there, there)
+
     def _grow(self) -> None:
         """An actor for every core of the cluster; those of new machines, too."""
-        there = int(self.ray.cluster_resources().get("CPU", 0))
-        while len(self.actors) < min(self.most or there, there):
+        while len(self.actors) < self._cores():
             handle = self.make.remote(self.limits)
             self.actors.append(_Actor(handle, handle.ready.remote()))
 

@@ -16,6 +16,7 @@ from bench import files
 from bench.errors import UserError
 from bench.records import store
 from bench.run import artefacts
+from bench.run.batches import batches
 from bench.run.config import RunConfig
 from bench.run.executors import EXECUTORS, Executor, Watcher
 from bench.run.failures import Failures
@@ -23,6 +24,7 @@ from bench.run.plan import Weights, key_of, loadings, units_of
 from bench.run.unit import Loading, Preparation, Unit, is_foreign
 from bench.run.work import Failure, Outcome, Task
 from bench.run.worker import Limits
+from bench.scenarios import Cell
 from bench.scenarios.axes import written
 
 
@@ -132,33 +134,37 @@ class _Driving:
             (waits if needed and needed.fingerprint in absent else ready).append(unit)
         first: list[Preparation | Unit] = [*absent.values(), *sorted(ready, key=_longest_first)]
         for works in (first, sorted(waits, key=_longest_first)):
-            with closing(self.back_end.map(self._tasks(works), self.watcher)) as finished:
+            together = batches(works, self.recorded, self.back_end.size)
+            with closing(self.back_end.map(self._tasks(together), self.watcher)) as finished:
                 for task, outcome in finished:
                     self._end(task, outcome)
 
-    def _tasks(self, works: Iterable[Preparation | Unit]) -> Iterator[Task]:
-        """The tasks of works, without those of a pair that was given up, and without those whose preparation failed."""
-        for work in works:
+    def _tasks(self, together: Iterable[Sequence[Preparation | Unit]]) -> Iterator[Task]:
+        """The tasks of batches, without those of a pair that was given up, and without those whose preparation failed."""
+        for work, *others in together:
             if self.failures.given_up(work.pair):
-                self.failures.leave(work)
+                self.failures.leave(work.pair, 1 + len(others))
             elif isinstance(work, Preparation):
                 yield Task(work=work)
             elif work.preparation is None or artefacts.path_of(self.out, work.preparation).exists():
                 artefact = self._read(artefacts.path_of(self.out, work.preparation)) if work.preparation else None
-                yield Task(work=work, artefact=artefact, recorded=self.recorded.get(work.fingerprint, ()))
+                units = [other for other in others if isinstance(other, Unit)]
+                yield Task(work=work, artefact=artefact, recorded=self.recorded.get(work.fingerprint, ()), others=units)
 
     def _end(self, task: Task, outcome: Outcome | Failure) -> None:
-        work = task.work
-        assert not isinstance(work, Loading)
-        if isinstance(outcome, Failure):
-            if line := self.failures.add(work, outcome):
-                self.watcher.failed(line)
-            return
-        self._keep(work, outcome)
-        self.finished.add(work.fingerprint)
-        self.watcher.finished(work, outcome.wall_s)
-        for warning in outcome.warnings:
-            self.watcher.warn(warning)
+        # A batch may fail as a whole: then none of its units has an outcome of its own.
+        others = outcome.others or [outcome] * len(task.others)
+        for work, one in zip((task.work, *task.others), (outcome, *others), strict=True):
+            assert not isinstance(work, Loading)
+            if isinstance(one, Failure):
+                if line := self.failures.add(work, one):
+                    self.watcher.failed(line)
+                continue
+            self._keep(work, one)
+            self.finished.add(work.fingerprint)
+            self.watcher.finished(work, one.wall_s)
+            for warning in one.warnings:
+                self.watcher.warn(warning)
 
     def _keep(self, work: Unit | Preparation, outcome: Outcome) -> None:
         """Write the outcome of a task: the records last, because they mark it as finished."""
@@ -181,8 +187,12 @@ def keep_recording(path: Path, content: bytes) -> None:
 
 def recording_path(out: Path, unit: Unit, seed: int) -> Path:
     """The file of an episode's recording."""
-    cell = "-".join(f"{name}-{written(value)}" for name, value in unit.cell.items())
-    return out / "recordings" / unit.pair.id / f"{cell}-{seed}.rrd"
+    return out / "recordings" / unit.pair.id / f"{stem(unit.cell, seed)}.rrd"
+
+
+def stem(cell: Cell, seed: int) -> str:
+    """The name of an episode in the names of files: `lanes-3-density-1-weather-clear-1000000`."""
+    return "-".join([*(f"{name}-{written(value)}" for name, value in cell.items()), str(seed)])
 
 
 def _recorded(config: RunConfig, units: Iterable[Unit]) -> dict[str, Sequence[int]]:

@@ -74,12 +74,14 @@ class Work:
     @property
     def modules(self) -> tuple[str, ...]:
         """Modules hashed into the code digest, with their imports."""
-        return (self.module, *sorted(type(part.component).__module__ for part in self.pair.parts))
+        shipped = (part for part in self.pair.parts if not part.code)
+        return (self.module, *sorted(type(part.component).__module__ for part in shipped))
 
     @property
     def code_digest(self) -> str:
         """Hash of the source code that computes it: the track's and the components' modules, with their imports."""
-        return code_digest(self.modules)
+        own = [part.code for part in self.pair.parts if part.code]
+        return digest([code_digest(self.modules), *own]) if own else code_digest(self.modules)
 
     @property
     def libraries(self) -> dict[str, str]:
@@ -118,7 +120,7 @@ class Work:
             "weights": self.weights_sha256,
             **({"adversary": self.adversary_sha256} if self.adversary_sha256 else {}),
             "code": self.code_digest,
-            "shipped_by": [shipped_by(part) for part in self.pair.parts],
+            "shipped_by": [part.shipped_by for part in self.pair.parts],
             "libraries": self.libraries,
         }
 
@@ -215,7 +217,7 @@ class Unit(Work):
             "grid": self.grid,
             "cell": json.dumps(dict(self.cell), separators=(",", ":")),
             "world_facts": json.dumps(pair.world.component.facts.written(), separators=(",", ":")),
-            **{f"{part.kind}_shipped_by": shipped_by(part) for part in pair.parts},
+            **{f"{part.kind}_shipped_by": part.shipped_by for part in pair.parts},
             "weights_sha256": self.weights_sha256,
             "code_digest": self.code_digest,
             "libraries": canonical(self.libraries),
@@ -230,10 +232,7 @@ class Unit(Work):
 
 
 def is_foreign(part: Chosen[Any]) -> bool:
-    """Whether a plug-in ships a component."""
-    return registry.find(registry.GROUPS[part.kind], part.name, part.kind).distribution != registry.OWN
-
-
-def shipped_by(part: Chosen[Any]) -> str:
-    """The distribution and version that ship a component."""
-    return registry.find(registry.GROUPS[part.kind], part.name, part.kind).shipped_by
+    """Whether cavbench does not ship a component: a plug-in does, or it is an object of Python."""
+    return (
+        bool(part.code) or registry.find(registry.GROUPS[part.kind], part.name, part.kind).distribution != registry.OWN
+    )

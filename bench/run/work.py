@@ -34,12 +34,18 @@ class Task:
         artefact: content of the file of the unit's preparation; None if it has none.
         recorded: scenario seeds of the episodes to record.
         entropy: seed of the probes of a replay; None draws one, which nobody can foresee.
+        others: units to drive in the same batch (`bench.run.batches`).
     """
 
     work: Unit | Preparation | Loading
     artefact: bytes | None = None
     recorded: Sequence[int] = ()
     entropy: int | None = None
+    others: Sequence[Unit] = ()
+
+    def parts(self) -> list[Task]:
+        """A task for each unit of a batch; none if it is not a batch."""
+        return [Task(work=unit) for unit in (self.work, *self.others)] if self.others else []
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +53,13 @@ class Outcome:
     """The results of a task.
 
     Args:
-        wall_s: wall time in seconds.
+        wall_s: wall time in seconds; of several units in one batch, each has its share.
         records: records of a unit, with their provenance; otherwise None.
         artefact: content of the file of a preparation; otherwise None.
         weights: of a loading, the hashes of the networks; otherwise None.
         recordings: contents of the `.rrd` files of a unit, by scenario seed.
         warnings: problems that do not affect the records.
+        others: the results of the task's other units, in their order.
     """
 
     wall_s: float
@@ -61,6 +68,7 @@ class Outcome:
     weights: tuple[str, str] | None = None
     recordings: Mapping[int, bytes] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    others: Sequence[Outcome | Failure] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +82,7 @@ class Failure:
         bad_input: whether the options or the files of the user are the reason.
         tampered: whether it changed its process, which must do no other work.
         trace: the traceback, for --debug.
+        others: the results of the task's other units, in their order; empty if these have none either.
     """
 
     why: str
@@ -82,6 +91,7 @@ class Failure:
     bad_input: bool = False
     tampered: bool = False
     trace: str = ""
+    others: Sequence[Outcome | Failure] = ()
 
 
 def attempt(task: Task, tell: Tell, framework: Snapshot) -> Outcome | Failure:
@@ -92,13 +102,42 @@ def attempt(task: Task, tell: Tell, framework: Snapshot) -> Outcome | Failure:
         tell: called with the progress of a preparation.
         framework: the functions of the framework as they should be.
     """
-    outcome = _attempted(task, tell)
+    outcome = _together(task, tell) if task.others else _alone(task, tell)
     if changed := framework.changed():
         return Failure(why=f"is refused: {changed} was replaced{blamed(task.work.pair)}", tampered=True)
     return outcome
 
 
-def _attempted(task: Task, tell: Tell) -> Outcome | Failure:
+def _together(task: Task, tell: Tell) -> Outcome | Failure:
+    """The outcomes of a task with several units: one after the other, if one batch gives no results."""
+    try:
+        with contained():
+            outcomes: Sequence[Outcome | Failure] = _in_one_batch(task)
+    # Each unit alone says what is wrong with it.
+    except Exception:
+        outcomes = []
+    first, *others = outcomes or [_alone(part, tell) for part in task.parts()]
+    return replace(first, others=others)
+
+
+def _in_one_batch(task: Task) -> list[Outcome]:
+    """The outcomes of units that are driven together; none if they must be driven one by one."""
+    assert isinstance(task.work, Unit)
+    units = (task.work, *task.others)
+    start, entropy = time.perf_counter(), secrets.randbits(62)
+    driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units])
+    if driven is None:
+        return []
+    per_episode = (time.perf_counter() - start) / sum(len(unit.seeds) for unit in units)
+    outcomes = []
+    for unit, result in zip(units, driven, strict=True):
+        wall_s = per_episode * len(unit.seeds)
+        records = table(unit.constants(wall_s), result.columns, track=unit.track)
+        outcomes.append(Outcome(wall_s=wall_s, records=records))
+    return outcomes
+
+
+def _alone(task: Task, tell: Tell) -> Outcome | Failure:
     work = task.work
     try:
         with contained():
@@ -133,7 +172,10 @@ def _driven(unit: Unit, task: Task) -> Outcome:
     driven = unit.track.drive(replace(unit.job, entropy=entropy), task.artefact, task.recorded)
     wall_s = time.perf_counter() - start
     constants = unit.constants(wall_s)
-    records = table(constants, driven.columns, track=unit.track)
+    try:
+        records = table(constants, driven.columns, track=unit.track)
+    except ValueError as error:
+        raise UserError(f"its measurements cannot be: {error}") from error
     recordings, warnings = _recordings(unit, driven.traces, constants)
     return Outcome(wall_s=wall_s, records=records, recordings=recordings, warnings=warnings)
 

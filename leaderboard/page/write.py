@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.text import Text
 
 from bench.errors import UserError
-from bench.files import whole
+from bench.files import check_folder, whole
 from bench.plugins.track import tracks
 from bench.records import reading
 from bench.run.process import follow_parent
@@ -46,6 +46,9 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         UserError: if there are no records, or nothing can be written.
     """
     page = page / NAME if page.is_dir() else page
+    check_folder(page.parent, "the folder of the page")
+    if folders := [target for target in _files(page) if target.is_dir()]:
+        raise UserError(f"the page {page} cannot be written: {folders[0]} is a folder; choose another with html=")
     # The thesis' tables are made of other records, and so in a process of their own meanwhile.
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=follow_parent) as beside:
         beside.submit(chapters.prepare)
@@ -54,12 +57,11 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         boards, comparisons = read_boards(records)
         made = document(boards, comparisons, out)
         texts = {
-            page.with_suffix(".json"): json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
-            page.with_suffix(".csv"): table(made),
+            _files(page)[0]: json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
+            _files(page)[1]: table(made),
             page: html(made, sum(map(len, records.values())), thesis.result(), _link(out, page)),
         }
     try:
-        page.parent.mkdir(parents=True, exist_ok=True)
         for path, text in texts.items():
             with whole(path) as file:
                 file.write(text.encode())
@@ -68,6 +70,11 @@ def write(out: Path | None, page: Path, console: Console) -> None:
     print_boards(boards, console)
     for path in sorted(texts):
         console.print(Text(f" {path} ({path.stat().st_size / 1e6:.2f} MB)"), soft_wrap=True)
+
+
+def _files(page: Path) -> tuple[Path, Path, Path]:
+    """The JSON, the CSV and the page."""
+    return page.with_suffix(".json"), page.with_suffix(".csv"), page
 
 
 def _read(out: Path | None) -> dict[str, pa.Table]:

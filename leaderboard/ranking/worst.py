@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from bench.scenarios import Cell
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
+from bench.statistics.strongest import strongest_of
 from leaderboard.comparisons.comparison import Comparison
-
-FOLDS = 5
-"""Parts of the scenarios. In each, the attack counts that is the strongest in the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +73,7 @@ class Panel:
         cells = np.flatnonzero(known.any(0))
         if not len(cells):
             return None
-        choice = np.array(some)[_chosen(self.scores[some][:, :, cells])]
+        choice = np.array(some)[strongest_of(self.scores[some][:, :, cells])]
         pick = (
             choice[None],
             np.arange(len(self.runs))[:, None, None],
@@ -103,16 +101,6 @@ def _episodes(attacks: Sequence[Comparison], runs: Sequence[int], seeds: Sequenc
     """How many episodes of the attacks count on these seeds."""
     cells = sum(len(one.cells) for one in attacks if _covers(one, runs, seeds))
     return len(runs) * cells * len(seeds)
-
-
-def _chosen(scores: Array) -> NDArray[np.int64]:
-    """[C, E] the attack with the lowest mean over runs and the other folds' scenarios, from scores [A, R, C, E]."""
-    totals = scores.sum(1)
-    count = scores.shape[-1]
-    fold = np.arange(count) % min(FOLDS, count)
-    others = (fold[:, None] != fold).astype(float) if count > 1 else np.ones((1, 1))
-    means = np.where(np.isnan(totals), np.inf, np.nan_to_num(totals) @ others / others.sum(0))
-    return np.asarray(means.argmin(0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,7 +72,7 @@ def test_an_unknown_component_has_no_page(bench: Bench) -> None:
     ("words", "part"),
     [
         (("attack=nugde",), "unknown attack 'nugde'; did you mean 'nudge'?"),
-        (("attack=nudge", "attack.pause=long"), "cannot read attack.pause=long"),
+        (("attack=nudge", "attack.pause=long"), "attack.pause must be a number, got long"),
         (("threat.budget=-1",), "threat.budget must be between 0 and 2, got -1"),
         (("attack=steer", "victim=toy"), "attack 'steer' does not fit victim 'toy'"),
         (("--fast",), "No such option"),
@@ -98,13 +98,17 @@ def test_a_repeated_run_only_prints_the_table(bench: Bench, tmp_path: Path) -> N
     assert again.err.strip() == "36 of 36 episodes are already done"
 
 
-def test_a_truncated_record_stops_every_command_that_reads_it(bench: Bench, tmp_path: Path) -> None:
+def test_a_truncated_record_stops_what_reads_it_and_is_driven_again(bench: Bench, tmp_path: Path) -> None:
     run = ("run", *TOY, "executor=serial", "record=0", "reference=false", f"out={tmp_path}")
     bench(*run)
     path = sorted((tmp_path / "episodes").glob("*.parquet"))[0]
     path.write_bytes(path.read_bytes()[:100])
-    for words in (run, ("show", str(tmp_path)), ("report", f"out={tmp_path}")):
+    for words in (("show", str(tmp_path)), ("report", f"out={tmp_path}")):
         assert_one_line(bench(*words), f"the record {path} is truncated")
+    again = bench(*run)
+    assert again.code == 0
+    assert [one.name for one in (tmp_path / "set_aside").iterdir()] == [path.name]
+    assert bench("report", f"out={tmp_path}").code == 0
 
 
 def test_show_prints_the_provenance_of_the_records(bench: Bench, tmp_path: Path) -> None:

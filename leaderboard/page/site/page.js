@@ -119,13 +119,14 @@ function draw(id, columns, rows, classes) {
 const shortest = (value) => (typeof value === "number" ? Number(value.toFixed(4)).toString() : value == null ? "" : String(value));
 function csv(lines) {
   return lines.map((line) => line.map((value) => {
-    const text = shortest(value);
-    return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+    // A spreadsheet takes these for formulas.
+    const text = (typeof value === "string" && /^[=+\-@\t\r]/.test(value) ? "'" : "") + shortest(value);
+    return /[",\n\r]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
   }).join(",")).join("\n") + "\n";
 }
 function latex(lines) {
   const escape = (value) => (typeof value === "number" ? value.toFixed(Number.isInteger(value) ? 0 : 2) : shortest(value))
-    .replaceAll("\\", "\\textbackslash ").replace(/[&%$#_{}]/g, "\\$&").replaceAll("×", "$\\times$").replaceAll("−", "$-$");
+    .replace(/[\\&%$#_{}~^]/g, (c) => ({ "\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}" })[c] ?? `\\${c}`).replaceAll("×", "$\\times$").replaceAll("−", "$-$");
   const rows = lines.map((line) => line.map(escape).join(" & ") + " \\\\");
   const align = lines[0].map((_, i) => (lines.slice(1).every((line) => typeof line[i] === "number" || line[i] == null) ? "r" : "l")).join("");
   return ["\\begin{tabular}{" + align + "}", "\\toprule", rows[0], "\\midrule", ...rows.slice(1), "\\bottomrule", "\\end{tabular}"].join("\n") + "\n";
