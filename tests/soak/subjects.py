@@ -28,7 +28,10 @@ CRAFT = (
     *("run", "attack=paint", "victim=red", "world=red_street", "weather=clear,fog", "seeds=0,1,2"),
     *("record=0", "workers=2"),
 )
-TRAIN = ("train", "victim=dqn", "world.vehicles=3", "victim.decisions=600", "seeds=0")
+TRAIN = (
+    *("train", "victim=dqn", "world.vehicles=3", "world.max_steps=30", "seeds=0"),
+    *("victim.decisions=300", "victim.checkpoints=1", "victim.hidden=16", "victim.batch=32", "victim.copies=4"),
+)
 REPORT = ("report", "leaderboard")
 
 
