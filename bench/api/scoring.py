@@ -142,10 +142,10 @@ class _Silent:
         pass
 
     def printed(self, work: object, lines: Sequence[str]) -> None:
-        pass
+        sys.stdout.write("".join(f"{line}\n" for line in lines))
 
     def failed(self, line: str) -> None:
-        """The error at the end of the run says it."""
+        warnings.warn(line, stacklevel=4)
 
     def warn(self, line: str) -> None:
         warnings.warn(line, stacklevel=4)

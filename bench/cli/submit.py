@@ -6,7 +6,6 @@ import json
 import os
 import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,6 +22,7 @@ from bench.cli.show import Report, pair_named, records_of
 from bench.cli.terminal import Console
 from bench.cli.words import split
 from bench.errors import UserError, short
+from bench.files import scratch
 from bench.records import reading, store
 from bench.records.schema import AUDIT
 from bench.run import runner, submission
@@ -174,8 +174,8 @@ def _audited(found: Submission, salt: int | None, episodes: int, console: Consol
         episodes=episodes,
         first_seed=SeedBlock.AUDIT + salt,
     )
-    with tempfile.TemporaryDirectory(prefix="cavbench-") as folder:
-        config = RunConfig(pairs=(pair,), grid=drawn, seeds=tuple(seeds), out=Path(folder), record=0, reference=False)
+    with scratch() as folder:
+        config = RunConfig(pairs=(pair,), grid=drawn, seeds=tuple(seeds), out=folder, record=0, reference=False)
         with RunProgress(Console(stderr=True)) as progress:
             units = runner.run(config, progress)
         fresh = reading.read(config.out, units, track=found.track)

@@ -188,7 +188,7 @@ def run_config(words: Sequence[str]) -> RunConfig:
 def _shard(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", text)
     if match is None or int(match[1]) > int(match[2]):
-        raise UserError(f"shard must be PART/PARTS, for instance shard=3/10, got {text}")
+        raise UserError(f"shard must be PART/PARTS, for instance shard=3/10, got {short(text)}")
     return int(match[1]), int(match[2])
 
 

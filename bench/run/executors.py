@@ -41,7 +41,9 @@ class Watcher(Protocol):
 
 
 class Executor(Protocol):
-    """A back end that carries out tasks."""
+    """A back end that carries out tasks. `size` is the number of tasks that it carries out at once."""
+
+    size: int
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
         """Carry out all tasks, and yield each with its outcome, or why it failed, as soon as it is finished.
@@ -65,29 +67,36 @@ class SerialExecutor:
         limits: of each task.
     """
 
+    size = 1
+
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
         settle()
         framework, culprit = Snapshot(), ""
-        for task in tasks:
+        waiting, parts = iter(tasks), deque[Task]()
+        while (task := parts.popleft() if parts else next(waiting, None)) is not None:
             if culprit:
                 yield task, Failure(why=f"was not driven: {culprit} changed this process; use executor=processes")
                 continue
-            watcher.working([task.work])
+            watcher.working([task.work, *task.others])
             outcome, text = self._carried_out(task, watcher, framework)
             if lines := [line for line in text.splitlines() if line.strip()]:
                 watcher.printed(task.work, lines)
             if isinstance(outcome, Failure) and outcome.tampered:
                 culprit = str(task.work)
+            elif isinstance(outcome, Failure) and outcome.lost and task.others:
+                # Each unit alone says which one it was.
+                parts.extend(task.parts())
+                continue
             yield task, outcome
 
     def _carried_out(self, task: Task, watcher: Watcher, framework: Snapshot) -> tuple[Outcome | Failure, str]:
         """The outcome of a task, and what it printed to standard output."""
         with contextlib.redirect_stdout(io.StringIO()) as output:
             try:
-                with _time_limit(self.limits.seconds * task.units):
+                with _time_limit(self.limits.seconds):
                     outcome = attempt(task, watcher.preparing, framework)
             except StopUnitError:
                 why = f"failed: it took longer than unit_timeout={self.limits.seconds:g} seconds"
@@ -126,7 +135,7 @@ class ProcessExecutor:
     """
 
     def __init__(self, workers: int, limits: Limits) -> None:
-        self.count, self.limits = workers, limits
+        self.size, self.limits = workers, limits
         self.idle: list[Worker] = []
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
@@ -134,17 +143,17 @@ class ProcessExecutor:
         busy: dict[Worker, Task] = {}
         try:
             while True:
-                while len(busy) < self.count and (task := retries.next(waiting)) is not None:
+                while len(busy) < self.size and (task := retries.next(waiting)) is not None:
                     content = packed(task)
                     if isinstance(content, Failure):
                         yield task, content
                         continue
                     worker = self.idle.pop() if self.idle else Worker(self.limits)
-                    worker.give(content, task.units)
+                    worker.give(content)
                     busy[worker] = task
                 if not busy:
                     return
-                watcher.working([task.work for task in busy.values()])
+                watcher.working([work for task in busy.values() for work in (task.work, *task.others)])
                 wait([item for worker in busy for item in (worker.connection, worker.process.sentinel)], NEWS_S)
                 for worker in list(busy):
                     for item in worker.news():
@@ -168,7 +177,7 @@ class ProcessExecutor:
 
 
 class Retries:
-    """Tries a task whose process died a second time, and passes on the outcomes of all others."""
+    """Tries a task whose process died a second time, the units of a batch alone, and passes on the outcomes of all others."""
 
     def __init__(self) -> None:
         self._again: deque[Task] = deque()
@@ -193,8 +202,11 @@ class Retries:
             lines: what it printed.
             watcher: is told.
         """
-        # A batch is not tried again: its units are, one by one.
-        if isinstance(outcome, Failure) and outcome.died and not task.others and id(task) not in self._died:
+        if isinstance(outcome, Failure) and (outcome.lost or outcome.tampered) and task.others:
+            # Each unit of a batch alone says which one it was.
+            self._again.extend(task.parts())
+            return
+        if isinstance(outcome, Failure) and outcome.died and id(task) not in self._died:
             self._died.add(id(task))
             self._again.append(task)
             return

@@ -49,9 +49,9 @@ class Failures:
         """Whether the rest of a pair is not worth the time."""
         return self._lost[pair.id] >= ENOUGH
 
-    def leave(self, work: Unit | Preparation) -> None:
-        """Note that a unit of a pair that was given up is not driven."""
-        self._left[work.pair.id] += 1
+    def leave(self, pair: Pair, units: int) -> None:
+        """Note that units of a pair that was given up are not driven."""
+        self._left[pair.id] += units
 
     def lines(self) -> list[str]:
         """One line for each plug-in that was left out, and for each pair and reason: the first unit, and how many more."""

@@ -50,11 +50,11 @@ class Host:
         told, self.told = self.told, []
         return told
 
-    def carry_out(self, content: bytes, units: int) -> tuple[bytes, list[str]]:
+    def carry_out(self, content: bytes) -> tuple[bytes, list[str]]:
         """The outcome of a task from `packed`, pickled, and what it printed."""
         worker = self.worker or Worker(self.limits)
         self.worker = worker
-        worker.give(content, units)
+        worker.give(content)
         while True:
             worker.wait(NEWS_S)
             for item in worker.news():
@@ -119,6 +119,7 @@ class RayExecutor:
             except Exception as error:
                 line = str(error).strip().splitlines()[0]
                 raise UserError(f"there is no Ray cluster at ray.address={address}: {line}") from error
+        self.size = self._cores()
         self.make = ray.remote(num_cpus=1, max_concurrency=2, max_restarts=0)(Host)
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
@@ -136,9 +137,9 @@ class RayExecutor:
                             yield following, content
                         else:
                             actor.task = following
-                            actor.pending = actor.handle.carry_out.remote(content, following.units)
+                            actor.pending = actor.handle.carry_out.remote(content)
                         following = retries.next(waiting)
-                watcher.working([actor.task.work for actor in self.actors if actor.task])
+                watcher.working([work for a in self.actors if a.task for work in (a.task.work, *a.task.others)])
                 for actor, answer in self._answers(watcher):
                     alive = time.monotonic()
                     task, actor.task = actor.task, None
@@ -162,10 +163,13 @@ class RayExecutor:
             for actor in [actor for actor in self.actors if actor.task]:
                 self._kill(actor)
 
+    def _cores(self) -> int:
+        there = int(self.ray.cluster_resources().get("CPU", 0))
+        return min(self.most or there, there)
+
     def _grow(self) -> None:
         """An actor for every core of the cluster; those of new machines, too."""
-        there = int(self.ray.cluster_resources().get("CPU", 0))
-        while len(self.actors) < min(self.most or there, there):
+        while len(self.actors) < self._cores():
             handle = self.make.remote(self.limits)
             self.actors.append(_Actor(handle, handle.ready.remote()))
 

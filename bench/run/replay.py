@@ -97,7 +97,7 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
         recorded=[record["seed"]],
         entropy=record.get("entropy"),
     )
-    outcome = _repeated(task)
+    outcome = _carried_out(task)
     after = outcome.records
     assert after is not None
     if not outcome.recordings:
@@ -108,12 +108,8 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     return Replay(saved, _changed(unit, record, after), differences)
 
 
-def _repeated(task: Task) -> Outcome:
-    """The outcome of a task.
-
-    Raises:
-        UserError: if it fails.
-    """
+def _carried_out(task: Task) -> Outcome:
+    """The outcome of a task in this process; UserError if it fails."""
     outcome = attempt(task, lambda *news: None, Snapshot())
     if isinstance(outcome, Failure):
         raise UserError(f"{task.work} {outcome.why}")
@@ -157,7 +153,7 @@ def repeat(out: Path, record: Mapping[str, Any]) -> Repeated:
     """
     unit, before = _unit(out, record)
     task = Task(work=unit, artefact=_artefact(out, unit, record), entropy=record.get("entropy"))
-    after = _repeated(task).records
+    after = _carried_out(task).records
     assert after is not None
     return Repeated(unit, before, after, _changed(unit, record, after), _differences(unit, before, after))
 

@@ -21,7 +21,6 @@ from bench.run.config import RunConfig
 from bench.run.executors import EXECUTORS, Executor, Watcher
 from bench.run.failures import Failures
 from bench.run.plan import Weights, key_of, loadings, units_of
-from bench.run.process import cores
 from bench.run.unit import Loading, Preparation, Unit, is_foreign
 from bench.run.work import Failure, Outcome, Task
 from bench.run.worker import Limits
@@ -66,8 +65,7 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
         missing = [unit for key, unit in units.items() if key not in done]
         episodes = len(config.grid.seeds())
         watcher.begin(episodes=episodes * len(units), finished=episodes * len(done))
-        recorded = _recorded(config, units.values())
-        driving = _Driving(config.out, recorded, config.workers or cores(), back_end, watcher, failures)
+        driving = _Driving(config.out, _recorded(config, units.values()), back_end, watcher, failures)
         driving.carry_out(missing)
     if failures:
         finished = [key for key, unit in units.items() if key in done or key in driving.finished]
@@ -116,15 +114,12 @@ class _Driving:
         self,
         out: Path,
         recorded: Mapping[str, Sequence[int]],
-        workers: int,
         back_end: Executor,
         watcher: RunWatcher,
         failures: Failures,
     ) -> None:
-        self.out, self.recorded, self.workers = out, recorded, workers
-        self.back_end, self.watcher, self.failures = back_end, watcher, failures
+        self.out, self.recorded, self.back_end, self.watcher, self.failures = out, recorded, back_end, watcher, failures
         self.finished: set[str] = set()
-        self._again: list[Unit] = []
         self._read = cache(artefacts.read)
 
     def carry_out(self, units: Iterable[Unit]) -> None:
@@ -139,51 +134,37 @@ class _Driving:
             (waits if needed and needed.fingerprint in absent else ready).append(unit)
         first: list[Preparation | Unit] = [*absent.values(), *sorted(ready, key=_longest_first)]
         for works in (first, sorted(waits, key=_longest_first)):
-            self._pass(batches(works, self.recorded, self.workers))
-            again, self._again = self._again, []
-            self._pass([[unit] for unit in again])
+            together = batches(works, self.recorded, self.back_end.size)
+            with closing(self.back_end.map(self._tasks(together), self.watcher)) as finished:
+                for task, outcome in finished:
+                    self._end(task, outcome)
 
-    def _pass(self, works: Sequence[Sequence[Preparation | Unit]]) -> None:
-        """Pass batches of works to the executor."""
-        with closing(self.back_end.map(self._tasks(works), self.watcher)) as finished:
-            for task, outcome in finished:
-                self._end(task, outcome)
-
-    def _tasks(self, works: Iterable[Sequence[Preparation | Unit]]) -> Iterator[Task]:
-        """The tasks of works, without those of a pair that was given up, and without those whose preparation failed."""
-        for batch in works:
-            work, *others = batch
+    def _tasks(self, together: Iterable[Sequence[Preparation | Unit]]) -> Iterator[Task]:
+        """The tasks of batches, without those of a pair that was given up, and without those whose preparation failed."""
+        for work, *others in together:
             if self.failures.given_up(work.pair):
-                for one in batch:
-                    self.failures.leave(one)
+                self.failures.leave(work.pair, 1 + len(others))
             elif isinstance(work, Preparation):
                 yield Task(work=work)
             elif work.preparation is None or artefacts.path_of(self.out, work.preparation).exists():
                 artefact = self._read(artefacts.path_of(self.out, work.preparation)) if work.preparation else None
-                units = [one for one in others if isinstance(one, Unit)]
-                recorded = self.recorded.get(work.fingerprint, ())
-                yield Task(work=work, artefact=artefact, recorded=recorded, others=units)
+                units = [other for other in others if isinstance(other, Unit)]
+                yield Task(work=work, artefact=artefact, recorded=self.recorded.get(work.fingerprint, ()), others=units)
 
     def _end(self, task: Task, outcome: Outcome | Failure) -> None:
-        """Note the results of a task. The units of a batch that failed as a whole are driven again, one by one."""
-        work = task.work
-        assert not isinstance(work, Loading)
-        if task.others and not outcome.others:
-            self._again += [one for one in (work, *task.others) if isinstance(one, Unit)]
-            return
-        for one, result in zip((work, *task.others), (outcome, *outcome.others), strict=True):
-            self._note(one, result)
-
-    def _note(self, work: Unit | Preparation, outcome: Outcome | Failure) -> None:
-        if isinstance(outcome, Failure):
-            if line := self.failures.add(work, outcome):
-                self.watcher.failed(line)
-            return
-        self._keep(work, outcome)
-        self.finished.add(work.fingerprint)
-        self.watcher.finished(work, outcome.wall_s)
-        for warning in outcome.warnings:
-            self.watcher.warn(warning)
+        # A batch may fail as a whole: then none of its units has an outcome of its own.
+        others = outcome.others or [outcome] * len(task.others)
+        for work, one in zip((task.work, *task.others), (outcome, *others), strict=True):
+            assert not isinstance(work, Loading)
+            if isinstance(one, Failure):
+                if line := self.failures.add(work, one):
+                    self.watcher.failed(line)
+                continue
+            self._keep(work, one)
+            self.finished.add(work.fingerprint)
+            self.watcher.finished(work, one.wall_s)
+            for warning in one.warnings:
+                self.watcher.warn(warning)
 
     def _keep(self, work: Unit | Preparation, outcome: Outcome) -> None:
         """Write the outcome of a task: the records last, because they mark it as finished."""

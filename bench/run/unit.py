@@ -232,7 +232,7 @@ class Unit(Work):
 
 
 def is_foreign(part: Chosen[Any]) -> bool:
-    """Whether a plug-in ships a component; an object of the caller's own process is not foreign to it."""
+    """Whether cavbench does not ship a component: a plug-in does, or it is an object of Python."""
     return (
-        not part.code and registry.find(registry.GROUPS[part.kind], part.name, part.kind).distribution != registry.OWN
+        bool(part.code) or registry.find(registry.GROUPS[part.kind], part.name, part.kind).distribution != registry.OWN
     )

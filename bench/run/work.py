@@ -43,10 +43,9 @@ class Task:
     entropy: int | None = None
     others: Sequence[Unit] = ()
 
-    @property
-    def units(self) -> int:
-        """Number of units, 1 for other works."""
-        return 1 + len(self.others)
+    def parts(self) -> list[Task]:
+        """A task for each unit of a batch; none if it is not a batch."""
+        return [Task(work=unit) for unit in (self.work, *self.others)] if self.others else []
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +82,7 @@ class Failure:
         bad_input: whether the options or the files of the user are the reason.
         tampered: whether it changed its process, which must do no other work.
         trace: the traceback, for --debug.
-        others: the results of the task's other units, in their order; none if the whole task failed.
+        others: the results of the task's other units, in their order; empty if these have none either.
     """
 
     why: str
@@ -103,16 +102,43 @@ def attempt(task: Task, tell: Tell, framework: Snapshot) -> Outcome | Failure:
         tell: called with the progress of a preparation.
         framework: the functions of the framework as they should be.
     """
-    outcome = _attempted(task, tell)
+    outcome = _together(task, tell) if task.others else _alone(task, tell)
     if changed := framework.changed():
         return Failure(why=f"is refused: {changed} was replaced{blamed(task.work.pair)}", tampered=True)
     return outcome
 
 
-def _attempted(task: Task, tell: Tell) -> Outcome | Failure:
+def _together(task: Task, tell: Tell) -> Outcome | Failure:
+    """The outcomes of a task with several units: one after the other, if one batch gives no results."""
+    try:
+        with contained():
+            outcomes: Sequence[Outcome | Failure] = _in_one_batch(task)
+    # Each unit alone says what is wrong with it.
+    except Exception:
+        outcomes = []
+    first, *others = outcomes or [_alone(part, tell) for part in task.parts()]
+    return replace(first, others=others)
+
+
+def _in_one_batch(task: Task) -> list[Outcome]:
+    """The outcomes of units that are driven together; none if they must be driven one by one."""
+    assert isinstance(task.work, Unit)
+    units = (task.work, *task.others)
+    start, entropy = time.perf_counter(), secrets.randbits(62)
+    driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units])
+    if driven is None:
+        return []
+    per_episode = (time.perf_counter() - start) / sum(len(unit.seeds) for unit in units)
+    outcomes = []
+    for unit, result in zip(units, driven, strict=True):
+        wall_s = per_episode * len(unit.seeds)
+        records = table(unit.constants(wall_s), result.columns, track=unit.track)
+        outcomes.append(Outcome(wall_s=wall_s, records=records))
+    return outcomes
+
+
+def _alone(task: Task, tell: Tell) -> Outcome | Failure:
     work = task.work
-    if task.others and isinstance(work, Unit):
-        return _together((work, *task.others), tell)
     try:
         with contained():
             return _performed(task, tell)
@@ -140,33 +166,6 @@ def _performed(task: Task, tell: Tell) -> Outcome:
             return Outcome(wall_s=time.perf_counter() - start, weights=weights)
 
 
-def _together(units: Sequence[Unit], tell: Tell) -> Outcome | Failure:
-    """The results of several units, driven in one batch, or one after the other if the batch gives none."""
-    try:
-        with contained():
-            results: Sequence[Outcome | Failure] = _in_one_batch(units)
-    # Driven alone, each unit says what fails in it.
-    except Exception:
-        results = []
-    results = results or [_attempted(Task(work=one), tell) for one in units]
-    return replace(results[0], others=results[1:])
-
-
-def _in_one_batch(units: Sequence[Unit]) -> list[Outcome]:
-    """The outcomes of units that are driven together; none if they must be driven one by one."""
-    start, entropy = time.perf_counter(), secrets.randbits(62)
-    driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units])
-    if driven is None:
-        return []
-    per_episode = (time.perf_counter() - start) / sum(len(unit.seeds) for unit in units)
-    outcomes = []
-    for unit, result in zip(units, driven, strict=True):
-        wall_s = per_episode * len(unit.seeds)
-        records = table(unit.constants(wall_s), result.columns, track=unit.track)
-        outcomes.append(Outcome(wall_s=wall_s, records=records))
-    return outcomes
-
-
 def _driven(unit: Unit, task: Task) -> Outcome:
     start = time.perf_counter()
     entropy = secrets.randbits(62) if task.entropy is None else task.entropy
@@ -176,16 +175,9 @@ def _driven(unit: Unit, task: Task) -> Outcome:
     try:
         records = table(constants, driven.columns, track=unit.track)
     except ValueError as error:
-        raise UserError(f"its measurements cannot be: {error} ({_authors(unit)})") from error
+        raise UserError(f"its measurements cannot be: {error}") from error
     recordings, warnings = _recordings(unit, driven.traces, constants)
     return Outcome(wall_s=wall_s, records=records, recordings=recordings, warnings=warnings)
-
-
-def _authors(unit: Unit) -> str:
-    """The components of a unit that do not ship with cavbench, or all of them, with their packages."""
-    shipped = {part: part.shipped_by for part in unit.pair.parts}
-    foreign = {part: by for part, by in shipped.items() if by.partition(" ")[0] != "cavbench"}
-    return ", ".join(f"{part.kind} {part.name!r} of {by}" for part, by in (foreign or shipped).items())
 
 
 def _recordings(

@@ -70,9 +70,9 @@ class Worker:
         far.close()
         end.close()
 
-    def give(self, content: bytes, units: int = 1) -> None:
-        """Start a task, from `packed`; one with several units may take as many times as long."""
-        self.busy, self.started, self.printed, self.units = True, time.monotonic(), b"", units
+    def give(self, content: bytes) -> None:
+        """Start a task, from `packed`."""
+        self.busy, self.started, self.printed = True, time.monotonic(), b""
         # A worker that died meanwhile is noticed when it is asked for news.
         with suppress(OSError):
             self.connection.send_bytes(content)
@@ -149,7 +149,7 @@ class Worker:
         if not self.ready:
             late = time.monotonic() - self.born > START_S
             return f"its worker process did not start within {START_S:g} seconds" if late else ""
-        if self.limits.seconds and time.monotonic() - self.started > self.limits.seconds * self.units:
+        if self.limits.seconds and time.monotonic() - self.started > self.limits.seconds:
             return f"it took longer than unit_timeout={self.limits.seconds:g} seconds"
         used = resident_bytes(self.process.pid or 0) / GB if self.limits.memory_gb else 0
         if used > self.limits.memory_gb:

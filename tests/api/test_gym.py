@@ -144,7 +144,7 @@ def test_the_command_scores_a_file_in_it(cartpole: Any, bench: Bench, tmp_path: 
         "pole=0.5",
         "episodes=2",
         "world.max_steps=50",
-        "workers=1",
+        "executor=serial",
         f"out={tmp_path / 'results'}",
     )
     assert said.code == 0, said.err

@@ -17,7 +17,7 @@ from tests.framework.conftest import Said
 Bench = Callable[..., Said]
 RUN = (
     "run", "attack=nudge", "defense=guard", "defense.digits=2", "victim=toy", "world=toy", "lanes=3,4", "density=1",
-    "weather=clear", "episodes=4", "seeds=0,1", "workers=1", "record=0",
+    "weather=clear", "episodes=4", "seeds=0,1", "executor=serial", "record=0",
 )  # fmt: skip
 
 
@@ -47,7 +47,7 @@ def test_a_submission_is_verified_and_becomes_a_row(bench: Bench, submission: Pa
 
 def test_its_command_drives_the_same_records(bench: Bench, submission: Path, tmp_path: Path) -> None:
     words = json.loads((submission / "submission.json").read_text())["commands"]["run"].split()[1:]
-    assert bench(*words, "workers=1", "record=0", f"out={tmp_path / 'again'}").code == 0
+    assert bench(*words, "executor=serial", "record=0", f"out={tmp_path / 'again'}").code == 0
     driven = {path.name for path in (tmp_path / "again" / "episodes").glob("*.parquet")}
     assert {path.name for path in (submission / "episodes").glob("*.parquet")} <= driven
 
