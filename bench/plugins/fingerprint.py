@@ -73,7 +73,8 @@ def _is_text(node: ast.stmt) -> bool:
 
 
 def sources(modules: Iterable[str]) -> dict[str, Path]:
-    """The source files of modules and of everything they import, directly or indirectly, anywhere in their code.
+    """The source files of modules and of everything they import, directly or indirectly, anywhere in their code but for
+    types alone (`if TYPE_CHECKING`).
 
     Imports are followed within the modules' top-level packages and `bench`, except `BESIDE_THE_RESULT`; of other packages only
     the version counts.
@@ -113,7 +114,12 @@ def file_of(module: str) -> Path | None:
 def _imports(module: str, path: Path) -> Iterator[str]:
     """Every name in the import statements of a module, whether it names a module or not."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    waiting: list[ast.AST] = [ast.parse(path.read_bytes())]
+    while waiting:
+        node = waiting.pop()
+        # What types alone need is never executed.
+        for_types = isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        waiting += node.orelse if for_types and isinstance(node, ast.If) else ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

@@ -109,7 +109,7 @@ def test_every_package_passes_its_own_tests(written: list[Path], installed: Path
 @pytest.mark.slow
 def test_an_installed_package_is_listed_checked_and_scored_in_workers(installed: Path, tmp_path: Path) -> None:
     (line,) = [line for line in ran(installed, "list").out.splitlines() if "my_attack_driving" in line]
-    assert line.split() == ["my_attack_driving", "driving", "cavbench-my-attack-driving", "0.1.0"]
+    assert line.split()[:2] == ["my_attack_driving", "driving"]
     checked = ran(installed, "check", "my_attack_driving", "attack.strength=2")
     assert checked.code == 0, checked.out
     assert "0 to fix" in checked.out

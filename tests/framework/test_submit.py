@@ -34,7 +34,7 @@ def test_a_submission_is_verified_and_becomes_a_row(bench: Bench, submission: Pa
     about = json.loads((submission / "submission.json").read_text())
     assert about["packages"] == ["cavbench-toy 1.0"]
     assert about["commands"]["install"] == "pip install cavbench-toy==1.0"
-    said = bench("verify", str(submission), "sample=2", "episodes=3", f"out={tmp_path / 'board'}")
+    said = bench("verify", str(submission), "sample=2", "audit=false", f"out={tmp_path / 'board'}")
     assert said.code == 0, said.err + said.out
     assert "execute the code of cavbench" in said.out
     assert "cavbench-toy 1.0" in said.out
@@ -43,6 +43,13 @@ def test_a_submission_is_verified_and_becomes_a_row(bench: Bench, submission: Pa
     board = reading.read(tmp_path / "board", track=track("driving"))
     assert {"nudge", "none"} == set(board["attack"].to_pylist())
     assert bench("report", "leaderboard", f"out={tmp_path / 'board'}").code == 0
+
+
+def test_fresh_scenarios_are_compared_with_the_submitted_ones(bench: Bench, submission: Path) -> None:
+    """The toy's cars are placed by the seed alone, so a few public scenarios may differ from the drawn ones."""
+    said = bench("verify", str(submission), "sample=1", "episodes=3", "salt=7")
+    assert "Fresh scenarios (salt=7), 3 a cell" in said.out
+    assert ("public_only" in said.out) == (said.code == 1)
 
 
 def test_its_command_drives_the_same_records(bench: Bench, submission: Path, tmp_path: Path) -> None:
