@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from bench.driving.kinematics import Kinematics
 from bench.plugins.contracts import Facts
 
 ActionType = Literal["discrete", "continuous"]
@@ -52,10 +53,12 @@ class DrivingFacts(Facts):
     Args:
         features: features of the observation.
         drivers: supported drivers: `agent` executes the policy's actions; `idm` is the world's own rule-based driver, if any.
+        kinematics: how its cars move; None if the world does not say.
     """
 
     features: Features
     drivers: tuple[Driver, ...] = ("agent",)
+    kinematics: Kinematics | None = None
 
     def blind_policies(self, action_type: ActionType) -> list[str]:
         """Names of this world's input-independent policies: each constant action, and `right_then_slower` if possible."""
@@ -66,4 +69,7 @@ class DrivingFacts(Facts):
         return [*constant, RIGHT_THEN_SLOWER] if sequence else constant
 
     def written(self) -> dict[str, Any]:
-        return super().written() | {"features": asdict(self.features), "drivers": list(self.drivers)}
+        values = super().written() | {"features": asdict(self.features), "drivers": list(self.drivers)}
+        # No report reads them.
+        del values["kinematics"]
+        return values

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, get_args
@@ -36,6 +36,21 @@ THESIS_FEATURES = Features(
 )
 STANDARD_TARGET_SPEEDS = (10.0, 15.0, 20.0, 25.0, 30.0)
 THESIS_TARGET_SPEEDS = (20.0, 25.0, 30.0)
+
+KINEMATICS: Mapping[str, float] = {
+    "lane_width": 4.0,
+    "length": 5.0,
+    "width": 2.0,
+    "start_speed": 25.0,
+    "speed_gain": 1 / 0.6,
+    "heading_gain": 1 / 0.2,
+    "lateral_gain": 1 / 0.6,
+    "max_heading": math.pi / 4,
+    "max_steering": math.pi / 3,
+    "acceleration_limit": 5.0,
+    "steering_limit": math.pi / 4,
+}
+"""highway-env's constants of a controlled vehicle, as `bench.driving.Kinematics` names them."""
 
 
 @dataclass(frozen=True, kw_only=True)
