@@ -20,6 +20,9 @@ OFF_THE_ROAD = 0.3
 SLACK = 1.0
 """The reckoned place and speed are corrected if they are farther outside of the measured box than this, in m and m/s."""
 
+ORDER = ("FASTER", "IDLE", "SLOWER", "LANE_LEFT", "LANE_RIGHT")
+"""The order in which margins are computed; `DeadReckoning.order` leads from it to the world's actions."""
+
 
 class Ego(NamedTuple):
     """The ego's motion, [...] each.
@@ -53,7 +56,8 @@ class DeadReckoning:
 
     def __init__(self, kinematics: Kinematics, period: float, actions: tuple[str, ...], action_type: ActionType) -> None:
         self.kinematics, self.dt, self.action_type = kinematics, period / kinematics.frames, action_type
-        self.numbers = {name: actions.index(name) for name in actions}
+        self.numbers = {name: number for number, name in enumerate(actions)}
+        self.order = [ORDER.index(name) for name in actions] if action_type == "discrete" else []
 
     def unknown(self, episodes: Tensor) -> TensorDict:
         """The state before the first observation."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import DeadReckoning, Ego
-from bench.driving.intervals.following import Braking, FollowingDistance
+from bench.driving.intervals.following import FollowingDistance
 
 FREE = 200.0
 """The margin where there is no car, in m."""
@@ -24,8 +24,6 @@ CLEARANCE = 0.4
 """Lateral room between two cars, in m, below which they are in the same lane."""
 ROOM = 12.0
 """This much of the room to a car ahead does not count as free, in m."""
-QUEUE = 35.0
-"""A leader brakes harder if there is a car less than this ahead of it, in m."""
 SIDES = (-4, -3, -2, -1, 0, 1, 2, 3, 4)
 """The lanes in question, relative to the ego's target lane."""
 
@@ -35,13 +33,13 @@ class Caution:
     """What is assumed of other cars.
 
     Args:
-        leader: how a car brakes that has another one ahead.
-        alone: how a car brakes that has none.
+        braking: least rate at which a car ahead may brake, in m/s2.
+        seconds: how long a car ahead may brake.
         distance: room between two cars that is always kept, in m.
     """
 
-    leader: Braking
-    alone: Braking
+    braking: float
+    seconds: float
     distance: float
 
 
@@ -77,11 +75,12 @@ class Judge:
         self.reckoning, self.period, self.caution, self.horizon = reckoning, period, caution, horizon
         continuous = reckoning.action_type == "continuous"
 
-        def distance(leader: Braking, within: float | None = None) -> FollowingDistance:
-            return FollowingDistance(reckoning.kinematics, period, leader, continuous=continuous, within=within)
+        def distance(within: float | None = None) -> FollowingDistance:
+            return FollowingDistance(
+                reckoning.kinematics, period, caution.seconds, continuous=continuous, within=within
+            )
 
-        self.behind_queue, self.behind_one = distance(caution.leader), distance(caution.alone)
-        self.crossing, self.crossing_alone = distance(caution.leader, CROSSING_S), distance(caution.alone, CROSSING_S)
+        self.following, self.crossing = distance(), distance(CROSSING_S)
 
     def __call__(self, ego: Ego, boxes: Boxes) -> Margins:
         car, period = self.reckoning.kinematics, self.period
@@ -101,17 +100,15 @@ class Judge:
         )
         in_lane &= present.unsqueeze(-1)
         ahead = (x_low + x_high) > 0
-        queued = self._queued(x_low, x_high, y_low, y_high, present, reach)
+        rate = self._rate(x_low, x_high, v_low, v_high, y_low, y_high, present, reach).unsqueeze(-1)
 
         options = torch.stack([self.reckoning.commanded(ego, change) for change in (1, 0, -1)], -1)
         own = self.reckoning.speed_after(Ego(*(value.unsqueeze(-1) for value in ego)), options)
         own, leader = own.unsqueeze(-2), v_low.clamp(min=0).unsqueeze(-1)
         gap = x_low + (v_low.clamp(min=0) - along.unsqueeze(-1)) * period - car.length - self.caution.distance
         in_near = in_lane[..., 3:6] & ahead.unsqueeze(-1)
-        used = torch.where(queued.unsqueeze(-1), self.behind_queue(own, leader), self.behind_one(own, leader))
-        front = _least(gap.unsqueeze(-1) - used, in_near)
-        crossed = torch.where(queued.unsqueeze(-1), self.crossing(own, leader), self.crossing_alone(own, leader))
-        cross = _least(gap.unsqueeze(-1) - crossed, in_near)
+        front = _least(gap.unsqueeze(-1) - self.following(own, leader, rate), in_near)
+        cross = _least(gap.unsqueeze(-1) - self.crossing(own, leader, rate), in_near)
         closing = (v_high - own[..., 1]).clamp(min=0)
         room = -x_high - car.length - self.caution.distance - 0.14 * closing - closing.square() / 8
         rear = _least(room.unsqueeze(-1), in_lane[..., 3:6] & ~ahead.unsqueeze(-1))[..., 0]
@@ -122,7 +119,6 @@ class Judge:
         leaving = torch.where((straddled < 0).unsqueeze(-1), cross[..., 0, :], cross[..., 2, :])
         leaving = torch.where((straddled == 0).unsqueeze(-1), FREE, leaving)
         stay = torch.minimum(front[..., 1, :], leaving)
-        self.parts = (front[..., [0, 2], 1], rear[..., [0, 2]], cross[..., 1, 1])
         change = torch.stack([front[..., 0, 1], front[..., 2, 1]], -1)
         change = torch.minimum(change, torch.stack([rear[..., 0], rear[..., 2]], -1))
         change = torch.minimum(change, cross[..., 1, 1].unsqueeze(-1))
@@ -130,17 +126,25 @@ class Judge:
         change = torch.where(exists, change, -FREE)
         return Margins(stay, change, self._speeds(x_low, x_high, v_low, v_high, in_lane, ahead), settled, straddled)
 
-    def _queued(
-        self, x_low: Tensor, x_high: Tensor, y_low: Tensor, y_high: Tensor, present: Tensor, reach: float
+    def _rate(
+        self, x_low: Tensor, x_high: Tensor, v_low: Tensor, v_high: Tensor, y_low: Tensor, y_high: Tensor, present: Tensor, reach: float
     ) -> Tensor:
-        """bool [..., V - 1]: whether a car may have another one closely ahead of it."""
-        other = present.unsqueeze(-2) & (x_low + x_high > 0).unsqueeze(-2)
-        gap = x_low.unsqueeze(-2) - x_high.unsqueeze(-1)
-        further = (x_low + x_high).unsqueeze(-2) > (x_low + x_high).unsqueeze(-1)
+        """[..., V - 1] how hard every car brakes for the next one ahead of it, by the IDM (Treiber et al. 2000), in m/s2."""
+        place = torch.where(x_high.isfinite(), (x_low + x_high) / 2, x_low)
+        speed = torch.where(v_high.isfinite(), (v_low + v_high) / 2, v_low)
+        other = present.unsqueeze(-2) & (place.unsqueeze(-2) > place.unsqueeze(-1))
         beside = (y_low.unsqueeze(-2) < y_high.unsqueeze(-1) + reach) & (
             y_high.unsqueeze(-2) > y_low.unsqueeze(-1) - reach
         )
-        return (other & further & beside & (gap < QUEUE)).any(-1)
+        mix = self.mix
+        gap = (mix * x_low + (1 - mix) * place).unsqueeze(-2) - (mix * torch.where(x_high.isfinite(), x_high, place) + (1 - mix) * place).unsqueeze(-1)
+        closing = speed.unsqueeze(-1) - speed.unsqueeze(-2)
+        wanted = 10 + 1.5 * speed.unsqueeze(-1) + speed.unsqueeze(-1) * closing / 7.746
+        rate = 3 * (wanted.clamp(min=0) / gap.clamp(min=1)).square() - self.free
+        rate = torch.where(other & beside, rate, 0.0).amax(-1)
+        return rate.clamp(self.caution.braking, 6)
+
+    mix, free = 0., 1.5
 
     def _speeds(
         self, x_low: Tensor, x_high: Tensor, v_low: Tensor, v_high: Tensor, in_lane: Tensor, ahead: Tensor

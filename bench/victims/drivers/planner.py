@@ -11,7 +11,6 @@ from torch import Tensor
 
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from bench.driving.intervals.boxes import Boxes
-from bench.driving.intervals.following import Braking
 from bench.driving.intervals.margins import SIDES, Caution, Judge
 from bench.driving.intervals.policy import IntervalPolicy
 from bench.driving.threat import Norm
@@ -36,13 +35,13 @@ class Planner(DrivingVictim):
 
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"
-    braking: NotNegative = 3.5
-    braking_s: NotNegative = 1.2
+    braking: NotNegative = 0.5
+    braking_s: NotNegative = 2.0
     distance: NotNegative = 0.4
     right: Share = 0.06
     gain: Share = 0.05
     horizon: NotNegative = 3.0
-    second: NotNegative = 0.1
+    second: NotNegative = 0.15
 
     @property
     def action_type(self) -> ActionType:
@@ -56,15 +55,8 @@ class _Planner(IntervalPolicy):
     def __init__(self, rules: Planner, facts: DrivingFacts) -> None:
         super().__init__(facts, "discrete", rules.assumed_norm, rules.assumed_budget)
         self.rules = rules
-        caution = Caution(
-            leader=Braking(rate=rules.braking, seconds=rules.braking_s),
-            alone=Braking(rate=0.5, seconds=1.0),
-            distance=rules.distance,
-        )
+        caution = Caution(braking=rules.braking, seconds=rules.braking_s, distance=rules.distance)
         self.judge = Judge(self.reckoning, self.period, caution, rules.horizon)
-        places = self.reckoning.numbers
-        order = ["FASTER", "IDLE", "SLOWER", "LANE_LEFT", "LANE_RIGHT"]
-        self.order = [order.index(name) for name in places]
 
     def initial(self, episodes: Tensor) -> State:
         return self.reckoning.unknown(episodes)
@@ -89,7 +81,7 @@ class _Planner(IntervalPolicy):
         # Only back to the lane that it comes from, if this one is no longer safe.
         back = torch.stack([found.straddled < 0, found.straddled > 0], -1) & (found.stay[..., 2:] < 0)
         side = torch.where(found.settled.unsqueeze(-1) | back, side, FORBIDDEN)
-        return torch.cat((stay, side), -1)[..., self.order]
+        return torch.cat((stay, side), -1)[..., self.reckoning.order]
 
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None
