@@ -7,14 +7,13 @@ from typing import Annotated
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 
 from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, State
 from bench.driving.intervals.boxes import Boxes
-from bench.driving.intervals.ego import Ego
 from bench.driving.intervals.margins import Caution, Judge, Margins
-from bench.driving.intervals.policy import IntervalPolicy
+from bench.driving.intervals.policy import IntervalPolicy, corrected
 from bench.driving.threat import Norm
 from bench.errors import UserError
 from bench.plugins.ranges import NotNegative
@@ -59,7 +58,7 @@ class Shielded(IntervalPolicy):
 
     def __init__(self, settings: Shield, policy: Policy, facts: DrivingFacts) -> None:
         super().__init__(facts, "discrete", settings.assumed_norm, settings.assumed_budget)
-        self.policy, self.band, self.features = policy, settings.band, facts.features
+        self.policy, self.band = policy, settings.band
         self.driver, self.weights_sha256 = policy.driver, policy.weights_sha256
         caution = Caution(braking=settings.braking, seconds=settings.braking_s, distance=settings.distance)
         self.judge = Judge(self.reckoning, self.period, caution)
@@ -71,7 +70,7 @@ class Shielded(IntervalPolicy):
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
         ego = self.reckoning.now(boxes, state["ego"])
-        values = self.policy.scores(self.corrected(observation, ego), state.get("inner", None))
+        values = self.policy.scores(corrected(observation, ego, self.assumed), state.get("inner", None))
         allowed = self.allowed(self.judge(ego, boxes))
         # The masked values are below the others; no step of this hides the victim's gradient.
         spread = (values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)).detach() + 1
@@ -80,17 +79,9 @@ class Shielded(IntervalPolicy):
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None
         ego = self.reckoning.now(boxes, state["ego"])
-        inner = self.policy.advance(self.corrected(observation, ego), action, state.get("inner", None))
+        inner = self.policy.advance(corrected(observation, ego, self.assumed), action, state.get("inner", None))
         own = self.reckoning.after(ego, action)
         return TensorDict({"ego": own, **({} if inner is None else {"inner": inner})}, batch_size=state.batch_size)
-
-    def corrected(self, observation: Tensor, ego: Ego) -> Tensor:
-        """The observation [..., V, F] with the reckoned y, vx and vy in the ego's row."""
-        along, across = ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
-        low, high = (torch.tensor(bound).to(observation)[1:] for bound in (self.features.low, self.features.high))
-        own = ((torch.stack([ego.y, along, across], -1) - low) / (high - low) * 2 - 1).clamp(-1, 1)
-        row = torch.cat((observation[..., :1, :2], own.unsqueeze(-2)), -1)
-        return torch.cat((row, observation[..., 1:, :]), -2)
 
     def allowed(self, margins: Margins) -> Tensor:
         """[..., A] 1 for the allowed actions and 0 for the others, with the gradient of a soft threshold (straight-through)."""

@@ -70,3 +70,8 @@ class Assumed:
         low = torch.where(low - centre <= -end, -torch.inf, low)
         high = torch.where(high - centre >= end, torch.inf, high)
         return Boxes(shown[..., 0] > 0, low, high)
+
+    def normalised(self, values: Tensor) -> Tensor:
+        """Physical values of the measured features [..., F - 1] on the scale of observations, clipped to [-1, 1]."""
+        low, high = (torch.tensor(bound).to(values) for bound in (self.features.low, self.features.high))
+        return ((values - low) / (high - low) * 2 - 1).clamp(-1, 1)

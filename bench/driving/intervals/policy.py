@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 
+import torch
 from torch import Tensor
 
 from bench.driving.features import ActionType, DrivingFacts
 from bench.driving.intervals.boxes import Assumed, Boxes
-from bench.driving.intervals.ego import DeadReckoning
+from bench.driving.intervals.ego import DeadReckoning, Ego
 from bench.driving.policy import Policy, State
 from bench.driving.threat import Norm
 from bench.errors import UserError
@@ -66,3 +67,11 @@ def reckoning(facts: DrivingFacts, action_type: ActionType) -> DeadReckoning:
     if action_type == "discrete" and not set(DECISIONS) <= set(facts.actions):
         raise UserError(f"intervals need the actions {', '.join(DECISIONS)}, the world has {', '.join(facts.actions)}")
     return DeadReckoning(facts.kinematics, 1 / facts.decision_hz, facts.actions, action_type)
+
+
+def corrected(observation: Tensor, ego: Ego, assumed: Assumed) -> Tensor:
+    """The observation [..., V, F] with the reckoned y, vx and vy in the ego's row."""
+    along, across = ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
+    own = assumed.normalised(torch.stack([torch.zeros_like(along), ego.y, along, across], -1))[..., 1:]
+    row = torch.cat((observation[..., :1, :2], own.unsqueeze(-2)), -1)
+    return torch.cat((row, observation[..., 1:, :]), -2)
