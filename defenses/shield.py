@@ -89,8 +89,7 @@ class Shielded(IntervalPolicy):
         safe = stay >= 0
         needless = stay[..., :1] >= self.band
         keeps = torch.cat((safe[..., :1], safe[..., 1:] & ~needless), -1)
-        back = torch.stack([margins.straddled < 0, margins.straddled > 0], -1) & (stay[..., 2:] < 0)
-        changes = (change >= 0) & (margins.settled.unsqueeze(-1) | back)
+        changes = (change >= 0) & margins.changeable
         none = ~keeps.any(-1, keepdim=True) & ~changes.any(-1, keepdim=True)
         slower = torch.tensor([False, False, True])
         hard = torch.cat((keeps | (none & slower), changes), -1).to(stay)

@@ -2,7 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarFollowing:
+    """How other cars keep their distance: the Intelligent Driver Model (Treiber, Hennecke and Helbing 2000).
+
+    Args:
+        acceleration, braking: comfortable ones, in m/s2.
+        jam_distance: d_0 in m, between the centres of two cars.
+        time_gap: T in s.
+        free_share: 1 - (v / v_0)^delta of a car in traffic, the part of the acceleration that pulls it forward.
+    """
+
+    acceleration: float
+    braking: float
+    jam_distance: float
+    time_gap: float
+    free_share: float
+
+    def desired_gap(self, speed: Tensor, closing: Tensor) -> Tensor:
+        """d* in m, from a car's speed and the speed at which it closes on the next one, in m/s."""
+        scale = 2 * math.sqrt(self.acceleration * self.braking)
+        return self.jam_distance + self.time_gap * speed + speed * closing / scale
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +49,7 @@ class Kinematics:
         max_steering: largest steering angle of the controllers, in rad.
         acceleration_limit: of the continuous action, in m/s2.
         steering_limit: of the continuous action, in rad.
+        following: how other cars keep their distance.
     """
 
     frames: int
@@ -38,3 +65,4 @@ class Kinematics:
     max_steering: float
     acceleration_limit: float
     steering_limit: float
+    following: CarFollowing

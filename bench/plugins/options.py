@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import UserError
 from bench.plugins import registry, suites
-from bench.plugins.contracts import Access, ThreatModel
+from bench.plugins.contracts import Access, Defense, ThreatModel
 from bench.plugins.pair import Chosen, choose
 from bench.plugins.parameters import Parameter, parameters
 from bench.plugins.registry import Kind
@@ -269,6 +269,10 @@ def _schema(owned: dict[str, Parameter]) -> type[Any]:
     made: list[tuple[str, Any, Any]] = []
     for parameter in owned.values():
         value = parameter.default
+        if _is_link(parameter.hint):
+            link = _schema(parameters(parameter.hint))
+            made.append((parameter.name, link, field(default_factory=link)))
+            continue
         default = field() if parameter.required else field(default_factory=partial(copy.copy, value))
         made.append((parameter.name, _omegaconf_type(parameter.hint), default))
     return make_dataclass("Parameters", made, kw_only=True)
@@ -300,11 +304,30 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
         raise UserError(f"the parameters of {kind} {name!r} cannot be set on the command line: {reason}") from error
     composed = _composed([f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())])[kind]
     arguments = OmegaConf.to_object(composed)
+    return _read(kind, owned, arguments)
+
+
+def _read(kind: str, owned: dict[str, Parameter], arguments: Any) -> dict[str, Any]:
+    """The typed values of a component's parameters; those of the links of a chain are defences."""
     values = {item: getattr(arguments, item) for item in owned}
     for key, value in values.items():
+        if _is_link(owned[key].hint):
+            values[key] = _link(f"{kind}.{key}", owned[key].hint, value)
+            continue
         choices = owned[key].choices
         if choices and value is not None and value not in choices:
             raise UserError(registry.unknown(f"{kind}.{key} {value!r}", str(value), map(str, choices)))
         if isinstance(value, list):
             values[key] = tuple(value)
     return values
+
+
+def _is_link(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, Defense)
+
+
+def _link(prefix: str, link: type[Any], arguments: Any) -> Any:
+    try:
+        return link(**_read(prefix, parameters(link), arguments))
+    except ValueError as error:
+        raise UserError(f"{prefix}: {str(error).splitlines()[0]}") from error

@@ -10,7 +10,7 @@ from bench.errors import UserError, reason
 from bench.plugins import registry, sources
 from bench.plugins.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
 from bench.plugins.fingerprint import canonical, digest, state_digest
-from bench.plugins.parameters import parameters
+from bench.plugins.parameters import differing
 from bench.plugins.registry import Kind
 
 C = TypeVar("C", Attack, Defense, Victim, World)
@@ -37,8 +37,7 @@ class Chosen(Generic[C]):
 
     def __str__(self) -> str:
         """The name, with the parameters that differ from their defaults: `pgd(steps=20)`."""
-        values = {p.name: (getattr(self.component, p.name), p) for p in parameters(type(self.component)).values()}
-        changed = [f"{name}={value}" for name, (value, p) in values.items() if p.required or value != p.default]
+        changed = [f"{name}={value}" for name, value in differing(self.component).items()]
         return f"{self.name}({', '.join(changed)})" if changed else self.name
 
 

@@ -49,7 +49,7 @@ class Work:
     @property
     def modules(self) -> tuple[str, ...]:
         """Modules hashed into the code digest, with their imports."""
-        return (self.module, *sorted(type(part.component).__module__ for part in self.pair.parts))
+        return (self.module, *sorted(module for part in self.pair.parts for module in part.component.modules()))
 
     @property
     def code_digest(self) -> str:

@@ -102,10 +102,10 @@ class DeadReckoning:
         index = ((ego.speed - low) / (high - low) * last).round().clamp(0, last) + change
         return low + index.clamp(0, last) * ((high - low) / last)
 
-    def speed_after(self, ego: Ego, target: Tensor) -> Tensor:
-        """The speed [...] after one decision towards the target speed [...]."""
+    def speed_after(self, speed: Tensor, target: Tensor) -> Tensor:
+        """The speed [...] in m/s after one decision towards the target speed [...]."""
         kept = (1 - self.kinematics.speed_gain * self.dt) ** self.kinematics.frames
-        return target + (ego.speed - target) * kept
+        return target + (speed - target) * kept
 
     def _driven(self, ego: Ego, action: Tensor) -> Ego:
         target, lane = ego.target_speed, ego.target_lane

@@ -25,12 +25,11 @@ class FollowingDistance:
         kinematics: kinematics of the ego.
         period: seconds per decision.
         seconds: how long the leader brakes.
-        continuous: whether the ego brakes with its largest deceleration instead of repeated SLOWER.
         within: seconds that count; None for all until the speeds are the same.
     """
 
     def __init__(
-        self, kinematics: Kinematics, period: float, seconds: float, *, continuous: bool, within: float | None = None
+        self, kinematics: Kinematics, period: float, seconds: float, *, within: float | None = None
     ) -> None:
         speeds = torch.arange(0.0, FASTEST + STEP, STEP, dtype=torch.float64)
         rates = torch.arange(HARDEST + 1.0, dtype=torch.float64)
@@ -45,8 +44,6 @@ class FollowingDistance:
             lost = lost + (own - other) * dt
             table = torch.maximum(table, lost)
             change = kinematics.speed_gain * (target - own)
-            if continuous:
-                change = torch.full_like(own, -kinematics.acceleration_limit)
             own = (own + change * dt).clamp(min=0)
             if period + frame * dt < seconds - 1e-9:
                 other = (other - rate * dt).clamp(min=0)
