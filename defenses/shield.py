@@ -29,7 +29,7 @@ class Shield(DrivingDefense):
     The worst case is over the true values that an assumed perturbation set allows behind the shown ones. The ego's own motion
     is reckoned from its actions; the victim receives the reckoned row. An action is safe if the gap to every car ahead lasts
     when the ego brakes from the next decision on. Where FASTER leaves a margin of at least `band`, IDLE and SLOWER are masked,
-    so that an attack cannot make the car crawl.
+    so that an attack cannot make the car crawl. If no action is safe, it brakes.
 
     Args:
         assumed_budget: budget of the perturbation set that it assumes.
@@ -42,7 +42,7 @@ class Shield(DrivingDefense):
 
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"
-    band: NotNegative = 6.0
+    band: NotNegative = 0.0
     braking: NotNegative = 0.5
     braking_s: NotNegative = 2.0
     distance: NotNegative = 0.4
@@ -75,6 +75,10 @@ class Shielded(IntervalPolicy):
         # The masked values are below the others; no step of this hides the victim's gradient.
         spread = (values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)).detach() + 1
         return values - spread * (1 - allowed)
+
+    def safe(self, boxes: Boxes, state: State) -> Tensor:
+        assert state is not None
+        return self.judge(self.reckoning.now(boxes, state["ego"]), boxes).safe
 
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None

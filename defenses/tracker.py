@@ -54,19 +54,19 @@ class Tracked(PolicyWrapper):
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         assert state is not None
-        boxes, inner = self._boxes(observation, state), state.get("inner", None)
+        boxes, inner = self.boxes(observation, state), state.get("inner", None)
         if isinstance(self.policy, IntervalPolicy):
             return self.policy.weighed(observation, boxes, inner)
         return self.policy.scores(self._estimate(observation, boxes, state), inner)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         assert state is not None
-        estimate = self._estimate(observation, self._boxes(observation, state), state)
+        estimate = self._estimate(observation, self.boxes(observation, state), state)
         return self.policy.value(estimate, action, state.get("inner", None))
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None
-        boxes, inner = self._boxes(observation, state), state.get("inner", None)
+        boxes, inner = self.boxes(observation, state), state.get("inner", None)
         if isinstance(self.policy, IntervalPolicy):
             inner = self.policy.moved(observation, boxes, action, inner)
         else:
@@ -77,7 +77,14 @@ class Tracked(PolicyWrapper):
         own = {"ego": after, "tracks": tracks, **({} if inner is None else {"inner": inner})}
         return TensorDict(own, batch_size=state.batch_size)
 
-    def _boxes(self, observation: Tensor, state: State) -> Boxes:
+    def assured(self, observation: Tensor, state: State) -> Tensor | None:
+        assert state is not None
+        if not isinstance(self.policy, IntervalPolicy):
+            return None
+        return self.policy.safe(self.boxes(observation, state), state.get("inner", None))
+
+    def boxes(self, observation: Tensor, state: State) -> Boxes:
+        """What is known about every row, from this observation [..., V, F] and those before."""
         assert state is not None
         boxes, tracks = self.assumed.boxes(observation), state.get("tracks", None)
         return boxes if tracks is None else narrowed(boxes, tracks)

@@ -29,7 +29,7 @@ from bench.errors import UserError
 from bench.plugins import registry, suites
 from bench.plugins.contracts import Access, Defense, ThreatModel
 from bench.plugins.pair import Chosen, choose
-from bench.plugins.parameters import Parameter, parameters
+from bench.plugins.parameters import Parameter, flattened, parameters
 from bench.plugins.registry import Kind
 from bench.plugins.suites import Suite
 from bench.plugins.track import track
@@ -190,9 +190,11 @@ def configured(kind: Kind, name: str, values: Mapping[str, str]) -> Chosen[Any]:
         UserError: if a value cannot be parsed or is not allowed.
     """
     owned = parameters(registry.load(kind, name))
+    known = flattened(registry.load(kind, name))
     for key in values:
-        if key.partition(".")[0] not in owned:
-            raise UserError(registry.unknown(f"parameter {kind}.{key} of {name}", key, owned))
+        head = key.partition(".")[0]
+        if head not in owned or (_is_link(owned[head].hint) and key not in known):
+            raise UserError(registry.unknown(f"parameter {kind}.{key} of {name}", key, known))
     return choose(kind, name, **_arguments(kind, name, owned, values))
 
 

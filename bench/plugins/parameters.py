@@ -83,6 +83,17 @@ def parameters(component: type) -> dict[str, Parameter]:
     }
 
 
+def flattened(component: type) -> dict[str, Parameter]:
+    """The parameters of a component class by name; those of the links of a chain as `LINK.NAME`."""
+    found: dict[str, Parameter] = {}
+    for name, parameter in parameters(component).items():
+        if isinstance(parameter.hint, type) and issubclass(parameter.hint, Component):
+            found |= {f"{name}.{inner}": each for inner, each in flattened(parameter.hint).items()}
+        else:
+            found[name] = parameter
+    return found
+
+
 def differing(component: Any) -> dict[str, Any]:
     """The parameters of a component that differ from their defaults; those of the links of a chain as `LINK.NAME`."""
     found: dict[str, Any] = {}

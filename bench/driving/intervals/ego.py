@@ -114,6 +114,9 @@ class DeadReckoning:
         for name, change in (("LANE_RIGHT", 1), ("LANE_LEFT", -1)):
             lane = torch.where(action == self.numbers[name], lane + change, lane)
         lane = torch.minimum(lane.clamp(min=0), ego.edge)
+        width = self.kinematics.lane_width
+        # A lane farther away than two lane widths cannot be chosen (highway-env's AbstractLane.is_reachable_from).
+        lane = torch.where((ego.y - width * lane).abs() <= 2 * width, lane, ego.target_lane)
         ego = ego._replace(target_lane=lane, target_speed=target)
         for _ in range(self.kinematics.frames):
             gain = self.kinematics.speed_gain

@@ -67,6 +67,11 @@ class Margins(NamedTuple):
     straddled: Tensor
 
     @property
+    def safe(self) -> Tensor:
+        """bool [...], whether any action is."""
+        return (self.stay >= 0).any(-1) | ((self.change >= 0) & self.changeable).any(-1)
+
+    @property
     def changeable(self) -> Tensor:
         """bool [..., 2]: from a lane the ego may go to both sides, and from between two back, if the new one is not safe."""
         back = torch.stack([self.straddled < 0, self.straddled > 0], -1) & (self.stay[..., 2:] < 0)

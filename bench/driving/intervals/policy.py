@@ -45,6 +45,13 @@ class IntervalPolicy(Policy):
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         """The state after a step, as in `advance`, for given boxes."""
 
+    @abstractmethod
+    def safe(self, boxes: Boxes, state: State) -> Tensor:
+        """Whether an action has a margin of at least 0, bool [...]."""
+
+    def assured(self, observation: Tensor, state: State) -> Tensor | None:
+        return self.safe(self.assumed.boxes(observation), state)
+
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         return self.weighed(observation, self.assumed.boxes(observation), state)
 

@@ -89,6 +89,10 @@ class IntervalPlanner(IntervalPolicy):
         side = torch.where(found.changeable, side, FORBIDDEN)
         return torch.cat((stay, side), -1)[..., self.reckoning.order]
 
+    def safe(self, boxes: Boxes, state: State) -> Tensor:
+        assert state is not None
+        return self.judge(self.reckoning.now(boxes, state), boxes).safe
+
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None
         return self.reckoning.after(self.reckoning.now(boxes, state), action)
