@@ -9,7 +9,7 @@ from torch import Tensor
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import Ego
 
-LONGITUDINAL, LATERAL = 6.0, 20.0
+LONGITUDINAL, LATERAL = 6.0, 40.0
 """Largest accelerations of another car along and across the road, in m/s2."""
 ROUNDING = 1e-3
 """Predicted boxes are wider by this on every side, in m and m/s."""
@@ -49,7 +49,9 @@ def narrowed(boxes: Boxes, tracks: TensorDictBase) -> Boxes:
     low, high = boxes.low[..., 1:, :], boxes.high[..., 1:, :]
     track_low, track_high = tracks["low"], tracks["high"]
     meet = (low.unsqueeze(-2) <= track_high.unsqueeze(-3)) & (track_low.unsqueeze(-3) <= high.unsqueeze(-2))
-    fits = meet.all(-1) & tracks["present"].unsqueeze(-2) & boxes.present[..., 1:].unsqueeze(-1)
+    # New cars appear where the sensor's range ends.
+    known = boxes.present[..., 1:] & high[..., 0].isfinite()
+    fits = meet.all(-1) & tracks["present"].unsqueeze(-2) & known.unsqueeze(-1)
     hull_low = torch.where(fits.unsqueeze(-1), track_low.unsqueeze(-3), torch.inf).amin(-2)
     hull_high = torch.where(fits.unsqueeze(-1), track_high.unsqueeze(-3), -torch.inf).amax(-2)
     ego_low, ego_high = boxes.low[..., :1, :], boxes.high[..., :1, :]
