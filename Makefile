@@ -1,5 +1,5 @@
 # make run: installs what running needs and prints the first score. make test, make lint, make docs: the checks of CI.
-# make bench: the speed figures. All but `run` install what development needs.
+# make bench: the speed figures. make wheel-check: the wheel in an environment of its own. All but `run` install what development needs.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,7 +7,7 @@ BROWSERS := chromium chromium-browser google-chrome
 RUN_STAMP := $(VENV)/installed-to-run
 DEV_STAMP := $(VENV)/installed-to-develop
 
-.PHONY: run test lint docs bench install install-dev browser clean
+.PHONY: run test lint docs bench soak wheel-check install install-dev browser clean
 
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
@@ -24,6 +24,10 @@ lint: install-dev
 docs: install-dev
 	rm -rf docs/_build
 	$(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
+
+# The wheel in an environment of its own: installs it, and runs a first command. Takes minutes and 2 GB.
+wheel-check: install-dev
+	CAVBENCH_WHEEL_CHECK=1 $(BIN)/python -m pytest tests/framework/test_packaging.py
 
 bench: install-dev
 	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
@@ -54,3 +58,7 @@ browser: install-dev
 
 clean:
 	rm -rf $(VENV) build dist docs/_build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+# Random kills, bad places and a long run, with a table of figures for docs/reliability.md; an hour and a half. Not part of `test`.
+soak: install-dev
+	$(BIN)/python -m tests.soak kills=100 minutes=60

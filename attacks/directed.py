@@ -13,7 +13,7 @@ from attacks.pgd import PGD
 from attacks.targets import Controls, EveryAction, Targets
 from bench.driving import ActionType, DrivingAttack, Policy
 from bench.plugins.contracts import Access, Progress, Trained
-from bench.plugins.ranges import Count
+from bench.plugins.ranges import Count, Width
 
 if TYPE_CHECKING:
     from bench.driving import Oracle
@@ -45,7 +45,7 @@ class Directed(DrivingAttack):
     restarts: Count = 2
     step_size: Annotated[float, Interval(gt=0, le=2)] = 0.5
     decisions: Count = 1000
-    hidden: Count = 128
+    hidden: Width = 128
     steering: Annotated[float, Interval(gt=0, le=1)] = 0.1
     crash_bonus: float = 200.0
     trained_in: str = ""

@@ -40,14 +40,16 @@ class Noise(DrivingAttack):
     """
 
     access: ClassVar[Access] = "oblivious"
+    joint: ClassVar[bool] = True
 
     distribution: Distribution = "uniform"
     scale: Annotated[float, Interval(gt=0, le=1)] = 1.0
     draw: Natural = 0
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
+        own = [(observation[part.rows].shape, part.generator) for part in oracle.parts]
         if self.distribution == "uniform":
-            share = torch.rand(observation.shape, generator=oracle.generator) * 2 - 1
+            share = torch.cat([torch.rand(shape, generator=generator) for shape, generator in own]) * 2 - 1
         else:
-            share = torch.randn(observation.shape, generator=oracle.generator)
+            share = torch.cat([torch.randn(shape, generator=generator) for shape, generator in own])
         return oracle.project(observation + self.scale * share * oracle.radius)

@@ -32,6 +32,17 @@ def expected(scores: Tensor, worth: Tensor, tau: Tensor) -> Tensor:
     return (torch.softmax(scores / tau, -1) * worth).sum(-1)
 
 
+def temperature(scores: Tensor, share: float) -> Tensor:
+    """[B, 1] the temperature of an expectation: a share of the standard deviation of the values [B, A]."""
+    spread = scores.std(-1, keepdim=True)
+    return (share * spread).clamp(min=torch.finfo(spread.dtype).tiny)
+
+
+def taken(scores: Tensor, worth: Tensor) -> Tensor:
+    """The worth [..., B] of the greedy action of `scores` [..., B, A], from the worth of each action [B, A]."""
+    return worth.expand(scores.shape).gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
+
+
 def spared(clean: Tensor, braking_action: int) -> Tensor:
     """Q(x) [B, A] with the value of braking raised to that of the best action, so that no attack aims for braking.
 
@@ -114,9 +125,21 @@ class DiscreteLoss:
             return self(scores) < 0
         return self._given(scores) <= self._goal
 
+    def judge(self, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The loss, the key and whether the goal is met, [..., B] each: as one call each, without computing anything twice."""
+        value = self(scores)
+        if self.objective in ("margin", "target"):
+            return value, value, value < 0
+        given = self._given(scores)
+        return value, given + TIE_BREAK * value, given <= self._goal
+
     def of(self, rows: Tensor) -> DiscreteLoss:
         """This loss for the episodes `rows`."""
-        return replace(self, clean=self.clean[rows])
+        part = replace(self, clean=self.clean[rows])
+        for name in ("_worth", "_tau", "_goal"):
+            if name in self.__dict__:
+                part.__dict__[name] = self.__dict__[name][rows]
+        return part
 
     @cached_property
     def _worth(self) -> Tensor:
@@ -126,8 +149,7 @@ class DiscreteLoss:
     @cached_property
     def _tau(self) -> Tensor:
         """Temperature of the expectation, [B, 1]."""
-        spread = self._worth.std(-1, keepdim=True)
-        return (self.temperature * spread).clamp(min=torch.finfo(spread.dtype).tiny)
+        return temperature(self._worth, self.temperature)
 
     @cached_property
     def _goal(self) -> Tensor:
@@ -137,7 +159,7 @@ class DiscreteLoss:
 
     def _given(self, scores: Tensor) -> Tensor:
         """Worth of the greedy action, [..., B]."""
-        return self._worth.expand(scores.shape).gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
+        return taken(scores, self._worth)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,6 +191,11 @@ class ContinuousLoss:
         if self.target is None:
             return torch.zeros(scores.shape[:-1], dtype=torch.bool)
         return self(scores) <= self.tolerance
+
+    def judge(self, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The loss, the key and whether the goal is met, [..., B] each."""
+        value = self(scores)
+        return value, value, self.met(scores) if self.target is None else value <= self.tolerance
 
     def of(self, rows: Tensor) -> ContinuousLoss:
         """This loss for the episodes `rows`."""

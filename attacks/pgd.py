@@ -11,7 +11,7 @@ from annotated_types import Interval
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Objective
-from bench.driving import DrivingAttack
+from bench.driving import DrivingAttack, parts_of
 from bench.plugins.contracts import Access
 from bench.plugins.ranges import Count, Natural, Positive, Share
 
@@ -66,6 +66,7 @@ class PGD(DrivingAttack):
     """
 
     access: ClassVar[Access] = "gradients"
+    joint: ClassVar[bool] = True
 
     steps: Count = 10
     step_size: Annotated[float, Interval(gt=0, le=2)] = 0.5
@@ -177,9 +178,13 @@ class PGD(DrivingAttack):
 
 
 def random_starts(observation: Tensor, restarts: int, oracle: Oracle, rows: Tensor | None = None) -> Tensor:
-    """[R, B, V, F] random points of the perturbation set; all episodes share the random numbers."""
-    share = torch.rand((restarts, 1, *observation.shape[1:]), generator=oracle.generator) * 2 - 1
-    return oracle.project(observation + share * _radius(oracle, rows), rows)
+    """[R, B, V, F] random points of the perturbation set; all episodes of a unit share the random numbers."""
+    shape = (restarts, 1, *observation.shape[1:])
+    shares = [
+        torch.rand(shape, generator=part.generator).expand(-1, part.rows.stop - part.rows.start, -1, -1)
+        for part in (oracle.parts if rows is None else parts_of(oracle.parts, rows))
+    ]
+    return oracle.project(observation + (torch.cat(shares, 1) * 2 - 1) * _radius(oracle, rows), rows)
 
 
 def descend(

@@ -11,7 +11,7 @@ from annotated_types import Interval
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from attacks.objectives import TIE_BREAK, distance, expected, margin, spared
+from attacks.objectives import TIE_BREAK, distance, expected, margin, spared, taken, temperature
 from attacks.pgd import better, descend, random_starts
 from bench.driving import DrivingAttack, Dynamics, Forecast, Oracle, State
 from bench.plugins.contracts import Access
@@ -117,7 +117,7 @@ class Plan(DrivingAttack):
         danger = belief["danger"]
         worth = torch.where(danger[:, None], belief["worth"], self._collision(clean))
         targets = worth.argsort(-1)[:, : min(self.targeted, restarts)].T
-        tau = _spread(clean, self.temperature)
+        tau = temperature(clean, self.temperature)
 
         def loss(scores: Tensor) -> Tensor:
             pulled = [-margin(one, target) for one, target in zip(scores, targets, strict=False)]
@@ -125,8 +125,7 @@ class Plan(DrivingAttack):
             return torch.cat((torch.stack(pulled), others)) if pulled else others
 
         def key(scores: Tensor, _: Tensor) -> Tensor:
-            taken = worth.expand(scores.shape).gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
-            return taken + TIE_BREAK * expected(scores, worth, tau)
+            return taken(scores, worth) + TIE_BREAK * expected(scores, worth, tau)
 
         known = key(clean, clean)
         start = random_starts(observation, restarts, oracle)
@@ -180,12 +179,6 @@ class Plan(DrivingAttack):
 def worth_of(forecast: Forecast, frames: int) -> Tensor:
     """[B, P] the worth of plans in [0, 1]: the time to a failure and, with a small weight, how slow the car is."""
     return (forecast.failed + HASTE * (frames - forecast.progress)) / ((1 + HASTE) * frames)
-
-
-def _spread(clean: Tensor, temperature: float) -> Tensor:
-    """[B, 1] the temperature of an expectation, from a share of the standard deviation of the Q-values."""
-    spread = clean.std(-1, keepdim=True)
-    return (temperature * spread).clamp(min=torch.finfo(spread.dtype).tiny)
 
 
 @cache

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from attacks.objectives import TIE_BREAK, expected
+from attacks.objectives import TIE_BREAK, expected, taken, temperature
 from attacks.pgd import PGD
 from bench.driving import (
     ActionType,
@@ -27,7 +27,7 @@ from bench.driving import (
 )
 from bench.errors import UserError
 from bench.plugins.contracts import Access, Progress, Trained
-from bench.plugins.ranges import Count, NotNegative, Positive, Share
+from bench.plugins.ranges import Count, NotNegative, Positive, Share, Width
 from bench.scenarios import SeedBlock
 from bench.victims import zoo
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
@@ -106,7 +106,7 @@ class RobustSarsa(DrivingAttack):
     exploration: Share = 0.3
     robustness: NotNegative = 0.1
     around: Positive = 0.3
-    hidden: Count = 128
+    hidden: Width = 128
     steering: Annotated[float, Interval(gt=0, le=1)] = 0.1
     gamma: Share = 0.97
     crash_penalty: float = 200.0
@@ -130,11 +130,10 @@ class RobustSarsa(DrivingAttack):
 
             return pgd.descend(observation, oracle, value, lambda _, loss: loss)
         worth = critic.every(truth).to(observation)
-        tau = self.temperature * worth.std(-1, keepdim=True).clamp(min=torch.finfo(worth.dtype).tiny)
+        tau = temperature(worth, self.temperature)
 
         def key(scores: Tensor, loss: Tensor) -> Tensor:
-            taken = scores.argmax(-1, keepdim=True)
-            return worth.expand(scores.shape).gather(-1, taken).squeeze(-1) + TIE_BREAK * loss
+            return taken(scores, worth) + TIE_BREAK * loss
 
         return pgd.descend(observation, oracle, lambda scores: expected(scores, worth, tau), key)
 
@@ -157,10 +156,10 @@ class RobustSarsa(DrivingAttack):
         learner = _SarsaLearner(self, policy, victim.action_type, env)
         learner.enter(phase)
         practice = Practice(env, learner, phase, crash_penalty=self.crash_penalty, memory=600_000, batch=512)
-        for taken in range(CHUNK, self.decisions + 1, CHUNK):
-            share = taken / self.decisions
+        for done in range(CHUNK, self.decisions + 1, CHUNK):
+            share = done / self.decisions
             practice.drive(CHUNK, share)
-            for _ in range(CHUNK * self.updates if taken > WARM_UP else 0):
+            for _ in range(CHUNK * self.updates if done > WARM_UP else 0):
                 learner.update(practice.sample(share), 5e-4 * max(0.05, min(1.0, 2 * (1 - share))))
             progress(share, f"loss {learner.last:.4f}")
         card = {"against": policy.weights_sha256, "loss": learner.last}

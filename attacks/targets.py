@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 
-from attacks.objectives import TIE_BREAK, DiscreteLoss, margin
+from attacks.objectives import TIE_BREAK, DiscreteLoss, margin, taken
 from attacks.pgd import Key, Loss
 
 
@@ -60,8 +60,7 @@ class EveryAction(Targets):
             return self.loss(scores, wanted[: len(scores)])
 
         def key(scores: Tensor, loss: Tensor) -> Tensor:
-            taken = scores.argmax(-1, keepdim=True)
-            return rank.expand(scores.shape).gather(-1, taken).squeeze(-1) + TIE_BREAK * loss.tanh()
+            return taken(scores, rank) + TIE_BREAK * loss.tanh()
 
         return len(wanted), loss, key
 

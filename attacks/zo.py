@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -11,7 +12,7 @@ from annotated_types import Interval
 from torch import Tensor
 
 from attacks.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion
-from bench.driving import DrivingAttack
+from bench.driving import DrivingAttack, Part, parts_of
 from bench.plugins.contracts import Access
 from bench.plugins.ranges import Count, Natural, NotNegative, Positive
 
@@ -65,6 +66,7 @@ class ZOSignSGD(DrivingAttack):
     """
 
     access: ClassVar[Access] = "scores"
+    joint: ClassVar[bool] = True
 
     steps: Count = 4
     directions: Count = 10
@@ -84,40 +86,42 @@ class ZOSignSGD(DrivingAttack):
     draw: Natural = 0
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
-        if not len(observation) or int(oracle.remaining.min()) < 1:
+        if not len(observation) or (left := int(oracle.remaining.min())) < 1:
             return observation
-        generator = _generator(oracle)
+        parts = [Part(part.rows, _generator(part.generator)) for part in oracle.parts]
         shape = observation.shape[1:]
-        clean = oracle.scores(observation)
+        clean, left = oracle.scores(observation), left - 1
         loss = self._loss(clean, oracle)
-        best, lowest = observation.clone(), self._value(loss, clean, observation, observation)[1]
-        rows, x = torch.arange(len(observation)), observation
+        _, lowest, met = self._judge(loss, clean, observation, observation)
+        x = observation
         if self.random_start:
-            x = oracle.project(x + oracle.radius * (2 * torch.rand(shape, generator=generator) - 1))
+            share = torch.cat([torch.rand(shape, generator=part.generator).expand_as(x[part.rows]) for part in parts])
+            x = oracle.project(x + oracle.radius * (2 * share - 1))
+        run = _Run(torch.arange(len(observation)), observation, oracle.radius, x, observation, lowest, loss, parts)
+        answer = observation.clone()
         if self.early_stop:
-            rows, x, loss = _running(~loss.met(clean), rows, x, loss)
-        known: Tensor | None = None if self.random_start else clean[rows]
+            run = run.without(met, answer)
+        known: Tensor | None = None if self.random_start else clean[run.rows]
         for _ in range(self.steps):
             # The scores on the true observation are known and need no second query.
             base = 1 if known is None else 0
-            count = min(self.directions, int(oracle.remaining[rows].min()) - base) if len(rows) else 0
+            count = min(self.directions, left - base) if len(run.rows) else 0
             if count < 1:
                 break
-            directions = _directions(count, shape, generator).to(observation)
-            probes = oracle.project(x + self.smoothing * oracle.radius[rows] * directions.unsqueeze(1), rows)
-            points = torch.cat((x.unsqueeze(0), probes))
-            scores = oracle.scores(points[1 - base :], rows)
+            directions = [_directions(count, shape, part.generator).to(observation) for part in run.parts]
+            left -= base + count
+            points = oracle.project(run.around(directions, self.smoothing), run.rows)
+            scores = oracle.scores(points[1 - base :], run.rows)
             scores, known = scores if known is None else torch.cat((known.unsqueeze(0), scores)), None
-            value, key = self._value(loss, scores, points, observation[rows])
-            smallest, at = key.min(0)
-            improved = smallest < lowest[rows]
-            lowest[rows] = torch.where(improved, smallest, lowest[rows])
-            best[rows[improved]] = points[at, torch.arange(len(rows))][improved]
-            estimate = _gradient(value, directions)
-            x = oracle.project(x - self.step_size * oracle.radius[rows] * estimate.sign(), rows)
+            value, key, met = self._judge(run.loss, scores, points, run.truth)
+            run.keep_best(points, key)
+            slopes = [_gradient(value[:, part.rows], own) for part, own in zip(run.parts, directions, strict=True)]
+            sign = torch.cat(slopes).sign_()
+            run.x = oracle.project(torch.addcmul(run.x, self.step_size * run.radius, sign, value=-1), run.rows)
             if self.early_stop:
-                rows, x, loss = _running(~loss.met(scores).any(0), rows, x, loss)
-        return best
+                run = run.without(met.any(0), answer)
+        answer[run.rows] = run.best
+        return answer
 
     def _loss(self, clean: Tensor, oracle: Oracle) -> Loss:
         """The objective on this step's clean scores."""
@@ -133,20 +137,62 @@ class ZOSignSGD(DrivingAttack):
             enough=self.enough,
         )
 
-    def _value(self, loss: Loss, scores: Tensor, points: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss of every queried point, and the key to choose the best, both [..., B]; Eq. 4.10 for `thesis`."""
+    def _judge(self, loss: Loss, scores: Tensor, points: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The loss of every queried point, the key to choose the best, and whether the goal is met, [..., B] each."""
+        value, key, met = loss.judge(scores)
         if self.objective != "thesis":
-            value = loss(scores)
-            return value, loss.key(scores, value)
-        size = distortion(points, observation)
-        value = loss(scores).clamp(min=0) + self.distortion_weight * size
-        # Points that reach the target come first, ordered by distortion.
-        return value, torch.where(loss.met(scores), -1 / (1 + size), value)
+            return value, key, met
+        # Eq. 4.10. Points that reach the target come first, ordered by distortion.
+        size = distortion(points, truth)
+        value = value.clamp(min=0) + self.distortion_weight * size
+        return value, torch.where(met, -1 / (1 + size), value), met
 
 
-def _running(keep: Tensor, rows: Tensor, x: Tensor, loss: Loss) -> tuple[Tensor, Tensor, Loss]:
-    """Keep only the episodes whose goal is not met yet; the others make no more queries."""
-    return (rows, x, loss) if bool(keep.all()) else (rows[keep], x[keep], loss.of(keep))
+@dataclass
+class _Run:
+    """The R episodes that still make queries in this step.
+
+    Args:
+        rows: int64 [R] their places in the batch.
+        truth, radius, x, best: [R, V, F] true observation, radius, current point, and best point so far.
+        lowest: [R] key of the best point.
+        loss: the objective.
+        parts: the units of these episodes, with the generator of each unit for this step.
+    """
+
+    rows: Tensor
+    truth: Tensor
+    radius: Tensor
+    x: Tensor
+    best: Tensor
+    lowest: Tensor
+    loss: Loss
+    parts: Sequence[Part]
+
+    def around(self, directions: Sequence[Tensor], smoothing: float) -> Tensor:
+        """[q + 1, R, V, F] the current points, and the points along the directions [q, V, F] of each part."""
+        reach, points = smoothing * self.radius, self.x.new_empty(len(directions[0]) + 1, *self.x.shape)
+        points[0] = self.x
+        for part, own in zip(self.parts, directions, strict=True):
+            torch.addcmul(self.x[part.rows], reach[part.rows], own.unsqueeze(1), out=points[1:, part.rows])
+        return points
+
+    def keep_best(self, points: Tensor, key: Tensor) -> None:
+        """Compare queried points [q + 1, R, V, F] by their keys [q + 1, R]."""
+        smallest, at = key.min(0)
+        improved = smallest < self.lowest
+        self.lowest = torch.where(improved, smallest, self.lowest)
+        self.best = torch.where(improved[:, None, None], points[at, torch.arange(len(at))], self.best)
+
+    def without(self, met: Tensor, answer: Tensor) -> _Run:
+        """The run without the episodes whose goal is met, bool [R]; their best points are written to `answer` [B, V, F]."""
+        if not bool(met.any()):
+            return self
+        answer[self.rows] = self.best
+        on = (~met).nonzero().squeeze(-1)
+        rows, truth, radius, x = self.rows[on], self.truth[on], self.radius[on], self.x[on]
+        loss, parts = self.loss.of(on), parts_of(self.parts, on)
+        return _Run(rows, truth, radius, x, self.best[on], self.lowest[on], loss, parts)
 
 
 def _gradient(value: Tensor, directions: Tensor) -> Tensor:
@@ -154,12 +200,12 @@ def _gradient(value: Tensor, directions: Tensor) -> Tensor:
 
     It uses differences to the mean loss instead of the loss at x, which have the same expectation and less variance.
     """
-    return torch.einsum("qb,qvf->bvf", value[1:] - value.mean(0), directions)
+    return ((value[1:] - value.mean(0)).T @ directions.flatten(1)).view(-1, *directions.shape[1:])
 
 
-def _generator(oracle: Oracle) -> torch.Generator:
+def _generator(of_run: torch.Generator) -> torch.Generator:
     """A generator for this step, seeded by one draw from the run's, whatever the number of iterations."""
-    seed = torch.randint(2**62, (1,), generator=oracle.generator)
+    seed = torch.randint(2**62, (1,), generator=of_run)
     return torch.Generator().manual_seed(int(seed))
 
 
@@ -183,5 +229,6 @@ def _directions(count: int, shape: torch.Size, generator: torch.Generator) -> Te
     rows = torch.randperm(order, generator=generator)[:count]
     columns = torch.randperm(order, generator=generator)[: vehicles * features]
     flips = torch.randint(0, 2, (vehicles * features,), generator=generator) * 2.0 - 1.0
-    signs = (_hadamard(order)[rows][:, columns] * flips).reshape(count, vehicles, features)
-    return torch.cat((torch.zeros(count, vehicles, 1), signs), -1)
+    directions = torch.zeros(count, *shape)
+    directions[..., 1:] = (_hadamard(order)[rows.unsqueeze(1), columns] * flips).view(count, vehicles, features)
+    return directions

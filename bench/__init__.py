@@ -1,7 +1,37 @@
-"""cavbench: a benchmark for the adversarial robustness of driving policies and object detectors."""
+"""cavbench: a benchmark for the adversarial robustness of driving policies and object detectors.
+
+`score`, `load` and `component` are the benchmark from Python; `gym` has its gymnasium environments. They are imported when they
+are first used, because torch takes seconds.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 from bench import shadow
 
+if TYPE_CHECKING:
+    import bench.gym as gym
+    from bench.api import component, load, score
+    from bench.errors import UserError
+
 __version__ = "0.1.0"
+__all__ = ["UserError", "__version__", "component", "gym", "load", "score"]
 
 shadow.check()
+
+_FROM = {"component": "bench.api", "load": "bench.api", "score": "bench.api", "UserError": "bench.errors"}
+
+
+def __getattr__(name: str) -> Any:
+    from importlib import import_module
+
+    if name in _FROM:
+        return getattr(import_module(_FROM[name]), name)
+    if name == "gym":
+        return import_module("bench.gym")
+    raise AttributeError(f"module 'bench' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

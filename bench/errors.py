@@ -1,12 +1,95 @@
-"""The exception that the command line prints as one line, with a non-zero exit code."""
+"""The exception that the command line prints as one line, with a non-zero exit code; warnings; text from strangers."""
 
 from __future__ import annotations
+
+import re
+import unicodedata
+import warnings
+from collections.abc import Sequence
+
+LONGEST = 60
+"""A value of a user in a message is cut to so many characters."""
+LONGEST_WORD, LONGEST_PATH, LONGEST_LINE = 100, 250, 900
+"""The same for the words, the paths and the whole of a message."""
 
 
 class UserError(Exception):
     """Bad input. The message is one line: what was wrong, what is allowed and, if it helps, what to type instead."""
 
 
+class PluginError(UserError):
+    """A plug-in is broken: it cannot be imported, is not what its entry point says, or cannot be created or loaded.
+
+    A sweep goes on without it.
+    """
+
+
+class UnfinishedError(UserError):
+    """A run went to its end, but some of its units failed.
+
+    Args:
+        lines: what failed, one line for each pair and reason.
+        finished: fingerprints of the finished units.
+        missing: number of units that are not finished.
+    """
+
+    def __init__(self, lines: Sequence[str], finished: Sequence[str], missing: int) -> None:
+        self.lines, self.finished = tuple(lines), finished
+        kept = f"{missing} of {len(finished) + missing} units are not finished, the others are kept"
+        if finished:
+            self.lines = (f"{lines[0]} ({kept})",) if len(lines) == 1 else (*lines, kept)
+        super().__init__("; ".join(self.lines))
+
+
+class EscapeError(Exception):
+    """Foreign code raised what ends a process: its message is the type and the first line of that."""
+
+
 def reason(error: BaseException) -> str:
     """The type and the first line of an exception: why something failed, in one line."""
-    return f"{type(error).__name__}: {error}".splitlines()[0]
+    if isinstance(error, EscapeError):
+        return str(error)
+    text = str(error).strip()
+    return f"{type(error).__name__}: {text}".splitlines()[0] if text else type(error).__name__
+
+
+class Notice(UserWarning):
+    """Something that the user should know and that stops nothing. The command line prints it as one line."""
+
+
+def notice(line: str) -> None:
+    """Give a notice."""
+    warnings.warn(line, Notice, stacklevel=2)
+
+
+def short(value: str) -> str:
+    """A value of a user for a message: on one line, and cut in the middle if it is long."""
+    line = " ".join(value.split())
+    return line if len(line) <= LONGEST else f"{_cut(line, LONGEST)} ({len(line)} characters)"
+
+
+def bounded(line: str) -> str:
+    """A message on one line: each word that is longer than a path is cut, and the whole in its middle."""
+    words = (
+        word if len(word) <= (LONGEST_PATH if "/" in word else LONGEST_WORD) else _cut(word, LONGEST)
+        for word in line.split()
+    )
+    return _cut(" ".join(words), LONGEST_LINE)
+
+
+def _cut(text: str, longest: int) -> str:
+    half = longest // 2
+    return text if len(text) <= longest else f"{text[:half]}…{text[-half:]}"
+
+
+def plain(text: str) -> str:
+    """Text from a stranger without what a terminal obeys: control characters, also of C1, marks of direction, line separators.
+
+    Line ends and tabs stay. Every other character of the Unicode categories Cc, Cf, Cs, Zl and Zp becomes a question mark.
+    """
+    return _OBEYED.sub(
+        lambda found: found[0] if unicodedata.category(found[0]) not in ("Cc", "Cf", "Cs", "Zl", "Zp") else "?", text
+    )
+
+
+_OBEYED = re.compile(r"[^\n\t\x20-\x7e]")

@@ -1,4 +1,4 @@
-"""Scores on the tuning seeds, which are never reported: `python benchmarks/tuning_scores.py victim=planner attack=pessimist episodes=16`.
+"""Scores on the tuning seeds, which are never reported: `python benchmarks/tuning_scores.py victim=planner episodes=16`.
 
 Takes the options of `bench run` that choose pairs, cells, training seeds and episodes, and keeps no records.
 """
@@ -30,11 +30,13 @@ def main() -> None:
                 for seed in (config.seeds if pair.is_seeded else (0,))
             ]
             columns = [drive(unit.job, ()).columns for unit in units]
-            cells.append([np.mean([each[name] for each in columns]) for name in ("safe_progress", "crashed", "assured")])
-            print(f"  {cell}: {cells[-1][0]:.3f}, crashed {cells[-1][1]:.0%}", flush=True)  # noqa: T201
+            cells.append(
+                [np.mean([each[name] for each in columns]) for name in ("safe_progress", "crashed", "assured")]
+            )
+            print(f"  {cell}: {cells[-1][0]:.3f}, crashed {cells[-1][1]:.0%}", flush=True)
         score, crashed, assured = np.mean(cells, 0)
         seconds = time.process_time() - start
-        print(f"{pair}: {score:.3f}, crashed {crashed:.1%}, assured {assured:.1%}, {seconds:.0f} CPU s", flush=True)  # noqa: T201
+        print(f"{pair}: {score:.3f}, crashed {crashed:.1%}, assured {assured:.1%}, {seconds:.0f} CPU s", flush=True)
 
 
 if __name__ == "__main__":

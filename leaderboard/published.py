@@ -17,7 +17,7 @@ from rich.console import Console
 
 from bench.errors import UserError
 from bench.files import whole
-from bench.plugins.track import Track
+from bench.plugins.track import Track, tracks
 from bench.records import reading
 from bench.records.generations import check
 from bench.records.schema import schema
@@ -29,6 +29,12 @@ def published(track: Track) -> pa.Table:
         paths = [path for path in sorted(folder.glob("*.parquet")) if check(path)[0].name == track.name]
         tables = [reading.upgraded(path) for path in paths]
     return pa.concat_tables([schema(track).empty_table(), *tables])
+
+
+def every_track() -> dict[str, pa.Table]:
+    """The published records of every track that has some."""
+    found = {track.name: published(track) for track in tracks()}
+    return {name: records for name, records in found.items() if records.num_rows}
 
 
 def publish(folder: Path, file: Path) -> int:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from bench.cli.progress import RunProgress, show_downloads
+from bench.cli.terminal import Console
 from bench.errors import UserError
 from bench.plugins.pair import Pair
 from bench.plugins.track import Track, track_of
@@ -45,15 +45,20 @@ def audit(words: Sequence[str], console: Console) -> int:
                 raise UserError(f"interrupted; {again}") from None
     track = track_of(config.public.pairs[0])
     found = differences(config, reading.read(config.public.out, units, track=track), track)
+    return int(not verdict(found, track, console))
+
+
+def verdict(found: dict[Pair, tuple[float, float, Interval]], track: Track, console: Console) -> bool:
+    """Print the differences and what follows, and return whether no pair scores significantly higher on public scenarios."""
     console.print(_table(found, track))
     flagged = [str(pair) for pair, (_, _, gain) in found.items() if gain.low > 0]
-    verdict = (
+    line = (
         f"public_only: {'; '.join(flagged)}"
         if flagged
         else "No pair scores significantly higher on the public scenarios."
     )
-    console.print(Text(verdict, style="bold red" if flagged else ""), soft_wrap=True)
-    return int(bool(flagged))
+    console.print(Text(line, style="bold red" if flagged else ""), soft_wrap=True)
+    return not flagged
 
 
 def differences(config: AuditConfig, records: pa.Table, track: Track) -> dict[Pair, tuple[float, float, Interval]]:

@@ -11,7 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.cli.listing import heading
-from bench.errors import UserError
+from bench.cli.words import split
+from bench.errors import UserError, short
 from bench.plugins import registry
 
 if TYPE_CHECKING:
@@ -32,7 +33,9 @@ def print_checks(name: str, words: Sequence[str], console: Console) -> int:
     from bench.run.process import settle
 
     settle()
-    given = dict(_read(word) for word in words)
+    for word in words:
+        _read(word)
+    _, given = split(words, (), names=0)
     kinds = registry.kinds_of(name)
     if strange := [key for key in given if key not in TRIED_WITH and key.partition(".")[0] not in kinds]:
         known = [*(f"{kind}.…" for kind in kinds), *TRIED_WITH]
@@ -64,11 +67,10 @@ def _table(outcomes: Sequence[Outcome]) -> Table:
     return table
 
 
-def _read(word: str) -> tuple[str, str]:
+def _read(word: str) -> None:
     key, equals, value = word.partition("=")
     if not (equals and value and (key in TRIED_WITH or "." in key)):
         raise UserError(
-            f"cannot read {word!r}: write, for instance, attack.steps=50 to set a parameter, victim=NAME to choose the victim of "
-            "a defence, or world=NAME to choose the world"
+            f"cannot read {short(word)!r}: write, for instance, attack.steps=50 to set a parameter, victim=NAME to choose the "
+            "victim of a defence, or world=NAME to choose the world"
         )
-    return key, value

@@ -1,9 +1,11 @@
-"""`bench list`: prints the names of all components, or the description of one."""
+"""`bench list`: prints all components with a line on each, or the description of one."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from rich.console import Console
@@ -14,29 +16,90 @@ from bench.errors import UserError
 from bench.plugins import registry, suites
 from bench.plugins.contracts import ANY_TRACK
 from bench.plugins.registry import GROUPS, KINDS, Kind
-from bench.plugins.sources import tracks_of
+from bench.plugins.sources import summary, tracks_of
 from bench.plugins.suites import Suite
 
+SUITE = "suite"
 
-def print_names(console: Console) -> None:
-    """Print every component by kind, with its tracks and the package that ships it, without importing it."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for column in ("kind", "name", "track", "shipped by"):
-        table.add_column(column)
-    for kind in KINDS:
-        for number, (name, claims) in enumerate(registry.entries(GROUPS[kind]).items()):
-            complaint = registry.problem(claims)
-            shipped_by = Text(complaint, style="red") if complaint else Text(claims[0].shipped_by)
-            served = ", ".join(tracks_of(claims[0].target)) or "?"
-            table.add_row(kind if number == 0 else "", Text(name, style="bold"), served, shipped_by)
-    for number, (name, claims) in enumerate(registry.entries(registry.SUITES).items()):
-        complaint = registry.problem(claims)
-        try:
-            served = suites.suite(name).track
-        except UserError as error:
-            served, complaint = "?", complaint or str(error)
-        shipped_by = Text(complaint, style="red") if complaint else Text(claims[0].shipped_by)
-        table.add_row("suite" if number == 0 else "", Text(name, style="bold"), served, shipped_by)
+
+@dataclass(frozen=True, kw_only=True)
+class Listed:
+    """A line of `bench list`; `problem` says why the component cannot be used, and is mostly empty."""
+
+    kind: str
+    name: str
+    tracks: tuple[str, ...]
+    summary: str
+    shipped_by: str
+    problem: str
+
+
+def listed(kind: str = "") -> list[Listed]:
+    """Every component, or those of one kind, read from the sources without importing them."""
+    found = []
+    for each in KINDS if kind in ("", *KINDS) else ():
+        if kind in ("", each):
+            found += [_component(each, name, claims) for name, claims in registry.entries(GROUPS[each]).items()]
+    return found + ([_suite(name) for name in registry.entries(registry.SUITES)] if kind in ("", SUITE) else [])
+
+
+def _component(kind: Kind, name: str, claims: tuple[registry.Entry, ...]) -> Listed:
+    return Listed(
+        kind=kind,
+        name=name,
+        tracks=tuple(tracks_of(claims[0].target)),
+        summary=summary(claims[0].target),
+        shipped_by=claims[0].shipped_by,
+        problem=registry.problem(claims),
+    )
+
+
+def _suite(name: str) -> Listed:
+    claims = registry.entries(registry.SUITES)[name]
+    try:
+        suite = suites.suite(name)
+    except UserError as error:
+        return Listed(kind=SUITE, name=name, tracks=(), summary="", shipped_by=claims[0].shipped_by, problem=str(error))
+    return Listed(
+        kind=SUITE,
+        name=name,
+        tracks=(suite.track,),
+        summary=suite.meaning,
+        shipped_by=claims[0].shipped_by,
+        problem=registry.problem(claims),
+    )
+
+
+def print_names(console: Console, kind: str = "", *, as_json: bool = False) -> None:
+    """Print the components, or those of one kind, with what they do, without importing them.
+
+    Args:
+        console: console to print to.
+        kind: attack, defense, victim, world or suite; empty for all.
+        as_json: whether to print a JSON list of objects with the fields of `Listed`.
+    """
+    found = listed(kind)
+    if as_json:
+        print(json.dumps([asdict(one) for one in found], indent=1))  # noqa: T201 - rich would wrap it
+        return
+    foreign = any(not one.shipped_by.startswith("cavbench ") for one in found)
+    table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
+    for column in ("kind", "name", "track"):
+        table.add_column(column, no_wrap=True)
+    table.add_column("what it does", ratio=1)
+    if foreign:
+        table.add_column("shipped by")
+    before = ""
+    for one in found:
+        said = Text(one.problem, style="red") if one.problem else _with_code(one.summary)
+        row = [
+            Text(one.kind if one.kind != before else ""),
+            Text(one.name, style="bold"),
+            Text(", ".join(one.tracks) or "?"),
+            said,
+        ]
+        table.add_row(*row, *([Text(one.shipped_by)] if foreign else []))
+        before = one.kind
     console.print(table)
     console.print("\n`bench list NAME` describes a component and its parameters.", style="dim", highlight=False)
 

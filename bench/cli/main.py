@@ -1,4 +1,4 @@
-"""The command line: `bench run | audit | train | list | new | check | render | show | view | report | fetch`.
+"""The command line: one function for each command of `bench`.
 
 A command imports what it needs when it is called, so that `bench list` and `--help` do not import torch.
 """
@@ -7,22 +7,25 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.text import Text
 
+from bench import __version__
 from bench.cli.axes_help import AxesHelp
-from bench.errors import UserError
+from bench.cli.completion import completed
+from bench.cli.terminal import Console
+from bench.errors import Notice, UnfinishedError, UserError, bounded
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from bench.plugins.track import Track
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(pretty_exceptions_enable=False)
 
 Words = Annotated[
     list[str] | None,
@@ -30,26 +33,73 @@ Words = Annotated[
         metavar="KEY=VALUE...",
         help="Comma lists sweep: attack=zo,noise defense=advtrain victim=dqn attack.steps=50 threat.budget=0.1,0.2. "
         "Training seeds and axes select a part of the grid: seeds=0,1 lanes=3,4 weather=clear,rain episodes=20.",
+        autocompletion=completed,
     ),
 ]
 
 
-@app.callback()
-def bench() -> None:
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"cavbench {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def bench(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
     """A benchmark for the adversarial robustness of driving policies and object detectors.
 
     With --debug, or BENCH_DEBUG=1 in the environment, errors show their traceback.
     """
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@app.command("help")
+def explain(
+    context: typer.Context,
+    term: Annotated[
+        list[str] | None, typer.Argument(help="A term of the tables, a column, a parameter, a component or a command.")
+    ] = None,
+) -> None:
+    """Explain a term, such as a column of the tables; without one, list all terms.
+
+    For instance: bench help kept, bench help "min TTC", bench help threat.budget, or bench help run
+    """
+    from bench.cli import explain as cli_explain
+
+    wanted = " ".join(term or [])
+    commands = getattr(context.find_root().command, "commands", {})
+    if wanted in commands:
+        command = commands[wanted]
+        with type(context)(command, info_name=wanted, parent=context.find_root()) as inner:
+            typer.echo(command.get_help(inner))
+    elif wanted:
+        cli_explain.print_term(wanted, Console())
+    else:
+        cli_explain.print_terms(Console())
 
 
 @app.command("list")
 def list_components(
-    name: Annotated[str, typer.Argument(help="A component to describe, with its parameters.")] = "",
+    name: Annotated[
+        str, typer.Argument(help="A component to describe, or a kind: attack, defense, victim, world, suite.")
+    ] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
-    """List the installed attacks, defences, victims and worlds, or describe one."""
+    """List the installed attacks, defences, victims and worlds with a line on each, or describe one."""
     from bench.cli import listing as cli_list
 
-    cli_list.print_component(name, Console()) if name else cli_list.print_names(Console())
+    if name in ("", "attack", "defense", "victim", "world", "suite"):
+        cli_list.print_names(Console(), name, as_json=as_json)
+    elif as_json:
+        raise UserError(f"--json lists components: bench list --json, or bench list attack --json, not {name}")
+    else:
+        cli_list.print_component(name, Console())
 
 
 @app.command()
@@ -120,46 +170,127 @@ def train(words: Words = None) -> None:
     cli_train.train(words or [], Console())
 
 
+Out = Annotated[Path | None, typer.Option(help="The same as out=FOLDER.")]
+
+
 @app.command()
 def render(
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the frames; by default the one that bench run reads.")
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[out=…] [world=…]",
+            help="out=FOLDER for the frames, by default the one that bench run reads; world=NAME for another camera world.",
+        ),
     ] = None,
-    world: Annotated[str, typer.Option(help="The camera world.")] = "camera",
+    out: Out = None,
+    world: Annotated[str, typer.Option(help="The same as world=NAME.")] = "camera",
 ) -> None:
     """Render the frames of a camera world. This takes hours; run the same command again to continue.
 
     It needs the renderer: pip install 'cavbench[render]'. The frames of the standard grid ship with cavbench.
     """
     from bench.cli import render as cli_render
+    from bench.cli.words import split
 
-    cli_render.render(world, out, Console())
+    _, values = split(words or [], ("out", "world"), names=0)
+    cli_render.render(values.get("world", world), _folder(values, out), Console())
 
 
 @app.command()
 def show(
-    run: Annotated[str, typer.Argument(help="A results folder, or the name of a pair.")] = "results",
-    out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
+    words: Annotated[
+        list[str] | None, typer.Argument(metavar="[RUN] [out=…]", help="A results folder, or the name of a pair.")
+    ] = None,
+    out: Out = None,
 ) -> None:
-    """Show a run: its configuration, provenance, table and recordings."""
+    """Show a run: its configuration, provenance, table and recordings. out=FOLDER is the results folder, by default results."""
     from bench.cli import show as cli_show
+    from bench.cli.words import split
 
-    cli_show.print_run(run, out, Console(), _print_report)
+    names, values = split(words or [], ("out",), names=1)
+    folder = _folder(values, out) or Path("results")
+    cli_show.print_run(names[0] if names else str(folder), folder, Console(), _print_report)
 
 
 @app.command()
 def view(
-    run: Annotated[str, typer.Argument(help="A recording (.rrd), a results folder, or the name of a pair.")],
-    where: Annotated[list[str] | None, typer.Argument(metavar="COLUMN=VALUE...", help="The record to replay.")] = None,
-    out: Annotated[Path, typer.Option(help="Results folder to look for the pair in.")] = Path("results"),
+    words: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN... [COLUMN=VALUE]... [out=…]",
+            help="A recording (.rrd), a results folder, or the name of a pair; then the record to replay.",
+        ),
+    ],
+    out: Out = None,
+    save: Annotated[Path | None, typer.Option(help="Write a film: a .gif, .webp or .mp4 file.")] = None,
+    seconds: Annotated[str | None, typer.Option(metavar="FROM:TO", help="The part of the film to save.")] = None,
+    web: Annotated[
+        bool, typer.Option("--web", help="Open it in a browser on this machine, without a display.")
+    ] = False,
 ) -> None:
     """Open a recording in the rerun viewer; with COLUMN=VALUE, replay and record that episode first.
 
-    For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017
+    For instance: bench view results, or bench view zo-advtrain-dqn lanes=3 weather=fog seed=1000017 out=results
+
+    With --save, replay it and write a film. Two pairs are shown one below the other, on the same scenario:
+    bench view none-none-dqn pgd-none-dqn --save clip.gif
     """
     from bench.cli import view as cli_view
+    from bench.cli.words import split
 
-    cli_view.open_recording(run, where or [], out, Console())
+    names, values = split(words, (), names=len(words))
+    folder = _folder(values, out) or Path("results")
+    where = {key: value for key, value in values.items() if key != "out"}
+    runs = names or [str(folder)]
+    if save is not None:
+        cli_view.save_film(runs, where, folder, Console(), save, seconds)
+        return
+    if len(runs) > 1 or seconds is not None:
+        raise UserError("several runs, and --seconds, need --save FILE")
+    cli_view.open_recording(runs[0], [f"{key}={value}" for key, value in where.items()], folder, Console(), web=web)
+
+
+def _folder(values: dict[str, str], option: Path | None) -> Path | None:
+    """The folder of out=FOLDER or --out FOLDER."""
+    if "out" in values and option is not None:
+        raise UserError("out is given twice")
+    folder = Path(values["out"]) if "out" in values else option
+    return folder.expanduser() if folder else None
+
+
+@app.command()
+def submit(
+    words: Annotated[
+        list[str], typer.Argument(metavar="PAIR out=FOLDER [results=FOLDER]", help="A pair of a results folder.")
+    ],
+) -> None:
+    """Write everything that others need to check a pair to one folder: records, weights, commands, environment, a card.
+
+    For instance: bench submit pgd-my_defense-dqn out=submission
+    """
+    from bench.cli import submit as cli_submit
+
+    cli_submit.submit(words, Console())
+
+
+@app.command()
+def verify(
+    words: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FOLDER [KEY=VALUE]...",
+            help="sample=3 units are replayed (or all); episodes=20 fresh scenarios in each cell are driven (audit=false for "
+            "none, salt=NUMBER to repeat them); out=FOLDER adds the records to a results folder.",
+        ),
+    ],
+) -> None:
+    """Check a submission: replay a sample, drive fresh scenarios, and print its row. Exit code 1 if it does not hold.
+
+    Its components must be installed with pip. Nothing in the folder is executed.
+    """
+    from bench.cli import submit as cli_submit
+
+    raise typer.Exit(cli_submit.verify(words, Console(), _print_report))
 
 
 @app.command()
@@ -200,24 +331,51 @@ def main() -> None:
     """Run the command line. Bad input prints one line on standard error and exits with code 2."""
     debug = "--debug" in sys.argv or bool(os.environ.get("BENCH_DEBUG"))
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
-    try:
-        status = app(arguments, standalone_mode=False)
-    except (UserError, typer.TyperException) as error:
-        if debug:
-            raise
-        reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
-        sys.exit(_complain(reason))
-    # Unexpected errors are mostly in plug-ins: tell their authors how to see the traceback.
-    except Exception as error:
-        if debug:
-            raise
-        sys.exit(_complain(f"{type(error).__name__}: {error} (--debug shows the traceback)"))
+    with warnings.catch_warnings():
+        if not debug:
+            # Warnings of libraries are for the authors of components.
+            warnings.simplefilter("ignore")
+        warnings.simplefilter("always", Notice)
+        warnings.showwarning = _show
+        try:
+            status = app(arguments, standalone_mode=False)
+        except UnfinishedError as error:
+            if debug:
+                raise
+            sys.exit(_complain(*error.lines))
+        except (UserError, typer.TyperException) as error:
+            if debug:
+                raise
+            reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
+            sys.exit(_complain(reason))
+        # Unexpected errors are mostly in plug-ins: tell their authors how to see the traceback.
+        except Exception as error:
+            if debug:
+                raise
+            full = "there is not enough memory for this: choose smaller numbers"
+            if isinstance(error, OSError) and error.strerror:
+                reason = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+            else:
+                reason = full if _is_full(error) else f"{type(error).__name__}: {error}"
+            sys.exit(_complain(f"{reason} (--debug shows the traceback)"))
     sys.exit(status or 0)
 
 
-def _complain(reason: str) -> int:
-    line = " ".join(reason.split())
-    Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
+def _is_full(error: Exception) -> bool:
+    """Whether an error says that memory is used up: Python's own, or that of torch, which has no type."""
+    return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)
+
+
+def _show(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any, **__: Any) -> None:
+    """Print a warning: a notice as one line, that of a library with its place."""
+    text = str(message) if issubclass(category, Notice) else f"{filename}:{lineno}: {category.__name__}: {message}"
+    Console(stderr=True).print(Text(f"warning: {bounded(text)}", style="yellow"), soft_wrap=True)
+
+
+def _complain(*reasons: str) -> int:
+    for reason in reasons:
+        line = bounded(reason)
+        Console(stderr=True).print(Text.assemble(("error:", "bold red"), f" {line}"), soft_wrap=True)
     return 2
 
 

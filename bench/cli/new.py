@@ -8,9 +8,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
+from bench.cli.words import split
 from bench.conformance import scaffold
-from bench.errors import UserError
-from bench.plugins import registry
 
 KEYS = ("track", "out")
 
@@ -21,12 +20,7 @@ def print_new(kind: str, name: str, words: Sequence[str], console: Console) -> N
     Raises:
         UserError: if an option cannot be parsed, or the package cannot be written.
     """
-    given: dict[str, str] = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if key not in KEYS or not (equals and value):
-            raise UserError(registry.unknown(f"option {word!r}", key, [f"{known}=…" for known in KEYS]))
-        given[key] = value
+    _, given = split(words, KEYS, names=0)
     track, out = given.get("track") or scaffold.default_track(), given.get("out")
     folder = scaffold.write(kind, name, track=track, folder=Path(out).expanduser() if out else None)
     console.print(Text(f"Created {folder}. Next, in the environment of cavbench:"), soft_wrap=True)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     DownloadColumn,
@@ -22,8 +21,13 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from bench.cli.terminal import Console
+
 if TYPE_CHECKING:
-    from bench.run.unit import Preparation, Unit
+    from bench.run.unit import Loading, Preparation, Unit
+
+PRINTED_LINES = 5
+"""Lines of a unit's output that are shown."""
 
 
 class RunProgress:
@@ -48,7 +52,8 @@ class RunProgress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.bar.stop()
+        if self.console.is_terminal:
+            self.bar.stop()
 
     def begin(self, *, episodes: int, finished: int) -> None:
         self.total, self.done = episodes, finished
@@ -56,7 +61,7 @@ class RunProgress:
         if finished:
             self.console.print(f"{finished} of {episodes} episodes are already done", style="dim", highlight=False)
 
-    def working(self, works: Sequence[Unit | Preparation]) -> None:
+    def working(self, works: Sequence[Unit | Preparation | Loading]) -> None:
         self.working_on = {str(work): self.working_on.get(str(work), "") for work in works}
         self._describe()
 
@@ -72,6 +77,14 @@ class RunProgress:
         if not self.console.is_terminal:
             line = f"{self.done}/{self.total} episodes | {work} | {wall_s:.1f} s"
             self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def printed(self, work: Unit | Preparation | Loading, lines: Sequence[str]) -> None:
+        shown = [*lines[:PRINTED_LINES], *(["…"] if len(lines) > PRINTED_LINES else [])]
+        for line in shown:
+            self.console.print(Text(f"{work} prints: {line[:300]}", style="dim"), soft_wrap=True)
+
+    def failed(self, line: str) -> None:
+        self.console.print(Text(f"failed: {line}", style="red"), soft_wrap=True)
 
     def _describe(self) -> None:
         if self.task is not None and self.working_on:
@@ -101,7 +114,8 @@ class TrainingProgress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.bar.stop()
+        if self.console.is_terminal:
+            self.bar.stop()
 
     def __call__(self, share: float, text: str) -> None:
         self.bar.update(self.task, completed=share, description=f"{self.label}  {text}")

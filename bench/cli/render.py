@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
 from rich.text import Text
 
 from bench.cli.progress import TrainingProgress
+from bench.cli.terminal import Console
 from bench.errors import UserError
+from bench.files import check_folder
 from bench.run.config import component
 
 
@@ -26,6 +27,8 @@ def render(world: str, out: Path | None, console: Console) -> None:
     make = getattr(component("world", world, {}), "render", None)
     if make is None:
         raise UserError(f"world {world!r} has no frames to render; choose a camera world")
+    if out is not None:
+        check_folder(out, "the folder")
     with TrainingProgress(Console(stderr=True), f"render {world}") as progress:
         try:
             files = make(out, progress)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.errors import UserError
+from bench.cli.words import split
 from bench.plugins import registry
 from bench.records import reading
 
@@ -25,18 +25,7 @@ def print_report(words: Sequence[str], console: Console) -> None:
     Raises:
         UserError: if an option is unknown, or there are no records.
     """
-    values: dict[str, str] = {}
-    names = []
-    for word in words:
-        key, given, value = word.partition("=")
-        if not given:
-            names.append(word)
-        elif key not in KEYS or key in values or not value:
-            raise UserError(_TAKES)
-        else:
-            values[key] = value
-    if len(names) > 1:
-        raise UserError(_TAKES)
+    names, values = split(words, KEYS, names=1)
     out = Path(values.get("out", "results")).expanduser()
     no_folder = "out" not in values and not out.exists()
     if "html" in values:
@@ -46,9 +35,3 @@ def print_report(words: Sequence[str], console: Console) -> None:
     name = names[0] if names else "run"
     function = registry.resolve(registry.REPORTS, name, "report")
     function({} if name != "run" and no_folder else reading.read_all(out), console)
-
-
-_TAKES = (
-    "bench report takes at most one NAME, one out=FOLDER and one html=PAGE, for instance: bench report thesis out=results, "
-    "or bench report out=results html=leaderboard.html"
-)

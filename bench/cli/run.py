@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import pyarrow as pa
-from rich.console import Console
 from rich.text import Text
 
 from bench.cli.progress import RunProgress, show_downloads
-from bench.errors import UserError
+from bench.cli.terminal import Console
+from bench.errors import UnfinishedError, UserError
 from bench.plugins.track import Track, track_of
 from bench.records import reading
 from bench.run import runner
@@ -25,20 +25,26 @@ def run(words: Sequence[str], console: Console, report: Callable[[Track, pa.Tabl
         report: prints the table of a track, from records.
 
     Raises:
-        UserError: if an option cannot be parsed or a component fails, or after Ctrl-C.
+        UserError: if an option cannot be parsed, after Ctrl-C, or at the end if a component failed.
     """
     show_downloads()
     config = run_config(words)
     with RunProgress(Console(stderr=True)) as progress:
         for line in config.skipped:
             progress.warn(line)
+        unfinished = None
         try:
-            units = runner.run(config, progress)
+            units: Sequence[str] = runner.run(config, progress)
+        except UnfinishedError as error:
+            unfinished, units = error, error.finished
         except KeyboardInterrupt:
             kept = f"{progress.done} of {progress.total} episodes are kept"
             raise UserError(f"interrupted; {kept}: run the same command again to continue") from None
     track = track_of(config.pairs[0])
-    report(track, reading.read(config.out, units, track=track))
+    if units:
+        report(track, reading.read(config.out, units, track=track))
+    if unfinished is not None:
+        raise unfinished
     console.print(
         Text(f"Records in {config.out}: `bench show {config.out}` shows their configuration and provenance."),
         soft_wrap=True,

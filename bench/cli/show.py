@@ -55,7 +55,9 @@ def located(run: str, out: Path) -> tuple[Path, str]:
     """
     if Path(run).is_dir():
         return Path(run), ""
-    if "/" in run:
+    if Path(run) == out and out == Path("results"):
+        raise UserError("there is no folder results; create one with `bench run`, or choose another with out=")
+    if "/" in run or Path(run) == out:
         raise UserError(f"the folder {run} does not exist")
     return out, run
 
@@ -177,4 +179,5 @@ def _listed(column: pa.ChunkedArray, digits: int | None = None) -> str:
 
 def recordings(folder: Path, pair: str | None) -> list[Path]:
     """The recordings of a pair, or of all pairs."""
-    return sorted((folder / "recordings").glob(f"{pair or '*'}/*.rrd"))
+    found = sorted((folder / "recordings").glob("*/*.rrd"))
+    return [path for path in found if pair in (None, path.parent.name)]

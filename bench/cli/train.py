@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.text import Text
 
 from bench.cli.progress import TrainingProgress
+from bench.cli.terminal import Console
 from bench.errors import UserError
+from bench.files import check_folder
 from bench.plugins.contracts import Trained, World
 from bench.plugins.pair import Chosen
 from bench.plugins.track import track
@@ -37,7 +37,9 @@ def train(words: Sequence[str], console: Console) -> None:
         recipe = zoo.Recipe.of(**{part.kind: part.component for part in _parts(config)} | {trained.kind: component})
     except NotImplementedError as error:
         raise UserError(f"there is nothing to train: {error}") from error
-    _check_writable(config.out or zoo.own())
+    root = config.out or zoo.own()
+    for folder in (root, root / recipe.key):
+        check_folder(folder, "the zoo")
     for seed in config.seeds:
         start = time.perf_counter()
         with TrainingProgress(Console(stderr=True), f"{recipe.name}, seed {seed}") as progress:
@@ -89,12 +91,3 @@ def _placed(trained: Chosen[Any], world: World) -> Any:
             "would distinguish it from one trained in the default world"
         )
     return trained.component
-
-
-def _check_writable(root: Path) -> None:
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"the zoo {root} cannot be written: {error.strerror or error}; choose another folder with out="
-        ) from None

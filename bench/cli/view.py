@@ -1,32 +1,45 @@
-"""`bench view`: opens a recording, or replays and records the episode of any record."""
+"""`bench view`: opens a recording, replays and records the episode of any record, or saves a film of it."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
+import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.console import Console
 from rich.text import Text
 
 from bench.cli.show import located, pair_named, recordings, records_of
+from bench.cli.terminal import Console
 from bench.errors import UserError
+from bench.files import check_folder
 from bench.scenarios.axes import written
 
+LOCAL = "127.0.0.1"
+"""The web viewer is offered to this machine only."""
+STARTS_S = 30.0
+"""Seconds within which the web viewer must answer."""
 
-def open_recording(run: str, where: Sequence[str], out: Path, console: Console) -> None:
-    """Open a recording in the rerun viewer; without a display, print the command that opens it.
+
+def open_recording(run: str, where: Sequence[str], out: Path, console: Console, *, web: bool = False) -> None:
+    """Open a recording in the rerun viewer; without a display, print the commands that open it.
 
     Args:
         run: a recording, a results folder, or the beginning of a pair's name; several recordings are listed.
         where: `column=value` options; the first matching record is replayed and recorded.
         out: results folder of the pair.
         console: console to print to.
+        web: whether to serve rerun's web viewer on this machine until Ctrl-C.
 
     Raises:
         UserError: if there is no such recording or record.
@@ -40,13 +53,139 @@ def open_recording(run: str, where: Sequence[str], out: Path, console: Console) 
         path = found
     if path.suffix != ".rrd":
         raise UserError(f"{path} is not a recording (.rrd)")
+    if web:
+        _serve(path, console)
+        return
     if not _has_display():
         console.print(
-            Text(f"No display found. On a machine with a display, run: rerun {path.resolve()}"), soft_wrap=True
+            Text(
+                f"No display found. `bench view {path} --web` opens it in a browser, --save clip.gif writes a film; "
+                f"on a machine with a display, run: rerun {path.resolve()}"
+            ),
+            soft_wrap=True,
         )
         return
     subprocess.Popen([sys.executable, "-m", "rerun", str(path)], start_new_session=True)
     console.print(Text(f"opened {path} in the rerun viewer"), soft_wrap=True)
+
+
+def save_film(
+    runs: Sequence[str],
+    where: Mapping[str, str],
+    out: Path,
+    console: Console,
+    path: Path,
+    seconds: str | None,
+) -> None:
+    """Replay an episode of each run, the same scenario for all, and save them as one film.
+
+    Args:
+        runs: recordings, or beginnings of the names of pairs in `out`.
+        where: values by column of the first record; the others are of the same cell, scenario and training seed.
+        out: results folder of the pairs.
+        console: console to print to.
+        path: file of the film.
+        seconds: the part to show, `FROM:TO`; None for all.
+
+    Raises:
+        UserError: if there is no such record, or the film cannot be written.
+    """
+    from bench.recording.film import KINDS, save, stacked
+    from bench.run.replay import film
+
+    if path.suffix.lower() not in KINDS:
+        raise UserError(f"--save {path}: the name must end in {', '.join(KINDS)}")
+    part = _seconds(seconds)
+    films, wanted = [], dict(where)
+    for run in runs:
+        folder, record = _record(run, out, wanted)
+        made, differences = film(folder, record)
+        if differences:
+            differing = ", ".join(differences)
+            console.print(Text(f"{record['pair']}: the replay differs from the record in {differing}.", style="yellow"))
+        films.append(made)
+        wanted = {name: str(record[name]) for name in ("cell", "seed")}
+    save(stacked(films), path, seconds=part)
+    console.print(Text(f"saved {path} ({path.stat().st_size / 1e6:.1f} MB)"), soft_wrap=True)
+
+
+def _record(run: str, out: Path, wanted: Mapping[str, str]) -> tuple[Path, dict[str, Any]]:
+    """The results folder and the record of a recording, or of a pair's first episode with these values."""
+    from bench.run.replay import find, recorded
+
+    path = Path(run)
+    if path.is_file():
+        if path.suffix != ".rrd" or not (path.parents[2] / "episodes").is_dir():
+            raise UserError(f"{path} is not a recording in a results folder: the film is made from its record there")
+        (_, records), *_ = records_of(path.parents[2], path.parent.name)
+        return path.parents[2], recorded(path.parents[2], path, records)
+    folder, beginning = located(run, out)
+    (_, records), *_ = records_of(folder, beginning)
+    known = pc.unique(records["pair"]).to_pylist()
+    if not beginning and len(known) > 1:
+        raise UserError(f"{folder} has {len(known)} pairs: name one of {', '.join(sorted(known))} with --out {folder}")
+    return folder, find(records, {"pair": pair_named(beginning, records), **wanted})
+
+
+def _seconds(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        first, last = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise UserError(f"--seconds takes FROM:TO, for instance 0:12, got {text}") from None
+    return first, last
+
+
+def _serve(path: Path, console: Console) -> None:
+    """Serve a recording and rerun's web viewer on this machine, until Ctrl-C."""
+    import rerun as rr
+
+    ports = {"grpc": _free_port(), "web": _free_port()}
+    command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", LOCAL, "--port", str(ports["grpc"])]
+    server = subprocess.Popen(
+        [*command, "--web-viewer-port", str(ports["web"]), str(path)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    source = f"rerun+http://{LOCAL}:{ports['grpc']}/proxy"
+    address = f"http://{LOCAL}:{ports['web']}/?url={quote(source, safe='')}"
+    try:
+        _await(server, ports["web"])
+        console.print(Text(f"rerun {rr.__version__} shows it at {address} (Ctrl-C ends it)"), soft_wrap=True)
+        server.wait()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        # `python -m rerun` starts the viewer as a process of its own.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGTERM)
+        server.wait()
+
+
+def _await(server: subprocess.Popen[bytes], port: int) -> None:
+    """Wait until the viewer answers.
+
+    Raises:
+        UserError: if it ends before.
+    """
+    until = time.monotonic() + STARTS_S
+    while time.monotonic() < until:
+        if server.poll() is not None:
+            assert server.stderr is not None
+            said = server.stderr.read().decode(errors="replace").strip().splitlines()
+            raise UserError(f"rerun's web viewer did not start: {said[-1] if said else server.returncode}")
+        with contextlib.suppress(OSError), socket.create_connection((LOCAL, port), timeout=1):
+            return
+        time.sleep(0.1)
+    raise UserError(f"rerun's web viewer did not start within {STARTS_S:.0f} s")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOCAL, 0))
+        return int(probe.getsockname()[1])
 
 
 def _listed(folder: Path, beginning: str, console: Console) -> Path | None:
@@ -84,6 +223,7 @@ def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Conso
     if beginning:
         words = {"pair": pair_named(beginning, records)} | words
     record = find(records, words)
+    check_folder(folder / "recordings", "the folder of recordings")
     made = replay(folder, record)
     if made.differences:
         cause = f"changed since: {made.changed}" if made.changed else "no known change since"

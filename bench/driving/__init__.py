@@ -4,7 +4,7 @@ from bench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim
 from bench.driving.dynamics import Dynamics, Forecast
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features
 from bench.driving.kinematics import Kinematics
-from bench.driving.oracle import Oracle
+from bench.driving.oracle import Oracle, Part, parts_of
 from bench.driving.policy import Policy, PolicyWrapper, State
 from bench.driving.threat import ObservationThreat
 
@@ -22,8 +22,10 @@ __all__ = [
     "Kinematics",
     "ObservationThreat",
     "Oracle",
+    "Part",
     "Policy",
     "PolicyWrapper",
     "State",
     "TrainingHooks",
+    "parts_of",
 ]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -12,6 +14,7 @@ from bench.driving.contracts import DrivingAttack
 from bench.driving.dynamics import Dynamics
 from bench.driving.enforcer import Enforcer
 from bench.driving.features import Features
+from bench.driving.oracle import Part, parts_of
 from bench.driving.policy import State, rows_of
 from bench.driving.threat import ObservationThreat
 from bench.driving.victim import CountedPolicy
@@ -46,7 +49,8 @@ class Attacker:
         subject: the victim; the attack reaches it only through an oracle.
         threat: the threat model, enforced here.
         features: features of the observation.
-        seed: seed of the attack's random generator.
+        seed: seed of the attack's random generator; of a `joint` attack, one seed for each episode: episodes with the same
+            seed are one unit, and stand together.
         dynamics: the world's rules of motion; None if the world does not offer them.
         frames: frames of each episode that may be attacked (`ObservationThreat.frames`); None for all.
     """
@@ -58,13 +62,19 @@ class Attacker:
         threat: ObservationThreat,
         features: Features,
         *,
-        seed: int,
+        seed: int | Sequence[int],
         dynamics: Dynamics | None = None,
         frames: int | None = None,
     ) -> None:
         self.attack, self.subject = attack, subject
         access = attack.access if attack else "oblivious"
-        self.enforcer = Enforcer(subject, threat, access, features, torch.Generator().manual_seed(seed), dynamics)
+        seeds = [seed] if isinstance(seed, int) else list(seed)
+        starts = [place for place, one in enumerate(seeds) if place == 0 or one != seeds[place - 1]]
+        self.parts = [
+            Part(slice(start, end), torch.Generator().manual_seed(seeds[start]))
+            for start, end in pairwise([*starts, len(seeds)])
+        ]
+        self.enforcer = Enforcer(subject, threat, access, features, self.parts[0].generator, dynamics)
         self.frames = frames
         self.changed = torch.zeros(0, dtype=torch.int64)
         self.state: State = None
@@ -107,7 +117,9 @@ class Attacker:
         The run keeps its own copy of the state and updates it in place.
         """
         self.changed = torch.zeros(len(observation), dtype=torch.int64)
-        oracle = self.enforcer.begin(observation, policy_state)
+        oracle = self.enforcer.begin(
+            observation, policy_state, parts=parts_of(self.parts, torch.arange(len(observation)))
+        )
         with self.subject.turn():
             state = attack.initial(observation.clone(), oracle)
         self.enforcer.close()
@@ -119,7 +131,8 @@ class Attacker:
         self, attack: DrivingAttack, observation: Tensor, rows: Tensor, policy_state: State
     ) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and its distance to the perturbation set."""
-        oracle, name = self.enforcer.begin(observation, policy_state), type(attack).__name__
+        oracle = self.enforcer.begin(observation, policy_state, parts=parts_of(self.parts, rows))
+        name = type(attack).__name__
         with self.subject.turn():
             answer, state = attack.step(observation, oracle, rows_of(self.state, rows))
         self.enforcer.close()

@@ -178,6 +178,10 @@ class DrivingAttack(Attack):
 
     track: ClassVar[str] = "driving"
     action_types: ClassVar[tuple[ActionType, ...]] = ("discrete", "continuous")
+    joint: ClassVar[bool] = False
+    """Whether one call may attack the episodes of several units. Such an attack draws the random numbers of each unit from the
+    unit's own generator (`Oracle.parts`), and nothing else that it does for a unit depends on the others. A subclass says it
+    for itself."""
 
     @classmethod
     def missing(cls) -> list[str]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate, pairwise
 
 from bench.driving import attacker, enforcer, meter, oracle, probes, threat, victim
 from bench.driving import rollout as rollouts
 from bench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
+from bench.driving.meter import Columns
 from bench.driving.policy import Policy
 from bench.driving.rollout import Trace, rollout
 from bench.driving.threat import ObservationThreat
@@ -26,31 +28,65 @@ def drive(job: Job, traced: Sequence[int]) -> Driven:
         job: the job.
         traced: scenario seeds of the episodes to record.
     """
-    pair, world = job.pair, job.pair.world.component
+    trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
+    return Driven(_columns([job], trace), trace.by_episode(traced) if trace else {})
+
+
+def joint(pair: Pair) -> bool:
+    """Whether `drive_jointly` can drive several jobs of a pair in one batch."""
+    attack = pair.attack.component
+    return pair.is_clean or bool(vars(type(attack)).get("joint"))
+
+
+def drive_jointly(jobs: Sequence[Job]) -> Sequence[Driven] | None:
+    """Drive jobs of one pair, training seed and entropy in one batch, with the measurements that each has alone.
+
+    One batch shares the cost of the many operations that take as long for one episode as for a hundred.
+
+    Args:
+        jobs: jobs in different cells, with different attack seeds.
+
+    Returns:
+        None if they must be driven one by one: their results would differ, or one of them fails.
+    """
+    try:
+        columns = _columns(jobs)
+    # Whatever went wrong is found again, and named, where the jobs are driven one by one.
+    except Exception:
+        return None
+    ends = list(accumulate((len(job.seeds) for job in jobs), initial=0))
+    return [Driven({name: values[a:b] for name, values in columns.items()}) for a, b in pairwise(ends)]
+
+
+def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
+    """The measurements of the episodes of all jobs, one after the other."""
+    first = jobs[0]
+    pair, world = first.pair, first.pair.world.component
     assert isinstance(world, DrivingWorld)
     assert isinstance(pair.threat, ObservationThreat)
     SEAL.check()
-    with Stream("load", job.attack_seed).in_use():
-        policy, attack = _checked(pair.load(job.training_seed), pair), pair.armed(job.training_seed)
-        env = world.make([job.cell] * len(job.seeds), action_type=policy.action_type, driver=policy.driver)
-        trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
+    with Stream("load", first.attack_seed).in_use():
+        policy, attack = _checked(pair.load(first.training_seed), pair), pair.armed(first.training_seed)
+        cells = [job.cell for job in jobs for _ in job.seeds]
+        env = world.make(cells, action_type=policy.action_type, driver=policy.driver)
         try:
             columns = rollout(
                 env,
                 policy,
                 attack if isinstance(attack, DrivingAttack) else None,
                 pair.threat,
-                job.seeds,
+                [seed for job in jobs for seed in job.seeds],
                 facts=world.facts,
-                attack_seed=job.attack_seed,
-                dynamics=world.dynamics(job.cell, policy.action_type),
-                entropy=job.entropy,
+                attack_seed=[job.attack_seed for job in jobs for _ in job.seeds],
+                # A joint attack has no access to them, because they differ between cells.
+                dynamics=world.dynamics(first.cell, policy.action_type) if len(jobs) == 1 else None,
+                entropy=first.entropy,
                 trace=trace,
             )
         finally:
             env.close(raise_if_closed=False)
     SEAL.check()
-    return Driven(columns, trace.by_episode(traced) if trace else {})
+    return columns
 
 
 def _checked(policy: Policy, pair: Pair) -> Policy:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from bench.driving.dynamics import Dynamics
 from bench.driving.features import Features
-from bench.driving.oracle import Loss, Oracle
+from bench.driving.oracle import Loss, Oracle, Part
 from bench.driving.policy import State, repeated, rows_of
 from bench.driving.threat import ObservationThreat, bounds
 from bench.driving.victim import CountedPolicy
@@ -60,13 +61,14 @@ class Enforcer:
         self._step = 0
         self.spent = self.gradients = self.zero_gradients = torch.empty(0, dtype=torch.int64)
 
-    def begin(self, observation: Tensor, state: State = None, scale: float = 1.0) -> Oracle:
+    def begin(self, observation: Tensor, state: State = None, scale: float = 1.0, parts: Sequence[Part] = ()) -> Oracle:
         """The oracle of a step, with counters at 0; the oracle of the step before answers no more.
 
         Args:
             observation: the true observation, [B, V, F].
             state: the victim's state for these B episodes.
             scale: multiplies the budget.
+            parts: the units of these episodes; by default they are one unit, with the generator of the enforcer.
         """
         radius = self.threat.radius(observation, self.features, scale)
         low, high = bounds(observation, radius)
@@ -80,7 +82,7 @@ class Enforcer:
             (observation.clone(), radius, low, high),
             threat=threat,
             features=features,
-            generator=self.generator,
+            parts=parts or (Part(slice(0, len(observation)), self.generator),),
             action_type=self.subject.action_type,
         )
 
@@ -131,14 +133,17 @@ class Enforcer:
             raise TamperError("the attack used the oracle of another step", "attack")
         if self.asked is not None:
             self.asked.append((rows, observation.detach()))
-        queries = observation.shape[:-3].numel()
-        wanted = self.spent + queries if rows is None else self.spent.index_add(0, rows, torch.full_like(rows, queries))
-        worst = int(wanted.max()) if wanted.numel() else 0
+        queries, spent = observation.shape[:-3].numel(), self.spent.numpy()
+        # NumPy: a call costs a fraction of torch's, and this runs before every query.
+        wanted = spent + (queries if rows is None else 0)
+        if rows is not None:
+            np.add.at(wanted, rows.numpy(), queries)
+        worst = int(wanted.max(initial=0))
         if worst > self.threat.queries:
             raise QueryBudgetError(
                 f"the attack asked for {worst} queries in a step, the threat model allows {self.threat.queries}"
             )
-        self.spent = wanted
+        self.spent = torch.from_numpy(wanted)
 
     def count(self, gradient: Tensor, rows: Tensor | None) -> None:
         """Count the gradients [..., B, n], and those that are 0 everywhere."""

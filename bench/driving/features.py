@@ -45,6 +45,11 @@ class Features:
         """[F - 1] size of one normalised unit, in physical units."""
         return (torch.tensor(self.high) - torch.tensor(self.low)) / 2
 
+    def physical(self, observation: Tensor) -> Tensor:
+        """[..., V, F - 1] the measured values of an observation [..., V, F], in physical units."""
+        low, high = torch.tensor(self.low).to(observation), torch.tensor(self.high).to(observation)
+        return (high + low) / 2 + observation[..., 1:] * (high - low) / 2
+
 
 @dataclass(frozen=True, kw_only=True)
 class DrivingFacts(Facts):
@@ -54,11 +59,20 @@ class DrivingFacts(Facts):
         features: features of the observation.
         drivers: supported drivers: `agent` executes the policy's actions; `idm` is the world's own rule-based driver, if any.
         kinematics: how its cars move; None if the world does not say.
+        flat: whether the observation is one row, which the world's own environment gives as a flat array in physical units.
     """
 
     features: Features
     drivers: tuple[Driver, ...] = ("agent",)
     kinematics: Kinematics | None = None
+    flat: bool = False
+
+    def native(self, observation: Tensor) -> Tensor:
+        """The observation [..., V, F] in the format of the world's own environment, which policies from outside expect.
+
+        Itself, or the measured values [..., F - 1] in physical units if `flat`.
+        """
+        return self.features.physical(observation).squeeze(-2) if self.flat else observation
 
     def blind_policies(self, action_type: ActionType) -> list[str]:
         """Names of this world's input-independent policies: each constant action, and `right_then_slower` if possible."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -13,6 +14,22 @@ from bench.driving.features import ActionType, Features
 from bench.driving.threat import ObservationThreat, within
 
 Loss = Callable[[Tensor], Tensor]
+
+
+class Part(NamedTuple):
+    """The episodes of one unit among those of a step, and the random generator of its attack."""
+
+    rows: slice
+    generator: torch.Generator
+
+
+def parts_of(parts: Sequence[Part], rows: Tensor) -> Sequence[Part]:
+    """The units of the episodes `rows`, int64 [R] in ascending order, without the units that have none of them."""
+    if len(parts) == 1:
+        return [Part(slice(0, len(rows)), parts[0].generator)]
+    ends = torch.searchsorted(rows, torch.tensor([0, *(part.rows.stop for part in parts)])).tolist()
+    found = [Part(slice(start, end), part.generator) for part, (start, end) in zip(parts, pairwise(ends), strict=True)]
+    return [part for part in found if part.rows.stop > part.rows.start]
 
 
 class Door(Protocol):
@@ -58,6 +75,8 @@ class Oracle:
         threat: the threat model.
         features: features of the observation.
         generator: the attack's random generator.
+        parts: the units of the episodes, one after the other, each with a generator of its own; one unit, unless the attack is
+            `joint`.
         action_type: whether the victim decides discretely or continuously.
     """
 
@@ -68,11 +87,12 @@ class Oracle:
         *,
         threat: ObservationThreat,
         features: Features,
-        generator: torch.Generator,
+        parts: Sequence[Part],
         action_type: ActionType,
     ) -> None:
         self._door = door
-        self.threat, self.features, self.generator, self.action_type = threat, features, generator, action_type
+        self.threat, self.features, self.parts, self.action_type = threat, features, parts, action_type
+        self.generator = parts[0].generator
         self.observation, self.radius, low, high = limits
         self._set = self._subset = (self.observation, low, high)
         self._rows: Tensor | None = None

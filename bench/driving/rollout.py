@@ -17,7 +17,7 @@ from bench.driving.contracts import DrivingAttack
 from bench.driving.dynamics import Dynamics
 from bench.driving.features import DrivingFacts
 from bench.driving.meter import Columns, Meter
-from bench.driving.policy import Policy, State
+from bench.driving.policy import Policy, State, rows_of
 from bench.driving.probes import Probe
 from bench.driving.threat import ObservationThreat
 from bench.driving.victim import CountedPolicy
@@ -25,6 +25,14 @@ from bench.errors import UserError
 from bench.trust.identifiers import opaque
 from bench.trust.streams import Stream
 from bench.trust.watch import Watch
+
+
+class NotJointError(Exception):
+    """Several units cannot be driven in one batch with the results that each has alone."""
+
+
+BATCHES = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
+"""Sizes of batches for which a victim's answers must be the same as in a larger one, if several units are driven together."""
 
 
 @dataclass
@@ -55,7 +63,7 @@ def rollout(
     seeds: Sequence[int],
     *,
     facts: DrivingFacts,
-    attack_seed: int,
+    attack_seed: int | Sequence[int],
     dynamics: Dynamics | None = None,
     entropy: int = 0,
     trace: Trace | None = None,
@@ -69,7 +77,8 @@ def rollout(
         threat: threat model, enforced on the attack.
         seeds: the scenario seed of each episode [B].
         facts: facts of the world.
-        attack_seed: seed of the attack's random generator.
+        attack_seed: seed of the attack's random generator; for several units in one batch one seed for each episode: episodes
+            with the same seed are one unit, and stand together.
         dynamics: the world's rules of motion, for attacks with that access; None if the world does not offer them.
         entropy: seed of the steps that are probed, which a victim must not be able to foresee; no measurement depends on it.
         trace: collects every step of its episodes.
@@ -80,20 +89,27 @@ def rollout(
     Raises:
         UserError: if the numbers of actions of the victim and the world differ, or the victim answers NaN or infinity.
         TamperError: if the attack or the victim changes what it may not change.
+        NotJointError: if there are several units, and the victim's answers depend on the rest of the batch, or anything was
+            drawn from the random generators of the process, which the units share.
     """
     frames = threat.frames(facts.max_steps)
     episodes = torch.as_tensor(list(seeds), dtype=torch.int64)
+    salts = [attack_seed] * len(seeds) if isinstance(attack_seed, int) else list(attack_seed)
+    several = len(set(salts)) > 1
+    victims_draws, attacks_draws = Stream("victim", salts[0]), Stream("attack", salts[0])
     with (
         torch.no_grad(),
-        Stream("victim", attack_seed).in_use(),
+        victims_draws.in_use(),
         Watch(policy, "victim", listens=attack is not None) as watch,
     ):
-        subject = CountedPolicy(policy, watch, Stream("attack", attack_seed))
+        subject = CountedPolicy(policy, watch, attacks_draws)
         attacker = Attacker(attack, subject, threat, facts.features, seed=attack_seed, dynamics=dynamics, frames=frames)
         td = env.reset(TensorDict({"seed": episodes}, batch_size=env.batch_size))
-        state = subject.initial(opaque(seeds, attack_seed))
+        state = subject.initial(torch.cat([opaque([seed], salt) for seed, salt in zip(seeds, salts, strict=True)]))
         meter, probe = Meter(subject, facts, td["info", "x"].squeeze(-1)), Probe(len(seeds), subject, entropy)
         _check_actions(subject, td["observation"], state, facts)
+        if several:
+            _check_rows(subject, td["observation"], state)
         for _ in range(facts.max_steps):
             truth, running = td["observation"], ~td["done"].squeeze(-1)
             probing = probe.due()
@@ -110,6 +126,8 @@ def rollout(
             state = subject.advance(shown.observation, action, state)
             if bool(td["done"].all()):
                 break
+    if several and (victims_draws.used() or attacks_draws.used()):
+        raise NotJointError
     return {"seed": episodes.numpy(), **meter.columns(), **probe.columns()}
 
 
@@ -121,6 +139,26 @@ def _check_actions(subject: CountedPolicy, observation: Tensor, state: State, fa
             raise UserError(
                 f"the victim has {count} actions, the world has {len(facts.actions)}: {', '.join(facts.actions)}"
             )
+
+
+def _check_rows(subject: CountedPolicy, observation: Tensor, state: State) -> None:
+    """Raise NotJointError if an answer depends, to the last bit, on the size of the batch or the place in it."""
+    whole = subject.aside(observation, state)
+    if subject.draws:
+        raise NotJointError
+    slope = _slope(subject, observation, state)
+    for size in BATCHES:
+        rows = torch.arange(len(observation))[-size:]
+        if not torch.equal(subject.aside(observation[rows], rows_of(state, rows)), whole[rows]):
+            raise NotJointError
+        if not torch.equal(_slope(subject, observation[rows], rows_of(state, rows)), slope[rows]):
+            raise NotJointError
+
+
+def _slope(subject: CountedPolicy, observation: Tensor, state: State) -> Tensor:
+    """[B, V, F] the gradient of the summed scores."""
+    with Stream("aside").in_use():
+        return subject.differentiated(observation, state, lambda scores: scores.sum(-1))[1]
 
 
 def _traced(

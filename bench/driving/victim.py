@@ -117,8 +117,11 @@ class CountedPolicy:
         flat = observation.clone()
         if len(flat) <= CHUNK:
             return self._scores(flat, state).clone()
-        states = [None] * -(-len(flat) // CHUNK) if state is None else state.split(CHUNK)
-        return torch.cat(list(map(self._scores, flat.split(CHUNK), states)))
+        # Parts of the same size: a small rest would cost almost as much as a full batch.
+        size = -(-len(flat) // -(-len(flat) // CHUNK))
+        parts = flat.split(size)
+        states = [None] * len(parts) if state is None else state.split(size)
+        return torch.cat(list(map(self._scores, parts, states)))
 
     def differentiated(
         self, observation: Tensor, state: State, loss: Callable[[Tensor], Tensor]

@@ -10,8 +10,9 @@ import copy
 import itertools
 import re
 import types
-from collections.abc import Mapping, Sequence
-from dataclasses import field, fields, is_dataclass, make_dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import Field, field, fields, is_dataclass, make_dataclass
 from enum import Enum
 from functools import cached_property, partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.errors import UserError
+from bench.errors import PluginError, UserError, short
 from bench.plugins import registry, suites
 from bench.plugins.contracts import Access, Defense, ThreatModel
 from bench.plugins.pair import Chosen, choose
@@ -35,6 +36,10 @@ from bench.plugins.suites import Suite
 from bench.plugins.track import track
 from bench.scenarios import Axes, Axis, Value
 
+LONGEST_VALUE, MOST_VALUES = 5_000, 1_000
+"""Limits of what is parsed: the characters of a value, and the values of a list."""
+NESTED = re.compile(r"\[[^\]]*\[|\(.*\(.*\(")
+"""A list in a list, which no option takes. A parser of deep nesting is slow."""
 DEFAULTS: dict[Kind, str] = {"attack": "none", "defense": "none", "victim": "dqn"}
 
 
@@ -46,6 +51,8 @@ class Options:
         kinds: kinds of components that may be chosen.
         settings: dataclass of the other keys.
         axes: names of the axes of all worlds; empty for a training, which has neither cells nor a threat model.
+
+    `broken` says of each component that was left out of a sweep what is wrong with it.
     """
 
     def __init__(
@@ -53,13 +60,18 @@ class Options:
     ) -> None:
         self.kinds, self.axes = tuple(kinds), tuple(axes)
         self.schema = settings
+        keys = [word.partition("=")[0] for word in words]
+        if twice := [key for key in keys if keys.count(key) > 1]:
+            hint = "" if twice[0] == "out" else f"; separate its values with commas: {short(twice[0])}=a,b"
+            raise UserError(f"{short(twice[0])} is given twice{hint}")
         # Paths bypass hydra: its grammar gives a meaning to many characters that occur in them.
-        self.out = [word.partition("=")[2] for word in words if word.startswith("out=")]
+        self.out = next((word.partition("=")[2] for word in words if word.startswith("out=")), None)
+        if self.out == "":
+            raise UserError("out has an empty value; write out=FOLDER")
         self.values: dict[str, tuple[str, ...]] = {}
+        self.broken: dict[str, str] = {}
         for override in _parsed([word for word in words if not word.startswith("out=")]):
             key = override.key_or_group
-            if key in self.values or len(self.out) > 1:
-                raise UserError(f"{key} is given twice; separate its values with commas: {key}=a,b")
             self._check_key(key)
             self.values[key] = _elements(override)
 
@@ -70,9 +82,10 @@ class Options:
         if threats and head == "threat" and parameter:
             # `threats` checks it against the threat model of the victim's track.
             return
-        known = [*self.kinds, *(item.name for item in fields(self.schema)), *self.axes, *threats]
+        settings = [name for item in fields(self.schema) for name in _setting_names(item)]
+        known = [*self.kinds, *settings, *self.axes, *threats]
         if key not in known and not (head in self.kinds and parameter):
-            raise UserError(registry.unknown(f"key {key!r}", key, known))
+            raise UserError(registry.unknown(f"key {short(key)!r}", key, known))
 
     def settings(self) -> dict[str, Any]:
         """The values of the keys that choose neither a component nor a cell."""
@@ -84,12 +97,12 @@ class Options:
             if key.partition(".")[0] in (*self.kinds, *self.axes, "threat"):
                 continue
             if key not in lists and len(values) > 1:
-                raise UserError(f"{key} takes one value, got {','.join(values)}")
+                raise UserError(f"{key} takes one value, got {short(','.join(values))}")
             whole = values[0] if len(values) == 1 and values[0].startswith("[") else f"[{','.join(values)}]"
             overrides.append(f"{key}={whole if key in lists else values[0]}")
-        found = OmegaConf.to_container(_composed(overrides, config_name="settings"))
+        found = OmegaConf.to_container(_composed(overrides, self.schema, config_name="settings"))
         assert isinstance(found, dict)
-        return {str(key): value for key, value in found.items()} | ({"out": self.out[0]} if self.out else {})
+        return {str(key): value for key, value in found.items()} | ({"out": self.out} if self.out else {})
 
     def cell_values(self, axes: Axes) -> dict[str, tuple[Value, ...]]:
         """The given values on the axes of the world of the run.
@@ -100,7 +113,10 @@ class Options:
         given = [key for key in self.values if key in self.axes]
         if strange := [key for key in given if key not in axes]:
             raise UserError(registry.unknown(f"axis {strange[0]!r} of the world", strange[0], axes))
-        return {key: tuple(_axis_value(axes[key], text) for text in _listed(self.values[key])) for key in given}
+        return {
+            key: tuple(_axis_value(axes[key], text) for text in _distinct(key, _listed(self.values[key])))
+            for key in given
+        }
 
     @cached_property
     def track(self) -> str:
@@ -118,7 +134,13 @@ class Options:
         return next(iter(found))
 
     def chosen(self, kind: Kind) -> list[Chosen[Any]]:
-        """The chosen components of a kind, with every combination of their parameter values."""
+        """The chosen components of a kind, with every combination of their parameter values.
+
+        Broken plug-ins are left out, if there is another component: see `broken`.
+
+        Raises:
+            UserError: if a component or a parameter is unknown, a value is not allowed, or every component is broken.
+        """
         names = self.values.get(kind) or (track(self.track).world if kind == "world" else DEFAULTS[kind],)
         # Hydra's grammar escapes the colon of NAME:CHOICE.
         names = tuple(name.replace("\\:", ":") for name in names)
@@ -126,13 +148,15 @@ class Options:
             names = tuple(name for name in names if name not in suites.names())
         if kind != "victim":
             names = tuple(registry.on_track(kind, name, self.track) for name in names)
-        known = {name: parameters(registry.load(kind, name)) for name in names}
+        known = self._parameters(kind, names)
         swept = {key.partition(".")[2]: v for key, v in self.values.items() if key.startswith(f"{kind}.")}
         if swept and not names:
             fixed = " and ".join(suite.name for suite in self.suites)
             raise UserError(f"the attacks of the suite {fixed} have fixed parameters, got {kind}.{next(iter(swept))}")
         for key in swept:
             if not any(key.partition(".")[0] in owned for owned in known.values()):
+                if lost := [why for name, why in self.broken.items() if name in names]:
+                    raise PluginError(lost[0])
                 what = f"parameter {kind}.{key} of {', '.join(names)}"
                 raise UserError(
                     registry.unknown(what, key, dict.fromkeys(p for owned in known.values() for p in owned))
@@ -141,9 +165,28 @@ class Options:
         for name, owned in known.items():
             keys = [key for key in swept if key.partition(".")[0] in owned]
             for values in itertools.product(*(swept[key] for key in keys)):
-                one = configured(kind, name, dict(zip(keys, values, strict=True)))
-                found[f"{name} {one.params}"] = one
+                with self._left_out(name):
+                    one = configured(kind, name, dict(zip(keys, values, strict=True)))
+                    found[f"{name} {one.params}"] = one
+        if names and not found:
+            raise PluginError(self.broken[names[0]])
         return list(found.values())
+
+    def _parameters(self, kind: Kind, names: Sequence[str]) -> dict[str, dict[str, Parameter]]:
+        """The parameters of the components that can be loaded."""
+        found = {}
+        for name in names:
+            with self._left_out(name):
+                found[name] = parameters(registry.load(kind, name))
+        return found
+
+    @contextmanager
+    def _left_out(self, name: str) -> Iterator[None]:
+        """Note in `broken` that a component is broken."""
+        try:
+            yield
+        except PluginError as error:
+            self.broken[name] = str(error)
 
     @cached_property
     def suites(self) -> list[Suite]:
@@ -208,9 +251,19 @@ def parameter_words(text: str) -> dict[str, str]:
     for word in text.split():
         name, equals, value = word.partition("=")
         if not equals:
-            raise UserError(f'attack_params takes name=value pairs, for instance "steps=3 restarts=2", got {word!r}')
+            raise UserError(
+                f'attack_params takes name=value pairs, for instance "steps=3 restarts=2", got {short(word)!r}'
+            )
         found[name] = value
     return found
+
+
+def _setting_names(setting: Field[Any]) -> list[str]:
+    """The keys of a setting: its name or, if it is a group, those of its members."""
+    group = setting.default_factory
+    if isinstance(group, type) and is_dataclass(group):
+        return [f"{setting.name}.{item.name}" for item in fields(group)]
+    return [setting.name]
 
 
 def _parsed(words: Sequence[str]) -> list[Override]:
@@ -219,23 +272,46 @@ def _parsed(words: Sequence[str]) -> list[Override]:
     for word in words:
         key, equals, value = word.partition("=")
         if not (equals and re.fullmatch(r"\w+(\.\w+)*", key)):
-            raise UserError(f"cannot read {word!r}: write key=value, for instance attack=zo or lanes=3,4")
+            raise UserError(f"cannot read {short(word)!r}: write key=value, for instance attack=zo or lanes=3,4")
+        if not value:
+            raise UserError(f"{key} has an empty value; write {key}=value")
+        if "${" in value or not value.isprintable():
+            raise UserError(f"cannot read {short(word)!r}: a value is plain text on one line, without ${{…}}")
+        if len(value) > LONGEST_VALUE or NESTED.search(value):
+            raise UserError(f"cannot read {short(word)!r}: a value is one word, or a list a,b,c of them")
         try:
             (override,) = parser.parse_overrides([word])
         except HydraException:
             # The value is outside of hydra's grammar: quote it as plain text.
             escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-            (override,) = parser.parse_overrides([f'{key}="{escaped}"'])
+            try:
+                (override,) = parser.parse_overrides([f'{key}="{escaped}"'])
+            except HydraException as error:
+                raise UserError(f"cannot read {short(word)!r}") from error
         overrides.append(override)
     return overrides
 
 
 def _elements(override: Override) -> tuple[str, ...]:
     swept = override.is_sweep_override()
-    values = list(override.sweep_string_iterator()) if swept else [override.get_value_element_as_str()]
+    key = override.key_or_group
+    try:
+        every = override.sweep_string_iterator() if swept else iter([override.get_value_element_as_str()])
+        values = list(itertools.islice(every, MOST_VALUES + 1))
+    except (HydraException, ValueError, TypeError) as error:
+        raise UserError(f"cannot read {short(str(override.input_line))!r}") from error
+    if len(values) > MOST_VALUES:
+        raise UserError(f"{key} has more than {MOST_VALUES} values")
+    return _distinct(key, values)
+
+
+def _distinct(key: str, values: Sequence[str]) -> tuple[str, ...]:
+    """The values, none of which is empty or given twice."""
     if "" in values:
-        raise UserError(f"{override.key_or_group} has an empty value; write {override.key_or_group}=value")
-    return tuple(dict.fromkeys(values))
+        raise UserError(f"{key} has an empty value; write {key}=value")
+    if twice := [value for value in values if values.count(value) > 1]:
+        raise UserError(f"{key} has the value {short(twice[0])!r} twice")
+    return tuple(values)
 
 
 def _listed(values: Sequence[str]) -> Sequence[str]:
@@ -250,20 +326,36 @@ def _axis_value(axis: Axis, text: str) -> Value:
         return axis.read(text)
     except ValueError as error:
         if axis.kind == "str" and axis.choices:
-            raise UserError(registry.unknown(f"{axis.name} {text!r}", text, map(str, axis.choices))) from error
+            raise UserError(registry.unknown(f"{axis.name} {short(text)!r}", text, map(str, axis.choices))) from error
         raise UserError(str(error)) from error
 
 
-def _composed(overrides: list[str], config_name: str | None = None) -> DictConfig:
+NOUNS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "text"}
+
+
+def _composed(overrides: list[str], schema: type[Any], config_name: str | None = None) -> DictConfig:
+    """The values of a structured config.
+
+    Raises:
+        UserError: if one of them has another type than its field.
+    """
     try:
         with initialize(version_base="1.3", config_path=None):
-            return compose(config_name, overrides=overrides)
+            found = compose(config_name, overrides=overrides)
+            OmegaConf.resolve(found)
+            return found
     except (HydraException, OmegaConfBaseException) as error:
         cause = error if error.__cause__ is None else error.__cause__
-        key = str(getattr(cause, "full_key", "") or "").partition("[")[0]
-        word = next((word for word in overrides if key and word.startswith(f"{key}=")), " ".join(overrides))
-        reason = str(cause).splitlines()[0]
-        raise UserError(f"cannot read {word}: {reason[:1].lower()}{reason[1:]}") from error
+        full = str(getattr(cause, "full_key", "") or "").partition("[")[0]
+        word = next((word for word in overrides if full and word.startswith(f"{full}=")), " ".join(overrides))
+        key, _, value = word.partition("=")
+        names = {item.name for item in fields(schema)}
+        wanted = re.search(r"could not be converted to (\w+)", str(cause))
+        noun = NOUNS.get(wanted[1]) if wanted else None
+        if key.rpartition(".")[2] in names and noun:
+            listed = "whole numbers, for instance 0,1,2" if "[" in value and noun == NOUNS["Integer"] else noun
+            raise UserError(f"{key} must be {listed}, got {short(value)}") from error
+        raise UserError(f"cannot read {short(word)}: its value is not of the type that {short(key)} takes") from error
 
 
 def _schema(owned: dict[str, Parameter]) -> type[Any]:
@@ -304,7 +396,8 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
     except OmegaConfBaseException as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"the parameters of {kind} {name!r} cannot be set on the command line: {reason}") from error
-    composed = _composed([f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())])[kind]
+    overrides = [f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())]
+    composed = _composed(overrides, _schema(owned))[kind]
     arguments = OmegaConf.to_object(composed)
     return _read(kind, owned, arguments)
 
@@ -318,7 +411,7 @@ def _read(kind: str, owned: dict[str, Parameter], arguments: Any) -> dict[str, A
             continue
         choices = owned[key].choices
         if choices and value is not None and value not in choices:
-            raise UserError(registry.unknown(f"{kind}.{key} {value!r}", str(value), map(str, choices)))
+            raise UserError(registry.unknown(f"{kind}.{key} {short(str(value))!r}", str(value), map(str, choices)))
         if isinstance(value, list):
             values[key] = tuple(value)
     return values

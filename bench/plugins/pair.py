@@ -6,13 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from bench.errors import UserError, reason
+from bench.errors import PluginError, UserError, reason
 from bench.plugins import registry, sources
 from bench.plugins.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
 from bench.plugins.fingerprint import canonical, digest, state_digest
+from bench.plugins.foreign import contained
 from bench.plugins.parameters import differing
 from bench.plugins.registry import Kind
 
+IN_PROCESS = "a Python process"
+"""What records say of a component that no package ships."""
 C = TypeVar("C", Attack, Defense, Victim, World)
 
 
@@ -24,19 +27,29 @@ class Chosen(Generic[C]):
         kind: attack, defense, victim or world.
         name: name of the entry point.
         component: the instance; its fields are its parameters.
+        code: hash of its code, for an object of Python that no package ships; otherwise empty.
     """
 
     kind: Kind
     name: str
     component: C
+    code: str = ""
 
     @property
     def params(self) -> str:
         """The parameters as canonical JSON."""
         return canonical(self.component)
 
+    @property
+    def shipped_by(self) -> str:
+        """The distribution and version that ship it; `IN_PROCESS` for an object of Python."""
+        return IN_PROCESS if self.code else registry.find(registry.GROUPS[self.kind], self.name, self.kind).shipped_by
+
     def __str__(self) -> str:
         """The name, with the parameters that differ from their defaults: `pgd(steps=20)`."""
+        if self.code and self.kind == "victim":
+            # Its parameters only say what the object was.
+            return self.name
         changed = [f"{name}={value}" for name, value in differing(self.component).items()]
         return f"{self.name}({', '.join(changed)})" if changed else self.name
 
@@ -49,12 +62,15 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
     """
     component = registry.load(kind, name)
     try:
-        return Chosen(kind=kind, name=name, component=component(**params))
+        with contained():
+            return Chosen(kind=kind, name=name, component=component(**params))
     except (ValueError, TypeError) as error:
         raise UserError(f"{kind} {name!r}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
     # The checks of a plug-in may raise anything else.
     except Exception as error:
-        raise UserError(f"{kind} {name!r} cannot be created: {reason(error)} (--debug shows the traceback)") from error
+        raise PluginError(
+            f"{kind} {name!r} cannot be created: {reason(error)} (--debug shows the traceback)"
+        ) from error
 
 
 def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:
@@ -175,7 +191,7 @@ class Pair:
         network = _loaded(f"{self.defense} + {self.victim}", lambda: self.load(training_seed))
         wanted = self.victim.component.network
         if not isinstance(network, wanted):
-            raise UserError(
+            raise PluginError(
                 f"{self.defense} + {self.victim} loads a {type(network).__name__}, but a {wanted.__name__} is needed"
             )
         return _weights(network)
@@ -187,12 +203,13 @@ class Pair:
 def _loaded(named: str, load: Callable[[], Any]) -> Any:
     """What `load` returns; a UserError that names the component if it fails."""
     try:
-        return load()
+        with contained():
+            return load()
     except UserError:
         raise
     # Third-party code may raise anything: name the component that failed.
     except Exception as error:
-        raise UserError(f"{named} cannot be loaded: {reason(error)} (--debug shows the traceback)") from error
+        raise PluginError(f"{named} cannot be loaded: {reason(error)} (--debug shows the traceback)") from error
 
 
 def _weights(network: Any) -> str:

@@ -9,7 +9,7 @@ import typing
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any, Literal, Union, get_args, get_origin
 
-from bench.errors import UserError
+from bench.errors import PluginError
 from bench.plugins import ranges
 from bench.plugins.contracts import Component
 
@@ -59,13 +59,13 @@ def parameters(component: type) -> dict[str, Parameter]:
     """The parameters of a component class, in order.
 
     Raises:
-        UserError: if a type annotation cannot be read at run time.
+        PluginError: if a type annotation cannot be read at run time.
     """
     try:
         hints, annotated = (typing.get_type_hints(component, include_extras=extras) for extras in (False, True))
     # Annotations are evaluated, and may be any expression.
     except Exception as error:
-        raise UserError(f"the parameters of {component.__qualname__} cannot be read: {error}") from error
+        raise PluginError(f"the parameters of {component.__qualname__} cannot be read: {error}") from error
     meanings: dict[str, str] = {}
     for base in reversed(component.__mro__):
         meanings |= _meanings(base)

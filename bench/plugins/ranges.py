@@ -23,6 +23,8 @@ NotNegative = Annotated[float, Ge(0)]
 """A number of at least 0."""
 Count = Annotated[int, Ge(1)]
 """A whole number of at least 1."""
+Width = Annotated[int, Ge(1), Le(4096)]
+"""Size of a layer of a network; its square must fit into memory."""
 Natural = Annotated[int, Ge(0)]
 """A whole number of at least 0."""
 

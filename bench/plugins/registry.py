@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import inspect
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
@@ -15,7 +16,8 @@ from importlib import metadata
 from typing import Any, Literal, get_args
 
 from bench import shadow
-from bench.errors import UserError, reason
+from bench.errors import PluginError, UserError, reason
+from bench.plugins.foreign import contained, harm
 from bench.scenarios import Grid
 
 Kind = Literal["attack", "defense", "victim", "world"]
@@ -28,6 +30,8 @@ GROUPS: dict[Kind, str] = {
     "victim": "cavbench.victims",
     "world": "cavbench.worlds",
 }
+OWN = "cavbench"
+"""The distribution of the framework and its built-in components."""
 REPORTS, TRACKS, GRIDS, SUITES = "cavbench.reports", "cavbench.tracks", "cavbench.grids", "cavbench.suites"
 
 
@@ -133,17 +137,29 @@ def _joined(links: list[Entry]) -> Entry:
 def resolve(group: str, name: str, noun: str) -> Any:
     """Import the object of an entry point.
 
+    Foreign modules are imported in a copy of this process first, which may end or hang in place of this one.
+
     Raises:
-        UserError: if there is no such name, or importing it fails; the message names the package that ships it.
+        UserError: if there is no such name.
+        PluginError: if importing it fails; the message names the package that ships it.
     """
     entry = find(group, name, noun)
     point = metadata.EntryPoint(name=name, value=entry.target, group=group)
+    if entry.distribution != OWN and (why := _harm(point.module)):
+        raise PluginError(f"{_where(group, name, noun)} cannot be imported: {why}")
     try:
-        return point.load()
-    # Importing a plug-in may raise anything, even SystemExit; that must not break the other components.
-    except (Exception, SystemExit) as error:
+        with contained():
+            return point.load()
+    # Importing a plug-in may raise anything; that must not break the other components.
+    except Exception as error:
         why = shadow.explanation(point.module, entry.distribution) or reason(error)
-        raise UserError(f"{_where(group, name, noun)} cannot be imported: {why}") from error
+        raise PluginError(f"{_where(group, name, noun)} cannot be imported: {why}") from error
+
+
+@cache
+def _harm(module: str) -> str:
+    """What importing a module does to a process; empty for nothing, or if it is imported already."""
+    return "" if module in sys.modules else harm(module)
 
 
 def declared(kind: Kind, name: str) -> type[Any]:
@@ -159,10 +175,10 @@ def declared(kind: Kind, name: str) -> type[Any]:
     where = _where(GROUPS[kind], name, kind)
     base = getattr(contracts, kind.capitalize())
     if not (inspect.isclass(component) and issubclass(component, base)):
-        raise UserError(f"{where} is not a subclass of bench.plugins.contracts.{base.__name__}")
+        raise PluginError(f"{where} is not a subclass of bench.plugins.contracts.{base.__name__}")
     known: type[Any] = component
     if not known.tracks():
-        raise UserError(
+        raise PluginError(
             f"{where} belongs to no track: derive it from a base class of bench.driving, bench.detection or another track"
         )
     return known
@@ -176,7 +192,7 @@ def grid(name: str) -> Grid:
     """
     found = resolve(GRIDS, name, "grid")
     if not isinstance(found, Grid) or found.name != name:
-        raise UserError(f"{_where(GRIDS, name, 'grid')} is not a bench.scenarios.Grid with that name")
+        raise PluginError(f"{_where(GRIDS, name, 'grid')} is not a bench.scenarios.Grid with that name")
     return found
 
 
@@ -215,15 +231,15 @@ def load(kind: Kind, name: str) -> type[Any]:
     component = _chosen(kind, name)
     where = _where(GROUPS[kind], name, kind)
     if missing := component.missing():
-        raise UserError(f"{where} does not implement {', '.join(missing)}")
+        raise PluginError(f"{where} does not implement {', '.join(missing)}")
     if not (is_dataclass(component) and component.__dataclass_params__.frozen):  # type: ignore[attr-defined]
-        raise UserError(f"{where} is not a frozen dataclass: write @dataclass(frozen=True, kw_only=True) above it")
+        raise PluginError(f"{where} is not a frozen dataclass: write @dataclass(frozen=True, kw_only=True) above it")
     if positional := [field.name for field in fields(component) if field.init and not field.kw_only]:
         taken = ", ".join(positional)
-        raise UserError(f"{where} has the positional parameters {taken}: write @dataclass(frozen=True, kw_only=True)")
+        raise PluginError(f"{where} has the positional parameters {taken}: write @dataclass(frozen=True, kw_only=True)")
     if kind == "attack" and getattr(component, "access", None) not in get_args(contracts.Access):
         levels = ", ".join(get_args(contracts.Access))
-        raise UserError(f"{where} must declare the access it needs: access: ClassVar[Access] = one of {levels}")
+        raise PluginError(f"{where} must declare the access it needs: access: ClassVar[Access] = one of {levels}")
     return component
 
 

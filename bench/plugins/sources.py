@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 from functools import cache
 
 from bench.plugins import registry
@@ -48,6 +49,20 @@ def tracks_of(target: str) -> list[str]:
                 case ast.Attribute(value=ast.Name(id=parent), attr=parent_class):
                     waiting.append((".".join(filter(None, imported.get(parent, (parent, "")))), parent_class))
     return sorted(found)
+
+
+def summary(target: str) -> str:
+    """The first sentence of the docstring of the class `module:Class` of an entry point; empty if the source has none."""
+    module, _, name = target.partition(":")
+    classes, imported = _top_level(module)
+    if name not in classes:
+        return summary(":".join(imported[name])) if name in imported and imported[name] != (module, name) else ""
+    text = " ".join((ast.get_docstring(classes[name]) or "").partition("\n\n")[0].split())
+    # The end of a sentence is no full stop within brackets or of an abbreviation, which a small letter or a number follows.
+    for end in re.finditer(r"\.(?=\s+[A-Z`]|$)", text):
+        if text.count("(", 0, end.start()) == text.count(")", 0, end.start()):
+            return text[: end.start()]
+    return text
 
 
 @cache

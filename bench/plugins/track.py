@@ -151,6 +151,8 @@ class Track(ABC):
     """The columns of its records, in addition to those of all tracks (`bench.records.schema`)."""
     probes: ClassVar[tuple[pa.Field, ...]] = ()
     """Further columns, which may be null, for the flags of a leaderboard."""
+    norms: ClassVar[tuple[str, ...]] = ()
+    """The norms of its threat models; records with another one are refused. Empty: any name."""
     facts_of_v1: ClassVar[Mapping[str, object]] = {}
     """Facts of its world for records of format 1, which do not contain them; empty for a newer track."""
     metric: ClassVar[str]
@@ -251,6 +253,18 @@ class Track(ABC):
             traced: scenario seeds of the episodes to record.
         """
 
+    def joint(self, pair: Pair) -> bool:
+        """Whether jobs of this pair in several cells may be given to `drive_jointly`."""
+        return False
+
+    def drive_jointly(self, jobs: Sequence[Job]) -> Sequence[Driven] | None:
+        """Carry out jobs of one pair and training seed in one batch, which is faster, with the results that each has alone.
+
+        Returns:
+            None if they must be carried out one by one.
+        """
+        return None
+
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         """Write the recording of an episode.
 
@@ -261,6 +275,14 @@ class Track(ABC):
             path: path of the `.rrd` file, in an existing folder.
         """
         raise NotImplementedError(f"the {self.name} track makes no recordings")
+
+    def film(self, job: Job, trace: Any, meta: Mapping[str, object]) -> Any:
+        """The film of an episode, a `bench.recording.film.Film`; arguments as in `record`.
+
+        Raises:
+            UserError: if the track makes no films.
+        """
+        raise UserError(f"the {self.name} track makes no films; leave out --save to look at its recordings")
 
 
 @cache

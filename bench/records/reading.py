@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import duckdb
@@ -12,13 +13,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from bench.errors import UserError
+from bench.errors import UserError, notice, short
 from bench.plugins import track as of
 from bench.plugins.track import Track
 from bench.records import validity
 from bench.records.generations import check, glance, selection
 from bench.records.schema import IDENTITY, PROVENANCE, schema
 from bench.records.store import FOLDER, path_of
+
+SKEW = timedelta(hours=1)
+"""Clocks of machines may differ so much; a record that is dated further ahead is not believed to be the newest."""
 
 
 def read_all(out: Path) -> dict[str, pa.Table]:
@@ -47,10 +51,11 @@ def read(out: Path, units: Collection[str] | None = None, *, track: Track) -> pa
     known = [(path, generation) for path in paths for found, generation in [check(path)] if found.name == track.name]
     if not known:
         raise UserError(_NOTHING.format(out=out))
-    query = "from records" + (_NEWEST if units is None else "") + _ORDER
+    names = ", ".join(f'"{name}"' for name in schema(track).names)
+    query = f"select {names} from records" + (_NEWEST if units is None else _OF_UNITS) + _ORDER
     with _records(out, known, track) as connection:
-        records = connection.sql(query).to_arrow_table().cast(schema(track))
-    return _valid(records, out, track)
+        records = connection.sql(query, params=None if units is None else [sorted(units)]).to_arrow_table()
+    return _valid(records.cast(schema(track)), out, track)
 
 
 def upgraded(path: Path) -> pa.Table:
@@ -61,7 +66,7 @@ def upgraded(path: Path) -> pa.Table:
     """
     track, generation = check(path)
     with _records(path.parent, [(path, generation)], track) as connection:
-        return connection.sql("from records").to_arrow_table().cast(schema(track))
+        return connection.sql("select * exclude (file) from records").to_arrow_table().cast(schema(track))
 
 
 def _paths(out: Path) -> list[Path]:
@@ -73,12 +78,23 @@ def _paths(out: Path) -> list[Path]:
 
 def _valid(records: pa.Table, out: Path, track: Track) -> pa.Table:
     """The records, unchanged; UserError with the name of the file if a value is invalid."""
-    if problem := validity.complaint(records, schema(track)):
+    if problem := validity.complaint(records, track):
         row, why = problem
         path = path_of(out, records["unit"][row].as_py())
         named = f"the record {path}" if path.exists() else f"a record in {out} (unit {path.stem})"
         raise UserError(f"{named} is invalid: {why}; delete it and run again to recreate it")
     return records
+
+
+def times(records: pa.Table) -> NDArray[np.int64]:
+    """When records were created, in microseconds, to find the newest; 0 for those from the future."""
+    created = records["created_at"]
+    return np.where(pc.greater(created, _latest()).to_numpy(), 0, created.cast(pa.int64()).to_numpy())
+
+
+def _latest() -> datetime:
+    """The latest time that is believed: now, and as much as clocks differ."""
+    return datetime.now(UTC) + SKEW
 
 
 def read_compact(out: Path, measurements: Collection[str]) -> dict[str, pa.Table]:
@@ -112,14 +128,27 @@ def _read_compact(
     lists = ", ".join(f'list("{name}") as "{name}"' for name in ("seed", *wanted))
     with _records(out, known, track) as connection:
         connection.sql("set preserve_insertion_order = false")
-        units = connection.sql(f"select unit, {once}, {lists} from records group by unit").to_arrow_table()
+        query = f"select unit, {once}, {lists}, file from records group by unit, file {_ONCE}"
+        units = connection.sql(query).to_arrow_table()
         alone = units.select(["unit", *shared]).append_column("row", pa.array(range(units.num_rows)))
         connection.register("alone", alone)
         newest = connection.sql(f"select row from alone {_NEWEST_UNITS} {_UNIT_ORDER}").to_arrow_table()
     units = units.take(newest["row"]).combine_chunks()
+    _check_distinct(units, out)
     rows = np.repeat(np.arange(units.num_rows), pc.list_value_length(units["seed"]).to_numpy())
     names = [name for name in schema(track).names if name in units.column_names]
     return _valid(pa.table({name: _laid_out(units[name].chunk(0), rows) for name in names}), out, track)
+
+
+def _check_distinct(units: pa.Table, out: Path) -> None:
+    """Raise UserError if a file has an episode twice."""
+    seeds = units["seed"].chunk(0) if units.num_rows else pa.array([], pa.list_(pa.int64()))
+    owner = np.repeat(np.arange(len(seeds)), pc.list_value_length(seeds).to_numpy())
+    order = np.lexsort((flat := seeds.flatten().to_numpy(), owner))
+    twice = (np.diff(flat[order]) == 0) & (np.diff(owner[order]) == 0)
+    if twice.any():
+        unit = units["unit"][int(owner[order][:-1][twice][0])].as_py()
+        raise UserError(f"the records of unit {short(unit)} in {out} have an episode twice; delete them and run again")
 
 
 def _laid_out(column: pa.Array, rows: NDArray[np.int64]) -> pa.Array:
@@ -139,12 +168,16 @@ def _records(out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track) -
     for path, generation in known:
         by_columns.setdefault(generation, []).append("'" + str(path).replace("'", "''") + "'")
     parts = [
-        f"select {selection(track, generation)} from read_parquet([{', '.join(paths)}])"
+        f"select {selection(track, generation)}, filename as file from read_parquet([{', '.join(paths)}], filename = true)"
         for generation, paths in by_columns.items()
     ]
     try:
         with duckdb.connect() as connection:
             connection.sql("create view records as " + " union all by name ".join(parts))
+            connection.execute("set variable latest = ?", [_latest()])
+            future = "select file from records where created_at > getvariable('latest') limit 1"
+            if ahead := connection.execute(future).fetchall():
+                notice(f"the record {ahead[0][0]} is dated in the future: such records count as older than all others")
             yield connection
     except duckdb.Error as error:
         for path, _ in known:
@@ -153,16 +186,23 @@ def _records(out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track) -
 
 
 _NOTHING = "there are no records in {out}; create some with `bench run out={out}`"
-_NEWEST = """
-    qualify (code_digest, weights_sha256) = first_value((code_digest, weights_sha256)) over (
-        partition by pair, training_seed, grid = 'audit' order by created_at desc, unit)
-    and row_number() over (
-        partition by pair, training_seed, cell, seed order by created_at desc, unit) = 1
+_BELIEVED = "created_at <= getvariable('latest') desc, created_at desc"
+"""Newest first; records from the future last."""
+_WHOSE = f"""
+    (code_digest, weights_sha256) = first_value((code_digest, weights_sha256)) over (
+        partition by pair, training_seed, grid = 'audit' order by {_BELIEVED}, unit)
 """
-_NEWEST_UNITS = """
-    qualify (code_digest, weights_sha256) = first_value((code_digest, weights_sha256)) over (
-        partition by pair, training_seed, grid = 'audit' order by created_at desc, unit)
+_NEWEST = f"""
+    qualify {_WHOSE} and row_number() over (
+        partition by pair, training_seed, cell, seed order by {_BELIEVED}, unit) = 1
 """
+_NEWEST_UNITS = f" qualify {_WHOSE}"
 """The same for units; if two of them drove a scenario, the caller keeps the last."""
-_UNIT_ORDER = " order by pair, training_seed, cell, created_at"
+_OF_UNITS = " where list_contains(?, unit) qualify row_number() over (partition by unit, seed order by file) = 1"
+_ONCE = """
+    qualify row_number() over (
+        partition by unit order by ends_with(file, '/' || unit || '.parquet') desc, file) = 1
+"""
+"""Of a unit in several files, for instance copies: the file of its name, or the first."""
+_UNIT_ORDER = " order by pair, training_seed, cell, created_at <= getvariable('latest'), created_at"
 _ORDER = " order by pair, training_seed, cell, seed"

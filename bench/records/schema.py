@@ -13,9 +13,37 @@ AUDIT = "audit"
 TEXT, FLOAT, INT = pa.string(), pa.float64(), pa.int64()
 
 
-def field(name: str, kind: pa.DataType, meaning: str, unit: str = "", *, nullable: bool = False) -> pa.Field:
-    """A column with its unit and meaning. If the unit contains "0 to 1", values are checked against that range."""
-    return pa.field(name, kind, nullable=nullable, metadata={"unit": unit, "meaning": meaning})
+LARGEST = 1e15
+"""No number of a record is larger, unless its column says so."""
+
+
+def field(
+    name: str,
+    kind: pa.DataType,
+    meaning: str,
+    unit: str = "",
+    *,
+    nullable: bool = False,
+    low: float = -LARGEST,
+    high: float = LARGEST,
+    at_most: str = "",
+) -> pa.Field:
+    """A column with its unit, its meaning and the numbers that it can hold; records are checked when written and read.
+
+    Args:
+        name: of the column.
+        kind: type of its values.
+        meaning: one line.
+        unit: of its values. If it ends with "0 to 1", they lie between 0 and 1.
+        nullable: whether values may be missing.
+        low: smallest number, or number in a list.
+        high: largest number; `math.inf` if it may be infinite.
+        at_most: the fact of the world (`world_facts`) that the numbers do not exceed, for instance `max_steps`.
+    """
+    if unit.endswith("0 to 1"):
+        low, high = 0.0, 1.0
+    limits = {"low": repr(float(low)), "high": repr(float(high)), "at_most": at_most}
+    return pa.field(name, kind, nullable=nullable, metadata={"unit": unit, "meaning": meaning, **limits})
 
 
 IDENTITY: tuple[pa.Field, ...] = (
@@ -31,16 +59,16 @@ IDENTITY: tuple[pa.Field, ...] = (
     field("world_params", TEXT, "canonical JSON"),
     field("action_type", TEXT, "driving track: discrete or continuous; otherwise empty"),
     field("sees", pa.bool_(), "false if the victim ignores its input; perceptual axes are then at their first value"),
-    field("training_seed", INT, "of the victim and of the attack's preparation; 0 if neither depends on it"),
+    field("training_seed", INT, "of the victim and of the attack's preparation; 0 if neither depends on it", low=0),
     field("threat_norm", TEXT, "name of the perturbation set; a clean run has budget 0"),
-    field("threat_budget", FLOAT, "size of the perturbation set", "share or normalised, depending on the norm"),
+    field("threat_budget", FLOAT, "size of the perturbation set", "share or normalised, depending on the norm", low=0),
     field("threat_access", TEXT, "highest access allowed to the attacker"),
-    field("threat_queries", INT, "query budget of a step or of a patch", "queries"),
+    field("threat_queries", INT, "query budget of a step or of a patch", "queries", low=0),
     field("threat_share", FLOAT, "share of the frames of an episode that may be attacked", "share, 0 to 1"),
     field("grid", TEXT, "name of the grid; `audit` for scenarios that an audit drew"),
     field("cell", TEXT, "JSON: the value on each axis of the world"),
     field("world_facts", TEXT, "JSON: axes, decision rate, episode length and actions of the world"),
-    field("seed", INT, "scenario seed of the episode"),
+    field("seed", INT, "scenario seed of the episode", low=0),
 )
 """What was evaluated."""
 
@@ -58,13 +86,13 @@ PROVENANCE: tuple[pa.Field, ...] = (
     ),
     field("machine", TEXT, "system, processor and number of cores"),
     field("created_at", pa.timestamp("us", tz="UTC"), "time when the unit was finished"),
-    field("wall_s", FLOAT, "wall time of the unit with all its episodes", "s"),
+    field("wall_s", FLOAT, "wall time of the unit with all its episodes", "s", low=0),
 )
 """What produced the record, where and when."""
 
 
 def schema(track: Track) -> pa.Schema:
-    """The schema of a track's records; the metadata of each field holds its unit and its meaning."""
+    """The schema of a track's records; the metadata of each field holds its unit, meaning and range."""
     columns = (*IDENTITY, *track.measurements, *PROVENANCE, *track.probes)
     return pa.schema(columns, metadata={"cavbench": VERSION, "track": track.name})
 
@@ -76,6 +104,7 @@ PROBES: tuple[pa.Field, ...] = (
         "gradients that the attack took: mean per step, or per patch",
         "gradients",
         nullable=True,
+        low=0,
     ),
     field(
         "zero_gradients",
@@ -104,6 +133,7 @@ PROBES: tuple[pa.Field, ...] = (
         "queries of the attack per observation, if the victim is random",
         "queries",
         nullable=True,
+        low=0,
     ),
     field(
         "inconsistent",
@@ -112,6 +142,13 @@ PROBES: tuple[pa.Field, ...] = (
         "share, 0 to 1",
         nullable=True,
     ),
-    field("entropy", INT, "seed of the moments that were probed, drawn when the unit was driven", nullable=True),
+    field(
+        "entropy",
+        INT,
+        "seed of the moments that were probed, drawn when the unit was driven",
+        nullable=True,
+        low=0,
+        high=2**63,
+    ),
 )
 """Columns for the flags of a leaderboard; null if not measured. A track that measures them lists them in `probes`."""

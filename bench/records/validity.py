@@ -1,50 +1,92 @@
-"""Checks the values of records: shares are in [0, 1]; cells, access levels and JSON can be read."""
+"""Checks the values of records: numbers are in the ranges of their columns; cells, names and JSON can be read."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import get_args
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
+from bench.errors import short
 from bench.plugins.contracts import Access
+from bench.plugins.track import Track
+from bench.records.schema import schema
 from bench.scenarios import Axes
 
 JSON = ("attack_params", "defense_params", "victim_params", "world_params", "libraries")
 
 
-def complaint(records: pa.Table, schema: pa.Schema) -> tuple[int, str] | None:
+def complaint(records: pa.Table, track: Track) -> tuple[int, str] | None:
     """The first row with an invalid value, and why it is invalid; None if all rows are valid.
 
     Args:
-        records: columns of `bench.records.schema`; text may be dictionary-encoded.
-        schema: schema of the records, which may lack some of its columns.
+        records: columns of `bench.records.schema`, maybe not all; text may be dictionary-encoded.
+        track: track of the records.
     """
-    problems = [*_out_of_range(records, schema), *_unreadable(records)]
+    problems = [*_out_of_range(records, schema(track)), *_unreadable(records, track)]
     return min(problems, default=None)
 
 
-def _out_of_range(records: pa.Table, schema: pa.Schema) -> Iterator[tuple[int, str]]:
-    """Problems of shares and confidences: numbers whose unit ends with "0 to 1"."""
-    for field in schema:
-        share = field.type == pa.float64() and field.metadata[b"unit"].endswith(b"0 to 1")
-        if not share or field.name not in records.column_names:
+def _out_of_range(records: pa.Table, columns: pa.Schema) -> Iterator[tuple[int, str]]:
+    """Problems of numbers: each column says its range (`bench.records.schema.field`)."""
+    for column in columns:
+        flat = column.type.value_type if pa.types.is_list(column.type) else column.type
+        if column.name not in records.column_names or not (pa.types.is_floating(flat) or pa.types.is_integer(flat)):
             continue
-        values = records[field.name].to_numpy()
-        wrong = ~((values >= 0) & (values <= 1))
-        if field.nullable:
+        rows, values = _numbers(records[column.name])
+        low, high, fact = (column.metadata[key] for key in (b"low", b"high", b"at_most"))
+        most = _facts(records["world_facts"], fact.decode())[rows] if fact else np.inf
+        wrong = ~((values >= float(low)) & (values <= np.minimum(float(high), most)))
+        if column.nullable:
             wrong &= ~np.isnan(values)
         if wrong.any():
-            row = int(wrong.argmax())
-            yield row, f"{field.name} must be between 0 and 1, got {values[row]:g}"
+            first = int(wrong.argmax())
+            limit = float(np.broadcast_to(np.minimum(float(high), most), values.shape)[first])
+            yield int(rows[first]), f"{column.name} must be {_range(float(low), limit)}, got {values[first]:g}"
 
 
-def _unreadable(records: pa.Table) -> Iterator[tuple[int, str]]:
+def _numbers(column: pa.ChunkedArray) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The numbers of a column or of its lists, with their rows; NaN where there is none."""
+    whole = column.combine_chunks()
+    if not pa.types.is_list(whole.type):
+        return np.arange(len(whole)), whole.to_numpy(zero_copy_only=False).astype(np.float64)
+    rows = np.repeat(np.arange(len(whole)), pc.fill_null(pc.list_value_length(whole), 0).to_numpy())
+    return rows, whole.flatten().to_numpy(zero_copy_only=False).astype(np.float64)
+
+
+def _facts(column: pa.ChunkedArray, name: str) -> NDArray[np.float64]:
+    """A fact of the world in each row; infinity where a world does not say it, or says 0."""
+    encoded = column.combine_chunks()
+    if not pa.types.is_dictionary(encoded.type):
+        encoded = encoded.dictionary_encode()
+    found = []
+    for text in encoded.dictionary.to_pylist():
+        try:
+            fact = json.loads(text)[name]
+        # `_unreadable` complains of facts that cannot be read.
+        except (ValueError, KeyError, TypeError):
+            fact = 0
+        found.append(float(fact) if isinstance(fact, int | float) and fact else np.inf)
+    return np.array(found)[encoded.indices.to_numpy(zero_copy_only=False)]
+
+
+def _range(low: float, high: float) -> str:
+    if high == np.inf:
+        return f"at least {low:g}"
+    return f"between {low:g} and {high:g}"
+
+
+def _unreadable(records: pa.Table, track: Track) -> Iterator[tuple[int, str]]:
     """Problems of texts and cells; each distinct value is checked once."""
     yield from _refused(records, ("cell", "world_facts"), _cell)
-    yield from _refused(records, ("threat_access",), _access)
+    yield from _refused(records, ("threat_access",), partial(_known, known=get_args(Access)))
+    if track.norms:
+        yield from _refused(records, ("threat_norm",), partial(_known, known=track.norms))
     for name in JSON:
         yield from _refused(records, (name,), _object)
 
@@ -64,7 +106,7 @@ def _refused(records: pa.Table, names: Sequence[str], check: Callable[..., objec
         try:
             check(*values)
         except ValueError as error:
-            yield row, f"{names[0]} {values[0]}: {error}"
+            yield row, f"{names[0]} {short(str(values[0]))}: {error}"
 
 
 def _cell(cell: str, facts: str) -> None:
@@ -74,9 +116,9 @@ def _cell(cell: str, facts: str) -> None:
     Axes.read(world["axes"]).cell(**values)
 
 
-def _access(name: str) -> None:
-    if name not in get_args(Access):
-        raise ValueError(f"known: {', '.join(get_args(Access))}")
+def _known(name: str, known: Sequence[str]) -> None:
+    if name not in known:
+        raise ValueError(f"known: {', '.join(known)}")
 
 
 def _object(text: str) -> None:

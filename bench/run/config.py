@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import itertools
-import os
+import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.errors import UserError
+from bench.errors import UserError, short
 from bench.plugins import registry
 from bench.plugins.options import Options, configured
 from bench.plugins.pair import Chosen, Pair, check_track
 from bench.plugins.registry import KINDS, Kind
+from bench.plugins.suites import Suite
 from bench.run.executors import EXECUTORS
+from bench.run.process import machine_bytes
 from bench.scenarios import Grid
 
 
@@ -28,11 +31,17 @@ class RunConfig:
         grid: cells and scenario seeds.
         seeds: training seeds of the victims, and seeds of the patches.
         executor: back end that carries out the work, a name in `bench.run.executors.EXECUTORS`.
-        workers: number of worker processes; results do not depend on it.
+        workers: number of worker processes; results do not depend on it. None takes every core, of this machine or of the
+            Ray cluster.
+        ray_address: of the Ray cluster: `local` starts one on this machine, `auto` finds the running one.
         out: results folder.
         record: episodes to record in every cell of each pair; None records one episode of the first cell.
         reference: whether to run the baselines of the pairs, too.
         skipped: members of suites that do not fit a victim, one line each.
+        broken: plug-ins that were chosen but cannot be used, one line each.
+        shard: (3, 10) drives the third of ten equal parts of the units.
+        unit_timeout: seconds that a unit or preparation may take; 0 for no limit.
+        unit_memory: GB of memory that a worker process may use; 0 for no limit.
 
     Raises:
         ValueError: if a number is out of range.
@@ -42,18 +51,26 @@ class RunConfig:
     grid: Grid
     seeds: tuple[int, ...] = (0, 1, 2)
     executor: str = "processes"
-    workers: int = field(default_factory=lambda: cores())
+    workers: int | None = None
+    ray_address: str = "local"
     out: Path = Path("results")
     record: int | None = None
     reference: bool = True
     skipped: tuple[str, ...] = ()
+    broken: tuple[str, ...] = ()
+    shard: tuple[int, int] = (1, 1)
+    unit_timeout: float = 3600.0
+    unit_memory: float = field(default_factory=lambda: half_of_memory())
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
         if self.executor not in EXECUTORS:
             raise ValueError(registry.unknown(f"executor {self.executor!r}", self.executor, EXECUTORS))
-        if self.workers < 1:
+        if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers must be at least 1, got {self.workers}")
+        for name in ("unit_timeout", "unit_memory"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be a number of at least 0 (0: no limit), got {getattr(self, name):g}")
         if self.record is not None and not 0 <= self.record <= self.grid.episodes:
             raise ValueError(f"record must be between 0 and the {self.grid.episodes} episodes, got {self.record}")
 
@@ -95,13 +112,20 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
     """Raise ValueError unless there is at least one training seed, and all are distinct and not negative."""
     if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
         raise ValueError(
-            f"seeds must be distinct whole numbers of at least 0, got {','.join(map(str, seeds)) or 'none'}"
+            f"seeds must be distinct whole numbers of at least 0, got {short(','.join(map(str, seeds))) or 'none'}"
         )
 
 
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def half_of_memory() -> float:
+    """Half of the machine's memory in GB; 0 if it cannot be read."""
+    return machine_bytes() / 2e9
+
+
+@dataclass
+class RayOptions:
+    """The options of `executor=ray`."""
+
+    address: str = "local"
 
 
 @dataclass
@@ -112,10 +136,14 @@ class RunOptions:
     episodes: int | None = None
     seeds: list[int] | None = None
     executor: str = "processes"
-    workers: int = field(default_factory=cores)
+    workers: int | None = None
+    ray: RayOptions = field(default_factory=RayOptions)
     out: str = "results"
     record: int | None = None
     reference: bool = True
+    shard: str = "1/1"
+    unit_timeout: float = 3600.0
+    unit_memory: float = field(default_factory=half_of_memory)
 
 
 @dataclass
@@ -140,57 +168,95 @@ def run_config(words: Sequence[str]) -> RunConfig:
         grid = standard.with_(episodes=settings["episodes"], **given.cell_values(standard.axes))
         pairs, skipped = _pairs(given)
         return RunConfig(
-            pairs=tuple({pair.id: pair for pair in pairs}.values()),
+            pairs=tuple(pairs),
             grid=grid,
             seeds=tuple(range(standard.training_seeds) if settings["seeds"] is None else settings["seeds"]),
             executor=settings["executor"],
             workers=settings["workers"],
+            ray_address=settings["ray"]["address"],
             out=Path(settings["out"]).expanduser(),
             record=settings["record"],
             reference=settings["reference"],
-            skipped=tuple(dict.fromkeys(skipped)),
+            skipped=tuple(skipped),
+            broken=tuple(given.broken.values()),
+            shard=_shard(settings["shard"]),
+            unit_timeout=settings["unit_timeout"],
+            unit_memory=settings["unit_memory"],
         )
 
 
-def _pairs(given: Options) -> tuple[list[Pair], list[str]]:
-    """Every combination of the chosen components and threat models, and the members of suites that are skipped.
+def _shard(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", text)
+    if match is None or int(match[1]) > int(match[2]):
+        raise UserError(f"shard must be PART/PARTS, for instance shard=3/10, got {text}")
+    return int(match[1]), int(match[2])
+
+
+def combined(
+    attacks: Sequence[Chosen[Any]],
+    suites: Sequence[Suite],
+    others: Sequence[Mapping[str, Any]],
+) -> tuple[list[Pair], list[str]]:
+    """The pairs of every attack, and of every member of the suites, with every combination of the other parts.
+
+    Args:
+        attacks: attacks chosen by name.
+        suites: suites of attacks.
+        others: combinations of `defense`, `victim`, `world` and `threat`, as keywords of `Pair`.
+
+    Returns:
+        The distinct pairs, and why members of suites are skipped, one line each.
 
     Raises:
         UserError: if an attack that was chosen by its name does not fit, or no member of a suite does.
     """
-    attacks = given.chosen("attack")
     pairs, skipped = [], []
-    others: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS if kind != "attack"]
-    for defense, victim, world, threat in itertools.product(*others, given.threats()):
-        parts = {"defense": defense, "victim": victim, "world": world, "threat": threat}
+    for parts in others:
         own = [Pair(attack=attack, **parts) for attack in attacks]
         pairs += [pair.clean() if pair.is_clean else pair for pair in own]
-        for suite in given.suites:
+        for suite in suites:
             made, left = suite.pairs(**parts)
             pairs += made
             skipped += left
     if not pairs:
-        raise UserError(skipped[0] if skipped else f"no member of {given.suites[0].name} is meant for the victim")
-    return pairs, skipped
+        raise UserError(skipped[0] if skipped else f"no member of {suites[0].name} is meant for the victim")
+    return list({pair.id: pair for pair in pairs}.values()), list(dict.fromkeys(skipped))
+
+
+def _pairs(given: Options) -> tuple[list[Pair], list[str]]:
+    """Every combination of the chosen components and threat models, and the members of suites that are skipped."""
+    attacks = given.chosen("attack")
+    choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS if kind != "attack"]
+    names = ("defense", "victim", "world", "threat")
+    others = [dict(zip(names, parts, strict=True)) for parts in itertools.product(*choices, given.threats())]
+    return combined(attacks, given.suites, others)
 
 
 def _grid(given: Options, name: str | None) -> Grid:
     """The grid of this name, or the default grid of the world.
 
     Raises:
-        UserError: if the world has no such grid, or several worlds are chosen.
+        UserError: if there is no such grid, or several worlds are chosen.
     """
     worlds = {world.name: world.component for world in given.chosen("world")}
     if len(worlds) > 1:
         raise UserError(f"a run uses one world, got {' and '.join(worlds)}: start one run for each")
     ((world_name, world),) = worlds.items()
-    known = [grid.name for grid in registry.grids(world_name)]
-    wanted = name or world.grid
-    if wanted not in known:
-        if wanted in registry.entries(registry.GRIDS):
-            registry.grid(wanted)  # raises the reason if the grid is broken
-        raise UserError(registry.unknown(f"grid {wanted!r} of the world {world_name!r}", wanted, known))
-    return registry.grid(wanted)
+    return grid_of(world_name, name or world.grid)
+
+
+def grid_of(world: str, name: str) -> Grid:
+    """The grid of this name of a world.
+
+    Raises:
+        UserError: if there is no such grid.
+    """
+    known = [grid.name for grid in registry.grids(world)]
+    if name not in known:
+        if name in registry.entries(registry.GRIDS):
+            registry.grid(name)  # raises the reason if the grid is broken
+        raise UserError(registry.unknown(f"grid {name!r} of the world {world!r}", name, known))
+    return registry.grid(name)
 
 
 def train_config(words: Sequence[str]) -> TrainConfig:

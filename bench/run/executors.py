@@ -2,58 +2,119 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
+import contextlib
+import io
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.queues import SimpleQueue
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from multiprocessing.connection import wait
+from types import FrameType
 from typing import Protocol
 
-from bench.errors import UserError
-from bench.run.process import settle
-from bench.run.unit import Preparation, Unit
-from bench.run.work import Outcome, Task, Tell, perform
+from bench.plugins.foreign import StopUnitError
+from bench.plugins.framework import Snapshot
+from bench.run.blame import blamed
+from bench.run.process import cores, settle
+from bench.run.unit import Loading, Preparation, Unit
+from bench.run.work import Failure, Outcome, Task, attempt
+from bench.run.worker import Limits, Worker, packed
 
 NEWS_S = 1.0
-"""Seconds between two updates of the tasks' progress."""
-Finished = tuple[Task, Outcome]
+"""Seconds between two looks at the workers' time and memory."""
+Finished = tuple[Task, Outcome | Failure]
 
 
 class Watcher(Protocol):
     """Receives the progress of the work; the command line draws a progress bar."""
 
-    def working(self, works: Sequence[Unit | Preparation]) -> None:
+    def working(self, works: Sequence[Unit | Preparation | Loading]) -> None:
         """Called with the work in progress."""
 
     def preparing(self, work: str, share: float, text: str) -> None:
         """Called with the share of a preparation done in [0, 1], and a text of the attack."""
 
+    def printed(self, work: Unit | Preparation | Loading, lines: Sequence[str]) -> None:
+        """Called with what the components printed while they worked."""
+
 
 class Executor(Protocol):
     """A back end that carries out tasks."""
 
-    def map(self, tasks: Sequence[Task], watcher: Watcher) -> Generator[Finished, None, None]:
-        """Carry out all tasks, and yield each with its outcome as soon as it is finished.
+    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
+        """Carry out all tasks, and yield each with its outcome, or why it failed, as soon as it is finished.
 
-        Closing the generator stops the tasks in progress.
-
-        Raises:
-            UserError: if a task fails or a worker dies.
+        A task is taken when there is room for it. One whose process dies is tried a second time, because the first may have been
+        an accident. Closing the generator stops the tasks in progress.
         """
+        ...
+
+    def close(self) -> None:
+        """End all processes."""
         ...
 
 
 class SerialExecutor:
-    """Carries out the tasks in this process, one after the other."""
+    """Carries out the tasks in this process, one after the other.
 
-    def map(self, tasks: Sequence[Task], watcher: Watcher) -> Generator[Finished, None, None]:
+    It cannot survive a component that ends the process, nor end one that hangs in a library's code, nor limit memory.
+
+    Args:
+        limits: of each task.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+
+    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
         settle()
+        framework, culprit = Snapshot(), ""
         for task in tasks:
+            if culprit:
+                yield task, Failure(why=f"was not driven: {culprit} changed this process; use executor=processes")
+                continue
             watcher.working([task.work])
-            yield task, perform(task, watcher.preparing)
+            outcome, text = self._carried_out(task, watcher, framework)
+            if lines := [line for line in text.splitlines() if line.strip()]:
+                watcher.printed(task.work, lines)
+            if isinstance(outcome, Failure) and outcome.tampered:
+                culprit = str(task.work)
+            yield task, outcome
+
+    def _carried_out(self, task: Task, watcher: Watcher, framework: Snapshot) -> tuple[Outcome | Failure, str]:
+        """The outcome of a task, and what it printed to standard output."""
+        with contextlib.redirect_stdout(io.StringIO()) as output:
+            try:
+                with _time_limit(self.limits.seconds * task.units):
+                    outcome = attempt(task, watcher.preparing, framework)
+            except StopUnitError:
+                why = f"failed: it took longer than unit_timeout={self.limits.seconds:g} seconds"
+                outcome = Failure(why=why + blamed(task.work.pair), lost=True)
+        return outcome, output.getvalue()
+
+    def close(self) -> None:
+        pass
+
+
+@contextmanager
+def _time_limit(seconds: float) -> Iterator[None]:
+    """Raise StopUnitError after so many seconds, if this is the main thread; 0 for no limit."""
+    if not (seconds and hasattr(signal, "setitimer")) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise StopUnitError
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 class ProcessExecutor:
@@ -61,92 +122,102 @@ class ProcessExecutor:
 
     Args:
         workers: number of worker processes.
+        limits: of each task.
     """
 
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
+    def __init__(self, workers: int, limits: Limits) -> None:
+        self.count, self.limits = workers, limits
+        self.idle: list[Worker] = []
 
-    def map(self, tasks: Sequence[Task], watcher: Watcher) -> Generator[Finished, None, None]:
-        if not tasks:
-            return
-        others = set(multiprocessing.active_children())
-        context = multiprocessing.get_context("spawn")
-        news: SimpleQueue[tuple[str, float, str]] = context.SimpleQueue()
-        workers = min(self.workers, len(tasks))
-        pool = ProcessPoolExecutor(workers, context, initializer=_begin_work, initargs=(news,))
+    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
+        waiting, retries = iter(tasks), Retries()
+        busy: dict[Worker, Task] = {}
         try:
-            yield from _pooled(pool, tasks, workers, watcher, news)
-        except BrokenProcessPool:
-            raise UserError(
-                "a worker process died (killed, or out of memory); "
-                "finished units are kept: run the same command again to continue"
-            ) from None
-        except BaseException:
-            for process in set(multiprocessing.active_children()) - others:
-                process.terminate()
-            raise
+            while True:
+                while len(busy) < self.count and (task := retries.next(waiting)) is not None:
+                    content = packed(task)
+                    if isinstance(content, Failure):
+                        yield task, content
+                        continue
+                    worker = self.idle.pop() if self.idle else Worker(self.limits)
+                    worker.give(content, task.units)
+                    busy[worker] = task
+                if not busy:
+                    return
+                watcher.working([task.work for task in busy.values()])
+                wait([item for worker in busy for item in (worker.connection, worker.process.sentinel)], NEWS_S)
+                for worker in list(busy):
+                    for item in worker.news():
+                        if not isinstance(item, Outcome | Failure):
+                            watcher.preparing(*item)
+                            continue
+                        task, lines = busy.pop(worker), worker.lines()
+                        if worker.spent:
+                            worker.close()
+                        else:
+                            self.idle.append(worker)
+                        yield from retries.ended(task, item, lines, watcher)
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            # Those still busy were stopped by the caller.
+            for worker in busy:
+                worker.close()
+
+    def close(self) -> None:
+        for worker in self.idle:
+            worker.close()
 
 
-def _pooled(
-    pool: ProcessPoolExecutor,
-    tasks: Sequence[Task],
-    workers: int,
-    watcher: Watcher,
-    news: SimpleQueue[tuple[str, float, str]],
-) -> Iterator[Finished]:
-    """Submit only as many tasks as there are workers, so that all submitted tasks are in progress."""
-    waiting = list(reversed(tasks))
-    running: dict[Future[Outcome], Task] = {}
-    while waiting or running:
-        while waiting and len(running) < workers:
-            task = waiting.pop()
-            running[pool.submit(_perform, task)] = task
-        watcher.working([task.work for task in running.values()])
-        finished = wait(running, NEWS_S, FIRST_COMPLETED).done
-        while not news.empty():
-            watcher.preparing(*news.get())
-        for future in finished:
-            yield running.pop(future), future.result()
+class Retries:
+    """Tries a task whose process died a second time, and passes on the outcomes of all others."""
+
+    def __init__(self) -> None:
+        self._again: deque[Task] = deque()
+        self._died: set[int] = set()
+
+    def next(self, waiting: Iterator[Task]) -> Task | None:
+        """The next task; None if there is none at the moment."""
+        return self._again.popleft() if self._again else next(waiting, None)
+
+    def put_back(self, task: Task) -> None:
+        """A task that was interrupted by no fault of its own."""
+        self._again.append(task)
+
+    def ended(
+        self, task: Task, outcome: Outcome | Failure, lines: Sequence[str], watcher: Watcher
+    ) -> Iterator[Finished]:
+        """The task with its outcome, unless it is tried again.
+
+        Args:
+            task: the task.
+            outcome: its outcome.
+            lines: what it printed.
+            watcher: is told.
+        """
+        # A batch is not tried again: its units are, one by one.
+        if isinstance(outcome, Failure) and outcome.died and not task.others and id(task) not in self._died:
+            self._died.add(id(task))
+            self._again.append(task)
+            return
+        self._died.discard(id(task))
+        if lines:
+            watcher.printed(task.work, lines)
+        if isinstance(outcome, Failure) and outcome.lost:
+            outcome = replace(outcome, why=outcome.why + blamed(task.work.pair))
+        yield task, outcome
 
 
-EXECUTORS: dict[str, Callable[[int], Executor]] = {
-    "serial": lambda workers: SerialExecutor(),
-    "processes": ProcessExecutor,
+def _ray(workers: int | None, limits: Limits, address: str) -> Executor:
+    from bench.run.ray_executor import RayExecutor
+
+    return RayExecutor(workers, limits, address)
+
+
+EXECUTORS: dict[str, Callable[[int | None, Limits, str], Executor]] = {
+    "serial": lambda workers, limits, address: SerialExecutor(limits),
+    "processes": lambda workers, limits, address: ProcessExecutor(workers or cores(), limits),
+    "ray": _ray,
 }
-"""Every back end by the name that `executor=` has on the command line; made with the number of workers."""
+"""Every back end by the name that `executor=` has on the command line.
 
-
-def executor(name: str, workers: int, tasks: int) -> Executor:
-    """The back end of a name, for so many workers and tasks; `processes` is this process where one worker is enough."""
-    one = name == "processes" and min(workers, tasks) <= 1
-    return EXECUTORS["serial" if one else name](workers)
-
-
-_tell: Tell
-"""In a worker process, reports the progress of its work."""
-
-
-def _begin_work(news: SimpleQueue[tuple[str, float, str]]) -> None:
-    """Set up a worker process: one thread, ignores Ctrl-C (the parent stops it), exits when the parent is gone."""
-    global _tell
-
-    def tell(work: str, share: float, text: str) -> None:
-        news.put((work, share, text))
-
-    _tell = tell
-    settle()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
-
-
-def _perform(task: Task) -> Outcome:
-    return perform(task, _tell)
+Each is made with the number of workers (None: as many as there are cores), the limits, and the address of the Ray cluster.
+"""

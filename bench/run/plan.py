@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 from bench.plugins.fingerprint import canonical
-from bench.plugins.pair import Pair
+from bench.plugins.pair import Chosen, Pair
 from bench.plugins.track import track_of
 from bench.run.config import RunConfig
-from bench.run.unit import Unit
+from bench.run.unit import Loading, Unit
 from bench.scenarios import Axes, Cell
+
+Weights = Mapping[str, tuple[str, str]]
+"""The hashes of the networks of each loading (`key_of`)."""
 
 
 def plan(config: RunConfig) -> list[Unit]:
@@ -21,27 +25,71 @@ def plan(config: RunConfig) -> list[Unit]:
     Raises:
         UserError: if a victim or an adversary cannot be loaded.
     """
-    clean = [pair.clean() for pair in config.pairs]
-    baselines = [other for pair in config.pairs for other in track_of(pair).baselines(pair)] if config.reference else []
-    pairs = {pair.id: pair for pair in (*config.pairs, *clean, *baselines)}
-    weights: dict[str, str] = {}
-    units = []
-    for pair in pairs.values():
-        for training_seed in config.seeds if pair.is_seeded else (0,):
-            loaded = (pair.defense, pair.victim, pair.world)
-            key = canonical([*([part.name, part.params] for part in loaded), training_seed])
-            if key not in weights:
-                weights[key] = pair.weights_sha256(training_seed)
+    return units_of(config, {key_of(loading): loading.weights() for loading in loadings(config)})
+
+
+def loadings(config: RunConfig, *, baselines: bool = True) -> list[Loading]:
+    """The networks of a run, each once: of all its pairs and training seeds; without `baselines`, of the requested pairs only."""
+    found: dict[str, Loading] = {}
+    for pair in _pairs(config) if baselines else config.pairs:
+        for training_seed in _training_seeds(pair, config):
+            loading = Loading(pair=pair, training_seed=training_seed)
+            found.setdefault(key_of(loading), loading)
+    return list(found.values())
+
+
+def units_of(config: RunConfig, weights: Weights) -> list[Unit]:
+    """The distinct units of a run, or of its shard, whose networks could be loaded.
+
+    Every shard has every `shards`th unit, whatever could be loaded where it is driven.
+
+    Args:
+        config: the run.
+        weights: by the key of the loading, the hashes of the networks.
+    """
+    units, place = [], 0
+    own, shards = config.shard
+    for pair in _pairs(config):
+        for training_seed in _training_seeds(pair, config):
+            cells = cells_of(pair, config)
+            mine = [cell for number, cell in enumerate(cells, place) if number % shards == own - 1]
+            place += len(cells)
+            loaded = weights.get(key_of(Loading(pair=pair, training_seed=training_seed)))
+            if loaded is None:
+                continue
             first = Unit(
                 pair=pair,
                 cell=config.grid.cells()[0],
                 training_seed=training_seed,
                 seeds=config.grid.seeds(),
-                weights_sha256=weights[key],
-                adversary_sha256=pair.adversary_sha256(training_seed),
+                weights_sha256=loaded[0],
+                adversary_sha256=loaded[1],
             )
-            units += [replace(first, cell=cell) for cell in _cells(pair, config.grid.cells(), config.grid.axes)]
+            units += [replace(first, cell=cell) for cell in mine]
     return units
+
+
+def key_of(loading: Loading) -> str:
+    """Equal for pairs with the same networks."""
+    pair = loading.pair
+    parts: list[Chosen[Any]] = [pair.defense, pair.victim, pair.world]
+    parts += [pair.attack] if pair.attack.component.learns else []
+    return canonical([*([part.kind, part.name, part.params] for part in parts), loading.training_seed])
+
+
+def cells_of(pair: Pair, config: RunConfig) -> list[Cell]:
+    """The cells that a pair drives."""
+    return _cells(pair, config.grid.cells(), config.grid.axes)
+
+
+def _pairs(config: RunConfig) -> Iterable[Pair]:
+    clean = [pair.clean() for pair in config.pairs]
+    baselines = [other for pair in config.pairs for other in track_of(pair).baselines(pair)] if config.reference else []
+    return {pair.id: pair for pair in (*config.pairs, *clean, *baselines)}.values()
+
+
+def _training_seeds(pair: Pair, config: RunConfig) -> tuple[int, ...]:
+    return config.seeds if pair.is_seeded else (0,)
 
 
 def _cells(pair: Pair, cells: Iterable[Cell], axes: Axes) -> list[Cell]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,14 +15,16 @@ import pyarrow.compute as pc
 
 from bench.errors import UserError
 from bench.plugins import registry
-from bench.plugins.pair import Chosen, Pair, choose
+from bench.plugins.framework import Snapshot
+from bench.plugins.pair import IN_PROCESS, Chosen, Pair, choose
 from bench.plugins.track import track
-from bench.records import reading
+from bench.records import reading, store
 from bench.records.schema import IDENTITY
 from bench.run import artefacts
-from bench.run.runner import keep_recording, recording_path
+from bench.run.process import settle
+from bench.run.runner import keep_recording, recording_path, stem
 from bench.run.unit import Unit
-from bench.run.work import Task, perform
+from bench.run.work import Failure, Outcome, Task, attempt
 from bench.scenarios import Cell
 
 
@@ -88,44 +91,147 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
         UserError: if a component, the weights or the artefact is missing.
     """
     unit, before = _unit(out, record)
-    noun, folder = unit.track.artefact or ("", "")
-    path = out / folder / f"{record[noun]}.safetensors" if record.get(noun) else None
     task = Task(
         work=unit,
-        artefact=artefacts.read(path) if path else None,
+        artefact=_artefact(out, unit, record),
         recorded=[record["seed"]],
         entropy=record.get("entropy"),
     )
-    outcome = perform(task, lambda *news: None)
+    outcome = _repeated(task)
     after = outcome.records
     assert after is not None
     if not outcome.recordings:
         raise UserError("; ".join(outcome.warnings) or "nothing was recorded")
     saved = recording_path(out, unit, record["seed"])
     keep_recording(saved, outcome.recordings[record["seed"]])
-    columns = [column.name for column in unit.track.measurements if column.name not in unit.track.unrepeatable]
-    differences = tuple(name for name in columns if not _equal(before[name], after[name]))
+    differences = _differences(unit, before, after)
+    return Replay(saved, _changed(unit, record, after), differences)
+
+
+def _repeated(task: Task) -> Outcome:
+    """The outcome of a task.
+
+    Raises:
+        UserError: if it fails.
+    """
+    outcome = attempt(task, lambda *news: None, Snapshot())
+    if isinstance(outcome, Failure):
+        raise UserError(f"{task.work} {outcome.why}")
+    return outcome
+
+
+def _changed(unit: Unit, record: Mapping[str, Any], after: pa.Table) -> str:
+    """Names of what has changed since the record: weights, code, libraries, machine, adversary."""
     now = after.slice(0, 1).to_pylist()[0]
     origin = ("weights_sha256", "code_digest", "libraries", "machine")
     changed = ", ".join(name for name in origin if now[name] != record[name])
     if not changed and unit.adversary_sha256 and now["unit"] != record["unit"]:
-        changed = "adversary"
-    return Replay(saved, changed, differences)
+        return "adversary"
+    return changed
 
 
-def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
-    """The unit of a record, and all records of that unit."""
+@dataclass(frozen=True)
+class Repeated:
+    """A unit that was driven again.
+
+    Args:
+        unit: the unit.
+        before: its records.
+        after: the records of the repetition.
+        changed: names of what has changed since the record; empty if nothing has.
+        differences: the measurements that differ.
+    """
+
+    unit: Unit
+    before: pa.Table
+    after: pa.Table
+    changed: str
+    differences: tuple[str, ...]
+
+
+def repeat(out: Path, record: Mapping[str, Any]) -> Repeated:
+    """Drive the unit of a record again, without a recording.
+
+    Raises:
+        UserError: if a component, the weights or the artefact is missing.
+    """
+    unit, before = _unit(out, record)
+    task = Task(work=unit, artefact=_artefact(out, unit, record), entropy=record.get("entropy"))
+    after = _repeated(task).records
+    assert after is not None
+    return Repeated(unit, before, after, _changed(unit, record, after), _differences(unit, before, after))
+
+
+def film(out: Path, record: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
+    """Repeat the unit of a record, and return the film of its episode and the measurements that differ from the record.
+
+    Args:
+        out: results folder.
+        record: one of its records.
+
+    Returns:
+        A `bench.recording.film.Film`, and names of measurements.
+
+    Raises:
+        UserError: if a component, the weights or the artefact is missing, or the track makes no films.
+    """
+    unit, before = _unit(out, record)
+    settle()
+    driven = unit.track.drive(
+        dataclasses.replace(unit.job, entropy=record.get("entropy") or 0),
+        _artefact(out, unit, record),
+        [record["seed"]],
+    )
+    made = unit.track.film(unit.job, driven.traces[record["seed"]], {**unit.constants(0.0), "seed": record["seed"]})
+    after = store.table(unit.constants(0.0), driven.columns, track=unit.track)
+    return made, _differences(unit, before, after)
+
+
+def _artefact(out: Path, unit: Unit, record: Mapping[str, Any]) -> bytes | None:
+    noun, folder = unit.track.artefact or ("", "")
+    return artefacts.read(out / folder / f"{record[noun]}.safetensors") if record.get(noun) else None
+
+
+def _differences(unit: Unit, before: pa.Table, after: pa.Table) -> tuple[str, ...]:
+    columns = [column.name for column in unit.track.measurements if column.name not in unit.track.unrepeatable]
+    return tuple(name for name in columns if not _equal(before[name], after[name]))
+
+
+def recorded(out: Path, path: Path, records: pa.Table) -> dict[str, Any]:
+    """The record of a recording's episode, by the name of the file.
+
+    Raises:
+        UserError: if none of the records of its pair is of that episode.
+    """
+    own = records.filter(pc.equal(records["pair"], path.parent.name)).sort_by("training_seed")
+    for row in own.select(["cell", "seed"]).to_pylist():
+        if stem(Cell(**json.loads(row["cell"])), row["seed"]) == path.stem:
+            same = pc.and_(pc.equal(own["cell"], row["cell"]), pc.equal(own["seed"], row["seed"]))
+            return own.filter(same).slice(0, 1).to_pylist()[0]
+    raise UserError(f"{out} has no record of the recording {path}")
+
+
+def pair_of(record: Mapping[str, Any]) -> Pair:
+    """The pair of a record.
+
+    Raises:
+        UserError: if a component is not installed, or a parameter is not allowed any more.
+    """
     victim = _chosen("victim", record)
-    track_of_victim = track(victim.component.tracks()[0])
-    before = reading.read(out, [record["unit"]], track=track_of_victim).sort_by("seed")
-    seeds = before["seed"].to_pylist()
-    pair = Pair(
+    return Pair(
         attack=_chosen("attack", record),
         defense=_chosen("defense", record),
         victim=victim,
         world=_chosen("world", record),
         threat=victim.component.threat.recorded(record),
     )
+
+
+def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
+    """The unit of a record, and all records of that unit."""
+    pair = pair_of(record)
+    before = reading.read(out, [record["unit"]], track=track(pair.track)).sort_by("seed")
+    seeds = before["seed"].to_pylist()
     unit = Unit(
         pair=pair,
         cell=Cell(**json.loads(record["cell"])),
@@ -138,6 +244,11 @@ def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
 
 
 def _chosen(kind: registry.Kind, record: Mapping[str, Any]) -> Chosen[Any]:
+    if record[f"{kind}_shipped_by"] == IN_PROCESS:
+        raise UserError(
+            f"{kind} {record[kind]!r} was an object of a Python process and cannot be loaded again; record=N of "
+            "cavbench.score records episodes while they are driven"
+        )
     params = json.loads(record[f"{kind}_params"])
     return choose(kind, record[kind], **{k: tuple(v) if isinstance(v, list) else v for k, v in params.items()})
 

@@ -6,20 +6,26 @@ do not depend on the executor, the number of workers or the order of work.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import Protocol
 
 from bench import files
+from bench.errors import UserError
 from bench.records import store
 from bench.run import artefacts
+from bench.run.batches import batches
 from bench.run.config import RunConfig
-from bench.run.executors import Executor, Watcher, executor
-from bench.run.plan import plan
-from bench.run.unit import Preparation, Unit
-from bench.run.work import Outcome, Task
+from bench.run.executors import EXECUTORS, Executor, Watcher
+from bench.run.failures import Failures
+from bench.run.plan import Weights, key_of, loadings, units_of
+from bench.run.process import cores
+from bench.run.unit import Loading, Preparation, Unit, is_foreign
+from bench.run.work import Failure, Outcome, Task
+from bench.run.worker import Limits
+from bench.scenarios import Cell
 from bench.scenarios.axes import written
 
 
@@ -32,6 +38,9 @@ class RunWatcher(Watcher, Protocol):
     def finished(self, work: Unit | Preparation, wall_s: float) -> None:
         """A unit or preparation is finished and written; it took `wall_s` seconds."""
 
+    def failed(self, line: str) -> None:
+        """A unit, preparation or loading failed; the run goes on."""
+
     def warn(self, line: str) -> None:
         """Something went wrong that does not affect the records."""
 
@@ -40,66 +49,152 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
     """Carry out the unfinished units of a run, and return the fingerprints of all its units.
 
     Raises:
-        UserError: if the results folder cannot be written, weights are missing, a component fails or a worker dies; finished
-            units are kept.
+        UserError: if the results folder cannot be written, weights are missing, or no pair can be driven.
+        UnfinishedError: at the end, if a component failed or a worker died; all other units are finished.
     """
-    units = {unit.fingerprint: unit for unit in plan(config)}
     store.prepare(config.out)
-    done = store.finished(config.out, units)
-    missing = [unit for key, unit in units.items() if key not in done]
-    episodes = len(config.grid.seeds())
-    watcher.begin(episodes=episodes * len(units), finished=episodes * len(done))
-    recorded = _recorded(config, units.values())
-    preparations = {p.fingerprint: p for unit in missing if (p := unit.preparation)}
-    absent = {key: p for key, p in preparations.items() if not artefacts.path_of(config.out, p).exists()}
-    ready: list[Unit] = []
-    waits: list[Unit] = []
-    for unit in missing:
-        (waits if unit.preparation and unit.preparation.fingerprint in absent else ready).append(unit)
-    back_end = executor(config.executor, config.workers, len(missing) + len(absent))
-    first: list[Preparation | Unit] = [*absent.values(), *sorted(ready, key=_longest_first)]
-    for works in (first, sorted(waits, key=_longest_first)):
-        _carry_out(works, config.out, recorded, back_end, watcher)
+    failures = Failures(config.broken)
+    for line in config.broken:
+        watcher.failed(line)
+    limits = Limits(seconds=config.unit_timeout, memory_gb=config.unit_memory)
+    with closing(EXECUTORS[config.executor](config.workers, limits, config.ray_address)) as back_end:
+        weights = _loaded(config, back_end, watcher, failures)
+        if not any(key_of(loading) in weights for loading in loadings(config, baselines=False)):
+            raise failures.error((), 0)
+        units = {unit.fingerprint: unit for unit in units_of(config, weights)}
+        done = store.finished(config.out, units)
+        missing = [unit for key, unit in units.items() if key not in done]
+        episodes = len(config.grid.seeds())
+        watcher.begin(episodes=episodes * len(units), finished=episodes * len(done))
+        recorded = _recorded(config, units.values())
+        driving = _Driving(config.out, recorded, config.workers or cores(), back_end, watcher, failures)
+        driving.carry_out(missing)
+    if failures:
+        finished = [key for key, unit in units.items() if key in done or key in driving.finished]
+        raise failures.error(finished, len(units) - len(finished))
     return list(units)
 
 
-def _carry_out(
-    works: Sequence[Preparation | Unit],
-    out: Path,
-    recorded: Mapping[str, Sequence[int]],
-    back_end: Executor,
-    watcher: RunWatcher,
-) -> None:
-    """Pass work to the executor, and write each outcome as soon as it is finished."""
-    read = cache(artefacts.read)
-    tasks = [_task(work, out, recorded, read) for work in works]
-    with closing(back_end.map(tasks, watcher)) as finished:
+def _loaded(config: RunConfig, back_end: Executor, watcher: RunWatcher, failures: Failures) -> Weights:
+    """The hashes of the networks. Built-in components are loaded here, plug-ins where they are driven.
+
+    Raises:
+        UserError: if a network is missing.
+    """
+    weights: dict[str, tuple[str, str]] = {}
+    foreign = []
+    for loading in loadings(config):
+        if any(is_foreign(part) for part in loading.pair.parts):
+            foreign.append(Task(work=loading))
+        else:
+            weights[key_of(loading)] = loading.weights()
+    with closing(back_end.map(foreign, watcher)) as finished:
         for task, outcome in finished:
-            _keep(task, outcome, out)
-            watcher.finished(task.work, outcome.wall_s)
-            for warning in outcome.warnings:
-                watcher.warn(warning)
+            assert isinstance(task.work, Loading)
+            if isinstance(outcome, Outcome):
+                assert outcome.weights is not None
+                weights[key_of(task.work)] = outcome.weights
+            elif outcome.bad_input:
+                raise UserError(f"{task.work} {outcome.why}")
+            elif line := failures.add(task.work, outcome):
+                watcher.failed(line)
+    return weights
 
 
-def _task(
-    work: Preparation | Unit, out: Path, recorded: Mapping[str, Sequence[int]], read: Callable[[Path], bytes]
-) -> Task:
-    if isinstance(work, Preparation):
-        return Task(work=work)
-    artefact = read(artefacts.path_of(out, work.preparation)) if work.preparation else None
-    return Task(work=work, artefact=artefact, recorded=recorded.get(work.fingerprint, ()))
+class _Driving:
+    """Passes work to an executor, and writes each outcome as soon as it is finished.
 
+    Args:
+        out: results folder.
+        recorded: the scenario seeds to record, by fingerprint of the unit.
+        back_end: the executor.
+        watcher: is told what happens.
+        failures: collects what failed.
+    """
 
-def _keep(task: Task, outcome: Outcome, out: Path) -> None:
-    """Write the outcome of a task: the records last, because they mark it as finished."""
-    if isinstance(task.work, Preparation):
-        assert outcome.artefact is not None
-        artefacts.write(out, task.work, outcome.artefact)
-        return
-    for seed, recording in outcome.recordings.items():
-        keep_recording(recording_path(out, task.work, seed), recording)
-    assert outcome.records is not None
-    store.write(out, outcome.records)
+    def __init__(
+        self,
+        out: Path,
+        recorded: Mapping[str, Sequence[int]],
+        workers: int,
+        back_end: Executor,
+        watcher: RunWatcher,
+        failures: Failures,
+    ) -> None:
+        self.out, self.recorded, self.workers = out, recorded, workers
+        self.back_end, self.watcher, self.failures = back_end, watcher, failures
+        self.finished: set[str] = set()
+        self._again: list[Unit] = []
+        self._read = cache(artefacts.read)
+
+    def carry_out(self, units: Iterable[Unit]) -> None:
+        """Prepare what is missing, and drive the units."""
+        absent: dict[str, Preparation] = {}
+        ready: list[Unit] = []
+        waits: list[Unit] = []
+        for unit in units:
+            needed = unit.preparation
+            if needed and not artefacts.path_of(self.out, needed).exists():
+                absent[needed.fingerprint] = needed
+            (waits if needed and needed.fingerprint in absent else ready).append(unit)
+        first: list[Preparation | Unit] = [*absent.values(), *sorted(ready, key=_longest_first)]
+        for works in (first, sorted(waits, key=_longest_first)):
+            self._pass(batches(works, self.recorded, self.workers))
+            again, self._again = self._again, []
+            self._pass([[unit] for unit in again])
+
+    def _pass(self, works: Sequence[Sequence[Preparation | Unit]]) -> None:
+        """Pass batches of works to the executor."""
+        with closing(self.back_end.map(self._tasks(works), self.watcher)) as finished:
+            for task, outcome in finished:
+                self._end(task, outcome)
+
+    def _tasks(self, works: Iterable[Sequence[Preparation | Unit]]) -> Iterator[Task]:
+        """The tasks of works, without those of a pair that was given up, and without those whose preparation failed."""
+        for batch in works:
+            work, *others = batch
+            if self.failures.given_up(work.pair):
+                for one in batch:
+                    self.failures.leave(one)
+            elif isinstance(work, Preparation):
+                yield Task(work=work)
+            elif work.preparation is None or artefacts.path_of(self.out, work.preparation).exists():
+                artefact = self._read(artefacts.path_of(self.out, work.preparation)) if work.preparation else None
+                units = [one for one in others if isinstance(one, Unit)]
+                recorded = self.recorded.get(work.fingerprint, ())
+                yield Task(work=work, artefact=artefact, recorded=recorded, others=units)
+
+    def _end(self, task: Task, outcome: Outcome | Failure) -> None:
+        """Note the results of a task. The units of a batch that failed as a whole are driven again, one by one."""
+        work = task.work
+        assert not isinstance(work, Loading)
+        if task.others and not outcome.others:
+            self._again += [one for one in (work, *task.others) if isinstance(one, Unit)]
+            return
+        for one, result in zip((work, *task.others), (outcome, *outcome.others), strict=True):
+            self._note(one, result)
+
+    def _note(self, work: Unit | Preparation, outcome: Outcome | Failure) -> None:
+        if isinstance(outcome, Failure):
+            if line := self.failures.add(work, outcome):
+                self.watcher.failed(line)
+            return
+        self._keep(work, outcome)
+        self.finished.add(work.fingerprint)
+        self.watcher.finished(work, outcome.wall_s)
+        for warning in outcome.warnings:
+            self.watcher.warn(warning)
+
+    def _keep(self, work: Unit | Preparation, outcome: Outcome) -> None:
+        """Write the outcome of a task: the records last, because they mark it as finished."""
+        if isinstance(work, Preparation):
+            assert outcome.artefact is not None
+            artefacts.write(self.out, work, outcome.artefact)
+            return
+        for seed, recording in outcome.recordings.items():
+            keep_recording(recording_path(self.out, work, seed), recording)
+        assert outcome.records is not None
+        store.write(self.out, outcome.records)
 
 
 def keep_recording(path: Path, content: bytes) -> None:
@@ -111,8 +206,12 @@ def keep_recording(path: Path, content: bytes) -> None:
 
 def recording_path(out: Path, unit: Unit, seed: int) -> Path:
     """The file of an episode's recording."""
-    cell = "-".join(f"{name}-{written(value)}" for name, value in unit.cell.items())
-    return out / "recordings" / unit.pair.id / f"{cell}-{seed}.rrd"
+    return out / "recordings" / unit.pair.id / f"{stem(unit.cell, seed)}.rrd"
+
+
+def stem(cell: Cell, seed: int) -> str:
+    """The name of an episode in the names of files: `lanes-3-density-1-weather-clear-1000000`."""
+    return "-".join([*(f"{name}-{written(value)}" for name, value in cell.items()), str(seed)])
 
 
 def _recorded(config: RunConfig, units: Iterable[Unit]) -> dict[str, Sequence[int]]:

@@ -17,6 +17,31 @@ from bench.scenarios import Cell, SeedBlock
 
 
 @dataclass(frozen=True, kw_only=True)
+class Loading:
+    """Loads the networks of a pair once, before anything is driven, to hash their weights.
+
+    Args:
+        pair: attack, defence, victim, world, threat model.
+        training_seed: seed of the victim.
+    """
+
+    pair: Pair
+    training_seed: int
+
+    def weights(self) -> tuple[str, str]:
+        """The hashes of the weights of the defended victim, and of an attack that learns (otherwise empty).
+
+        Raises:
+            UserError: if a network cannot be loaded.
+        """
+        return self.pair.weights_sha256(self.training_seed), self.pair.adversary_sha256(self.training_seed)
+
+    def __str__(self) -> str:
+        seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""
+        return f"{self.pair}{seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Work:
     """The common part of units and preparations.
 
@@ -49,12 +74,14 @@ class Work:
     @property
     def modules(self) -> tuple[str, ...]:
         """Modules hashed into the code digest, with their imports."""
-        return (self.module, *sorted(module for part in self.pair.parts for module in part.component.modules()))
+        shipped = (part for part in self.pair.parts if not part.code)
+        return (self.module, *sorted(module for part in shipped for module in part.component.modules()))
 
     @property
     def code_digest(self) -> str:
         """Hash of the source code that computes it: the track's and the components' modules, with their imports."""
-        return code_digest(self.modules)
+        own = [part.code for part in self.pair.parts if part.code]
+        return digest([code_digest(self.modules), *own]) if own else code_digest(self.modules)
 
     @property
     def libraries(self) -> dict[str, str]:
@@ -93,7 +120,7 @@ class Work:
             "weights": self.weights_sha256,
             **({"adversary": self.adversary_sha256} if self.adversary_sha256 else {}),
             "code": self.code_digest,
-            "shipped_by": [shipped_by(part) for part in self.pair.parts],
+            "shipped_by": [part.shipped_by for part in self.pair.parts],
             "libraries": self.libraries,
         }
 
@@ -190,7 +217,7 @@ class Unit(Work):
             "grid": self.grid,
             "cell": json.dumps(dict(self.cell), separators=(",", ":")),
             "world_facts": json.dumps(pair.world.component.facts.written(), separators=(",", ":")),
-            **{f"{part.kind}_shipped_by": shipped_by(part) for part in pair.parts},
+            **{f"{part.kind}_shipped_by": part.shipped_by for part in pair.parts},
             "weights_sha256": self.weights_sha256,
             "code_digest": self.code_digest,
             "libraries": canonical(self.libraries),
@@ -204,6 +231,8 @@ class Unit(Work):
         return f"{self.pair} | {self.cell}{seed}"
 
 
-def shipped_by(part: Chosen[Any]) -> str:
-    """The distribution and version that ship a component."""
-    return registry.find(registry.GROUPS[part.kind], part.name, part.kind).shipped_by
+def is_foreign(part: Chosen[Any]) -> bool:
+    """Whether a plug-in ships a component; an object of the caller's own process is not foreign to it."""
+    return (
+        not part.code and registry.find(registry.GROUPS[part.kind], part.name, part.kind).distribution != registry.OWN
+    )

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import secrets
-import tempfile
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 
 import pyarrow as pa
 
-from bench.errors import UserError, reason
+from bench import files
+from bench.errors import PluginError, UserError, reason
 from bench.plugins.fingerprint import canonical
+from bench.plugins.foreign import contained
+from bench.plugins.framework import Snapshot
 from bench.records.store import table
-from bench.run.unit import Preparation, Unit, shipped_by
+from bench.run.blame import blamed
+from bench.run.unit import Loading, Preparation, Unit
 from bench.trust.watch import TamperError
 
 Tell = Callable[[str, float, str], None]
@@ -27,16 +30,23 @@ class Task:
     """A piece of work with everything that it needs.
 
     Args:
-        work: the unit or preparation.
+        work: the unit, preparation or loading.
         artefact: content of the file of the unit's preparation; None if it has none.
         recorded: scenario seeds of the episodes to record.
         entropy: seed of the probes of a replay; None draws one, which nobody can foresee.
+        others: units to drive in the same batch (`bench.run.batches`).
     """
 
-    work: Unit | Preparation
+    work: Unit | Preparation | Loading
     artefact: bytes | None = None
     recorded: Sequence[int] = ()
     entropy: int | None = None
+    others: Sequence[Unit] = ()
+
+    @property
+    def units(self) -> int:
+        """Number of units, 1 for other works."""
+        return 1 + len(self.others)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,45 +54,117 @@ class Outcome:
     """The results of a task.
 
     Args:
-        wall_s: wall time in seconds.
-        records: records of a unit, with their provenance; None for a preparation.
-        artefact: content of the file of a preparation; None for a unit.
+        wall_s: wall time in seconds; of several units in one batch, each has its share.
+        records: records of a unit, with their provenance; otherwise None.
+        artefact: content of the file of a preparation; otherwise None.
+        weights: of a loading, the hashes of the networks; otherwise None.
         recordings: contents of the `.rrd` files of a unit, by scenario seed.
         warnings: problems that do not affect the records.
+        others: the results of the task's other units, in their order.
     """
 
     wall_s: float
     records: pa.Table | None = None
     artefact: bytes | None = None
+    weights: tuple[str, str] | None = None
     recordings: Mapping[int, bytes] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    others: Sequence[Outcome | Failure] = ()
 
 
-def perform(task: Task, tell: Tell) -> Outcome:
-    """Carry out a task.
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """Why a task has no results.
 
-    Raises:
-        UserError: if a component fails; the message names the work.
+    Args:
+        why: one line, which continues the name of the work: "failed: …" or "is refused: …".
+        lost: whether it hung, ended its process, or used up its memory: a few of these and its pair is given up.
+        died: whether it ended its process.
+        bad_input: whether the options or the files of the user are the reason.
+        tampered: whether it changed its process, which must do no other work.
+        trace: the traceback, for --debug.
+        others: the results of the task's other units, in their order; none if the whole task failed.
     """
+
+    why: str
+    lost: bool = False
+    died: bool = False
+    bad_input: bool = False
+    tampered: bool = False
+    trace: str = ""
+    others: Sequence[Outcome | Failure] = ()
+
+
+def attempt(task: Task, tell: Tell, framework: Snapshot) -> Outcome | Failure:
+    """Carry out a task; whatever foreign code raises is a `Failure` that names the package.
+
+    Args:
+        task: the task.
+        tell: called with the progress of a preparation.
+        framework: the functions of the framework as they should be.
+    """
+    outcome = _attempted(task, tell)
+    if changed := framework.changed():
+        return Failure(why=f"is refused: {changed} was replaced{blamed(task.work.pair)}", tampered=True)
+    return outcome
+
+
+def _attempted(task: Task, tell: Tell) -> Outcome | Failure:
     work = task.work
+    if task.others and isinstance(work, Unit):
+        return _together((work, *task.others), tell)
     try:
-        return _prepared(work, tell) if isinstance(work, Preparation) else _driven(work, task)
+        with contained():
+            return _performed(task, tell)
     except TamperError as error:
-        kinds = {"attack": ("attack",), "defense": ("defense", "victim")}
-        parts = [part for part in work.pair.parts if any(part.kind in kinds[side] for side in error.sides)]
-        shipped = " and ".join(f"{part.kind} {part.name!r} of {shipped_by(part)}" for part in parts)
-        raise UserError(f"{work} is refused: {error} ({shipped})") from error
+        return Failure(why=f"is refused: {error}{blamed(work.pair, error)}", trace=traceback.format_exc())
     except UserError as error:
-        raise UserError(f"{work}: {error}") from error
+        why, bad_input = f"failed: {error}{blamed(work.pair, error)}", not isinstance(error, PluginError)
+        return Failure(why=why, bad_input=bad_input, trace=traceback.format_exc())
     # Third-party code may raise anything: name the component that failed.
     except Exception as error:
-        raise UserError(f"{work} failed: {reason(error)} (--debug shows the traceback)") from error
+        why = f"failed: {reason(error)} (--debug shows the traceback){blamed(work.pair, error)}"
+        return Failure(why=why, trace=traceback.format_exc())
 
 
-def _prepared(work: Preparation, tell: Tell) -> Outcome:
+def _performed(task: Task, tell: Tell) -> Outcome:
     start = time.perf_counter()
-    artefact = work.track.prepare(work.job, canonical(work.origin), partial(tell, str(work)))
-    return Outcome(wall_s=time.perf_counter() - start, artefact=artefact)
+    match task.work:
+        case Unit() as unit:
+            return _driven(unit, task)
+        case Preparation() as work:
+            artefact = work.track.prepare(work.job, canonical(work.origin), partial(tell, str(work)))
+            return Outcome(wall_s=time.perf_counter() - start, artefact=artefact)
+        case Loading() as loading:
+            weights = loading.weights()
+            return Outcome(wall_s=time.perf_counter() - start, weights=weights)
+
+
+def _together(units: Sequence[Unit], tell: Tell) -> Outcome | Failure:
+    """The results of several units, driven in one batch, or one after the other if the batch gives none."""
+    try:
+        with contained():
+            results: Sequence[Outcome | Failure] = _in_one_batch(units)
+    # Driven alone, each unit says what fails in it.
+    except Exception:
+        results = []
+    results = results or [_attempted(Task(work=one), tell) for one in units]
+    return replace(results[0], others=results[1:])
+
+
+def _in_one_batch(units: Sequence[Unit]) -> list[Outcome]:
+    """The outcomes of units that are driven together; none if they must be driven one by one."""
+    start, entropy = time.perf_counter(), secrets.randbits(62)
+    driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units])
+    if driven is None:
+        return []
+    per_episode = (time.perf_counter() - start) / sum(len(unit.seeds) for unit in units)
+    outcomes = []
+    for unit, result in zip(units, driven, strict=True):
+        wall_s = per_episode * len(unit.seeds)
+        records = table(unit.constants(wall_s), result.columns, track=unit.track)
+        outcomes.append(Outcome(wall_s=wall_s, records=records))
+    return outcomes
 
 
 def _driven(unit: Unit, task: Task) -> Outcome:
@@ -91,9 +173,19 @@ def _driven(unit: Unit, task: Task) -> Outcome:
     driven = unit.track.drive(replace(unit.job, entropy=entropy), task.artefact, task.recorded)
     wall_s = time.perf_counter() - start
     constants = unit.constants(wall_s)
-    records = table(constants, driven.columns, track=unit.track)
+    try:
+        records = table(constants, driven.columns, track=unit.track)
+    except ValueError as error:
+        raise UserError(f"its measurements cannot be: {error} ({_authors(unit)})") from error
     recordings, warnings = _recordings(unit, driven.traces, constants)
     return Outcome(wall_s=wall_s, records=records, recordings=recordings, warnings=warnings)
+
+
+def _authors(unit: Unit) -> str:
+    """The components of a unit that do not ship with cavbench, or all of them, with their packages."""
+    shipped = {part: part.shipped_by for part in unit.pair.parts}
+    foreign = {part: by for part, by in shipped.items() if by.partition(" ")[0] != "cavbench"}
+    return ", ".join(f"{part.kind} {part.name!r} of {by}" for part, by in (foreign or shipped).items())
 
 
 def _recordings(
@@ -101,9 +193,9 @@ def _recordings(
 ) -> tuple[dict[int, bytes], tuple[str, ...]]:
     """The recordings of a unit, and why one failed: a failed recording must not lose the records."""
     found: dict[int, bytes] = {}
-    with tempfile.TemporaryDirectory(prefix="cavbench-") as folder:
+    with files.scratch() as folder:
         for seed, trace in traces.items():
-            path = Path(folder) / f"{seed}.rrd"
+            path = folder / f"{seed}.rrd"
             try:
                 unit.track.record(unit.job, trace, {**constants, "seed": seed}, path)
                 found[seed] = path.read_bytes()

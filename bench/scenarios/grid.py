@@ -20,6 +20,10 @@ class SeedBlock(IntEnum):
     AUDIT = 2**40
 
 
+MOST_EPISODES = 10_000
+"""Most episodes of a cell: they are one batch in memory, and a unit of work that is kept or lost as a whole."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Grid:
     """A named, versioned set of scenarios in a world: all combinations of values, with `episodes` seeds per cell.
@@ -46,8 +50,8 @@ class Grid:
     first_seed: int = SeedBlock.REPORT
 
     def __post_init__(self) -> None:
-        if not 1 <= self.episodes <= SeedBlock.SELECT - SeedBlock.REPORT:
-            raise ValueError(f"episodes must be between 1 and 1000000, got {self.episodes}")
+        if not 1 <= self.episodes <= MOST_EPISODES:
+            raise ValueError(f"episodes must be between 1 and {MOST_EPISODES}, got {self.episodes}")
         if self.training_seeds < 1:
             raise ValueError(f"training_seeds must be at least 1, got {self.training_seeds}")
         for name in self.axes:

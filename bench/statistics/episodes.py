@@ -84,6 +84,18 @@ class Episodes:
         values = self.table[name].to_numpy(zero_copy_only=False)
         return np.asarray(values, dtype=np.float64).reshape(self.shape)
 
+    def places(
+        self, runs: Sequence[int], cells: Sequence[Cell], seeds: Sequence[int]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """An index into arrays [R, C, E] of these episodes that takes out the given runs, cells and seeds, in that order.
+
+        The single run of a victim that does not learn stands for every run that it lacks.
+        """
+        alone = len(self.runs) == 1 and set(runs) != set(self.runs)
+        of_runs = [0 if alone else self.runs.index(run) for run in runs]
+        of_cells, of_seeds = [self.cells.index(cell) for cell in cells], [self.seeds.index(seed) for seed in seeds]
+        return np.ix_(of_runs, of_cells, of_seeds)  # type: ignore[return-value]
+
     def only(
         self,
         *,

@@ -63,15 +63,15 @@ class Components:
         freedom = np.asarray(sum(np.square(part) / df for part, df in parts))
         effective = np.divide(np.square(variance), freedom, out=np.ones_like(variance), where=freedom > 0)
         joint = np.square(t_quantile(effective)) * variance
-        apart = sum(np.square(t_quantile(np.asarray(float(df)))) * part for part, df in parts)
+        apart = sum(np.square(t_quantile(df)) * part for part, df in parts)
         return np.asarray(np.sqrt((joint + apart) / 2))
 
 
-def t_quantile(freedom: Array) -> Array:
-    """The 97.5 % quantile of Student's t."""
+def t_quantile(freedom: Array | float, tail: float = 1 - _TAIL) -> Array:
+    """The quantile of Student's t that is exceeded with probability `tail`."""
     from scipy.special import stdtrit
 
-    return np.asarray(stdtrit(freedom, _TAIL))
+    return np.asarray(stdtrit(freedom, 1 - tail))
 
 
 def components(means: Array) -> Components:
@@ -152,20 +152,6 @@ def scenario_covariance(scores: Array) -> Array:
     of_scenarios = runs * by_scenario @ by_scenario.T / max(scenarios - 1, 1)
     of_rest = np.einsum("rce,rde->cd", rest, rest) / max((runs - 1) * (scenarios - 1), 1)
     return np.asarray((of_scenarios - of_rest) / (runs * scenarios))
-
-
-def wilson(successes: float, trials: int) -> Interval:
-    """A rate in [0, 1] of independent trials with its 95 % Wilson score interval (Wilson 1927).
-
-    Raises:
-        ValueError: unless 0 <= successes <= trials.
-    """
-    if not 0 <= successes <= trials:
-        raise ValueError(f"successes must be between 0 and the {trials} trials, got {successes}")
-    if trials == 0:
-        return Interval(np.nan, 0.0, 1.0)
-    rate = successes / trials
-    return _wilson(rate, math.sqrt(_Z2 * rate * (1 - rate) / trials), trials)
 
 
 def _symmetric(estimate: float, margin: float) -> Interval:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-from scipy.special import stdtrit
-
-from bench.statistics.estimates import CONFIDENCE, Array, Interval
+from bench.statistics.estimates import CONFIDENCE, Array, Interval, t_quantile
 
 
 def unpaired(first: Array, second: Array, *, comparisons: int = 1) -> Interval:
@@ -36,5 +34,5 @@ def unpaired(first: Array, second: Array, *, comparisons: int = 1) -> Interval:
     if error == 0:
         return Interval(estimate, estimate, estimate)
     freedom = sum(errors) ** 2 / sum(one**2 / (len(side) - 1) for one, side in zip(errors, means, strict=True))
-    reach = error * float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / 2 / comparisons))
+    reach = error * float(t_quantile(freedom, (1 - CONFIDENCE) / 2 / comparisons))
     return Interval(estimate, estimate - reach, estimate + reach)

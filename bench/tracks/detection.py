@@ -30,11 +30,15 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
     ),
     field("confidence_median", FLOAT, "as confidence_mean, but the median over the frames", "0 to 1"),
     field("detection_rate", FLOAT, "frames with a confidence above 0.25", "share, 0 to 1"),
-    field("first_seen_m", FLOAT, "distance at which the sign is first detected; 0 if never", "m"),
+    field("first_seen_m", FLOAT, "distance at which the sign is first detected; 0 if never", "m", low=0),
     field(
-        "confirmed_m", FLOAT, "distance at which the sign is first detected in 3 of the last 5 frames; 0 if never", "m"
+        "confirmed_m",
+        FLOAT,
+        "distance at which the sign is first detected in 3 of the last 5 frames; 0 if never",
+        "m",
+        low=0,
     ),
-    field("overrun_m", FLOAT, "how far beyond the stop line the car stops; 0 if before it", "m"),
+    field("overrun_m", FLOAT, "how far beyond the stop line the car stops; 0 if before it", "m", low=0),
     field("ran", pa.bool_(), "whether the car never brakes for the sign, or stops more than 1 m beyond the line"),
     field(
         "visible_share",
@@ -42,14 +46,16 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
         "share of the sign inside the image and not occluded, mean over the frames",
         "share, 0 to 1",
     ),
-    field("false_alarms", FLOAT, "stop signs detected where there is none, mean per frame", "detections"),
-    field("queries", FLOAT, "images that the detector was queried with to craft the patch", "images"),
-    field("gradients", FLOAT, "images whose gradient was taken to craft the patch", "images"),
-    field("crafting_s", FLOAT, "wall time of crafting the patch", "s"),
-    field("excess", FLOAT, "largest distance of the attack's texels outside [0, 1], before clipping", "texel value"),
+    field("false_alarms", FLOAT, "stop signs detected where there is none, mean per frame", "detections", low=0),
+    field("queries", FLOAT, "images that the detector was queried with to craft the patch", "images", low=0),
+    field("gradients", FLOAT, "images whose gradient was taken to craft the patch", "images", low=0),
+    field("crafting_s", FLOAT, "wall time of crafting the patch", "s", low=0),
+    field(
+        "excess", FLOAT, "largest distance of the attack's texels outside [0, 1], before clipping", "texel value", low=0
+    ),
     field("patch", TEXT, "fingerprint of the patch, patches/<fingerprint>.safetensors; empty if there is none"),
     field("patch_sha256", TEXT, "of its texels; empty if the attack makes no patch"),
-    field("frame_distance_m", pa.list_(FLOAT), "of each frame: distance from the camera to the sign", "m"),
+    field("frame_distance_m", pa.list_(FLOAT), "of each frame: distance from the camera to the sign", "m", low=0),
     field("frame_confidence", pa.list_(FLOAT), "of each frame: confidence in the sign at its true position", "0 to 1"),
     field("frame_visible", pa.list_(FLOAT), "of each frame: visible share of the sign", "share, 0 to 1"),
 )
@@ -68,6 +74,7 @@ class DetectionTrack(Track):
     unrepeatable: ClassVar[tuple[str, ...]] = ("patch",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
     probes: ClassVar[tuple[pa.Field, ...]] = PROBES
+    norms: ClassVar[tuple[str, ...]] = ("patch",)
     metric: ClassVar[str] = "confidence_mean"
     metric_title: ClassVar[str] = "confidence"
     failure: ClassVar[str] = "ran"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -17,11 +18,12 @@ from bench.records.schema import FLOAT, PROBES, field
 
 if TYPE_CHECKING:
     from bench.driving import DrivingVictim, DrivingWorld
+    from bench.recording.film import Film
 
 BEST_BLIND, IDM, RANDOM = "best blind", "idm", "random"
 
 MEASUREMENTS: tuple[pa.Field, ...] = (
-    field("steps", pa.int32(), "decisions until the episode ended", "steps"),
+    field("steps", pa.int32(), "decisions until the episode ended", "steps", low=0, at_most="max_steps"),
     field("return", FLOAT, "reward of the world, summed over the episode", "reward"),
     field(
         "safe_progress",
@@ -32,31 +34,39 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
     field("crashed", pa.bool_(), "the ego hit another vehicle"),
     field("offroad", pa.bool_(), "the ego left the road"),
     field("distance_m", FLOAT, "driven along the road", "m"),
-    field("min_ttc_s", FLOAT, "smallest time to collision with the car ahead; inf if there is none", "s"),
+    field(
+        "min_ttc_s", FLOAT, "smallest time to collision with the car ahead; inf if there is none", "s", low=0, high=inf
+    ),
     field("mean_speed", FLOAT, "mean over the steps", "m/s"),
-    field("queries", FLOAT, "victim evaluations per step, mean", "queries"),
-    field("queries_median", FLOAT, "victim evaluations per step, median", "queries"),
-    field("queries_max", FLOAT, "victim evaluations per step, maximum", "queries"),
+    field("queries", FLOAT, "victim evaluations per step, mean", "queries", low=0),
+    field("queries_median", FLOAT, "victim evaluations per step, median", "queries", low=0),
+    field("queries_max", FLOAT, "victim evaluations per step, maximum", "queries", low=0),
     field("changed", FLOAT, "steps on which the attack changed the decision", "share, 0 to 1"),
-    field("linf", FLOAT, "largest deviation of a step, mean over the steps", "normalised, 2 is the full range"),
-    field("linf_max", FLOAT, "largest deviation of the episode", "normalised, 2 is the full range"),
-    field("l2", FLOAT, "L2 norm of a step's deviation, mean over the steps", "normalised"),
-    field("linf_m", FLOAT, "largest deviation of a position in a step, mean over the steps", "m"),
-    field("linf_mps", FLOAT, "largest deviation of a velocity in a step, mean over the steps", "m/s"),
+    field("linf", FLOAT, "largest deviation of a step, mean over the steps", "normalised, 2 is the full range", low=0),
+    field("linf_max", FLOAT, "largest deviation of the episode", "normalised, 2 is the full range", low=0),
+    field("l2", FLOAT, "L2 norm of a step's deviation, mean over the steps", "normalised", low=0),
+    field("linf_m", FLOAT, "largest deviation of a position in a step, mean over the steps", "m", low=0),
+    field("linf_mps", FLOAT, "largest deviation of a velocity in a step, mean over the steps", "m/s", low=0),
     field(
         "excess_max",
         FLOAT,
         "largest distance of the attack's answer outside its perturbation set, before projection",
         "normalised",
+        low=0,
     ),
     field(
         "attack_ms",
         FLOAT,
         "wall time of the attack per step and episode (the time of a batch, divided by its episodes)",
         "ms",
+        low=0,
     ),
     field(
-        "action_counts", pa.list_(pa.int32()), "how often each discrete action was taken; empty for continuous actions"
+        "action_counts",
+        pa.list_(pa.int32()),
+        "how often each discrete action was taken; empty for continuous actions",
+        low=0,
+        at_most="max_steps",
     ),
 )
 
@@ -66,6 +76,8 @@ ASSURED = field(
     "frames in which an action was safe under the victim's own assumptions; null if it makes none",
     "share, 0 to 1",
     nullable=True,
+    low=0,
+    high=1,
 )
 
 
@@ -79,6 +91,7 @@ class DrivingTrack(Track):
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
     probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED)
+    norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"
     failure: ClassVar[str] = "crashed"
@@ -187,10 +200,26 @@ class DrivingTrack(Track):
 
         return drive(job, traced)
 
+    def joint(self, pair: Pair) -> bool:
+        from bench.driving.drive import joint
+
+        return joint(pair)
+
+    def drive_jointly(self, jobs: Sequence[Job]) -> Sequence[Driven] | None:
+        from bench.driving.drive import drive_jointly
+
+        return drive_jointly(jobs)
+
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         from bench.recording.driving import save
 
         save(trace, facts=_parts(job.pair)[1].facts, meta=meta, path=path)
+
+    def film(self, job: Job, trace: Any, meta: Mapping[str, object]) -> Film:
+        from bench.recording.driving.episode import Episode
+        from bench.recording.driving.film import EpisodeFilm
+
+        return EpisodeFilm(Episode.of(trace, _parts(job.pair)[1].facts, meta))
 
 
 def _parts(pair: Pair) -> tuple[DrivingVictim, DrivingWorld]:

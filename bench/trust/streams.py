@@ -25,6 +25,12 @@ class Stream:
         self._torch = torch.Generator().manual_seed(number).get_state()
         self._python = random.Random(number).getstate()
         self._numpy: np.random.BitGenerator = np.random.MT19937(number)
+        self._fresh = self._torch.numpy().tobytes(), self._python, _drawn(self._numpy)
+
+    def used(self) -> bool:
+        """Whether anything was drawn from it, or it was seeded, since it was made; ask while it is not in use."""
+        with self.in_use():
+            return self.marks() != self._fresh
 
     def swap(self) -> None:
         """Exchange these states with those of the global generators; a second call changes them back."""

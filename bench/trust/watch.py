@@ -19,6 +19,8 @@ HOOKS = (
     "_state_dict_hooks",
     "_load_state_dict_pre_hooks",
 )
+HOOK = -1
+"""Key of the watch's own hook; torch counts its keys up from 0."""
 
 
 class TamperError(UserError):
@@ -38,7 +40,8 @@ class Watch:
     """Watches a network for the time of a unit: `with Watch(network, "victim") as watch: ...`.
 
     A forward pass of a module with weights while foreign code runs (`away`), other than through the oracle, is counted in
-    `strays`. Tensors are compared by their version counters at any time (`touched`), and by their contents at the end.
+    `strays`. The hooks that count are on the modules only while foreign code runs, because they make every forward pass
+    slower. Tensors are compared by their version counters at any time (`touched`), and by their contents at the end.
 
     Args:
         network: the (defended) victim.
@@ -52,37 +55,48 @@ class Watch:
 
     def __init__(self, network: nn.Module, noun: str, *sides: Side, listens: bool = True) -> None:
         self.network, self.noun, self.sides = network, noun, sides or ("attack", "defense")
-        self.away = False
         self.strays = 0
+        self._away = self._removed = False
         self._tensors = [value for _, value in _tensors(network) if not value.is_inference()]
         self._version = self._versions()
-        # A hook takes time on every call: only modules that compute with weights of their own, and the network itself, have one.
+        # Only modules that compute with weights of their own, and the network itself, have a hook.
         own = [one for one in network.modules() if one is network or any(True for _ in _own(one))]
         self._heard = own if listens else []
 
     def __enter__(self) -> Watch:
         self._before = marks(self.network)
-        self._handles = [module.register_forward_pre_hook(self._called) for module in self._heard]
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        there = [
-            handle.id in module._forward_pre_hooks for handle, module in zip(self._handles, self._heard, strict=True)
-        ]
-        for handle in self._handles:
-            handle.remove()
+        self.away = False
         if error is not None:
             return
         after = marks(self.network)
         changed = [name for name, mark in self._before.items() if after[name] != mark]
-        if not all(there) and "hooks" not in changed:
+        if self._removed and "hooks" not in changed:
             changed.append("hooks")
         if changed:
             raise TamperError(f"the {' and '.join(changed)} of the {self.noun} changed during the run", *self.sides)
 
+    @property
+    def away(self) -> bool:
+        """Whether foreign code runs."""
+        return self._away
+
+    @away.setter
+    def away(self, away: bool) -> None:
+        if away == self._away:
+            return
+        self._away = away
+        # `register_forward_pre_hook` and `remove` do the same, and take as long as the forward pass of a small network.
+        for module in self._heard:
+            if away:
+                module._forward_pre_hooks[HOOK] = self._called
+            elif module._forward_pre_hooks.pop(HOOK, None) is None:
+                self._removed = True
+
     def _called(self, module: nn.Module, inputs: object) -> None:
-        if self.away:
-            self.strays += 1
+        self.strays += 1
 
     def touched(self) -> bool:
         """Whether a weight was written to since the last call."""

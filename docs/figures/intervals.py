@@ -78,7 +78,9 @@ def tracker() -> Figure:
             enforcer = Enforcer(CountedPolicy(policy), threat, "oblivious", FACTS.features, generator)
             shown = enforcer.project(Noise().perturb(truth, enforcer.begin(truth, state)))[0]
             plain, boxes = policy.assumed.boxes(shown), policy.boxes(shown, state)
-            rows.append([float(truth[0, 1, 1]) * 100, *(float(side[0, 1, 0]) for each in (plain, boxes) for side in each[1:])])
+            rows.append(
+                [float(truth[0, 1, 1]) * 100, *(float(side[0, 1, 0]) for each in (plain, boxes) for side in each[1:])]
+            )
             action = policy.decide(shown, state)
             state = policy.advance(shown, action, state)
             td = env.step(td.set("action", action))["next"]

@@ -18,7 +18,7 @@ from envs.camera.frame import frame
 from envs.camera.poses import Pose
 from envs.camera.street import layout, render
 from envs.camera.street.light import light, lighting
-from envs.camera.street.render import Traced, trace, variant
+from envs.camera.street.render import Traced, trace, variant, works
 from envs.weather import WEATHERS
 
 VERSION = 2
@@ -97,8 +97,14 @@ def _made_by() -> dict[str, object]:
 
 
 def _check_installed() -> None:
+    """Raise UserError unless the renderer is installed and renders a small picture."""
     for name in ("mitsuba", "pyoidn"):
         try:
             metadata.version(name)
         except metadata.PackageNotFoundError:
             raise UserError(f"rendering needs {name}: pip install 'cavbench[render]'") from None
+    if not works(variant()):
+        raise UserError(
+            f"the renderer cannot render with the variant {variant()!r}: its LLVM library may be missing or broken; "
+            "MITSUBA_VARIANT=scalar_rgb needs none and is slower"
+        )

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from bench.scenarios import Cell
 from bench.statistics.estimates import Array
 from leaderboard.comparisons.comparison import Comparison
@@ -38,13 +36,5 @@ def align(comparisons: Sequence[Comparison]) -> Aligned | None:
     seeds = sorted(set.intersection(*(set(one.seeds) for one in own)))
     if not (runs and cells and seeds):
         return None
-    scores = []
-    for one in comparisons:
-        kept_runs = one.own.runs * len(runs) if one.stands_for_all else runs
-        places = (
-            [one.own.runs.index(run) for run in kept_runs],
-            [one.own.cells.index(cell) for cell in cells],
-            [one.own.seeds.index(seed) for seed in seeds],
-        )
-        scores.append(one.scores[np.ix_(*places)])
+    scores = [one.scores[one.own.places(runs, cells, seeds)] for one in comparisons]
     return Aligned(scores, tuple(runs), tuple(cells), tuple(seeds))

@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from bench.plugins.track import Measure, Track, track
+from bench.records.reading import times
 from bench.records.schema import AUDIT
 from bench.statistics.episodes import Episodes
 from leaderboard.comparisons.baselines import Baselines, identity_of
@@ -102,8 +103,7 @@ def newest(records: pa.Table, identity: Sequence[str] = (*DEFENDED, *ATTACKER, "
     rising = np.sort(codes)
     if (rising[1:] > rising[:-1]).all():
         return records
-    created = records["created_at"].cast(pa.int64()).to_numpy()
-    order = np.lexsort((np.arange(len(codes)), created, codes))
+    order = np.lexsort((np.arange(len(codes)), times(records), codes))
     last = np.append(codes[order][1:] != codes[order][:-1], True)
     return records.take(pa.array(np.sort(order[last])))
 

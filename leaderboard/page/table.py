@@ -8,6 +8,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from bench.errors import plain
+
 CSV = (
     "track", "world", "grid", "threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share",
     "group", "flagged", "flags",
@@ -50,5 +52,13 @@ def table(made: Mapping[str, Any]) -> str:
                 prefix = "" if name == "score" else f"{name}_"
                 value = "worst_cell_score" if name == "worst_cell" else name
                 line |= {value: found["estimate"], f"{prefix}low": found["low"], f"{prefix}high": found["high"]}
-            writer.writerow(line)
+            writer.writerow({name: cell(value) for name, value in line.items()})
     return out.getvalue()
+
+
+def cell(value: object) -> object:
+    """A cell of a table: a text that a spreadsheet would take for a formula begins with an apostrophe; numbers stay numbers."""
+    if not isinstance(value, str):
+        return value
+    formula = value.startswith(("=", "+", "-", "@", "\t", "\r"))
+    return ("'" if formula else "") + plain(value)

@@ -18,13 +18,14 @@ from rich.console import Console
 from rich.text import Text
 
 from bench.errors import UserError
-from bench.files import whole
+from bench.files import check_folder, whole
 from bench.plugins.track import tracks
 from bench.records import reading
+from bench.run.process import follow_parent
 from leaderboard.comparisons.reading import measurements
 from leaderboard.page.document import document
 from leaderboard.page.table import table
-from leaderboard.published import published
+from leaderboard.published import every_track
 from leaderboard.ranking.boards import read_boards
 from leaderboard.ranking.flags import FLAGS
 from leaderboard.terminal.ranking import print_boards
@@ -45,20 +46,22 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         UserError: if there are no records, or nothing can be written.
     """
     page = page / NAME if page.is_dir() else page
+    check_folder(page.parent, "the folder of the page")
+    if folders := [target for target in _files(page) if target.is_dir()]:
+        raise UserError(f"the page {page} cannot be written: {folders[0]} is a folder; choose another with html=")
     # The thesis' tables are made of other records, and so in a process of their own meanwhile.
-    with ProcessPoolExecutor(1, get_context("spawn")) as beside:
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=follow_parent) as beside:
         beside.submit(chapters.prepare)
         records = _read(out)
         thesis = beside.submit(chapters.chapters, chapters.needed(records))
         boards, comparisons = read_boards(records)
         made = document(boards, comparisons, out)
         texts = {
-            page.with_suffix(".json"): json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
-            page.with_suffix(".csv"): table(made),
+            _files(page)[0]: json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
+            _files(page)[1]: table(made),
             page: html(made, sum(map(len, records.values())), thesis.result(), _link(out, page)),
         }
     try:
-        page.parent.mkdir(parents=True, exist_ok=True)
         for path, text in texts.items():
             with whole(path) as file:
                 file.write(text.encode())
@@ -69,11 +72,15 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         console.print(Text(f" {path} ({path.stat().st_size / 1e6:.2f} MB)"), soft_wrap=True)
 
 
+def _files(page: Path) -> tuple[Path, Path, Path]:
+    """The JSON, the CSV and the page."""
+    return page.with_suffix(".json"), page.with_suffix(".csv"), page
+
+
 def _read(out: Path | None) -> dict[str, pa.Table]:
     """The records of a folder, or the published ones."""
     if out is None:
-        every = {track.name: published(track) for track in tracks()}
-        return {name: records for name, records in every.items() if records.num_rows}
+        return every_track()
     return reading.read_compact(out, {name for track in tracks() for name in measurements(track)})
 
 

@@ -126,12 +126,12 @@ def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
         own = [one for one in allowed if one.defended == defended]
         panel = Panel.of(own)
         found = panel.strongest()
-        assert found is not None, "the attack that was driven most has a cell"
+        assert found is not None, "the attack whose seeds the panel has has a cell"
         own = sorted(panel.attacks, key=lambda one: (-found.attacks.count(one), one.score.estimate))
         same = [one for one in attacked if one.defended == defended and one.identity["grid"] == grid]
         others = [one for one in same if one.identity["threat_norm"] == threat[0]]
         doubts = tuple(flags(Subject(track, own, others, found)))
-        rows.append(Row(tuple(own), found, panel.marginal(), panel.left_out, doubts))
+        rows.append(Row(tuple(own), found, panel.marginal(found), panel.left_out, doubts))
     return Board(track, (world, world_params), grid, tuple(threat), tuple(ranked(rows)), _baselines(allowed))
 
 

@@ -20,9 +20,9 @@ from bench.statistics.estimates import Interval
 from bench.statistics.unpaired import unpaired
 from leaderboard.comparisons.alignment import align
 from leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison, mean
-from leaderboard.ranking.curves import Curve
+from leaderboard.ranking.curves import ENOUGH_CELLS, Curve
 from leaderboard.ranking.families import budgets, efforts
-from leaderboard.ranking.worst import Worst, margin
+from leaderboard.ranking.worst import Panel, Worst, margin
 
 NOTHING_LEFT = 0.01
 """A score this low cannot fall further: attacks that reach it are not told apart."""
@@ -86,6 +86,22 @@ def unattacked(of: Subject) -> Finding:
     if of.strongest("answers", "gradients", "unknown"):
         return False, f"{sum(attack.knowledge != 'nothing' for attack in of.attacks)} attacks asked the victim."
     return True, "No attack that was run asks the victim anything: this is a score under noise."
+
+
+def left_out(of: Subject) -> Finding:
+    """Fires where an attack that does not count, because it lacks seeds or scenarios of the row, lowers the score more."""
+    found = {}
+    for attack in of.worst.panel.left_out:
+        alone = Panel.of([attack]).strongest()
+        if alone is None or len(set(alone.cells) & set(of.worst.cells)) < min(ENOUGH_CELLS, len(of.worst.cells)):
+            continue
+        change = margin(of.worst, alone)
+        if change:
+            found[alone.name] = change
+    if not found:
+        return False, "No attack is left out of as many cells as are evidence."
+    name, largest = max(found.items(), key=lambda item: item[1].low)
+    return largest.low > 0, f"The score minus that under {name}, which is left out: {_signed(largest)}."
 
 
 def masked_gradients(of: Subject) -> Finding:
@@ -271,6 +287,7 @@ FLAGS: dict[str, tuple[str, Callable[[Subject], Finding]]] = {
     "ignores_input": ("the answer does not depend on the input", ignores_input),
     "public_only": ("higher on the public scenarios than on new ones", public_only),
     "decoy": ("answers an attack otherwise than it acts", decoy),
+    "left_out": ("an attack that is left out lowers the score more", left_out),
     "masked_gradients": ("a black-box attack beats the white-box one", masked_gradients),
     "zero_gradients": ("gradients are zero", zero_gradients),
     "noise": ("random noise lowers the score as much as the attack", noise),

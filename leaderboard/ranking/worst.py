@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from bench.scenarios import Cell
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
+from bench.statistics.strongest import strongest_of
 from leaderboard.comparisons.comparison import Comparison
-
-FOLDS = 5
-"""Parts of the scenarios. In each, the attack counts that is the strongest in the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,27 +41,24 @@ class Panel:
 
     @classmethod
     def of(cls, attacks: Sequence[Comparison]) -> Panel:
-        """The attacks on the training and scenario seeds of the one that was driven most.
+        """The attacks on the training and scenario seeds of one of them: those that keep the most episodes of all attacks.
 
-        An attack counts in the cells in which it has all of them, so that a partial run changes nothing.
+        An attack counts in the cells in which it has all of these seeds. So a partial run changes nothing, and neither does one
+        attack on more training seeds than the others have.
         """
-        most = max(attacks, key=lambda one: (not one.stands_for_all, one.own.table.num_rows))
-        runs, seeds = most.own.runs, most.own.seeds
-        whole = [
-            one
-            for one in attacks
-            if set(seeds) <= set(one.own.seeds) and (one.stands_for_all or set(runs) <= set(one.own.runs))
-        ]
-        cells = sorted({cell for one in whole for cell in one.cells}, key=most.axes.place)
+        designs = [(one.own.runs, one.own.seeds) for one in attacks if not one.stands_for_all]
+        designs = designs or [(one.own.runs, one.own.seeds) for one in attacks]
+        runs, seeds = max(designs, key=lambda design: (_episodes(attacks, *design), -len(design[0])))
+        whole = [one for one in attacks if _covers(one, runs, seeds)]
+        cells = sorted({cell for one in whole for cell in one.cells}, key=whole[0].axes.place)
         shape = (len(whole), len(runs), len(cells), len(seeds))
         scores, failed = np.full(shape, np.nan), np.full(shape, np.nan)
         for number, one in enumerate(whole):
-            of_runs = [0] * len(runs) if one.stands_for_all else [one.own.runs.index(run) for run in runs]
             there = [cells.index(cell) for cell in one.cells]
-            from_ = np.ix_(of_runs, range(len(one.cells)), [one.own.seeds.index(seed) for seed in seeds])
-            scores[number][:, there] = one.scores[from_]
+            places = one.own.places(runs, one.cells, seeds)
+            scores[number][:, there] = one.scores[places]
             if one.track.failure:
-                failed[number][:, there] = one.own.column(one.track.failure)[from_]
+                failed[number][:, there] = one.own.column(one.track.failure)[places]
         left_out = tuple(one for one in attacks if one not in whole)
         return cls(tuple(whole), runs, tuple(cells), seeds, scores, failed, left_out)
 
@@ -78,7 +73,7 @@ class Panel:
         cells = np.flatnonzero(known.any(0))
         if not len(cells):
             return None
-        choice = np.array(some)[_chosen(self.scores[some][:, :, cells])]
+        choice = np.array(some)[strongest_of(self.scores[some][:, :, cells])]
         pick = (
             choice[None],
             np.arange(len(self.runs))[:, None, None],
@@ -87,26 +82,25 @@ class Panel:
         )
         return Worst(self, tuple(cells.tolist()), choice, self.scores[pick], self.failed[pick])
 
-    def marginal(self) -> dict[Comparison, Interval]:
-        """By how much each attack lowers the score further than all the others do together."""
+    def marginal(self, worst: Worst) -> dict[Comparison, Interval]:
+        """By how much each attack lowers the score further than all the others do together; `worst` is that of all."""
         found: dict[Comparison, Interval] = {}
-        full = self.strongest()
-        for attack in self.attacks if full else ():
+        for attack in self.attacks:
             rest = self.strongest([one for one in self.attacks if one is not attack])
-            change = margin(rest, full) if rest and full else None
+            change = margin(rest, worst) if rest else None
             if change:
                 found[attack] = change
         return found
 
 
-def _chosen(scores: Array) -> NDArray[np.int64]:
-    """[C, E] the attack with the lowest mean over runs and the other folds' scenarios, from scores [A, R, C, E]."""
-    totals = scores.sum(1)
-    count = scores.shape[-1]
-    fold = np.arange(count) % min(FOLDS, count)
-    others = (fold[:, None] != fold).astype(float) if count > 1 else np.ones((1, 1))
-    means = np.where(np.isnan(totals), np.inf, np.nan_to_num(totals) @ others / others.sum(0))
-    return np.asarray(means.argmin(0))
+def _covers(attack: Comparison, runs: Sequence[int], seeds: Sequence[int]) -> bool:
+    return set(seeds) <= set(attack.own.seeds) and (attack.stands_for_all or set(runs) <= set(attack.own.runs))
+
+
+def _episodes(attacks: Sequence[Comparison], runs: Sequence[int], seeds: Sequence[int]) -> int:
+    """How many episodes of the attacks count on these seeds."""
+    cells = sum(len(one.cells) for one in attacks if _covers(one, runs, seeds))
+    return len(runs) * cells * len(seeds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,14 +201,13 @@ class Worst:
             alone = len(control.runs) == 1 and control.runs != runs
             if not (alone or set(runs) <= set(control.runs)):
                 continue
-            rows = [0] if alone else [control.runs.index(run) for run in runs]
+            of_runs = control.runs if alone else runs
             if found is None:
-                found = np.full((len(rows), *self.choice.shape), np.nan)
+                found = np.full((len(of_runs), *self.choice.shape), np.nan)
             missing = [n for n, cell in enumerate(self.cells) if np.isnan(found[:, n]).any() and cell in control.cells]
-            if len(rows) == len(found) and missing:
-                places = [control.cells.index(self.cells[n]) for n in missing]
-                from_ = np.ix_(rows, places, [control.seeds.index(seed) for seed in seeds])
-                found[:, missing] = control.column(column)[from_]
+            if len(of_runs) == len(found) and missing:
+                places = control.places(of_runs, [self.cells[n] for n in missing], seeds)
+                found[:, missing] = control.column(column)[places]
         return found
 
 

@@ -12,10 +12,22 @@ from rich.text import Text
 from bench.plugins.track import Track
 from bench.statistics.estimates import share_interval
 from leaderboard.comparisons.naming import component, varying
+from leaderboard.published import every_track
 from leaderboard.ranking.boards import Board, Row, read_boards
 from leaderboard.ranking.flags import FLAGS
 from leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
-from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, estimate, number, share, signed, strip, verdict
+from leaderboard.terminal.text import (
+    ATTACKED,
+    BASELINE,
+    CLEAN,
+    estimate,
+    number,
+    of_frames,
+    share,
+    signed,
+    strip,
+    verdict,
+)
 
 ADDED = 0.01
 """What an attack must add to be named."""
@@ -25,18 +37,17 @@ def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> Non
     """Print the ranking of every threat model, with the flags that have fired.
 
     Args:
-        records: by track (`bench.records.schema`).
+        records: by track (`bench.records.schema`); where there are none, the published records count.
         console: where to print.
     """
-    print_boards(read_boards(records)[0], console)
+    print_boards(read_boards(records or every_track())[0], console)
 
 
 def print_boards(boards: Sequence[Board], console: Console) -> None:
     """Print the leaderboard of each threat model."""
     for board in boards:
-        norm, budget, access, queries, share = board.threat
-        frames = "" if share == 1 else f", {100 * share:g} % of the frames"
-        allowed = f"{board.grid}, {norm} {budget:g}, access {access}, {queries} queries{frames}"
+        norm, budget, access, queries, frames = board.threat
+        allowed = f"{board.grid}, {norm} {budget:g}, access {access}, {queries} queries{of_frames(frames)}"
         title = Text.assemble((board.track.name, "bold"), f" in {board.world[0]}, {allowed}")
         console.print(Padding(title, (1, 1)))
         console.print(Padding(fitted(_columns(board), [Section(board.rows)], console), (0, 1)))

@@ -116,5 +116,11 @@ def threat(one: Comparison) -> str:
         return "nothing is attacked"
     norm, budget, access, queries, share = (one.identity[name] for name in THREAT)
     allowed = one.track.allowed(norm, budget, one.facts)
-    frames = "" if share == 1 else f", {100 * share:g} % of the frames"
-    return f"{norm} {budget:g}: {allowed}; access {access}, at most {queries} {one.track.queries_title}{frames}"
+    return (
+        f"{norm} {budget:g}: {allowed}; access {access}, at most {queries} {one.track.queries_title}{of_frames(share)}"
+    )
+
+
+def of_frames(share: float) -> str:
+    """What `threat.share` adds to a threat model in words: nothing if every frame may be perturbed."""
+    return "" if share == 1 else f", {100 * share:g} % of the frames"

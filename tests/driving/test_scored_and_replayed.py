@@ -28,6 +28,8 @@ class Warned:
 
     def __init__(self) -> None:
         self.lines: list[str] = []
+        self.failures: list[str] = []
+        self.said: list[str] = []
 
     def begin(self, *, episodes: int, finished: int) -> None:
         pass
@@ -41,15 +43,21 @@ class Warned:
     def finished(self, work: Unit | Preparation, wall_s: float) -> None:
         pass
 
+    def failed(self, line: str) -> None:
+        self.failures.append(line)
+
+    def printed(self, work: object, lines: Sequence[str]) -> None:
+        self.said += lines
+
     def warn(self, line: str) -> None:
         self.lines.append(line)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_stateful_attack_on_a_stateful_defence_is_scored_recorded_and_replayed(tmp_path: Path, workers: int) -> None:
+@pytest.mark.parametrize("back_end", ["executor=serial", "workers=2"])
+def test_a_stateful_attack_on_a_stateful_defence_is_scored_recorded_and_replayed(tmp_path: Path, back_end: str) -> None:
     watcher = Warned()
-    runner.run(run_config([*RUN.split(), f"workers={workers}", f"out={tmp_path}"]), watcher)
+    runner.run(run_config([*RUN.split(), back_end, f"out={tmp_path}"]), watcher)
     assert watcher.lines == []
     records = reading.read(tmp_path, track=track("driving"))
     assert set(records["attack"].to_pylist()) >= set(ATTACKS)

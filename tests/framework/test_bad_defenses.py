@@ -16,7 +16,7 @@ from tests.framework.conftest import Said
 from tests.framework.distributions import install
 
 BAD = ("deaf", "stepped", "detached", "dicing")
-WORDS = ("victim=toy", "world=toy", "lanes=3,4", "density=1", "weather=clear", "episodes=20", "seeds=0,1,2", "workers=1",
+WORDS = ("victim=toy", "world=toy", "lanes=3,4", "density=1", "weather=clear", "episodes=20", "seeds=0,1,2", "executor=serial",
          "reference=false")  # fmt: skip
 
 

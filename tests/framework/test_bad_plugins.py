@@ -13,7 +13,16 @@ from tests.framework.test_check import CROOKED, POINTS
 from tests.framework.test_cli import assert_one_line
 
 Bench = Callable[..., Said]
-RUN = ("lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0", "workers=1", "record=0", "reference=false")
+RUN = (
+    "lanes=3",
+    "density=1",
+    "weather=clear",
+    "episodes=2",
+    "seeds=0",
+    "executor=serial",
+    "record=0",
+    "reference=false",
+)
 TOY = ("world=toy", *RUN)
 
 HEAD = """

@@ -23,7 +23,16 @@ from envs.highway.world import HighwayWorld
 from tests.framework.test_runner import Silent
 
 FACTS = HighwayWorld().facts
-WORDS = ("victim=dqn", "attack=none", "lanes=3", "density=1", "weather=clear", "seeds=0", "episodes=2", "reference=false")
+WORDS = (
+    "victim=dqn",
+    "attack=none",
+    "lanes=3",
+    "density=1",
+    "weather=clear",
+    "seeds=0",
+    "episodes=2",
+    "reference=false",
+)
 
 
 def test_the_observation_passes_the_links_in_their_order() -> None:

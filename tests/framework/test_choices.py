@@ -78,7 +78,7 @@ def shelf(plugins: Path) -> None:
 def test_a_choice_is_a_component_with_parameters_of_its_own(bench: Callable[..., Said], tmp_path: Path) -> None:
     said = bench(
         *("run", "attack=shelf:up,shelf:down", "attack.strength=0.5,1", "attack.steps=3", "victim=toy", "world=toy"),
-        *("lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0", "workers=1", "reference=false"),
+        *("lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0", "executor=serial", "reference=false"),
         f"out={tmp_path}",
     )
     assert said.code == 0, said.err

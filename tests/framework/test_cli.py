@@ -72,7 +72,7 @@ def test_an_unknown_component_has_no_page(bench: Bench) -> None:
     ("words", "part"),
     [
         (("attack=nugde",), "unknown attack 'nugde'; did you mean 'nudge'?"),
-        (("attack=nudge", "attack.pause=long"), "cannot read attack.pause=long"),
+        (("attack=nudge", "attack.pause=long"), "attack.pause must be a number, got long"),
         (("threat.budget=-1",), "threat.budget must be between 0 and 2, got -1"),
         (("attack=steer", "victim=toy"), "attack 'steer' does not fit victim 'toy'"),
         (("--fast",), "No such option"),
@@ -89,7 +89,7 @@ def test_a_results_folder_that_cannot_be_written_is_refused(bench: Bench, tmp_pa
 
 
 def test_a_repeated_run_only_prints_the_table(bench: Bench, tmp_path: Path) -> None:
-    words = ("run", *TOY, "workers=1", "record=0", f"out={tmp_path}")
+    words = ("run", *TOY, "executor=serial", "record=0", f"out={tmp_path}")
     first, again = bench(*words), bench(*words)
     assert (first.code, again.code) == (0, 0), first.err
     assert "nudge" in first.out
@@ -98,17 +98,21 @@ def test_a_repeated_run_only_prints_the_table(bench: Bench, tmp_path: Path) -> N
     assert again.err.strip() == "36 of 36 episodes are already done"
 
 
-def test_a_truncated_record_stops_every_command_that_reads_it(bench: Bench, tmp_path: Path) -> None:
-    run = ("run", *TOY, "workers=1", "record=0", "reference=false", f"out={tmp_path}")
+def test_a_truncated_record_stops_what_reads_it_and_is_driven_again(bench: Bench, tmp_path: Path) -> None:
+    run = ("run", *TOY, "executor=serial", "record=0", "reference=false", f"out={tmp_path}")
     bench(*run)
     path = sorted((tmp_path / "episodes").glob("*.parquet"))[0]
     path.write_bytes(path.read_bytes()[:100])
-    for words in (run, ("show", str(tmp_path)), ("report", f"out={tmp_path}")):
+    for words in (("show", str(tmp_path)), ("report", f"out={tmp_path}")):
         assert_one_line(bench(*words), f"the record {path} is truncated")
+    again = bench(*run)
+    assert again.code == 0
+    assert [one.name for one in (tmp_path / "set_aside").iterdir()] == [path.name]
+    assert bench("report", f"out={tmp_path}").code == 0
 
 
 def test_show_prints_the_provenance_of_the_records(bench: Bench, tmp_path: Path) -> None:
-    bench("run", *TOY, "workers=1", "record=0", "attack.scale=0.5", f"out={tmp_path}")
+    bench("run", *TOY, "executor=serial", "record=0", "attack.scale=0.5", f"out={tmp_path}")
     whole = bench("show", str(tmp_path))
     pair = next(line for line in whole.out.splitlines() if line.startswith("nudge-none-toy-")).strip()
     one = bench("show", "nudge", "--out", str(tmp_path))
@@ -121,7 +125,7 @@ def test_show_prints_the_provenance_of_the_records(bench: Bench, tmp_path: Path)
 
 
 def test_report_prints_a_report_by_name(bench: Bench, tmp_path: Path) -> None:
-    bench("run", *TOY, "workers=1", "record=0", f"out={tmp_path}")
+    bench("run", *TOY, "executor=serial", "record=0", f"out={tmp_path}")
     assert "nudge" in bench("report", f"out={tmp_path}").out
     assert_one_line(bench("report", "theses", f"out={tmp_path}"), "unknown report 'theses'; did you mean 'thesis'?")
     assert_one_line(bench("report", f"out={tmp_path / 'none'}"), "there are no records")
@@ -226,3 +230,22 @@ def test_ctrl_c_ends_a_run_in_one_line_and_with_its_workers(toy_folder: Path, tm
     assert "Traceback" not in err
     assert not psutil.wait_procs(children, timeout=60)[1]
     assert reading.read(tmp_path, track=track("driving")).num_rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["run", "report"])
+def test_kill_9_leaves_no_process_and_no_temporary_file(toy_folder: Path, tmp_path: Path, command: str) -> None:
+    run = ("run", *TOY, "attack.pause=600", "workers=2", "reference=false", "record=0", f"out={tmp_path}")
+    words = run if command == "run" else ("report", f"html={tmp_path / 'page.html'}")
+    process = started(toy_folder, *words)
+    started_by = psutil.Process(process.pid)
+    until = time.monotonic() + 240
+    # A run has a fork server with two workers, a report one worker; each has Python's own tracker of resources, too.
+    while len(children := started_by.children(recursive=True)) < {"run": 4, "report": 2}[command]:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    process.kill()
+    process.communicate(timeout=60)
+    assert not psutil.wait_procs(children, timeout=60)[1]
+    assert not list(tmp_path.rglob(".*.tmp"))

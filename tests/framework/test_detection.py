@@ -40,7 +40,7 @@ def read(line: str) -> RunConfig:
 
 
 def run(out: Path, *more: str, watcher: Silent | None = None) -> tuple[pa.Table, Silent]:
-    words = dict(word.split("=", 1) for word in [*SMALL.split(), "workers=1", f"out={out}", "record=0", *more])
+    words = dict(word.split("=", 1) for word in [*SMALL.split(), "executor=serial", f"out={out}", "record=0", *more])
     watcher = watcher or Silent()
     units = runner.run(run_config([f"{key}={value}" for key, value in words.items()]), watcher)
     return reading.read(out, units, track=track("detection")), watcher
@@ -161,7 +161,7 @@ def test_an_interrupted_run_loses_neither_patches_nor_cells(tmp_path: Path) -> N
 @pytest.mark.slow
 def test_results_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     one, _ = run(tmp_path / "one")
-    three, watcher = run(tmp_path / "three", "workers=3")
+    three, watcher = run(tmp_path / "three", "executor=processes", "workers=3")
     assert len(crafted(watcher)) == 2
     assert one.drop_columns(BESIDE).equals(three.drop_columns(BESIDE))
 
@@ -227,7 +227,7 @@ def count(records, console):
 
 def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path, plugins: Path, bench: Bench) -> None:
     install(plugins, "counting", {"cavbench.reports": {"count": "counting:count"}}, {"counting": COUNT})
-    monkey = ("workers=1", "record=0", "reference=false", f"out={tmp_path}")
+    monkey = ("executor=serial", "record=0", "reference=false", f"out={tmp_path}")
     assert bench("run", *TOY, *monkey).code == 0
     made = bench("run", *SMALL.split(), *monkey)
     assert made.code == 0, made.err
@@ -269,7 +269,7 @@ def test_the_first_approaches_of_each_requested_pair_are_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench
 ) -> None:
     monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ("blank",))
-    said = bench("run", *SMALL.split(), "workers=1", f"out={tmp_path}")
+    said = bench("run", *SMALL.split(), "executor=serial", f"out={tmp_path}")
     assert said.code == 0, said.err
     assert "was not recorded" not in said.err
     (path,) = recordings(tmp_path, None)
@@ -302,8 +302,8 @@ def test_a_replay_reproduces_the_record_and_writes_a_recording(tmp_path: Path, b
 
 @pytest.mark.slow
 def test_a_worker_that_is_killed_while_it_crafts_loses_no_patch_and_no_cell(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="a worker process died"):
-        run(tmp_path, "attack.mood=calm,kill", "workers=2", "seeds=0")
+    with pytest.raises(UserError, match=r"ended its worker process \(SIGKILL"):
+        run(tmp_path, "attack.mood=calm,kill", "executor=processes", "workers=2", "seeds=0")
     kept = set(tmp_path.glob("patches/*.safetensors"))
     records, watcher = run(tmp_path, "seeds=0")
     assert len(crafted(watcher)) == 1 - len(kept)

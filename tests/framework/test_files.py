@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.files import whole
+from bench.files import sweep, whole
 
 KILLED = """
 import os, signal, sys
@@ -48,3 +48,12 @@ def test_a_killed_process_leaves_the_existing_file_unchanged(tmp_path: Path) -> 
         file.write(b"new")
     assert path.read_bytes() == b"new"
     assert path.stat().st_mode & 0o777 == 0o644
+    assert os.listdir(tmp_path) == ["record"]
+
+
+def test_the_temporary_file_of_a_process_that_runs_is_kept(tmp_path: Path) -> None:
+    with whole(tmp_path / "record") as file:
+        (aside,) = tmp_path.iterdir()
+        sweep(tmp_path)
+        assert aside.exists()
+        file.write(b"new")

@@ -132,7 +132,7 @@ def test_an_installed_package_is_listed_checked_and_scored_in_workers(installed:
 def test_the_first_run_of_a_package_works_as_printed(installed: Path, tmp_path: Path, kind: str, on: str) -> None:
     name = name_of(kind, on)
     _, command, *words = scaffold.first_run(kind, name, on).split()
-    quicker = ["seeds=0", "reference=false", "record=0", "workers=1"]
+    quicker = ["seeds=0", "reference=false", "record=0", "executor=serial"]
     quicker += ["world.max_steps=30"] if on == "driving" else ["episodes=1"]
     said = ran(installed, command, *words, *quicker, f"out={tmp_path}")
     assert said.code == 0, said.err

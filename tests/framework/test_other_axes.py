@@ -9,7 +9,7 @@ from bench.plugins.track import track
 from bench.records import reading
 from tests.framework.conftest import Bench
 
-RUN = ("run", "attack=nudge", "victim=toy", "world=bend", "seeds=0,1", "workers=1", "record=1")
+RUN = ("run", "attack=nudge", "victim=toy", "world=bend", "seeds=0,1", "executor=serial", "record=1")
 
 
 def test_a_run_takes_its_axes_from_the_world(bench: Bench, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import shutil
 import subprocess
@@ -18,19 +19,31 @@ from bench.shadow import PACKAGES, ROOT
 
 TREE = Path(ROOT)
 OWN = ("bench", *PACKAGES)
+FIRST_RUN = ("attack=noise", "lanes=3", "density=1", "weather=clear", "episodes=5")
 NOT_SHIPPED = {f"leaderboard/index.{kind}" for kind in ("html", "json", "csv")}
 """The published page, which is generated for readers of the repository."""
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
-    """The files of a wheel that pip builds from a copy of the tree."""
-    folder = tmp_path_factory.mktemp("wheel")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the tree."""
     left = shutil.ignore_patterns(".*", "__pycache__", "build", "dist", "results", "runs", "_build", "*.egg-info")
-    copy = shutil.copytree(TREE, folder / "tree", ignore=left)
+    return shutil.copytree(TREE, tmp_path_factory.mktemp("copy") / "tree", ignore=left)
+
+
+@pytest.fixture(scope="module")
+def built(copy: Path) -> Path:
+    """A wheel that pip builds from it."""
+    folder = copy.parent
     pip = (sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", folder, copy)
     subprocess.run(pip, check=True, capture_output=True, text=True)
-    (built,) = folder.glob("*.whl")
+    (found,) = folder.glob("*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def wheel(built: Path) -> set[str]:
+    """The files of the wheel."""
     return set(zipfile.ZipFile(built).namelist())
 
 
@@ -50,11 +63,55 @@ def test_the_wheel_holds_every_file_of_our_packages(wheel: set[str]) -> None:
     assert files - NOT_SHIPPED == {name for name in wheel if name.partition("/")[0] in OWN}
 
 
+@pytest.mark.skipif("CAVBENCH_WHEEL_CHECK" not in os.environ, reason="make wheel-check installs 2 GB")
+def test_the_wheel_runs_in_an_environment_of_its_own(built: Path, tmp_path: Path) -> None:
+    python = tmp_path / "venv" / "bin" / "python"
+    limits = ("-c", TREE / "constraints.txt")
+    for command in (
+        (sys.executable, "-m", "venv", tmp_path / "venv"),
+        (python, "-m", "pip", "install", "--quiet", *limits, "torch==2.13.0"),
+        (python, "-m", "pip", "install", "--quiet", *limits, built),
+        (python.with_name("bench"), "--version"),
+        (python.with_name("bench"), "run", *FIRST_RUN, "out=results"),
+        (python, "-c", "import cavbench; print(cavbench.load('dqn+advtrain'))"),
+    ):
+        said = subprocess.run(command, cwd=tmp_path, env=_outside(), capture_output=True, text=True, check=False)
+        assert said.returncode == 0, said.stderr
+    assert len(list((tmp_path / "results" / "episodes").glob("*.parquet"))) == 14
+
+
+def _outside() -> dict[str, str]:
+    """The environment variables without those that lead to this tree."""
+    return {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+
+
+@pytest.mark.slow
+def test_the_source_distribution_builds_the_same_wheel(wheel: set[str], copy: Path, tmp_path: Path) -> None:
+    build = "import sys; from setuptools.build_meta import build_sdist; build_sdist(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", build, tmp_path], cwd=copy, check=True, capture_output=True)
+    (archive,) = tmp_path.glob("*.tar.gz")
+    pip = (
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "-w",
+        tmp_path,
+        archive,
+    )
+    subprocess.run(pip, check=True, capture_output=True, text=True)
+    (again,) = tmp_path.glob("*.whl")
+    assert set(zipfile.ZipFile(again).namelist()) == wheel
+
+
 def test_the_base_dependencies_are_what_the_packages_import() -> None:
     project = tomllib.loads((TREE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     base = {_name(one) for one in project["dependencies"]}
     extras = project["optional-dependencies"]
-    optional = {_name(one) for extra in ("reference", "art", "onnx", "render") for one in extras[extra]}
+    optional = {_name(one) for extra in ("reference", "art", "onnx", "render", "gym") for one in extras[extra]}
     shipped_by = metadata.packages_distributions()
     imported = {_name(one) for module in _imported() for one in shipped_by.get(module, ())}
     # Weights that ship as pip packages are fetched with `python -m pip`.

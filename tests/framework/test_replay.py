@@ -25,7 +25,7 @@ def records_of(folder: Path) -> pa.Table:
 @pytest.fixture
 def folder(bench: Bench, tmp_path: Path) -> Path:
     """The results of a small run, with a recording of one episode of each requested pair."""
-    said = bench("run", *TOY, "attack.scale=0.5", "workers=1", "reference=false", f"out={tmp_path}")
+    said = bench("run", *TOY, "attack.scale=0.5", "executor=serial", "reference=false", f"out={tmp_path}")
     assert said.code == 0, said.err
     assert "warning" not in said.err
     return tmp_path

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Sequence
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bench.errors import UserError
+from bench.errors import Notice, UserError
 from bench.plugins.track import Columns, track
 from bench.records import reading
 from bench.records import store as results
@@ -93,9 +95,8 @@ def test_a_killed_writer_leaves_no_record(written: Path, units: list[Unit]) -> N
 def test_a_truncated_record_is_named(written: Path, units: list[Unit], share: float) -> None:
     path = results.path_of(written, units[1].fingerprint)
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    for reads in (lambda: read(written), lambda: results.finished(written, [units[1].fingerprint])):
-        with pytest.raises(UserError, match=f"the record {path} is truncated or not Parquet; delete it"):
-            reads()
+    with pytest.raises(UserError, match=f"the record {path} is truncated or not Parquet; delete it"):
+        read(written)
 
 
 def test_a_record_whose_data_is_damaged_is_named(written: Path, units: list[Unit]) -> None:
@@ -116,6 +117,15 @@ def test_a_foreign_table_is_reported_by_its_path(written: Path) -> None:
 
 CANNOT_BE = {
     "safe_progress": (5.0, "safe_progress must be between 0 and 1, got 5"),
+    "return": (float("nan"), "return must be between -1e+15 and 1e+15, got nan"),
+    "distance_m": (1e300, "distance_m must be between -1e+15 and 1e+15, got 1e+300"),
+    "mean_speed": (float("inf"), "mean_speed must be between -1e+15 and 1e+15, got inf"),
+    "queries": (-1.0, "queries must be between 0 and 1e+15, got -1"),
+    "min_ttc_s": (-0.5, "min_ttc_s must be at least 0, got -0.5"),
+    "steps": (10**6, "steps must be between 0 and"),
+    "action_counts": ([0, 0, -1, 0, 0], "action_counts must be between 0 and"),
+    "threat_norm": ("l7", "threat_norm l7: known: relative, linf"),
+    "threat_budget": (-0.1, "threat_budget must be between 0 and 1e+15, got -0.1"),
     "changed": (float("nan"), "changed must be between 0 and 1, got nan"),
     "cell": ('{"lanes":-1,"density":1.0,"weather":"clear"}', "lanes must be "),
     "world_facts": ("{}", "not a cell, or world_facts has no axes"),
@@ -123,6 +133,9 @@ CANNOT_BE = {
     "world_params": ("[1]", "world_params [1]: not a JSON object"),
     "threat_access": ("all", "threat_access all: known: oblivious, decisions, scores, gradients, dynamics"),
 }
+
+
+MEASURED = {field.name for field in TRACK.measurements if not pa.types.is_list(field.type)}
 
 
 @pytest.mark.parametrize("name", CANNOT_BE)
@@ -133,11 +146,98 @@ def test_an_invalid_value_is_reported_with_its_record(written: Path, units: list
     place = records.schema.get_field_index(name)
     wrong = pa.array([value] * records.num_rows, records.schema.field(name).type)
     pq.write_table(records.set_column(place, records.schema.field(name), wrong), path)
-    for reads in (read, lambda out: reading.read_compact(out, {"safe_progress", "changed"})):
+    for reads in (read, lambda out: reading.read_compact(out, MEASURED)):
+        if reads is not read and name == "action_counts":  # compact records have no lists
+            continue
         with pytest.raises(UserError) as raised:
             reads(written)
         assert str(raised.value).startswith(f"the record {path} is invalid: ")
         assert why in str(raised.value)
+
+
+def rewritten(path: Path, change: Callable[[pa.Table], pa.Table], to: Path | None = None) -> None:
+    pq.write_table(change(pq.read_table(path)), to or path)
+
+
+UNFINISHED: dict[str, tuple[Callable[[pa.Table, pa.Table], pa.Table], str]] = {
+    "no rows": (lambda own, other: own.slice(0, 0), "it has 0 rows, the unit has 3 episodes"),
+    "two rows": (lambda own, other: own.slice(0, 2), "it has 2 rows, the unit has 3 episodes"),
+    "another unit": (lambda own, other: other, "it has the rows of another unit"),
+    "an episode twice": (lambda own, other: own.take([0, 1, 1]), "it has other scenarios"),
+    "impossible": (
+        lambda own, other: own.set_column(
+            own.schema.get_field_index("return"), own.schema.field("return"), pa.array([float("nan")] * 3)
+        ),
+        "return must be between -1e+15 and 1e+15, got nan",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", UNFINISHED)
+def test_a_unit_is_finished_if_its_own_rows_are_there(written: Path, units: list[Unit], what: str) -> None:
+    change, why = UNFINISHED[what]
+    wanted = {unit.fingerprint: unit for unit in units}
+    assert results.finished(written, wanted) == set(wanted)
+    first, second = (results.path_of(written, unit.fingerprint) for unit in units[:2])
+    other = pq.read_table(second)
+    rewritten(first, lambda own: change(own, other))
+    content = first.read_bytes()
+    with pytest.warns(Notice) as told:
+        assert results.finished(written, wanted) == set(wanted) - {units[0].fingerprint}
+    (line,) = (str(one.message) for one in told)
+    assert line.startswith(f"the record {first} does not count as finished: {why}; its unit is driven again")
+    assert not first.exists()
+    assert (written / "set_aside" / first.name).read_bytes() == content
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_a_truncated_file_is_not_finished(written: Path, units: list[Unit], share: float) -> None:
+    path = results.path_of(written, units[1].fingerprint)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    for number in range(2):
+        with pytest.warns(Notice, match="does not count as finished: it is truncated or not Parquet"):
+            assert results.finished(written, {units[1].fingerprint: units[1]}) == set()
+        assert len(list((written / "set_aside").iterdir())) == number + 1
+        path.write_bytes(b"PAR1")
+
+
+def test_a_copied_file_counts_once(written: Path, units: list[Unit]) -> None:
+    before = read(written), reading.read_compact(written, MEASURED)
+    path = results.path_of(written, units[0].fingerprint)
+    for name in ("0-copy.parquet", "z-copy.parquet"):
+        shutil.copy(path, path.parent / name)
+    assert read(written).equals(before[0])
+    assert read(written, [units[0].fingerprint]).num_rows == 3
+    for name, records in reading.read_compact(written, MEASURED).items():
+        assert records.num_rows == before[1][name].num_rows
+
+
+def test_a_record_from_the_future_is_not_the_newest(written: Path, units: list[Unit]) -> None:
+    today = read(written)
+    rows = read(written, [units[0].fingerprint]).to_pylist()
+    future = [
+        row | {"unit": "future", "code_digest": "future", "created_at": row["created_at"].replace(year=2999)}
+        for row in rows
+    ]
+    results.write(written, pa.Table.from_pylist(future, SCHEMA))
+    with pytest.warns(
+        Notice, match=r"the record .*future\.parquet is dated in the future: such records count as older"
+    ):
+        assert read(written).equals(today)
+    with pytest.warns(Notice):
+        assert "future" not in reading.read_compact(written, MEASURED)["driving"]["code_digest"].to_pylist()
+    for unit in units:
+        results.path_of(written, unit.fingerprint).unlink()
+    with pytest.warns(Notice):
+        assert set(read(written)["code_digest"].to_pylist()) == {"future"}
+
+
+def test_values_that_cannot_be_are_not_written(units: list[Unit]) -> None:
+    measured = dict(drive(units[0]))
+    measured["return"] = np.array([1.0, float("nan"), 2.0])
+    seed = units[0].seeds[1]
+    with pytest.raises(ValueError, match=rf"return must be .* got nan in scenario seed {seed}"):
+        results.table(units[0].constants(1.0), measured, track=TRACK)
 
 
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
@@ -154,7 +254,7 @@ def test_an_empty_folder_says_how_to_fill_it(tmp_path: Path) -> None:
 def test_reading_a_folder_keeps_the_newest_code_and_each_scenario_once(written: Path, units: list[Unit]) -> None:
     old = read(written, [units[0].fingerprint]).to_pylist()
     newer = [
-        row | {"unit": "newer", "code_digest": "newer", "created_at": row["created_at"].replace(year=2999)}
+        row | {"unit": "newer", "code_digest": "newer", "created_at": row["created_at"] + timedelta(minutes=5)}
         for row in old
     ]
     longer = [row | {"unit": "longer", "seed": row["seed"] + 1} for row in newer]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from bench.errors import UserError
+from bench.errors import UnfinishedError, UserError
 from bench.plugins import registry
 from bench.plugins.track import track
 from bench.records import reading
@@ -36,6 +36,8 @@ class Silent:
         self.done: list[Work] = []
         self.told: list[tuple[str, float, str]] = []
         self.warnings: list[str] = []
+        self.failures: list[str] = []
+        self.said: list[str] = []
         self.stop_after = stop_after
 
     def begin(self, *, episodes: int, finished: int) -> None:
@@ -51,12 +53,18 @@ class Silent:
     def finished(self, work: Work, wall_s: float) -> None:
         self.done.append(work)
 
+    def failed(self, line: str) -> None:
+        self.failures.append(line)
+
+    def printed(self, work: object, lines: Sequence[str]) -> None:
+        self.said += lines
+
     def warn(self, line: str) -> None:
         self.warnings.append(line)
 
 
 def run(out: Path, *more: str, line: str = SMALL, watcher: Silent | None = None) -> tuple[pa.Table, Silent]:
-    words = dict(word.split("=", 1) for word in [*line.split(), "workers=1", f"out={out}", "record=0", *more])
+    words = dict(word.split("=", 1) for word in [*line.split(), "executor=serial", f"out={out}", "record=0", *more])
     config = run_config([f"{key}={value}" for key, value in words.items()])
     watcher = watcher or Silent()
     return reading.read(out, runner.run(config, watcher), track=track("driving")), watcher
@@ -111,7 +119,7 @@ def test_continuous_victims_have_continuous_baselines() -> None:
 @pytest.mark.slow
 def test_results_do_not_depend_on_the_executor_nor_on_the_number_of_workers(tmp_path: Path) -> None:
     one, _ = run(tmp_path / "one", "reference=false", "executor=serial", "workers=3")
-    three, _ = run(tmp_path / "three", "reference=false", "workers=3")
+    three, _ = run(tmp_path / "three", "reference=false", "executor=processes", "workers=3")
     assert comparable(one).equals(comparable(three))
 
 
@@ -151,8 +159,11 @@ def test_a_failing_attack_is_reported_with_its_cell_in_one_line(tmp_path: Path) 
 @pytest.mark.slow
 def test_a_worker_that_is_killed_is_reported_and_loses_no_finished_unit(tmp_path: Path) -> None:
     calm, _ = run(tmp_path, "reference=false")
-    with pytest.raises(UserError, match="a worker process died"):
-        run(tmp_path, "attack.mood=calm,kill", "workers=2", "reference=false")
+    deadly = ("attack.mood=calm,kill", "executor=processes", "workers=2", "reference=false")
+    with pytest.raises(
+        UnfinishedError, match=r"ended its worker process \(SIGKILL.*of cavbench-toy 1.0.* more were not driven"
+    ):
+        run(tmp_path, *deadly)
     kept, watcher = run(tmp_path, "reference=false")
     assert watcher.done == []
     assert kept.equals(calm)
@@ -216,3 +227,19 @@ class Poison(DrivingAttack):
     assert "is refused: the attack changed the victim's weights (attack 'poison' of cavbench-poison 2.1)" in last
     kept = reading.read_all(out)["driving"] if list(out.glob("episodes/*.parquet")) else None
     assert kept is None or set(kept["attack"].to_pylist()) == {"none"}
+
+
+def test_shards_drive_every_unit_once(tmp_path: Path) -> None:
+    whole, _ = run(tmp_path / "whole")
+    parts = [run(tmp_path / "parts", f"shard={part}/3")[1].done for part in (1, 2, 3)]
+    units = [work.fingerprint for done in parts for work in done]
+    assert sorted(units) == sorted(set(whole["unit"].to_pylist()))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    merged = reading.read(tmp_path / "parts", set(units), track=track("driving"))
+    assert comparable(merged).equals(comparable(whole))
+
+
+@pytest.mark.parametrize("shard", ["0/3", "4/3", "1", "a/b"])
+def test_a_shard_that_there_is_not_is_refused(shard: str) -> None:
+    with pytest.raises(UserError, match="shard must be PART/PARTS"):
+        run_config([*SMALL.split(), f"shard={shard}"])

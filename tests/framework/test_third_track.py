@@ -21,7 +21,7 @@ POINTS = {
     "cavbench.victims": {"ear": "listening_plugin:Ear"},
     "cavbench.attacks": {"down": "listening_plugin:Down"},
 }
-RUN = ("run", "attack=down", "victim=ear", "seeds=0", "threat.budget=0.3", "workers=1")
+RUN = ("run", "attack=down", "victim=ear", "seeds=0", "threat.budget=0.3", "executor=serial")
 
 
 @pytest.fixture(autouse=True)
@@ -107,7 +107,7 @@ def test_a_results_folder_holds_both_tracks(bench: Bench, tmp_path: Path) -> Non
         "weather=clear",
         "episodes=2",
         "reference=false",
-        "workers=1",
+        "executor=serial",
     )
     assert bench(*driving, f"out={out}").code == 0
     said = bench("report", f"out={out}")

@@ -13,7 +13,16 @@ from tests.framework.conftest import Bench
 from tests.framework.test_cli import assert_one_line
 
 SHORT = ("attack=paad", "attack.decisions=8", "attack.hidden=8", "attack.training_steps=1", "victim=dqn")
-RUN = ("lanes=3", "density=1", "weather=clear", "episodes=2", "record=0", "reference=false", "workers=1", "seeds=0")
+RUN = (
+    "lanes=3",
+    "density=1",
+    "weather=clear",
+    "episodes=2",
+    "record=0",
+    "reference=false",
+    "executor=serial",
+    "seeds=0",
+)
 
 
 @pytest.mark.slow

@@ -61,6 +61,11 @@ FIRES: dict[str, tuple[pa.Table, ...]] = {
     ),
     "public_only": (clean(), zo(0.6), zo(0.2, grid="audit")),
     "decoy": (clean(inconsistent=0.2), probed(zo(), inconsistent=0.2)),
+    "left_out": (
+        probed(drive(skill=0.8, weights="ab", runs=range(9)), **SEEN),
+        zo(0.7, runs=range(9)),
+        probed(drive(attack="pgd", skill=0.2, queries=45.0, weights="ab", runs=(1, 2)), **(PGD | SEEN)),
+    ),
     "too_little": (probed(drive(skill=0.8, cells=HALF), **SEEN), zo(cells=HALF)),
 }
 FIRES_NOT: dict[str, tuple[pa.Table, ...]] = {
@@ -80,6 +85,11 @@ FIRES_NOT: dict[str, tuple[pa.Table, ...]] = {
     ),
     "public_only": (clean(), zo(0.4), zo(0.4, grid="audit")),
     "decoy": (clean(inconsistent=0.0), probed(zo(), inconsistent=0.0)),
+    "left_out": (
+        probed(drive(skill=0.8, weights="ab", runs=range(9)), **SEEN),
+        zo(0.2, runs=range(9)),
+        probed(drive(attack="pgd", skill=0.7, queries=45.0, weights="ab", runs=(1, 2)), **(PGD | SEEN)),
+    ),
     "too_little": (clean(), zo()),
 }
 NOT_MEASURED: dict[str, tuple[pa.Table, ...]] = {
@@ -216,6 +226,21 @@ def test_a_stray_partial_run_changes_no_row(stray: dict[str, object]) -> None:
         before.worst.failure,
         before.flags,
     )
+
+
+@pytest.mark.parametrize("more", [{"runs": (0, 1, 2, 3)}, {"runs": range(9)}])
+def test_a_weak_attack_on_more_training_seeds_does_not_push_out_the_strong_ones(more: dict[str, object]) -> None:
+    records = [
+        clean(),
+        pgd(0.2),
+        probed(drive(attack="pgd", attack_params={"steps": 30}, skill=0.25, queries=99.0), **PGD),
+        BLIND,
+    ]
+    # A run drives the clean control of every seed, too.
+    control = probed(drive(skill=0.8, weights="ab", **more), **SEEN)  # type: ignore[arg-type]
+    (before,), (after,) = (board(*tables).rows for tables in (records, [control, *records[1:], zo(0.7, **more)]))
+    assert after.worst.score == before.worst.score
+    assert len(after.attacks) == 3
 
 
 def test_the_strongest_attack_is_not_the_luckiest() -> None:

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from rich.console import Console
 
 import leaderboard
 from leaderboard.page.write import write
+from leaderboard.terminal.ranking import leaderboard_report
 
 MADE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d\+00:00)?")
 NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
@@ -23,6 +25,14 @@ def remade(tmp_path_factory: pytest.TempPathFactory) -> Path:
     page = tmp_path_factory.mktemp("remade") / "index.html"
     write(None, page, Console(quiet=True))
     return page
+
+
+def test_without_records_the_leaderboard_on_the_terminal_is_the_published_one() -> None:
+    console = Console(file=StringIO(), width=110)
+    leaderboard_report({}, console)
+    said = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "driving in highway, standard-v1, relative 0.1" in said
+    assert re.search(r"1 +advtrain +dqn +0\.\d\d", said)
 
 
 def test_reports_import_no_torch(tmp_path: Path) -> None:

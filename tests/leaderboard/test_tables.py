@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from datetime import timedelta
 
 import numpy as np
 import pyarrow as pa
@@ -146,7 +147,7 @@ def test_a_run_that_broke_off_says_what_is_left_out() -> None:
 def test_the_newest_record_of_a_scenario_counts() -> None:
     old, new = drive(cells=CLEAR[:1], runs=(0,)), drive(cells=CLEAR[:1], runs=(0,), skill=0.9)
     later = pa.array(
-        [stamp.replace(year=2027) for stamp in new["created_at"].to_pylist()], SCHEMA.field("created_at").type
+        [stamp + timedelta(minutes=5) for stamp in new["created_at"].to_pylist()], SCHEMA.field("created_at").type
     )
     new = new.set_column(SCHEMA.get_field_index("created_at"), SCHEMA.field("created_at"), later)
     for records in (pa.concat_tables([old, new]), pa.concat_tables([new, old])):

@@ -54,7 +54,9 @@ class DeadReckoning:
         action_type: kind of the actions.
     """
 
-    def __init__(self, kinematics: Kinematics, period: float, actions: tuple[str, ...], action_type: ActionType) -> None:
+    def __init__(
+        self, kinematics: Kinematics, period: float, actions: tuple[str, ...], action_type: ActionType
+    ) -> None:
         self.kinematics, self.dt, self.action_type = kinematics, period / kinematics.frames, action_type
         self.numbers = {name: number for number, name in enumerate(actions)}
         self.order = [ORDER.index(name) for name in actions] if action_type == "discrete" else []
@@ -91,7 +93,9 @@ class DeadReckoning:
     def after(self, ego: Ego, action: Tensor) -> TensorDict:
         """The state after an action, int64 [B] or float [B, 2]."""
         moved = self._steered(ego, action) if self.action_type == "continuous" else self._driven(ego, action)
-        return TensorDict({**moved._asdict(), "known": torch.ones_like(ego.y, dtype=torch.bool)}, batch_size=ego.y.shape)
+        return TensorDict(
+            {**moved._asdict(), "known": torch.ones_like(ego.y, dtype=torch.bool)}, batch_size=ego.y.shape
+        )
 
     def commanded(self, ego: Ego, change: int) -> Tensor:
         """The target speed [...] after FASTER (`change` 1), SLOWER (-1) or another action (0)."""

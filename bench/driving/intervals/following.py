@@ -28,9 +28,7 @@ class FollowingDistance:
         within: seconds that count; None for all until the speeds are the same.
     """
 
-    def __init__(
-        self, kinematics: Kinematics, period: float, seconds: float, *, within: float | None = None
-    ) -> None:
+    def __init__(self, kinematics: Kinematics, period: float, seconds: float, *, within: float | None = None) -> None:
         speeds = torch.arange(0.0, FASTEST + STEP, STEP, dtype=torch.float64)
         rates = torch.arange(HARDEST + 1.0, dtype=torch.float64)
         dt = period / kinematics.frames

@@ -130,7 +130,9 @@ class Judge:
         front = _least(gap - self.following(own, leader.unsqueeze(-1), rate), beside & ahead)
         cross = _least(gap - self.crossing(own, leader.unsqueeze(-1), rate), beside & ahead)
         closing = (cars.vx[1] - own[..., 1]).clamp(min=0)
-        room = -cars.x[1] - car.length - self.caution.distance - REAR_S * closing - closing.square() / (2 * REAR_BRAKING)
+        room = (
+            -cars.x[1] - car.length - self.caution.distance - REAR_S * closing - closing.square() / (2 * REAR_BRAKING)
+        )
         rear = _least(room.unsqueeze(-1), beside & ~ahead)[..., 0]
 
         off = ego.y - car.lane_width * ego.target_lane

@@ -36,11 +36,11 @@ def log(episode: Episode, columns: Columns) -> None:
 
 def bounds(episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
     """Initial x and y range of the view, in m."""
-    low, high = _edges(episode)
+    low, high = edges(episode)
     return (-45.0, 105.0), (low - 2.5, high + 2.5)
 
 
-def _edges(episode: Episode) -> tuple[float, float]:
+def edges(episode: Episode) -> tuple[float, float]:
     """y of the left and right edge of the road, in m."""
     lanes = json.loads(str(episode.meta.get("cell", "{}"))).get("lanes")
     if lanes is None:
@@ -50,14 +50,14 @@ def _edges(episode: Episode) -> tuple[float, float]:
 
 
 def _road(episode: Episode, columns: Columns) -> None:
-    low, high = _edges(episode)
+    low, high = edges(episode)
     middle = (low + high) / 2
     surface = [[-BEHIND, middle], [AHEAD, middle]]
     columns.fixed(
         "road/surface", rr.LineStrips2D([surface], radii=[(high - low) / 2], colors=[ASPHALT], draw_order=0.0)
     )
-    edges = [[[-BEHIND, y], [AHEAD, y]] for y in (low, high)]
-    columns.fixed("road/edges", rr.LineStrips2D(edges, radii=[0.12], colors=[PAINT], draw_order=1.0))
+    sides = [[[-BEHIND, y], [AHEAD, y]] for y in (low, high)]
+    columns.fixed("road/edges", rr.LineStrips2D(sides, radii=[0.12], colors=[PAINT], draw_order=1.0))
     between = np.arange(low + LANE_WIDTH, high - 0.1, LANE_WIDTH)
     if not len(between):
         return

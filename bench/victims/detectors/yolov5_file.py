@@ -20,6 +20,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
+from bench.archive import Archive
 from bench.detection import Detector
 from bench.errors import UserError
 from bench.files import whole
@@ -29,6 +30,10 @@ EXPECTED = re.compile(
     r"|pathlib\.(_local\.)?\w*Path|argparse\.Namespace|numpy\.(dtype|ndarray)|numpy\._?core\.multiarray\.(scalar|_reconstruct)"
 )
 """Allowed class names in a checkpoint: the model's classes, and classes of the training's options and metrics."""
+
+
+LARGEST_HEADER = 2**24
+"""Most bytes of the JSON at the beginning of a .safetensors file."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +67,13 @@ def read(path: Path) -> Weights:
         return Weights(tensors, names, hashlib.sha256(path.read_bytes()).hexdigest())
     except UserError:
         raise
+    except OSError as error:
+        raise UserError(f"the weights {path} cannot be read: {error.strerror or error}") from error
     # A truncated or malicious file can fail anywhere in the unpickler.
     except Exception as error:
-        reason = shorten(f"{type(error).__name__}: {error}", 200)
-        raise UserError(f"the weights {path} cannot be read: {reason}") from None
+        raise UserError(
+            f"the weights {path} cannot be read: the file is not a checkpoint of YOLOv5, or a damaged one"
+        ) from error
 
 
 def save(detector: Detector, path: Path) -> None:
@@ -77,17 +85,22 @@ def save(detector: Detector, path: Path) -> None:
 
 
 def _safetensors(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
+    with path.open("rb") as start:
+        if int.from_bytes(start.read(8), "little") > LARGEST_HEADER:
+            raise UserError(f"the weights {path} are refused: their header has more than {LARGEST_HEADER >> 20} MiB")
     with safe_open(path, "pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         return tensors, _names(json.loads((file.metadata() or {})["names"]))
 
 
 def _checkpoint(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
-    named = get_unsafe_globals_in_checkpoint(path)
+    copy = Archive.read(path, f"the weights {path}").repacked()
+    named = get_unsafe_globals_in_checkpoint(copy)
     if unexpected := sorted(name for name in named if not EXPECTED.fullmatch(name)):
         raise UserError(f"the weights {path} are refused: they name {shorten(', '.join(unexpected), 200)}")
     with safe_globals([(_Inert, name) for name in named]):
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        copy.seek(0)
+        checkpoint = torch.load(copy, map_location="cpu", weights_only=True)
     model = isinstance(checkpoint, dict) and (checkpoint.get("ema") or checkpoint.get("model"))
     if not isinstance(model, _Inert):
         raise UserError(f"the weights {path} cannot be read: the file is not a checkpoint with a model")

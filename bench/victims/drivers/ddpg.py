@@ -17,7 +17,7 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
 from bench.driving import ActionType, Policy, TrainingHooks
-from bench.plugins.ranges import Count, NotNegative
+from bench.plugins.ranges import Count, NotNegative, Width
 from bench.victims.drivers.learner import CHUNK, Learner, Phase, copy_weights
 from bench.victims.drivers.networks import Actor, ActorPolicy, Critic
 from bench.victims.drivers.training import LearningDriver
@@ -41,7 +41,7 @@ class DDPG(LearningDriver):
 
     # Smaller and shorter than for DQN, because training actor and critic in turns takes longer.
     decisions: Count = 24_000
-    hidden: Count = 64
+    hidden: Width = 64
     steering_limit: Annotated[float, Interval(gt=0, le=1)] = 0.1
     noise: NotNegative = 0.15
     actor_delay: Count = 2

@@ -7,13 +7,13 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from bench.errors import UserError, reason
+from bench.errors import UserError
 from bench.plugins.ranges import Count
 
 CONTROLS = 2
@@ -23,15 +23,16 @@ TRIED = (1, 2, 1500)
 
 
 class FilePolicy(Policy):
-    """A driving policy whose network comes from a file.
+    """A driving policy whose network comes from a file, or from another library.
 
     Args:
         network: maps observations [N, *shape] to scores [N, A], or to actions [N, 2], which are clipped to [-1, 1].
-        shape: input shape: [V, F] or, flattened, [V * F].
+        shape: input shape: [V, F] or, flattened, [V * F]; with flat facts [F - 1].
         action_type: discrete or continuous.
         width: size of the output for one observation.
         sha256: hash of the file.
         critic: maps (observations, actions) to values [N, 1], for white-box attacks on continuous actions; None if there is none.
+        native: converts observations to the format that the network takes (`DrivingFacts.native`); None leaves them.
     """
 
     def __init__(
@@ -42,9 +43,10 @@ class FilePolicy(Policy):
         width: int,
         sha256: str,
         critic: nn.Module | None = None,
+        native: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         super().__init__()
-        self.network, self.critic = network, critic
+        self.network, self.critic, self.native = network, critic, native
         self.shape, self.width = tuple(shape), width
         self.action_type, self.weights_sha256 = action_type, sha256
         self.requires_grad_(False).eval()
@@ -58,14 +60,18 @@ class FilePolicy(Policy):
         leading = observation.shape[:-2]
         if not leading.numel():
             return observation.new_zeros(*leading, self.width)
-        output = self.network(observation.reshape(-1, *self.shape))
+        output = self.network(self._native(observation).reshape(-1, *self.shape))
         output = output if self.action_type == "discrete" else output.clamp(-1, 1)
         return output.reshape(*leading, output.shape[-1])
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         if self.critic is None:
             return super().value(observation, action, state)
-        return self.critic(torch.cat((observation.flatten(-2), action), -1)).squeeze(-1)
+        entries = self._native(observation).reshape(*observation.shape[:-2], -1)
+        return self.critic(torch.cat((entries, action), -1)).squeeze(-1)
+
+    def _native(self, observation: Tensor) -> Tensor:
+        return observation if self.native is None else self.native(observation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +83,12 @@ class FileDriver(DrivingVictim):
         actions: `discrete`: the output is the values or logits of the world's actions (on the highway LANE_LEFT, IDLE,
             LANE_RIGHT, FASTER, SLOWER), and the largest is taken; `continuous`: it is [acceleration, steering] in [-1, 1].
         rows: number of rows of its observation, including the ego; the world must have the same number.
-        features: size of a row: presence and the measured features.
+        features: size of a row: presence and the measured features. A world from a gymnasium environment has 1 row, of the
+            values of that environment's observation.
     """
+
+    format: ClassVar[str]
+    """What the file must be, for errors."""
 
     path: str
     actions: Literal["discrete", "continuous"] = "discrete"
@@ -105,8 +115,9 @@ class FileDriver(DrivingVictim):
             raise
         # A truncated file, or one in another format, can fail anywhere in the library that reads it.
         except Exception as error:
-            raise UserError(f"{self.path} cannot be read: {reason(error)}") from error
-        self._try(policy)
+            raise UserError(f"{self.path} cannot be read: it is not {self.format}, or a damaged one") from error
+        policy.native = facts.native if facts.flat else None
+        self._try(policy, [self.rows, self.features + facts.flat])
         return policy
 
     @abstractmethod
@@ -131,14 +142,14 @@ class FileDriver(DrivingVictim):
                 "they must match each other and the world"
             )
 
-    def _try(self, policy: FilePolicy) -> None:
+    def _try(self, policy: FilePolicy, observation: Sequence[int]) -> None:
         for batch in TRIED:
             try:
                 with torch.no_grad():
-                    scores = policy.scores(torch.zeros(batch, self.rows, self.features))
+                    scores = policy.scores(torch.zeros(batch, *observation))
             except Exception as error:
                 raise UserError(
-                    f"{self.path} fails on a batch of {batch}: export it with a dynamic batch size ({reason(error)})"
+                    f"{self.path} fails on {batch} observations: export it with a dynamic batch size"
                 ) from error
             wanted = [batch, policy.width]
             if list(scores.shape) != wanted:

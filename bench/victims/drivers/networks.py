@@ -48,6 +48,25 @@ class QNetwork(nn.Module):
         return value + advantage - advantage.mean(-1, keepdim=True)
 
 
+FEW = 16
+"""A matrix product of fewer rows than this may differ in the last bit from the same rows in a product of many."""
+
+
+def whatever_the_batch(network: nn.Module, *inputs: Tensor) -> Tensor:
+    """The output [..., A] of a network for observations [..., V, F] (and actions), to the last bit the same in every batch.
+
+    Fewer than `FEW` observations are filled up. Units that are driven together thus have the results that each has alone.
+    """
+    leading = inputs[0].shape[:-2]
+    missing = FEW - leading.numel()
+    if 0 < missing < FEW:
+        rows = [values.reshape(-1, *values.shape[len(leading) :]) for values in inputs]
+        full = [torch.cat((values, values[:1].expand(missing, *values.shape[1:]))) for values in rows]
+        return whatever_the_batch(network, *full)[: leading.numel()].reshape(*leading, -1)
+    answer: Tensor = network(*inputs)
+    return answer
+
+
 class QPolicy(Policy):
     """The greedy policy of a Q-network.
 
@@ -65,7 +84,7 @@ class QPolicy(Policy):
         self.network = QNetwork(features, actions, hidden)
 
     def forward(self, observation: Tensor) -> Tensor:
-        return self.network(observation)
+        return whatever_the_batch(self.network, observation)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         return self.scores(observation).gather(-1, action.unsqueeze(-1)).squeeze(-1)
@@ -123,7 +142,7 @@ class ActorPolicy(Policy):
         self.critic = Critic(features, hidden, limit)
 
     def forward(self, observation: Tensor) -> Tensor:
-        return self.actor(observation)
+        return whatever_the_batch(self.actor, observation)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
-        return self.critic(observation, action).squeeze(-1)
+        return whatever_the_batch(self.critic, observation, action).squeeze(-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -12,6 +13,7 @@ from torch import Tensor
 from bench.errors import UserError
 from bench.plugins.contracts import Access
 from bench.victims.drivers.from_file import FileDriver, FilePolicy
+from bench.victims.drivers.onnx_file import companions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,17 +21,24 @@ class ONNX(FileDriver):
     """Your own policy as an ONNX file. It has no gradients: attacks that need gradients are refused.
 
     Its first output maps observations [batch, rows, features], flattened or not, to scores or actions. The batch size must be
-    dynamic. Needs ONNX Runtime: pip install 'cavbench[onnx]'.
+    dynamic. Tensors in other files are read from the folder of the model only. Needs ONNX Runtime: pip install 'cavbench[onnx]'.
     """
 
     answers: ClassVar[Access] = "scores"
+    format: ClassVar[str] = "an ONNX model"
 
     def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
         try:
             import onnxruntime
         except ImportError:
             raise UserError("victim 'onnx' needs ONNX Runtime: pip install 'cavbench[onnx]'") from None
+        for file in companions(path, self.path):
+            sha256 = hashlib.sha256((sha256 + hashlib.sha256(file.read_bytes()).hexdigest()).encode()).hexdigest()
+        onnxruntime.disable_telemetry_events()
+        # Its own complaints would go to standard error beside ours.
+        onnxruntime.set_default_logger_severity(4)
         options = onnxruntime.SessionOptions()
+        options.add_session_config_entry("session.load_model_format", "ONNX")
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         inputs = session.get_inputs()

@@ -6,17 +6,16 @@ versions of every object: a pickle, which is ignored, and text, from which the s
 
 from __future__ import annotations
 
-import io
 import json
 import re
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
+from bench.archive import Archive
 from bench.driving import ActionType
 from bench.errors import UserError
 from bench.victims.drivers.from_file import FileDriver, FilePolicy
@@ -48,6 +47,8 @@ class StableBaselines3(FileDriver):
         actions: `discrete` or `continuous`, for PPO and A2C; the other algorithms support one action type.
     """
 
+    format: ClassVar[str] = "a model of Stable-Baselines3"
+
     algo: Algorithm
     actions: Literal["discrete", "continuous"] = "discrete"
 
@@ -58,10 +59,13 @@ class StableBaselines3(FileDriver):
         return "discrete" if self.algo == "dqn" else "continuous"
 
     def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
-        with zipfile.ZipFile(path) as archive:
-            data = json.loads(archive.read("data"))
-            blob = io.BytesIO(archive.read("policy.pth"))
-        weights = torch.load(blob, map_location="cpu", weights_only=True)
+        saved = Archive.read(path, self.path)
+        data = json.loads(saved.member("data"))
+        weights = torch.load(
+            Archive(saved.member("policy.pth"), f"{self.path}, policy.pth").repacked(),
+            map_location="cpu",
+            weights_only=True,
+        )
         shape = self._observation(data["observation_space"])
         self._check_actions(data["action_space"], width)
         options = data.get("policy_kwargs") or {}

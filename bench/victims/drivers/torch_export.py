@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-
-import torch
+from typing import ClassVar
 
 from bench.errors import UserError
 from bench.victims.drivers.from_file import FileDriver, FilePolicy
+from bench.victims.drivers.torch_program import read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,20 +16,19 @@ class TorchExport(FileDriver):
     """Your own policy, written by `torch.export.save`. It has gradients for white-box attacks.
 
     It maps observations [batch, rows, features], flattened or not, to scores or actions. The batch size must be dynamic
-    (`torch.export.Dim`).
+    (`torch.export.Dim`). Nothing in the file is executed: a file with anything but tensors and operations of ATen is refused.
     """
 
+    format: ClassVar[str] = "a program of torch.export.save"
+
     def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
-        program = torch.export.load(path)
-        inputs = program.graph_signature.user_inputs
-        nodes = [node for node in program.graph.nodes if node.op == "placeholder" and node.name in inputs]
-        if len(nodes) != 1:
-            raise UserError(f"{self.path} takes {len(inputs)} inputs, a driver takes one: the observation")
-        batch, *shape = nodes[0].meta["val"].shape
+        program = read(path, self.path)
+        batch, *shape = program.shape
         self.check_observation(shape)
-        if not isinstance(batch, torch.SymInt):
+        if batch is not None:
             raise UserError(
                 f"{self.path} has a fixed batch size of {batch}: export it with "
                 'dynamic_shapes={"observation": {0: torch.export.Dim("batch")}}'
             )
-        return FilePolicy(program.module(), shape, self.action_type, width, sha256)
+        sizes = [side for side in shape if side is not None]
+        return FilePolicy(program.graph, sizes, self.action_type, width, sha256)

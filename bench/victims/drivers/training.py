@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from bench.driving import DrivingFacts, DrivingVictim, DrivingWorld, Policy, TrainingHooks
 from bench.plugins.contracts import Progress, Trained
-from bench.plugins.ranges import Count, Share
+from bench.plugins.ranges import Count, Share, Width
 from bench.scenarios import SeedBlock
 from bench.victims import zoo
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
@@ -60,7 +60,7 @@ class LearningDriver(DrivingVictim):
     decisions: Count = 36_000
     fine: Share = 0.45
     repeat: Count = 5
-    hidden: Count = 128
+    hidden: Width = 128
     gamma: Share = 0.97
     n_step: Count = 3
     crash_penalty: float = 40.0

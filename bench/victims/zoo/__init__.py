@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from bench.victims.zoo.recipe import Recipe, trained_in
-from bench.victims.zoo.store import card, load, missing, own, save, seeds
+from bench.victims.zoo.store import card, load, missing, own, own_files, save, seeds
 
-__all__ = ["Recipe", "card", "load", "missing", "own", "save", "seeds", "trained_in"]
+__all__ = ["Recipe", "card", "load", "missing", "own", "own_files", "save", "seeds", "trained_in"]

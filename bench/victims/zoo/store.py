@@ -154,6 +154,12 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
     return network
 
 
+def own_files(recipe: Recipe, seed: int) -> tuple[Path, ...]:
+    """The weights and the card of an entry of the user's zoo; empty if it has none, as for weights that ship in a package."""
+    path = own() / recipe.key / f"seed{seed}.safetensors"
+    return (path, path.with_suffix(".json")) if path.exists() else ()
+
+
 def seeds(recipe: Recipe) -> list[int]:
     """The training seeds of a recipe in the user's zoo and the shipped one."""
     return _seeds(recipe.key)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.errors import notice
 from envs.camera import sign
 from envs.camera.camera import Array, Camera
 from envs.camera.street import light as lights
@@ -54,19 +55,36 @@ class Traced:
     depth: NDArray[np.float32]
 
 
+PROBE = """
+import sys
+import mitsuba as mi
+mi.set_variant(sys.argv[1])
+sky = {"type": "envmap", "bitmap": mi.Bitmap(mi.TensorXf([0.5] * 96, (4, 8, 3)))}
+camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+scene = mi.load_dict({"type": "scene", "sky": sky, "ball": {"type": "sphere"}, "camera": camera})
+mi.Bitmap(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=1))
+"""
+"""Renders a picture with what the street needs: a path tracer and an environment map."""
+
+
 @cache
 def variant() -> str:
     """The Mitsuba variant: MITSUBA_VARIANT, else `llvm_ad_rgb` if LLVM can be loaded, else `scalar_rgb`.
 
     One variant gives equal results in any process with any number of threads. Two variants differ in noise.
     """
-    wanted = os.environ.get("MITSUBA_VARIANT")
-    if not wanted:
-        # Some LLVM versions abort the process, so a separate process tries first.
-        probe = "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.load_dict(mi.cornell_box())"
-        works = subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0
-        wanted = "llvm_ad_rgb" if works else "scalar_rgb"
-    return wanted
+    if wanted := os.environ.get("MITSUBA_VARIANT"):
+        return wanted
+    if works("llvm_ad_rgb"):
+        return "llvm_ad_rgb"
+    notice("the renderer finds no LLVM that works: it uses the variant scalar_rgb, which is slower")
+    return "scalar_rgb"
+
+
+@cache
+def works(name: str) -> bool:
+    """Whether a variant renders a small picture. A process of its own tries: some LLVM versions abort it."""
+    return subprocess.run([sys.executable, "-c", PROBE, name], capture_output=True, check=False).returncode == 0
 
 
 def trace(parts: list[Part], light: Light, camera: Camera, sign_x: float, seed: int) -> Traced:

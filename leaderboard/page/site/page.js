@@ -119,13 +119,14 @@ function draw(id, columns, rows, classes) {
 const shortest = (value) => (typeof value === "number" ? Number(value.toFixed(4)).toString() : value == null ? "" : String(value));
 function csv(lines) {
   return lines.map((line) => line.map((value) => {
-    const text = shortest(value);
-    return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+    // A spreadsheet takes these for formulas.
+    const text = (typeof value === "string" && /^[=+\-@\t\r]/.test(value) ? "'" : "") + shortest(value);
+    return /[",\n\r]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
   }).join(",")).join("\n") + "\n";
 }
 function latex(lines) {
   const escape = (value) => (typeof value === "number" ? value.toFixed(Number.isInteger(value) ? 0 : 2) : shortest(value))
-    .replaceAll("\\", "\\textbackslash ").replace(/[&%$#_{}]/g, "\\$&").replaceAll("×", "$\\times$").replaceAll("−", "$-$");
+    .replace(/[\\&%$#_{}~^]/g, (c) => ({ "\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}" })[c] ?? `\\${c}`).replaceAll("×", "$\\times$").replaceAll("−", "$-$");
   const rows = lines.map((line) => line.map(escape).join(" & ") + " \\\\");
   const align = lines[0].map((_, i) => (lines.slice(1).every((line) => typeof line[i] === "number" || line[i] == null) ? "r" : "l")).join("");
   return ["\\begin{tabular}{" + align + "}", "\\toprule", rows[0], "\\midrule", ...rows.slice(1), "\\bottomrule", "\\end{tabular}"].join("\n") + "\n";
@@ -154,7 +155,7 @@ for (const place of document.querySelectorAll(".copy")) {
 const boards = () => data.boards.filter((board) => board.track === state.track);
 const current = () => boards()[state.board];
 const said = () => data.tracks[state.track];
-const threatText = (t) => `${t.norm} ${t.budget}${t.allowed ? `: ${t.allowed};` : ","} access ${t.access}, ${t.queries} queries`;
+const threatText = (t) => `${t.norm} ${t.budget}${t.allowed ? `: ${t.allowed};` : ","} access ${t.access}, ${t.queries} queries${t.share === 1 ? "" : `, ${+(100 * t.share).toPrecision(3)} % of the frames`}`;
 const threatName = (t) => threatText({ ...t, allowed: "" });
 const threatShort = (t) => (t.budget ? `${t.norm} ${t.budget}, ${t.access}` : "none");
 const capital = (text) => text[0].toUpperCase() + text.slice(1);

@@ -1,0 +1,202 @@
+"""Turns what the caller of a Python function gives, names or objects, into the parts of a run."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args
+
+import torch
+from tensordict import TensorDict
+
+from bench.driving import DrivingWorld
+from bench.errors import UserError
+from bench.plugins import registry, suites
+from bench.plugins.bytecode import code_of
+from bench.plugins.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
+from bench.plugins.pair import Chosen, Pair, choose
+from bench.plugins.registry import GROUPS, Kind
+from bench.plugins.suites import Suite
+from bench.plugins.track import track
+from bench.run.config import combined, grid_of
+from bench.scenarios import Grid, SeedBlock, Value
+from bench.victims.drivers.in_process import code_of_policies, in_process
+
+BASES: dict[str, type[Component]] = {"attack": Attack, "defense": Defense, "victim": Victim, "world": World}
+TRIED = 4
+"""Observations that a network is tried on."""
+HASH_DIGITS = 6
+
+
+def component(kind: Kind, name: str, **params: object) -> Any:
+    """A component by its name, with these parameters: `component("attack", "pgd", steps=50)`.
+
+    Args:
+        kind: attack, defense, victim or world.
+        name: as on the command line; `bench list` prints the names.
+        params: parameters; the others keep their defaults.
+
+    Raises:
+        UserError: if the name is unknown, or a value is not allowed.
+    """
+    if kind not in BASES:
+        raise UserError(registry.unknown(f"kind of component {kind!r}", kind, BASES))
+    return choose(kind, name, **params).component
+
+
+def several(given: Any) -> list[Any]:
+    """A list of what was given, which may be one thing or a sequence."""
+    return list(given) if isinstance(given, list | tuple) else [given]
+
+
+def chosen(kind: Kind, given: object, track_name: str = "") -> Chosen[Any]:
+    """A component that was given by its name or as an object.
+
+    Raises:
+        UserError: if it is neither.
+    """
+    if isinstance(given, str):
+        return choose(kind, registry.on_track(kind, given, track_name) if track_name else given)
+    if not isinstance(given, BASES[kind]):
+        raise UserError(
+            f"{kind} takes a name or an object of a subclass of {BASES[kind].__name__}, got {type(given).__name__}"
+        )
+    target = f"{type(given).__module__}:{type(given).__qualname__}"
+    for name, claims in registry.entries(GROUPS[kind]).items():
+        if claims[0].target == target:
+            return Chosen(kind=kind, name=name, component=given)
+    if missing := given.missing():
+        raise UserError(f"{kind} {type(given).__name__} does not implement {', '.join(missing)}")
+    return Chosen(kind=kind, name=type(given).__name__, component=given, code=code_of(given))
+
+
+def world_of(given: World | str | None, victim: object) -> Chosen[Any]:
+    """The world: the given one, or the default of the victim's track."""
+    if given is not None:
+        return chosen("world", given)
+    own = choose("victim", victim).component if isinstance(victim, str) else victim
+    name = own.tracks()[0] if isinstance(own, Victim) else "driving"
+    return choose("world", track(name).world)
+
+
+def victim_of(given: Any, world: Chosen[Any], grid: Grid, *, name: str | None, actions: str | None) -> Chosen[Any]:
+    """The victim: a name, a component, or policies that were given as objects, one for each training seed.
+
+    Raises:
+        UserError: if an object is no policy of the world.
+    """
+    if isinstance(given, str | Victim):
+        if name is not None or actions is not None:
+            raise UserError("name= and actions= are for a victim that is an object, such as a torch.nn.Module")
+        return chosen("victim", given)
+    if not isinstance(world.component, DrivingWorld):
+        raise UserError(
+            f"victims of the {world.component.tracks()[0]} track are given by name, got {type(given).__name__}"
+        )
+    objects = several(given)
+    if not objects:
+        raise UserError("an empty list of victims")
+    victim = in_process(objects, world.component.facts, _observations(world.component, grid), actions)
+    code = code_of_policies(victim)
+    label = name or f"{type(objects[0]).__name__}-{victim.policies[0].weights_sha256[:HASH_DIGITS]}"
+    return Chosen(kind="victim", name=label, component=victim, code=code)
+
+
+def pairs_of(
+    attack: Any, defense: Any, victim: Chosen[Any], world: Chosen[Any], threat: ThreatModel | Mapping[str, Any] | None
+) -> tuple[list[Pair], list[str]]:
+    """Every combination of attacks and defences, as `bench.run.config.combined`."""
+    own_track = victim.component.tracks()[0]
+    names = suites.names()
+    chosen_suites = [suites.suite(one) for one in several(attack) if isinstance(one, str) and one in names]
+    attacks = [
+        chosen("attack", one, own_track) for one in several(attack) if not isinstance(one, str) or one not in names
+    ]
+    for suite in chosen_suites:
+        if suite.track != own_track:
+            raise UserError(
+                f"suite {suite.name!r} is for the {suite.track} track, the victim is of the {own_track} track"
+            )
+    allowed = threat_of(threat, victim, chosen_suites)
+    defenses = [chosen("defense", one, own_track) for one in several(defense)]
+    others = [{"defense": one, "victim": victim, "world": world, "threat": allowed} for one in defenses]
+    return combined(attacks, chosen_suites, others)
+
+
+def threat_of(
+    given: ThreatModel | Mapping[str, Any] | None, victim: Chosen[Any], chosen_suites: Sequence[Suite]
+) -> ThreatModel:
+    """The threat model; like on the command line, suites get the access of their members unless it is given.
+
+    Raises:
+        UserError: if a value is not allowed.
+    """
+    if isinstance(given, ThreatModel):
+        return given
+    values = dict(given or {})
+    if chosen_suites and "access" not in values:
+        values["access"] = max((suite.access for suite in chosen_suites), key=get_args(Access).index)
+    model = victim.component.threat
+    try:
+        return model(**values)
+    except (ValueError, TypeError) as error:
+        raise UserError(f"threat: {str(error).splitlines()[0]}") from error
+
+
+def grid_with(world: Chosen[Any], given: Grid | str | None, episodes: int | None, cells: Mapping[str, Any]) -> Grid:
+    """The grid of the world, with other values on some axes.
+
+    Args:
+        world: the world.
+        given: a grid or its name; None for the world's default.
+        episodes: scenarios in each cell; None for the grid's.
+        cells: a value, or a sequence of values, by the name of an axis.
+
+    Raises:
+        UserError: if the grid or an axis is unknown, or a value is not allowed.
+    """
+    grid = given if isinstance(given, Grid) else grid_of(world.name, given or world.component.grid)
+    if strange := [name for name in cells if name not in grid.axes]:
+        raise UserError(registry.unknown(f"argument or axis {strange[0]!r}", strange[0], grid.axes))
+    try:
+        values: dict[str, tuple[Value, ...]] = {
+            name: tuple(grid.axes[name].checked(value) for value in several(given)) for name, given in cells.items()
+        }
+        return grid.with_(episodes=episodes, **values)
+    except ValueError as error:
+        raise UserError(str(error).splitlines()[0]) from error
+
+
+def _observations(world: DrivingWorld, grid: Grid) -> torch.Tensor:
+    """The first observations [B, V, F] of some scenarios, to try a network on: none of a scenario that is reported."""
+    env = world.make([grid.cells()[0]] * TRIED, action_type="discrete" if world.actions else "continuous")
+    try:
+        seeds = torch.arange(TRIED) + SeedBlock.TUNE
+        return env.reset(TensorDict({"seed": seeds}, batch_size=env.batch_size))["observation"]
+    finally:
+        env.close(raise_if_closed=False)
+
+
+def checked_for_workers(pairs: Sequence[Pair], workers: int) -> None:
+    """Refuse objects that worker processes cannot create again.
+
+    Raises:
+        UserError: if one cannot be pickled, or its class is defined in a notebook or an interactive session.
+    """
+    if workers <= 1:
+        return
+    interactive = not hasattr(sys.modules["__main__"], "__file__")
+    for part in {id(part): part for pair in pairs for part in pair.parts if part.code}.values():
+        try:
+            content = pickle.dumps(part.component)
+        # Pickling calls code of the object, which may raise anything.
+        except Exception as error:
+            raise UserError(
+                f"{part.kind} {part.name!r} cannot be sent to workers ({error}); leave out workers="
+            ) from None
+        if interactive and b"__main__" in content:
+            raise UserError(
+                f"{part.kind} {part.name!r} is defined in this session, which worker processes cannot import: "
+                "leave out workers=, or move its class to a module"
+            )

@@ -1,0 +1,174 @@
+"""The scores of a run as a DataFrame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from bench.plugins.pair import Pair
+from bench.plugins.track import Track, track_of
+from bench.run.config import RunConfig
+from bench.scenarios import Cell
+from bench.statistics.episodes import Episodes
+from bench.statistics.estimates import Array, Interval, share_interval
+from bench.statistics.strongest import strongest_of
+
+STRONGEST = "strongest"
+"""Name of the row in which the strongest attack of each cell counts."""
+
+
+class Scores(pd.DataFrame):
+    """A DataFrame of scores; a part of it, such as `scores[scores.role == "attacked"]`, is a plain DataFrame."""
+
+    _metadata = ["_episodes"]  # noqa: RUF012 - pandas reads a list
+
+    @property
+    def records(self) -> pd.DataFrame:
+        """The records that the scores are computed from, one row an episode (columns: `bench.records.schema`)."""
+        return self._episodes.to_pandas()
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A row before it is aggregated.
+
+    Args:
+        role: strongest, attacked, clean or baseline.
+        pair: the pair; of the strongest attack, one of the pairs that it is chosen from.
+        attack: text of the attack.
+        cells: [C].
+        scores: [R, C, E] of the ranking metric.
+        failed: [R, C, E] whether the episode failed; None if the track has no failure.
+        queries: mean number of queries of the attack; NaN for none.
+        clean: [R, C, E] of the same victim without an attack; None for baselines and the clean control itself.
+    """
+
+    role: str
+    pair: Pair
+    attack: str
+    cells: tuple[Cell, ...]
+    scores: Array
+    failed: Array | None
+    queries: float = np.nan
+    clean: Array | None = None
+
+
+def scores_of(config: RunConfig, records: pa.Table, by: str = "pair") -> Scores:
+    """One row for each pair, or for each pair and cell, the strongest attack first.
+
+    Columns: `role` (`strongest`: in each cell the attack counts that is the strongest on other scenarios; `attacked`, `clean`,
+    `baseline`), `attack`, `defense`, `victim`, the axes if by cell, the ranking metric of the track (`safe_progress` for drivers)
+    with its 95 % interval `low` and `high`, the rate of the track's failure (`crashed`) with its interval, `kept` (attacked /
+    clean score), `worst_cell` and `worst_score` if by pair, `queries` of the attack, `episodes`, and `pair`, its name in records.
+
+    Args:
+        config: the run.
+        records: its records, clean controls and baselines among them.
+        by: `pair` or `cell`.
+    """
+    track = track_of(config.pairs[0])
+    found = [line for row in _rows(config, records, track) for line in _lines(row, track, by)]
+    table = Scores(found)
+    table._episodes = records
+    return table
+
+
+def _rows(config: RunConfig, records: pa.Table, track: Track) -> Iterator[_Row]:
+    groups: dict[str, list[Pair]] = {}
+    for pair in config.pairs:
+        groups.setdefault(pair.clean().id, []).append(pair)
+    for pairs in groups.values():
+        control = pairs[0].clean()
+        clean = _episodes(records, control)
+        attacked = []
+        for pair in (pair for pair in pairs if not pair.is_clean):
+            own = _episodes(records, pair)
+            # A run of an attack that has training seeds of its own is paired with the only one of the victim.
+            beside = _like(clean, own.shape, track.metric)
+            attacked.append(
+                _Row("attacked", pair, str(pair.attack), own.cells, own.column(track.metric), _failed(own, track),
+                     _queries(own, track), beside)
+            )  # fmt: skip
+        if len(attacked) > 1:
+            yield _strongest(attacked)
+        yield from sorted(attacked, key=lambda row: float(row.scores.mean()))
+        yield _Row("clean", control, "none", clean.cells, clean.column(track.metric), _failed(clean, track))
+    others = {other.id: other for pair in config.pairs for other in track.baselines(pair)} if config.reference else {}
+    baselines = []
+    for pair in others.values():
+        own = _episodes(records, pair)
+        baselines.append(
+            _Row("baseline", pair, str(pair.attack), own.cells, own.column(track.metric), _failed(own, track))
+        )
+    yield from sorted(baselines, key=lambda row: -float(row.scores.mean()))
+
+
+def _strongest(rows: list[_Row]) -> _Row:
+    """The row of the strongest attack of each cell; attacks without training seeds count in every run."""
+    runs = max(len(row.scores) for row in rows)
+    shape = (runs, *rows[0].scores.shape[1:])
+    scores = np.stack([np.broadcast_to(row.scores, shape) for row in rows])
+    choice = strongest_of(scores)
+    pick = (choice[None], np.arange(runs)[:, None, None], np.arange(shape[1])[:, None], np.arange(shape[2]))
+    failed = None
+    if rows[0].failed is not None:
+        failed = np.stack([np.broadcast_to(np.asarray(row.failed), shape) for row in rows])[pick]
+    clean = None if rows[0].clean is None else np.broadcast_to(rows[0].clean, shape)
+    text = f"{STRONGEST} of {len(rows)}"
+    return _Row(STRONGEST, rows[0].pair, text, rows[0].cells, scores[pick], failed, np.nan, clean)
+
+
+def _episodes(records: pa.Table, pair: Pair) -> Episodes:
+    return Episodes.arrange(records.filter(pc.equal(records["pair"], pair.id)))
+
+
+def _like(clean: Episodes, shape: tuple[int, int, int], metric: str) -> Array:
+    """The clean scores [R, C, E], repeated for the runs of an attack."""
+    return np.broadcast_to(clean.column(metric), shape) if len(clean.runs) == 1 else clean.column(metric)
+
+
+def _failed(episodes: Episodes, track: Track) -> Array | None:
+    return episodes.column(track.failure) if track.failure else None
+
+
+def _queries(episodes: Episodes, track: Track) -> float:
+    return float(np.nanmean(episodes.column(track.queries)))
+
+
+def _lines(row: _Row, track: Track, by: str) -> Iterator[dict[str, Any]]:
+    names = {
+        "role": row.role,
+        "attack": row.attack,
+        "defense": str(row.pair.defense),
+        "victim": str(row.pair.victim),
+    }
+    if by == "cell":
+        for place, cell in enumerate(row.cells):
+            yield names | dict(cell) | _aggregated(row, track, [place]) | _last(row)
+        return
+    means = row.scores.mean((0, 2))
+    worst = {"worst_cell": str(row.cells[int(means.argmin())]), "worst_score": float(means.min())}
+    yield names | _aggregated(row, track, list(range(len(row.cells)))) | worst | _last(row)
+
+
+def _aggregated(row: _Row, track: Track, places: list[int]) -> dict[str, Any]:
+    scores = row.scores[:, places]
+    found = _columns(track.metric, "", share_interval(scores))
+    if row.failed is not None:
+        found |= _columns(track.failure, f"{track.failure}_", share_interval(row.failed[:, places]))
+    before = float(row.clean[:, places].mean()) if row.clean is not None else 0.0
+    return found | {"kept": float(scores.mean()) / before if before > 0 else np.nan, "episodes": int(scores.size)}
+
+
+def _columns(name: str, prefix: str, found: Interval) -> dict[str, float]:
+    return {name: found.estimate, f"{prefix}low": found.low, f"{prefix}high": found.high}
+
+
+def _last(row: _Row) -> dict[str, Any]:
+    return {"queries": row.queries, "pair": "" if row.role == STRONGEST else row.pair.id}

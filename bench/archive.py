@@ -1,0 +1,109 @@
+"""Zip archives from strangers: their members are listed and their sizes bounded before anything is unpacked."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from bench.errors import UserError
+
+LARGEST = 2**30
+"""Most bytes that an archive may unpack to."""
+RATIO, SMALL = 100, 2**20
+"""An archive may unpack to 100 times its size, and to 1 MiB in any case: weights hardly compress, so more is a bomb."""
+MEMBERS = 20_000
+"""Most members of an archive."""
+
+
+class Archive:
+    """The members of a zip file, unpacked into memory within the bounds of this module.
+
+    The bounds are checked twice: on the sizes that the archive states, and on the bytes that come out of it, because a
+    stated size can be wrong. Two members of the same name are refused: another reader might take the other one.
+
+    Args:
+        content: the bytes of the archive.
+        name: its name in errors.
+
+    Raises:
+        UserError: if it is not a zip file, is encrypted, or unpacks to more than is allowed.
+    """
+
+    def __init__(self, content: bytes, name: str) -> None:
+        self.name = name
+        try:
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                members = archive.infolist()
+                self._check(members, len(content))
+                self.members = {member.filename: _unpacked(archive, member) for member in members}
+        # A damaged archive can fail anywhere in the decompressors.
+        except (zipfile.BadZipFile, OSError, EOFError, ValueError, NotImplementedError, RuntimeError) as error:
+            raise UserError(f"{name} cannot be read: it is not a zip archive, or a damaged one") from error
+        except Exception as error:
+            if isinstance(error, UserError):
+                raise
+            raise UserError(f"{name} cannot be read: it is a damaged zip archive") from error
+
+    @classmethod
+    def read(cls, path: Path, name: str = "") -> Archive:
+        """The archive in a file.
+
+        Raises:
+            UserError: if the file is larger than an archive may unpack to, or as the constructor.
+        """
+        name = name or str(path)
+        if path.stat().st_size > LARGEST:
+            raise UserError(f"{name} is refused: it has more than {_size(LARGEST)}")
+        return cls(path.read_bytes(), name)
+
+    def member(self, name: str) -> bytes:
+        """The content of a member.
+
+        Raises:
+            UserError: if there is no such member.
+        """
+        if name not in self.members:
+            raise UserError(f"{self.name} cannot be read: it has no {name!r}")
+        return self.members[name]
+
+    def repacked(self) -> io.BytesIO:
+        """A new archive with the same members, for a library with a zip reader of its own: it sees what was checked."""
+        copy = io.BytesIO()
+        with zipfile.ZipFile(copy, "w", zipfile.ZIP_STORED) as archive:
+            for name, content in self.members.items():
+                archive.writestr(name, content)
+        copy.seek(0)
+        return copy
+
+    def _check(self, members: Iterable[zipfile.ZipInfo], size: int) -> None:
+        members = list(members)
+        total = sum(member.file_size for member in members)
+        allowed = min(LARGEST, max(RATIO * size, SMALL))
+        if total > allowed:
+            raise UserError(
+                f"{self.name} is refused: {_size(size)} unpack to {_size(total)}, more than the {_size(allowed)} allowed"
+            )
+        if len(members) > MEMBERS:
+            raise UserError(f"{self.name} is refused: it has {len(members)} members, at most {MEMBERS} are allowed")
+        if len({member.filename for member in members}) < len(members):
+            raise UserError(f"{self.name} is refused: two of its members have the same name")
+
+
+def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
+    """The content of a member; no more bytes are unpacked than it states."""
+    with archive.open(member) as file:
+        content = file.read(member.file_size + 1)
+    if len(content) != member.file_size:
+        raise zipfile.BadZipFile(f"{member.filename} has another size than it states")
+    return content
+
+
+def _size(count: float) -> str:
+    """A number of bytes for people: 3.0 GB."""
+    for unit in ("bytes", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "bytes" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.1f} GB"

@@ -1,0 +1,107 @@
+"""`bench help TERM`: explains a term, a column, an option, a component or a command."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+from rich.text import Text
+
+from bench.cli.terminal import Console
+from bench.errors import UserError
+from bench.plugins import registry, suites
+from bench.plugins.registry import GROUPS, KINDS
+from bench.plugins.track import tracks
+from bench.records.schema import IDENTITY, PROVENANCE
+
+GLOSSARY = Path(__file__).with_name("glossary.toml")
+DOCUMENTATION = "docs/{page}.md"
+
+
+def print_terms(console: Console) -> None:
+    """Print every term of the glossary with its meaning."""
+    for name, entry in _glossary().items():
+        console.print(Text.assemble((name, "bold"), f"  {entry['meaning']}"), highlight=False)
+    console.print(
+        "\n`bench help TERM` also explains columns of records, parameters (attack.steps), components and commands.",
+        style="dim",
+        highlight=False,
+    )
+
+
+def print_term(term: str, console: Console) -> None:
+    """Explain a term of the tables, a column of the records, or a component.
+
+    Raises:
+        UserError: if nothing has this name.
+    """
+    found = [*_of_the_glossary(term), *_of_the_records(term), *_of_a_parameter(term)]
+    for line in found:
+        console.print(line, highlight=False)
+    kinds = [kind for kind in KINDS if term.partition(":")[0] in registry.entries(GROUPS[kind])]
+    if kinds or term in suites.names():
+        from bench.cli.listing import print_component
+
+        print_component(term, console)
+    elif not found:
+        raise UserError(registry.unknown(f"term {term!r}", term, _glossary()))
+
+
+def _glossary() -> dict[str, dict[str, str]]:
+    return tomllib.loads(GLOSSARY.read_text(encoding="utf-8"))
+
+
+def _plain(term: str) -> str:
+    """A term without what people write differently: case, hyphens, plural, surroundings."""
+    return re.sub(r"[\s_-]+", " ", term.lower()).strip(" /:[]").removesuffix("s")
+
+
+def _of_the_glossary(term: str) -> list[Text]:
+    entries = {name: entry for name, entry in _glossary().items() if _plain(name) == _plain(term)}
+    return [
+        Text.assemble((name, "bold"), f"  {entry['meaning']} ({DOCUMENTATION.format(page=entry['page'])})")
+        for name, entry in entries.items()
+    ]
+
+
+def _columns() -> dict[str, Text]:
+    """Every column of the records of all tracks, with its meaning and unit."""
+    found: dict[str, Text] = {}
+    owned = [(column, track.name) for track in tracks() for column in (*track.measurements, *track.probes)]
+    for column, owner in [*((column, "") for column in (*IDENTITY, *PROVENANCE)), *owned]:
+        known = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
+        meaning, unit = known.get("meaning", ""), known.get("unit", "")
+        where = f"column of {owner} records" if owner else "column of records"
+        found[column.name] = Text.assemble(
+            (column.name, "bold"), f"  {where}: {meaning}", f" ({unit})" if unit else "", "."
+        )
+    return found
+
+
+def _of_the_records(term: str) -> list[Text]:
+    return [text for name, text in _columns().items() if _plain(name) == _plain(term)]
+
+
+def _of_a_parameter(term: str) -> list[Text]:
+    """`threat.budget` or `attack.steps`: a parameter of the threat models, or of all components of a kind that have it."""
+    from bench.plugins.parameters import parameters
+
+    kind, _, name = term.partition(".")
+    found = []
+    if kind in KINDS and name:
+        for owner in registry.names(kind):
+            try:
+                known = {} if registry.offers(kind, owner) else parameters(registry.load(kind, owner))
+            except UserError:
+                continue
+            if name in known:
+                parameter = known[name]
+                found.append(
+                    Text.assemble(
+                        (f"{term} of {owner}", "bold"), f"  {parameter.meaning} Default {parameter.default_text}."
+                    )
+                )
+    if kind == "threat" and name:
+        found += _of_the_glossary(name)
+    return found

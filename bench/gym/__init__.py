@@ -1,0 +1,24 @@
+"""Gymnasium: every driving world as an environment, and `GymWorld`, a world made of a gymnasium environment.
+
+Importing this module registers an environment `cavbench/WORLD-v0` for each installed driving world.
+"""
+
+try:
+    import gymnasium
+except ImportError as error:
+    raise ImportError("cavbench.gym needs gymnasium: pip install 'cavbench[gym]'") from error
+
+from bench.gym.environment import DrivingEnv, make
+from bench.gym.vector import DrivingVectorEnv, make_vec
+from bench.gym.world import GymWorld
+from bench.plugins import sources
+
+__all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "make", "make_vec"]
+
+for _name in sources.names("world", "driving"):
+    gymnasium.register(
+        id=f"cavbench/{_name}-v0",
+        entry_point="bench.gym.environment:make",
+        vector_entry_point="bench.gym.vector:make_vec",
+        kwargs={"world": _name},
+    )

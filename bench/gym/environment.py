@@ -1,0 +1,137 @@
+"""A driving world as a gymnasium environment, to train policies in with any library."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
+
+from bench.driving import ActionType, DrivingWorld
+from bench.errors import UserError
+from bench.plugins import registry
+from bench.plugins.pair import choose
+from bench.scenarios import Cell, Grid, SeedBlock
+
+LAST_SEED = 2**31
+Observation = NDArray[np.float32]
+
+
+class DrivingEnv(gymnasium.Env[Observation, Any]):
+    """One episode at a time of a driving world. `reset` draws a cell and a scenario that no score is reported on.
+
+    The observation is float32 [V, F] in [-1, 1], as policies get it in a run (`bench.driving.Features`). The reward is the
+    world's: on the highway highway-env's, normalised to [0, 1] a step, whose sum is the `return` of records. `info` has the truth
+    for scoring: `progress`, `speed`, `x`, `ttc`, `crashed` and `offroad` (`bench.driving.DrivingWorld`), `cell` and `scenario`.
+
+    Args:
+        world: the world.
+        cells: an episode is on one of them.
+        action_type: `discrete`: the actions of the world by number; `continuous`: [acceleration, steering] in [-1, 1].
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    _td: TensorDictBase
+
+    def __init__(self, world: DrivingWorld, cells: Sequence[Cell], action_type: ActionType = "discrete") -> None:
+        self.world, self.cells, self.action_type = world, tuple(cells), action_type
+        self._envs: dict[Cell, EnvBase] = {}
+        self._begin(self.cells[0], SeedBlock.TRAIN)
+        self.observation_space, self.action_space = spaces_of(self._td["observation"], world, action_type)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode. `seed` fixes it and those after it."""
+        super().reset(seed=seed)
+        self.cell = self.cells[int(self.np_random.integers(len(self.cells)))]
+        self.scenario = int(drawn_seeds(self.np_random, 1)[0])
+        self._begin(self.cell, self.scenario)
+        return self._td["observation"][0].numpy(), self._info()
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Carry out an action."""
+        batch = torch.as_tensor(np.asarray(action)).unsqueeze(0)
+        self._td = self._env.step(self._td.set("action", batch))["next"]
+        reward, terminated, truncated = (self._td[name].item() for name in ("reward", "terminated", "truncated"))
+        return self._td["observation"][0].numpy(), reward, terminated, truncated and not terminated, self._info()
+
+    def close(self) -> None:
+        """Close the environments of all cells."""
+        for env in self._envs.values():
+            env.close(raise_if_closed=False)
+
+    def _begin(self, cell: Cell, seed: int) -> None:
+        if cell not in self._envs:
+            self._envs[cell] = self.world.make([cell], action_type=self.action_type)
+        self._env = self._envs[cell]
+        self._td = self._env.reset(TensorDict({"seed": torch.tensor([seed])}, batch_size=[1]))
+
+    def _info(self) -> dict[str, Any]:
+        measured = {name: value.item() for name, value in self._td["info"].items()}
+        return {**measured, "cell": dict(self.cell), "scenario": self.scenario}
+
+
+def make(world: str | DrivingWorld = "highway", *, action_type: ActionType = "discrete", **options: Any) -> DrivingEnv:
+    """The environment of a world; `gymnasium.make("cavbench/highway-v0", lanes=3)` after `import bench.gym` is the same.
+
+    Args:
+        world: a name, as on the command line, or a world.
+        action_type: discrete or continuous.
+        options: values on the axes of the world, one or a sequence each, of which every episode draws one (lanes=[3, 4]; by
+            default those of its grid); and, if `world` is a name, its parameters (vehicles=10).
+
+    Raises:
+        UserError: if there is no such world, axis or parameter, or a value is not allowed.
+    """
+    return DrivingEnv(*world_and_cells(world, options), action_type)
+
+
+def world_and_cells(world: str | DrivingWorld, options: Mapping[str, Any]) -> tuple[DrivingWorld, tuple[Cell, ...]]:
+    """The world, and its cells with these values on its axes; the other options are parameters of the world."""
+    known = registry.load("world", world).axes if isinstance(world, str) else world.axes
+    made: Any = world
+    parameters = {name: value for name, value in options.items() if name not in known}
+    if isinstance(world, str):
+        made = choose("world", world, **parameters).component
+    elif parameters:
+        raise UserError(registry.unknown(f"axis {next(iter(parameters))!r}", next(iter(parameters)), known))
+    if not isinstance(made, DrivingWorld):
+        raise UserError(f"world {world!r} is not a driving world")
+    return made, _cells(made, {name: value for name, value in options.items() if name in known})
+
+
+def _cells(world: DrivingWorld, given: Mapping[str, Any]) -> tuple[Cell, ...]:
+    values = {name: tuple(value) if isinstance(value, list | tuple) else (value,) for name, value in given.items()}
+    try:
+        if set(values) == set(world.axes):
+            grid = Grid(name="custom", world="", axes=world.axes, values=values, episodes=1)
+        else:
+            grid = registry.grid(world.grid)
+            grid = replace(grid, values={**grid.values, **values})
+        return grid.cells()
+    except ValueError as error:
+        raise UserError(str(error).splitlines()[0]) from error
+
+
+def spaces_of(
+    observation: torch.Tensor, world: DrivingWorld, action_type: ActionType
+) -> tuple[spaces.Box, spaces.Discrete | spaces.Box]:
+    """The observation space and the action space of one episode, from observations [B, V, F]."""
+    shown = spaces.Box(-1.0, 1.0, tuple(observation.shape[1:]), np.float32)
+    if action_type == "discrete":
+        return shown, spaces.Discrete(len(world.actions))
+    return shown, spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+def drawn_seeds(generator: np.random.Generator, count: int) -> NDArray[np.int64]:
+    """Scenario seeds for a training, which are never reported."""
+    return generator.integers(SeedBlock.TRAIN, LAST_SEED, count, dtype=np.int64)

@@ -1,0 +1,217 @@
+"""A worker process: carries out one task after the other, and is replaced when a task hangs, ends it or changes it.
+
+What components print is kept apart from the terminal and from the tables: it comes back as lines of text.
+"""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import os
+import pickle
+import signal
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+from bench.errors import reason
+from bench.plugins import registry
+from bench.plugins.foreign import contained, ended
+from bench.plugins.framework import Snapshot
+from bench.plugins.track import track
+from bench.run.blame import blamed
+from bench.run.process import context, follow_parent, resident_bytes, settle
+from bench.run.work import Failure, Outcome, Task, Tell, attempt
+
+GB = 1e9
+READY = "ready"
+START_S = 600.0
+"""Seconds that a worker may take to start: on a busy machine its imports take long."""
+KEPT_BYTES = 8192
+"""Bytes that are kept of what a task prints."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What a task may use.
+
+    Args:
+        seconds: wall time; 0 for no limit.
+        memory_gb: physical memory of its process in GB; 0 for no limit.
+    """
+
+    seconds: float = 0.0
+    memory_gb: float = 0.0
+
+
+class Worker:
+    """A worker process, as its parent sees it. Start it from a thread that lives as long as the parent.
+
+    Args:
+        limits: of each task.
+
+    `busy` says whether it has a task, `spent` whether it can do no other work: it is dead, hangs, or was changed.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        own = context(__name__, *_framework())
+        self.limits = limits
+        self.busy = self.ready = self.spent = False
+        self.printed = b""
+        self.connection, far = multiprocessing.Pipe()
+        self.output, end = multiprocessing.Pipe(duplex=False)
+        # Not daemonic: components may start processes of their own.
+        self.process = own.Process(target=_serve, args=(far, end, dict(os.environ)), daemon=False)  # type: ignore[attr-defined]
+        self.process.start()
+        self.born = time.monotonic()
+        far.close()
+        end.close()
+
+    def give(self, content: bytes, units: int = 1) -> None:
+        """Start a task, from `packed`; one with several units may take as many times as long."""
+        self.busy, self.started, self.printed, self.units = True, time.monotonic(), b"", units
+        # A worker that died meanwhile is noticed when it is asked for news.
+        with suppress(OSError):
+            self.connection.send_bytes(content)
+
+    def wait(self, seconds: float) -> None:
+        """Wait until there is news, or for so long."""
+        wait([self.connection, self.process.sentinel], seconds)
+
+    def news(self) -> list[Any]:
+        """What the worker sent since: progress as (work, share, text), and at the end of a task an outcome or a failure.
+
+        A worker that died, or used more time or memory than allowed, has failed its task, and is `spent`.
+        """
+        found: list[Any] = []
+        # Ask before reading: what it sent before it died is still there.
+        died = not self.process.is_alive()
+        try:
+            while self.connection.poll():
+                found.append(pickle.loads(self.connection.recv_bytes()))
+        except (EOFError, OSError):
+            died = True
+        self._listen()
+        if READY in found:
+            # Its imports do not count.
+            found.remove(READY)
+            self.ready, self.started = True, time.monotonic()
+        ends = [item for item in found if isinstance(item, Outcome | Failure)]
+        if self.busy and not ends and (why := self._death() if died else self._excess()):
+            ends = [Failure(why=f"failed: {why}", lost=True, died=died)]
+            found += ends
+        if ends:
+            self.busy = False
+            self.spent = died or any(isinstance(item, Failure) and (item.lost or item.tampered) for item in ends)
+        return found
+
+    def lines(self) -> list[str]:
+        """The lines that its task printed; only the first `KEPT_BYTES` are kept."""
+        self._listen()
+        text = self.printed[:KEPT_BYTES].decode(errors="replace")
+        return [line.rstrip() for line in text.splitlines() if line.strip()]
+
+    def kill(self) -> None:
+        """End the process, and those that its components started in its group."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.process.pid or 0, signal.SIGKILL)
+        self.process.kill()
+        self.process.join()
+
+    def close(self) -> None:
+        """End the process, and close the connections."""
+        self.kill()
+        self.connection.close()
+        self.output.close()
+
+    def _listen(self) -> None:
+        """Read what was printed, and forget what is too much."""
+        with suppress(EOFError, OSError):
+            while self.output.poll():
+                content = os.read(self.output.fileno(), 1 << 16)
+                if not content:
+                    return
+                self.printed += content[: max(0, KEPT_BYTES - len(self.printed))]
+
+    def _death(self) -> str:
+        self.process.join(10)
+        code = self.process.exitcode
+        hint = ", perhaps for want of memory" if code == -signal.SIGKILL else ""
+        last = self.lines()[-1:]
+        words = f"; its last words: {last[0][:200]}" if last else ""
+        return f"it ended its worker process ({'unknown' if code is None else ended(code)}{hint}){words}"
+
+    def _excess(self) -> str:
+        """What the task used too much of; empty if nothing."""
+        if not self.ready:
+            late = time.monotonic() - self.born > START_S
+            return f"its worker process did not start within {START_S:g} seconds" if late else ""
+        if self.limits.seconds and time.monotonic() - self.started > self.limits.seconds * self.units:
+            return f"it took longer than unit_timeout={self.limits.seconds:g} seconds"
+        used = resident_bytes(self.process.pid or 0) / GB if self.limits.memory_gb else 0
+        if used > self.limits.memory_gb:
+            return f"it used {used:.1f} GB of memory, more than unit_memory={self.limits.memory_gb:.3g} GB"
+        return ""
+
+
+def packed(task: Task) -> bytes | Failure:
+    """A task as a worker is sent it; a failure if a component does not survive pickling."""
+    try:
+        with contained():
+            return pickle.dumps(task, pickle.HIGHEST_PROTOCOL)
+    # A plug-in's own way of being pickled may raise anything.
+    except Exception as error:
+        return Failure(why=f"failed: it cannot be sent to a worker: {reason(error)}{blamed(task.work.pair, error)}")
+
+
+def _serve(connection: Connection, output: Connection, environment: dict[str, str]) -> None:
+    """The worker process: carry out tasks until the parent hangs up."""
+    follow_parent()
+    # A fork server has the environment of its own start.
+    os.environ.clear()
+    os.environ.update(environment)
+    # Components may start processes of their own: the group ends with the worker.
+    with suppress(OSError):
+        os.setpgid(0, 0)
+    for stream in (1, 2):
+        os.dup2(output.fileno(), stream)
+    output.close()
+    settle()
+    for module in _framework():
+        importlib.import_module(module)
+    # Before any plug-in is imported.
+    framework = Snapshot()
+    connection.send_bytes(pickle.dumps(READY))
+
+    def tell(work: str, share: float, text: str) -> None:
+        connection.send_bytes(pickle.dumps((work, share, text)))
+
+    while True:
+        try:
+            content = connection.recv_bytes()
+        except (EOFError, OSError):
+            return
+        outcome = _carried_out(content, tell, framework)
+        connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
+
+
+@cache
+def _framework() -> tuple[str, ...]:
+    """The modules that do the work of the built-in tracks."""
+    names = [
+        name for name, claims in registry.entries(registry.TRACKS).items() if claims[0].distribution == registry.OWN
+    ]
+    return tuple(module for name in names for module in (track(name).work, track(name).preparation) if module)
+
+
+def _carried_out(content: bytes, tell: Tell, framework: Snapshot) -> Outcome | Failure:
+    try:
+        with contained():
+            task: Task = pickle.loads(content)
+    # Unpickling imports the plug-ins.
+    except Exception as error:
+        return Failure(why=f"failed: a worker cannot load it: {reason(error)}")
+    return attempt(task, tell, framework)

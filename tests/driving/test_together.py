@@ -1,0 +1,170 @@
+"""Units that are driven in one batch have the records that each has alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from attacks.noise import Noise
+from attacks.pgd import PGD
+from attacks.zo import ZOSignSGD
+from bench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
+from bench.driving.drive import joint
+from bench.driving.rollout import NotJointError, rollout
+from bench.plugins.contracts import Access
+from bench.plugins.framework import Snapshot
+from bench.plugins.pair import Pair, choose
+from bench.plugins.track import Columns
+from bench.run.batches import EPISODES, batches
+from bench.run.unit import Unit
+from bench.run.work import Outcome, Task, attempt
+from bench.scenarios import Cell
+from bench.victims.drivers.ddpg import DDPG
+from bench.victims.drivers.dqn import DQN
+from bench.victims.drivers.networks import ActorPolicy, QPolicy
+from envs.highway.axes import AXES
+from envs.highway.world import HighwayWorld
+from tests.driving.cheats import WORLD, Noisy, Victim
+
+PROBES = {"redrawn", "same_answer", "inconsistent", "draws"}
+HIGHWAY = HighwayWorld(max_steps=40)
+CELLS = [
+    AXES.cell(lanes=3, density=2.0),
+    AXES.cell(lanes=4, density=1.0, weather="rain"),
+    AXES.cell(lanes=5, density=2.0),
+]
+SEEDS = range(1_000_000, 1_000_007)
+
+
+def driven(attack: DrivingAttack | None, policy: Policy, units: Sequence[int], share: float = 1.0) -> Columns:
+    """The measurements of some of three units."""
+    return rollout(
+        HIGHWAY.make([CELLS[unit] for unit in units for _ in SEEDS], action_type=policy.action_type),
+        policy,
+        attack,
+        ObservationThreat(norm="linf", budget=0.1, share=share),
+        list(SEEDS) * len(units),
+        facts=HIGHWAY.facts,
+        attack_seed=[unit for unit in units for _ in SEEDS],
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draws(DrivingAttack):
+    """Says that it is joint, and draws from the generator of the process."""
+
+    access: ClassVar[Access] = "oblivious"
+    joint: ClassVar[bool] = True
+
+    def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
+        return oracle.project(observation + torch.rand(observation.shape))
+
+
+ATTACKS: dict[str, DrivingAttack | None] = {
+    "none": None,
+    "uniform": Noise(),
+    "gaussian": Noise(distribution="gaussian"),
+    "pgd": PGD(),
+    "pgd at a preference gap": PGD(gap=0.3, restarts=2, steps=3),
+    "zo": ZOSignSGD(),
+    "zo from a random start": ZOSignSGD(random_start=True, early_stop=False),
+    "zo of the thesis": ZOSignSGD(objective="thesis", directions=20),
+}
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_units_in_one_batch_have_the_records_that_each_has_alone(name: str, kind: str) -> None:
+    torch.manual_seed(0)
+    policy: Policy = QPolicy(5, 5, 128) if kind == "discrete" else ActorPolicy(5, 64, 0.1)
+    policy.eval().requires_grad_(False)
+    attack = ATTACKS[name]
+    if attack is not None and attack.misfit(DDPG() if kind == "continuous" else DQN()):
+        pytest.skip("does not fit")
+    together = driven(attack, policy, (0, 1, 2), share=0.7)
+    alone = [driven(attack, policy, (unit,), share=0.7) for unit in range(3)]
+    for column in set(together) - PROBES - {"attack_ms"}:
+        np.testing.assert_array_equal(together[column], np.concatenate([one[column] for one in alone]), column)
+
+
+class WithTheBatch(Victim):
+    def forward(self, observation: Tensor) -> Tensor:
+        return super().forward(observation) + observation.mean()
+
+
+@pytest.mark.parametrize(
+    ("attack", "policy"),
+    [(None, WithTheBatch()), (Noise(), Noisy()), (Draws(), Victim())],
+    ids=["batch", "victim", "attack"],
+)
+def test_what_would_have_other_records_in_a_batch_is_driven_alone(attack: DrivingAttack | None, policy: Policy) -> None:
+    cells = [Cell(lanes=3, density=density, weather="clear") for density in (1.0, 2.0) for _ in SEEDS]
+    with pytest.raises(NotJointError):
+        rollout(
+            WORLD.make(cells, action_type="discrete"),
+            policy,
+            attack,
+            ObservationThreat(),
+            list(SEEDS) * 2,
+            facts=WORLD.facts,
+            attack_seed=[unit for unit in (0, 1) for _ in SEEDS],
+        )
+
+
+def units(attack: str, count: int, **seeds: Any) -> list[Unit]:
+    victim = choose("victim", "dqn")
+    pair = Pair(
+        attack=choose("attack", attack),
+        defense=choose("defense", "none"),
+        victim=victim,
+        world=choose("world", "highway"),
+        threat=ObservationThreat(access="dynamics"),
+    )
+    cells = [AXES.cell(lanes=lanes, density=1.0) for lanes in range(2, 2 + count)]
+    return [
+        Unit(pair=pair, training_seed=0, weights_sha256="", cell=cell, **{"seeds": SEEDS, **seeds}) for cell in cells
+    ]
+
+
+def test_alike_units_come_together_and_all_workers_have_enough_to_do() -> None:
+    zo, noise, plan = (units(attack, 6) for attack in ("zo", "noise", "plan"))
+    assert [joint(one[0].pair) for one in (zo, noise, plan)] == [True, True, False]
+    works = [unit for three in zip(zo, noise, plan, strict=True) for unit in three]
+    found = batches(works, (), workers=2)
+    assert sorted(map(len, found)) == [1] * 6 + [2] * 6
+    assert sorted(map(str, works)) == sorted(str(unit) for batch in found for unit in batch)
+    assert {len({(unit.pair.id, unit.training_seed) for unit in batch}) for batch in found} == {1}
+
+
+def test_a_batch_is_not_larger_than_the_cache_and_holds_no_recorded_unit() -> None:
+    many = units("zo", 6, seeds=range(EPISODES // 2)) * 2
+    assert {len(batch) for batch in batches(many, (), workers=1)} == {2}
+    few = units("zo", 6, seeds=range(10)) * 2
+    sizes = [len(batch) for batch in batches(few, {few[0].fingerprint}, workers=1)]
+    assert sorted(sizes) == [1, 1, 1, 3, 3, 3]
+
+
+def carried_out(task: Task) -> Outcome:
+    outcome = attempt(task, lambda *news: None, Snapshot())
+    assert isinstance(outcome, Outcome)
+    return outcome
+
+
+def test_a_task_of_several_units_has_the_outcome_of_each() -> None:
+    works = units("noise", 3, seeds=range(1_000_000, 1_000_002))
+    task = Task(work=works[0], others=works[1:])
+    outcome = carried_out(task)
+    alone = [carried_out(Task(work=unit)) for unit in works]
+    timed = {"attack_ms", "wall_s", "created_at", "entropy"}
+    for one, other in zip((outcome, *outcome.others), alone, strict=True):
+        assert isinstance(one, Outcome)
+        assert one.records is not None
+        assert other.records is not None
+        same = [name for name in one.records.column_names if name not in PROBES | timed]
+        assert one.records.select(same).to_pylist() == other.records.select(same).to_pylist()

@@ -1,0 +1,124 @@
+"""A plug-in whose attacks and victims misbehave, each in one way, while a unit is driven."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import random
+import sys
+import time
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from toy_plugin import ToyPolicy, ToyVictim
+
+import bench.driving.meter
+from bench.driving import DrivingAttack, DrivingFacts, Oracle, Policy, State
+from bench.plugins.contracts import Access
+
+Deed = Literal[
+    "none",
+    "system exit",
+    "interrupt",
+    "generator exit",
+    "os exit",
+    "segfault",
+    "hang",
+    "leak",
+    "memory error",
+    "nan",
+    "shape",
+    "weights",
+    "reseed",
+    "greedy",
+    "print",
+    "patch torch",
+    "patch bench",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rogue(DrivingAttack):
+    """Nudges by a tenth of the radius, after its deed.
+
+    Args:
+        deed: what it does wrong.
+    """
+
+    access: ClassVar[Access] = "scores"
+    deed: Deed = "none"
+
+    def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
+        match self.deed:
+            case "system exit":
+                sys.exit(0)
+            case "interrupt":
+                raise KeyboardInterrupt
+            case "generator exit":
+                raise GeneratorExit
+            case "os exit":
+                os._exit(0)
+            case "segfault":
+                ctypes.string_at(0)
+            case "hang":
+                while True:
+                    time.sleep(0.01)
+            case "leak":
+                kept = []
+                while True:
+                    kept.append(bytearray(os.urandom(1 << 20) * 64))
+            case "memory error":
+                raise MemoryError
+            case "nan":
+                return observation * float("nan")
+            case "shape":
+                return observation[..., :1]
+            case "weights":
+                for one in gc.get_objects():
+                    if isinstance(one, ToyPolicy):
+                        one.weights.zero_()
+            case "reseed":
+                for seed in (torch.manual_seed, np.random.seed, random.seed):
+                    seed(1)
+            case "greedy":
+                for _ in range(5):
+                    oracle.scores(observation)
+            case "print":
+                print("hello from rogue")  # noqa: T201
+                os.write(1, b"and from below\n")
+                print("complaint", file=sys.stderr)  # noqa: T201
+            case "patch torch":
+                torch.Tensor.tanh = lambda tensor: tensor  # type: ignore[method-assign,assignment]
+            case "patch bench":
+                bench.driving.meter.Meter.columns = lambda meter: {}  # type: ignore[method-assign,assignment]
+        return observation + 0.1 * oracle.radius
+
+
+class BadPolicy(ToyPolicy):
+    """Answers NaN, or too few scores."""
+
+    def __init__(self, answer: str, seed: int) -> None:
+        super().__init__("discrete", seed)
+        self.answer = answer
+
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        scores = super().scores(observation, state)
+        return scores * float("nan") if self.answer == "nan" else scores[..., :2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BadVictim(ToyVictim):
+    """A victim that cannot answer.
+
+    Args:
+        answer: what is wrong with it.
+    """
+
+    answer: Literal["nan", "shape"] = "nan"
+
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        return BadPolicy(self.answer, seed).eval()

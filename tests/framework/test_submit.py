@@ -1,0 +1,115 @@
+"""A pair of a plug-in is submitted, and verified by somebody else; what was changed or is missing is found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from bench.plugins import registry
+from bench.plugins.track import track
+from bench.records import reading
+from tests.framework.conftest import Said
+
+Bench = Callable[..., Said]
+RUN = (
+    "run", "attack=nudge", "defense=guard", "defense.digits=2", "victim=toy", "world=toy", "lanes=3,4", "density=1",
+    "weather=clear", "episodes=4", "seeds=0,1", "workers=1", "record=0",
+)  # fmt: skip
+
+
+@pytest.fixture
+def submission(bench: Bench, tmp_path: Path) -> Path:
+    results, folder = tmp_path / "results", tmp_path / "submission"
+    assert bench(*RUN, f"out={results}").code == 0
+    said = bench("submit", "nudge-guard", f"results={results}", f"out={folder}")
+    assert said.code == 0, said.err
+    return folder
+
+
+def test_a_submission_is_verified_and_becomes_a_row(bench: Bench, submission: Path, tmp_path: Path) -> None:
+    about = json.loads((submission / "submission.json").read_text())
+    assert about["packages"] == ["cavbench-toy 1.0"]
+    assert about["commands"]["install"] == "pip install cavbench-toy==1.0"
+    said = bench("verify", str(submission), "sample=2", "episodes=3", f"out={tmp_path / 'board'}")
+    assert said.code == 0, said.err + said.out
+    assert "execute the code of cavbench" in said.out
+    assert "cavbench-toy 1.0" in said.out
+    assert said.out.count("bit for bit the same") == 2
+    assert "The submission holds." in said.out
+    board = reading.read(tmp_path / "board", track=track("driving"))
+    assert {"nudge", "none"} == set(board["attack"].to_pylist())
+    assert bench("report", "leaderboard", f"out={tmp_path / 'board'}").code == 0
+
+
+def test_its_command_drives_the_same_records(bench: Bench, submission: Path, tmp_path: Path) -> None:
+    words = json.loads((submission / "submission.json").read_text())["commands"]["run"].split()[1:]
+    assert bench(*words, "workers=1", "record=0", f"out={tmp_path / 'again'}").code == 0
+    driven = {path.name for path in (tmp_path / "again" / "episodes").glob("*.parquet")}
+    assert {path.name for path in (submission / "episodes").glob("*.parquet")} <= driven
+
+
+def test_changed_scores_are_found_though_the_hashes_fit(bench: Bench, submission: Path) -> None:
+    import hashlib
+
+    about = json.loads((submission / "submission.json").read_text())
+    for name in about["files"]:
+        path = submission / name
+        records = pq.read_table(path)
+        if records["attack"][0].as_py() == "nudge":
+            better = records.set_column(
+                records.schema.get_field_index("safe_progress"),
+                records.schema.field("safe_progress"),
+                [[1.0] * records.num_rows],
+            )
+            pq.write_table(better.cast(records.schema), path)
+            about["files"][name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    (submission / "submission.json").write_text(json.dumps(about))
+    said = bench("verify", str(submission), "audit=false")
+    assert said.code == 1
+    assert "though nothing has changed" in said.out
+    assert "The submission does not hold." in said.out
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda folder: next(folder.glob("episodes/*")).write_bytes(b"x"), "is missing, too large, or not as"),
+        (lambda folder: (folder / "run.py").write_text("print('executed')"), "is not allowed in a submission"),
+        (lambda folder: (folder / "weights.pt").symlink_to("/etc/passwd"), "is not allowed in a submission"),
+        (lambda folder: (folder / "zoo.json").write_text("{}"), "is not listed in submission.json"),
+        (lambda folder: (folder / "submission.json").write_text("[]"), "is not a submission"),
+    ],
+)
+def test_files_that_are_not_as_described_are_refused(
+    change: Callable[[Path], object], line: str, bench: Bench, submission: Path
+) -> None:
+    change(submission)
+    said = bench("verify", str(submission))
+    assert said.code == 2
+    assert line in said.err
+    assert "executed" not in said.out
+
+
+def test_a_missing_plug_in_is_named_before_anything_is_executed(
+    bench: Bench, submission: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = registry.entries
+    monkeypatch.setattr(
+        registry,
+        "entries",
+        lambda group: {k: v for k, v in known(group).items() if v[0].distribution != "cavbench-toy"},
+    )
+    said = bench("verify", str(submission))
+    assert said.code == 2
+    assert "shipped by cavbench-toy 1.0, it is not installed" in said.err
+    assert "pip install cavbench-toy==1.0" in said.err
+
+
+def test_only_a_whole_grid_and_a_new_folder_are_taken(bench: Bench, submission: Path, tmp_path: Path) -> None:
+    said = bench("submit", "nudge-guard", f"results={tmp_path / 'results'}", f"out={submission}")
+    assert (said.code, "is not empty" in said.err) == (2, True)
+    assert bench("submit", "nudge-guard", f"results={tmp_path / 'results'}").code == 2

@@ -1,0 +1,119 @@
+"""Kills real commands at random moments, continues them, and compares the end with an undisturbed run: `make soak`.
+
+    python -m tests.soak kills=30 minutes=2 seed=0
+
+Prints a table of figures. Not part of the test suite.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import psutil
+
+from tests.framework.conftest import started
+from tests.framework.distributions import install_toy
+from tests.soak.conditions import CONDITIONS
+from tests.soak.endurance import endure
+from tests.soak.subjects import SUBJECTS, Subject
+
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+GONE_S = 20
+"""Seconds that the processes of a killed command may take to end."""
+
+
+def kill_and_continue(subject: Subject, kills: int, site: Path, root: Path, draw: random.Random) -> Counter[str]:
+    """Kill a command so often, each time at a random moment, and let it end after every third kill.
+
+    Returns:
+        Counts: kills by signal, `too late` (it had ended), and what went wrong.
+    """
+    counts: Counter[str] = Counter()
+    calm = root / "calm"
+    seconds = ran(subject, site, calm)
+    expected = subject.result(calm)
+    done, number = 0, 0
+    while done < kills:
+        out = root / str(number := number + 1)
+        for _ in range(min(3, kills - done)):
+            number_of_signal = draw.choice(SIGNALS)
+            before = subject.finished(out)
+            killed, left = kill(subject, site, out, number_of_signal, draw.uniform(0.02, 1) * seconds)
+            done += 1
+            counts[signal.Signals(number_of_signal).name if killed else "too late"] += 1
+            counts["processes left"] += left
+            after = subject.finished(out)
+            counts["lost"] += sum(after.get(name) != content for name, content in before.items())
+        ran(subject, site, out)
+        counts["other result"] += subject.result(out) != expected
+        counts["temporary files left"] += len(list(out.rglob(".*.tmp")))
+        shutil.rmtree(out)
+    return counts
+
+
+def ran(subject: Subject, site: Path, out: Path) -> float:
+    """Run a command to its end, and return its seconds; the harness ends if it fails."""
+    out.mkdir(exist_ok=True)
+    start = time.monotonic()
+    process = started(site, *subject.words(out))
+    _, err = process.communicate()
+    if process.returncode:
+        sys.exit(f"{subject.name} ended with {process.returncode}: {err}")
+    return time.monotonic() - start
+
+
+def kill(subject: Subject, site: Path, out: Path, number: signal.Signals, after: float) -> tuple[bool, int]:
+    """Start a command, and send it a signal: whether it was still running, and how many processes it left."""
+    out.mkdir(exist_ok=True)
+    process = started(site, *subject.words(out))
+    until = time.monotonic() + after
+    children: dict[int, psutil.Process] = {}
+    while time.monotonic() < until and process.poll() is None:
+        children |= {child.pid: child for child in psutil.Process(process.pid).children(recursive=True)}
+        time.sleep(0.05)
+    runs = process.poll() is None
+    if runs:
+        children |= {child.pid: child for child in psutil.Process(process.pid).children(recursive=True)}
+        process.send_signal(number)
+    process.communicate()
+    return runs, len(psutil.wait_procs(list(children.values()), timeout=GONE_S)[1])
+
+
+def main(words: list[str]) -> None:
+    """Run all parts, and print their figures."""
+    given = dict(word.split("=", 1) for word in words)
+    draw = random.Random(int(given.get("seed", "0")))
+    chosen = given.get("only", ",".join(SUBJECTS)).split(",")
+    with tempfile.TemporaryDirectory() as folder:
+        site = Path(folder) / "site"
+        site.mkdir()
+        install_toy(site)
+        share = -(-int(given.get("kills", "100")) // len(chosen))
+        for name in chosen:
+            root = Path(folder) / name
+            root.mkdir()
+            counts = kill_and_continue(SUBJECTS[name], share, site, root, draw)
+            say(f"{name}: {share} signals", counts)
+        for name, condition in CONDITIONS.items():
+            place = Path(folder) / name
+            place.mkdir()
+            print(f"{name}: {condition(site, place)}", flush=True)  # noqa: T201
+        print(f"endurance: {endure(site, Path(folder) / 'endurance', float(given.get('minutes', '60')))}")  # noqa: T201
+
+
+def say(title: str, counts: Counter[str]) -> None:
+    """Print a line of figures."""
+    wrong = ("lost", "other result", "processes left", "temporary files left")
+    signals = ", ".join(f"{name} {count}" for name, count in sorted(counts.items()) if name not in wrong)
+    print(f"{title} ({signals}): " + ", ".join(f"{name} {counts[name]}" for name in wrong), flush=True)  # noqa: T201
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

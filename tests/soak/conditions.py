@@ -1,0 +1,82 @@
+"""Bad places and bad company: a full disk, a folder that cannot be written, two writers, bad input."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.framework.conftest import ran, started
+from tests.soak.subjects import RUN, SUBJECTS, Condition
+
+BAD_INPUTS = 1000
+
+
+def full_disk(site: Path, place: Path) -> str:
+    """A run on a disk that fills up ends with one line; it continues when there is room."""
+    with _mounted(place, "size=700k") as works:
+        if not works:
+            return "skipped: only root may mount a small disk"
+        said = ran(site, *RUN, f"out={place}")
+        line = said.err.strip().splitlines()[-1]
+        kept = len(SUBJECTS["run"].finished(place))
+        subprocess.run(["mount", "-o", "remount,size=50m", str(place)], check=True)
+        again = ran(site, *RUN, f"out={place}")
+        return f"exit code {said.code}, {line!r}, {kept} units kept; with room again: exit code {again.code}"
+
+
+def read_only(site: Path, place: Path) -> str:
+    """A run into a folder that cannot be written ends with one line before any work."""
+    with _mounted(place, "size=10m,ro") as works:
+        if not works:
+            return "skipped: only root may mount a disk"
+        said = ran(site, *RUN, f"out={place}")
+        return f"exit code {said.code}, {said.err.strip().splitlines()[-1]!r}"
+
+
+def two_writers(site: Path, place: Path) -> str:
+    """Two runs into one folder at once both end well, and the records are those of one."""
+    both = [started(site, *RUN, f"out={place / 'both'}") for _ in range(2)]
+    codes = [(process.communicate(), process.returncode)[1] for process in both]
+    ran(site, *RUN, f"out={place / 'one'}")
+    subject = SUBJECTS["run"]
+    same = subject.result(place / "both") == subject.result(place / "one")
+    return f"exit codes {codes}, records {'equal' if same else 'DIFFERENT'} to those of one writer"
+
+
+def bad_input(site: Path, place: Path) -> str:
+    """Every bad command line ends with one line and a code other than 0."""
+    try:
+        from tests.soak.bad_inputs import bad_inputs
+    except ImportError:
+        return "skipped: tests/soak/bad_inputs.py is not there"
+    wrong = []
+    for argv in bad_inputs(BAD_INPUTS, seed=0, folder=place):
+        said = ran(site, *argv)
+        if said.code == 0 or len(said.err.strip().splitlines()) != 1 or "Traceback" in said.err:
+            wrong.append(argv)
+    return (
+        f"{BAD_INPUTS} bad inputs, {len(wrong)} not refused in one line{f', for instance {wrong[0]}' if wrong else ''}"
+    )
+
+
+@contextmanager
+def _mounted(place: Path, options: str) -> Iterator[bool]:
+    """A small disk in memory on a folder; False if this user may not mount one."""
+    command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(place)]
+    works = os.geteuid() == 0 and subprocess.run(command, check=False, capture_output=True).returncode == 0
+    try:
+        yield works
+    finally:
+        if works:
+            subprocess.run(["umount", str(place)], check=True)
+
+
+CONDITIONS: Mapping[str, Condition] = {
+    "full disk": full_disk,
+    "read-only folder": read_only,
+    "two writers": two_writers,
+    "bad input": bad_input,
+}

@@ -1,0 +1,45 @@
+"""A long run, with an eye on the memory and the open files of its processes."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import psutil
+
+from tests.framework.conftest import started
+from tests.soak.subjects import RUN
+
+LONG = [word for word in RUN if not word.startswith(("seeds=", "attack.pause="))]
+SEEDS = 20_000
+
+
+def endure(site: Path, out: Path, minutes: float) -> str:
+    """Drive units for so many minutes, and compare memory and open files of all processes early and late.
+
+    The first fifth is the start; means of the second and of the last fifth are compared.
+    """
+    # Training seeds without end: the run is stopped by the clock.
+    seeds = ",".join(map(str, range(SEEDS)))
+    process = started(site, *LONG, f"seeds={seeds}", "attack.pause=0", f"out={out}")
+    samples: list[tuple[float, float, int]] = []
+    begin = time.monotonic()
+    while (now := time.monotonic() - begin) < minutes * 60 and process.poll() is None:
+        family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+        try:
+            memory = sum(member.memory_info().rss for member in family) / 1e6
+            samples.append((now, memory, sum(member.num_fds() for member in family)))
+        except psutil.NoSuchProcess:
+            continue
+        time.sleep(1)
+    process.kill()
+    process.communicate()
+    units = len(list(out.glob("episodes/*.parquet")))
+    parts = [[s for s in samples if low <= s[0] / (minutes * 60) < low + 0.2] for low in (0.2, 0.8)]
+    (early, files), (late, later_files) = [
+        (sum(s[1] for s in part) / max(len(part), 1), max((s[2] for s in part), default=0)) for part in parts
+    ]
+    return (
+        f"{minutes:g} minutes, {units} units: memory {early:.0f} MB early, {late:.0f} MB late; "
+        f"open files at most {files} early, {later_files} late"
+    )
