@@ -126,7 +126,7 @@ def heading(kind: Kind, name: str) -> Text:
 
 
 def _print_page(kind: Kind, name: str, console: Console) -> None:
-    from bench.plugins.parameters import description, parameters
+    from bench.plugins.parameters import description, flattened
 
     offered = registry.offers(kind, name)
     component = registry.declared(kind, name) if offered else registry.load(kind, name)
@@ -140,7 +140,7 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
         return
     console.print(fits(kind, component), highlight=False)
     console.print()
-    known = parameters(component)
+    known = flattened(component)
     if not known:
         console.print("It has no parameters.")
         return
@@ -149,9 +149,9 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
     table.add_column("type", no_wrap=True)
     table.add_column("default", max_width=18)
     table.add_column("meaning", ratio=1)
-    for parameter in known.values():
+    for name, parameter in known.items():
         meaning = Text("\n").join(filter(None, [_with_code(parameter.meaning), Text(parameter.allowed, style="dim")]))
-        written = Text(f"{kind}.{parameter.name}", style="bold")
+        written = Text(f"{kind}.{name}", style="bold")
         table.add_row(written, parameter.type_name, parameter.default_text, meaning)
     console.print(table)
 

@@ -3,6 +3,7 @@
 from bench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, DrivingWorld, TrainingHooks
 from bench.driving.dynamics import Dynamics, Forecast
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features
+from bench.driving.kinematics import Kinematics
 from bench.driving.oracle import Oracle, Part, parts_of
 from bench.driving.policy import Policy, PolicyWrapper, State
 from bench.driving.threat import ObservationThreat
@@ -18,6 +19,7 @@ __all__ = [
     "Dynamics",
     "Features",
     "Forecast",
+    "Kinematics",
     "ObservationThreat",
     "Oracle",
     "Part",

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bench.driving.dynamics import Dynamics
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features
+from bench.driving.kinematics import Kinematics
 from bench.driving.oracle import Oracle
 from bench.driving.policy import Policy, State
 from bench.driving.threat import ObservationThreat
@@ -47,6 +48,11 @@ class DrivingWorld(World):
         """Decisions per second."""
 
     @property
+    def kinematics(self) -> Kinematics | None:
+        """How the world's cars move, for policies that predict their own motion; None if the world does not say."""
+        return None
+
+    @property
     def facts(self) -> DrivingFacts:
         return DrivingFacts(
             axes=self.axes,
@@ -55,6 +61,7 @@ class DrivingWorld(World):
             actions=self.actions,
             features=self.features,
             drivers=self.drivers,
+            kinematics=self.kinematics,
         )
 
     @abstractmethod

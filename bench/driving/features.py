@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from bench.driving.kinematics import Kinematics
 from bench.plugins.contracts import Facts
 
 ActionType = Literal["discrete", "continuous"]
@@ -57,11 +58,13 @@ class DrivingFacts(Facts):
     Args:
         features: features of the observation.
         drivers: supported drivers: `agent` executes the policy's actions; `idm` is the world's own rule-based driver, if any.
+        kinematics: how its cars move; None if the world does not say.
         flat: whether the observation is one row, which the world's own environment gives as a flat array in physical units.
     """
 
     features: Features
     drivers: tuple[Driver, ...] = ("agent",)
+    kinematics: Kinematics | None = None
     flat: bool = False
 
     def native(self, observation: Tensor) -> Tensor:
@@ -80,4 +83,7 @@ class DrivingFacts(Facts):
         return [*constant, RIGHT_THEN_SLOWER] if sequence else constant
 
     def written(self) -> dict[str, Any]:
-        return super().written() | {"features": asdict(self.features), "drivers": list(self.drivers)}
+        values = super().written() | {"features": asdict(self.features), "drivers": list(self.drivers)}
+        # No report reads them.
+        del values["kinematics"]
+        return values

@@ -48,6 +48,7 @@ class Meter:
         self.start_x = start_x.numpy().copy()
         self.end_x = self.start_x.copy()
         self.gradients, self.zero_gradients = np.zeros(batch), np.zeros(batch)
+        self.assured = np.zeros(batch)
         self.queries: list[NDArray[np.int64]] = []
         self.actions: list[NDArray[np.int64]] = []
 
@@ -88,6 +89,8 @@ class Meter:
         self.crashed |= info["crashed"] & running
         self.offroad |= info["offroad"] & running
         np.copyto(self.end_x, info["x"], where=running)
+        assured = self.subject.policy.assured(shown.observation, state)
+        self.assured += np.nan if assured is None else np.where(running, assured.numpy(), 0.0)
         self.gradients += shown.gradients.numpy()
         self.zero_gradients += shown.zero_gradients.numpy()
         self.queries.append(np.where(running, shown.queries.numpy(), -1))
@@ -131,6 +134,7 @@ class Meter:
             "excess_max": self.excess_max.astype(np.float64),
             **{name: sums[name] / steps for name in self.SUMS[3:]},
             "action_counts": self._action_counts(),
+            "assured": self.assured / steps,
             "gradient_queries": self.gradients / steps,
             "zero_gradients": np.where(self.gradients > 0, self.zero_gradients / np.maximum(self.gradients, 1), np.nan),
         }

@@ -65,6 +65,13 @@ class Policy(nn.Module, ABC):
         """
         return state
 
+    def assured(self, observation: Tensor, state: State) -> Tensor | None:
+        """Whether an action is safe under what the policy assumes, bool [B]; None if it promises nothing.
+
+        Records show the share of such frames (`assured`). Arguments as in `advance`.
+        """
+        return None
+
     def choose(self, scores: Tensor) -> Tensor:
         """The action for given scores: the greedy one, int64 [...] (discrete), or float [..., 2] in [-1, 1] (continuous)."""
         return scores.argmax(-1) if self.action_type == "discrete" else scores

@@ -61,6 +61,11 @@ class Component(ABC):
         raise NotImplementedError(f"{cls.__name__} has no choices")
 
     @classmethod
+    def modules(cls) -> tuple[str, ...]:
+        """The modules whose code, with their imports, decides its results."""
+        return (cls.__module__,)
+
+    @classmethod
     def tracks(cls) -> tuple[str, ...]:
         """Names of the tracks whose base classes it derives from; `any` if it works on all."""
         names = dict.fromkeys(base.__dict__["track"] for base in cls.__mro__ if "track" in base.__dict__)

@@ -28,9 +28,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import PluginError, UserError, short
 from bench.plugins import registry, suites
-from bench.plugins.contracts import Access, ThreatModel
+from bench.plugins.contracts import Access, Defense, ThreatModel
 from bench.plugins.pair import Chosen, choose
-from bench.plugins.parameters import Parameter, parameters
+from bench.plugins.parameters import Parameter, flattened, parameters
 from bench.plugins.registry import Kind
 from bench.plugins.suites import Suite
 from bench.plugins.track import track
@@ -233,9 +233,11 @@ def configured(kind: Kind, name: str, values: Mapping[str, str]) -> Chosen[Any]:
         UserError: if a value cannot be parsed or is not allowed.
     """
     owned = parameters(registry.load(kind, name))
+    known = flattened(registry.load(kind, name))
     for key in values:
-        if key.partition(".")[0] not in owned:
-            raise UserError(registry.unknown(f"parameter {kind}.{key} of {name}", key, owned))
+        head = key.partition(".")[0]
+        if head not in owned or (_is_link(owned[head].hint) and key not in known):
+            raise UserError(registry.unknown(f"parameter {kind}.{key} of {name}", key, known))
     return choose(kind, name, **_arguments(kind, name, owned, values))
 
 
@@ -361,6 +363,10 @@ def _schema(owned: dict[str, Parameter]) -> type[Any]:
     made: list[tuple[str, Any, Any]] = []
     for parameter in owned.values():
         value = parameter.default
+        if _is_link(parameter.hint):
+            link = _schema(parameters(parameter.hint))
+            made.append((parameter.name, link, field(default_factory=link)))
+            continue
         default = field() if parameter.required else field(default_factory=partial(copy.copy, value))
         made.append((parameter.name, _omegaconf_type(parameter.hint), default))
     return make_dataclass("Parameters", made, kw_only=True)
@@ -393,11 +399,30 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
     overrides = [f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())]
     composed = _composed(overrides, _schema(owned))[kind]
     arguments = OmegaConf.to_object(composed)
+    return _read(kind, owned, arguments)
+
+
+def _read(kind: str, owned: dict[str, Parameter], arguments: Any) -> dict[str, Any]:
+    """The typed values of a component's parameters; those of the links of a chain are defences."""
     values = {item: getattr(arguments, item) for item in owned}
     for key, value in values.items():
+        if _is_link(owned[key].hint):
+            values[key] = _link(f"{kind}.{key}", owned[key].hint, value)
+            continue
         choices = owned[key].choices
         if choices and value is not None and value not in choices:
             raise UserError(registry.unknown(f"{kind}.{key} {short(str(value))!r}", str(value), map(str, choices)))
         if isinstance(value, list):
             values[key] = tuple(value)
     return values
+
+
+def _is_link(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, Defense)
+
+
+def _link(prefix: str, link: type[Any], arguments: Any) -> Any:
+    try:
+        return link(**_read(prefix, parameters(link), arguments))
+    except ValueError as error:
+        raise UserError(f"{prefix}: {str(error).splitlines()[0]}") from error

@@ -11,7 +11,7 @@ from bench.plugins import registry, sources
 from bench.plugins.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
 from bench.plugins.fingerprint import canonical, digest, state_digest
 from bench.plugins.foreign import contained
-from bench.plugins.parameters import parameters
+from bench.plugins.parameters import differing
 from bench.plugins.registry import Kind
 
 IN_PROCESS = "a Python process"
@@ -50,8 +50,7 @@ class Chosen(Generic[C]):
         if self.code and self.kind == "victim":
             # Its parameters only say what the object was.
             return self.name
-        values = {p.name: (getattr(self.component, p.name), p) for p in parameters(type(self.component)).values()}
-        changed = [f"{name}={value}" for name, (value, p) in values.items() if p.required or value != p.default]
+        changed = [f"{name}={value}" for name, value in differing(self.component).items()]
         return f"{self.name}({', '.join(changed)})" if changed else self.name
 
 

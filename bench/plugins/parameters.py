@@ -11,6 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 from bench.errors import PluginError
 from bench.plugins import ranges
+from bench.plugins.contracts import Component
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +81,29 @@ def parameters(component: type) -> dict[str, Parameter]:
         for field in fields(component)
         if field.init
     }
+
+
+def flattened(component: type) -> dict[str, Parameter]:
+    """The parameters of a component class by name; those of the links of a chain as `LINK.NAME`."""
+    found: dict[str, Parameter] = {}
+    for name, parameter in parameters(component).items():
+        if isinstance(parameter.hint, type) and issubclass(parameter.hint, Component):
+            found |= {f"{name}.{inner}": each for inner, each in flattened(parameter.hint).items()}
+        else:
+            found[name] = parameter
+    return found
+
+
+def differing(component: Any) -> dict[str, Any]:
+    """The parameters of a component that differ from their defaults; those of the links of a chain as `LINK.NAME`."""
+    found: dict[str, Any] = {}
+    for name, parameter in parameters(type(component)).items():
+        value = getattr(component, name)
+        if isinstance(value, Component):
+            found |= {f"{name}.{inner}": each for inner, each in differing(value).items()}
+        elif parameter.required or value != parameter.default:
+            found[name] = value
+    return found
 
 
 def description(component: type) -> str:

@@ -22,6 +22,8 @@ from bench.scenarios import Grid
 
 Kind = Literal["attack", "defense", "victim", "world"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+MARK = "+"
+"""Separates the links of a chain of defences."""
 GROUPS: dict[Kind, str] = {
     "attack": "cavbench.attacks",
     "defense": "cavbench.defenses",
@@ -78,6 +80,8 @@ def kinds_of(name: str) -> list[Kind]:
         UserError: if there is none.
     """
     kinds = [kind for kind in KINDS if _plain(name) in names(kind)]
+    if MARK in name and all(link in names("defense") for link in split(name)):
+        kinds = ["defense"]
     if not kinds:
         raise UserError(
             unknown(f"component {name!r}", name, sorted({known for kind in KINDS for known in names(kind)}))
@@ -87,6 +91,8 @@ def kinds_of(name: str) -> list[Kind]:
 
 def on_track(kind: Kind, name: str, track: str) -> str:
     """The component that a name means on a track: NAME_TRACK if it exists, otherwise NAME."""
+    if kind == "defense" and MARK in name:
+        return MARK.join(on_track(kind, link, track) for link in split(name))
     specific = f"{name}_{track}"
     return specific if specific in entries(GROUPS[kind]) else name
 
@@ -110,12 +116,22 @@ def find(group: str, name: str, noun: str) -> Entry:
         UserError: if there is no such entry, or more than one.
     """
     known = entries(group)
+    if group == GROUPS["defense"] and MARK in name:
+        return _joined([find(group, link, noun) for link in split(name)])
     plain = _plain(name)
     if plain not in known:
         raise UserError(unknown(f"{noun} {plain!r}", plain, known))
     if complaint := problem(known[plain]):
         raise UserError(f"{noun} {plain!r} is {complaint}")
     return known[plain][0]
+
+
+def _joined(links: list[Entry]) -> Entry:
+    """The entry of a chain: the targets of its links, and every package that ships one."""
+    *others, last = dict.fromkeys((link.distribution, link.version) for link in links)
+    distribution = ", ".join([*(" ".join(other) for other in others), last[0]])
+    names, targets = MARK.join(link.name for link in links), " + ".join(link.target for link in links)
+    return Entry(name=names, target=targets, distribution=distribution, version=last[1])
 
 
 def resolve(group: str, name: str, noun: str) -> Any:
@@ -196,7 +212,7 @@ def grids(world: str) -> list[Grid]:
 
 def offers(kind: Kind, name: str) -> dict[str, str]:
     """The choices of an adapter, each with a short description; empty if the name is a component."""
-    return {} if ":" in name else dict(declared(kind, name).choices())
+    return {} if ":" in name or MARK in name else dict(declared(kind, name).choices())
 
 
 def load(kind: Kind, name: str) -> type[Any]:
@@ -208,6 +224,10 @@ def load(kind: Kind, name: str) -> type[Any]:
     """
     from bench.plugins import contracts
 
+    if kind == "defense" and MARK in name:
+        from bench.plugins.chain import chained
+
+        return chained(tuple((link, load(kind, link)) for link in split(name)))
     component = _chosen(kind, name)
     where = _where(GROUPS[kind], name, kind)
     if missing := component.missing():
@@ -239,6 +259,11 @@ def _chosen(kind: Kind, name: str) -> type[Any]:
             )
         raise UserError(unknown(f"{kind} {name!r}", choice, choices))
     return component.chosen(choice)
+
+
+def split(name: str) -> list[str]:
+    """The links of a chain of defences."""
+    return name.split(MARK)
 
 
 def _plain(name: str) -> str:

@@ -75,7 +75,7 @@ class Work:
     def modules(self) -> tuple[str, ...]:
         """Modules hashed into the code digest, with their imports."""
         shipped = (part for part in self.pair.parts if not part.code)
-        return (self.module, *sorted(type(part.component).__module__ for part in shipped))
+        return (self.module, *sorted(module for part in shipped for module in part.component.modules()))
 
     @property
     def code_digest(self) -> str:

@@ -70,6 +70,16 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
     ),
 )
 
+ASSURED = field(
+    "assured",
+    FLOAT,
+    "frames in which an action was safe under the victim's own assumptions; null if it makes none",
+    "share, 0 to 1",
+    nullable=True,
+    low=0,
+    high=1,
+)
+
 
 class DrivingTrack(Track):
     """Driving policies on a road, attacked through their observations, ranked by `safe_progress`."""
@@ -80,7 +90,7 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = PROBES
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED)
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from bench.driving.features import ActionType, Driver, Features
+from bench.driving.kinematics import CarFollowing
 from bench.scenarios import Cell
 from envs.highway.axes import AXES
 
@@ -36,6 +37,22 @@ THESIS_FEATURES = Features(
 )
 STANDARD_TARGET_SPEEDS = (10.0, 15.0, 20.0, 25.0, 30.0)
 THESIS_TARGET_SPEEDS = (20.0, 25.0, 30.0)
+
+KINEMATICS: Mapping[str, Any] = {
+    "lane_width": 4.0,
+    "length": 5.0,
+    "width": 2.0,
+    "start_speed": 25.0,
+    "speed_gain": 1 / 0.6,
+    "heading_gain": 1 / 0.2,
+    "lateral_gain": 1 / 0.6,
+    "max_heading": math.pi / 4,
+    "max_steering": math.pi / 3,
+    "acceleration_limit": 5.0,
+    "steering_limit": math.pi / 4,
+    "following": CarFollowing(acceleration=3.0, braking=5.0, jam_distance=10.0, time_gap=1.5, free_share=0.5),
+}
+"""highway-env's constants, as `bench.driving.Kinematics` names them. In flowing traffic half of the IDM's free term is left."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from bench.driving import ActionType, Driver, DrivingWorld, Dynamics, Features
+from bench.driving import ActionType, Driver, DrivingWorld, Dynamics, Features, Kinematics
 from bench.scenarios import Axes, Cell
 from envs.highway.axes import AXES, STANDARD_V1
 from envs.highway.config import (
     ACTIONS,
+    KINEMATICS,
     STANDARD_FEATURES,
     STANDARD_TARGET_SPEEDS,
     THESIS_FEATURES,
@@ -84,6 +85,11 @@ class HighwayWorld(DrivingWorld):
     @property
     def decision_hz(self) -> float:
         return self.policy_frequency
+
+    @property
+    def kinematics(self) -> Kinematics:
+        config = self.config((AXES.cell(lanes=3, density=1.0),))
+        return Kinematics(frames=config.substeps, target_speeds=config.target_speeds, **KINEMATICS)
 
     def config(
         self,

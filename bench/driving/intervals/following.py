@@ -1,0 +1,71 @@
+"""Following distances: how much of the gap to a braking leader the ego uses up until it is as slow as the leader."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.driving.kinematics import Kinematics
+
+FASTEST, STEP = 40.0, 0.5
+"""Largest speed and resolution of a table, in m/s."""
+HARDEST = 6
+"""Hardest braking of a leader in a table, in m/s2."""
+LASTING_S = 8.0
+
+
+class FollowingDistance:
+    """D(v, w, r): the largest part of a gap that the ego uses up, in m, by braking as hard as it can from the next decision on.
+
+    The leader brakes at r m/s2 for `seconds`, then keeps its speed. Both cars are simulated once for a grid of speeds and
+    rates; values between are interpolated linearly. (A closed form with one deceleration, as in RSS, Shalev-Shwartz et al.
+    2017, does not fit: the ego brakes weakly near its lowest target speed.)
+
+    Args:
+        kinematics: kinematics of the ego.
+        period: seconds per decision.
+        seconds: how long the leader brakes.
+        within: seconds that count; None for all until the speeds are the same.
+    """
+
+    def __init__(self, kinematics: Kinematics, period: float, seconds: float, *, within: float | None = None) -> None:
+        speeds = torch.arange(0.0, FASTEST + STEP, STEP, dtype=torch.float64)
+        rates = torch.arange(HARDEST + 1.0, dtype=torch.float64)
+        dt = period / kinematics.frames
+        rate, own, other = torch.meshgrid(rates, speeds, speeds, indexing="ij")
+        table, lost, target = torch.zeros_like(own), torch.zeros_like(own), own
+        # The leader has braked for one decision when the ego begins to.
+        other = (other - rate * min(period, seconds)).clamp(min=0)
+        for frame in range(round((within or LASTING_S) / dt)):
+            if frame % kinematics.frames == 0:
+                target = slower(own, kinematics.target_speeds)
+            lost = lost + (own - other) * dt
+            table = torch.maximum(table, lost)
+            change = kinematics.speed_gain * (target - own)
+            own = (own + change * dt).clamp(min=0)
+            if period + frame * dt < seconds - 1e-9:
+                other = (other - rate * dt).clamp(min=0)
+        self.side = len(speeds)
+        self.table = table.float().flatten()
+
+    def __call__(self, own: Tensor, leader: Tensor, rate: Tensor) -> Tensor:
+        """D [...] for the ego's speeds after its next decision, the leader's speeds now and its rates of braking.
+
+        It is differentiable in the speeds; the rates are rounded up.
+        """
+        first, second = (speed.clamp(0, FASTEST - 1e-3) / STEP for speed in torch.broadcast_tensors(own, leader))
+        row, column = first.detach().floor(), second.detach().floor()
+        down, right = first - row, second - column
+        level = rate.detach().clamp(0, HARDEST).ceil()
+        place = ((level * self.side + row) * self.side + column).long()
+        table = self.table
+        upper = table[place] * (1 - right) + table[place + 1] * right
+        lower = table[place + self.side] * (1 - right) + table[place + self.side + 1] * right
+        return upper * (1 - down) + lower * down
+
+
+def slower(speed: Tensor, target_speeds: tuple[float, ...]) -> Tensor:
+    """The target speed after SLOWER (highway-env's MDPVehicle.speed_to_index)."""
+    low, high, last = target_speeds[0], target_speeds[-1], len(target_speeds) - 1
+    index = ((speed - low) / (high - low) * last).round().clamp(0, last)
+    return low + (index - 1).clamp(min=0) * ((high - low) / last)

@@ -1,0 +1,84 @@
+"""Policies that act on the intervals behind the shown values."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from bench.driving.features import ActionType, DrivingFacts
+from bench.driving.intervals.boxes import Assumed, Boxes
+from bench.driving.intervals.ego import DeadReckoning, Ego
+from bench.driving.policy import Policy, State
+from bench.driving.threat import Norm
+from bench.errors import UserError
+
+FEATURES = ("x", "y", "vx", "vy")
+DECISIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
+
+
+class IntervalPolicy(Policy):
+    """A policy on boxes. A tracker in front of it gives it tighter boxes than a single observation does.
+
+    Args:
+        facts: facts of the world.
+        action_type: kind of the actions.
+        norm, budget: the perturbation set that it assumes.
+
+    Raises:
+        UserError: if the world does not offer what intervals need.
+    """
+
+    def __init__(self, facts: DrivingFacts, action_type: ActionType, norm: Norm, budget: float) -> None:
+        super().__init__()
+        self.action_type = action_type
+        self.assumed = Assumed(facts.features, norm, budget)
+        self.period = 1 / facts.decision_hz
+        self.reckoning = reckoning(facts, action_type)
+
+    @abstractmethod
+    def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
+        """The scores, as in `scores`, for given boxes."""
+
+    @abstractmethod
+    def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
+        """The state after a step, as in `advance`, for given boxes."""
+
+    @abstractmethod
+    def safe(self, boxes: Boxes, state: State) -> Tensor:
+        """Whether an action has a margin of at least 0, bool [...]."""
+
+    def assured(self, observation: Tensor, state: State) -> Tensor | None:
+        return self.safe(self.assumed.boxes(observation), state)
+
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        return self.weighed(observation, self.assumed.boxes(observation), state)
+
+    def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
+        return self.moved(observation, self.assumed.boxes(observation), action, state)
+
+
+def reckoning(facts: DrivingFacts, action_type: ActionType) -> DeadReckoning:
+    """Dead reckoning in a world.
+
+    Raises:
+        UserError: if the world does not offer what it needs.
+    """
+    if facts.kinematics is None:
+        raise UserError("intervals need the kinematics of the world, which this world does not offer")
+    if facts.features.names != FEATURES:
+        raise UserError(
+            f"intervals need the features {', '.join(FEATURES)}, the world measures {', '.join(facts.features.names)}"
+        )
+    if action_type == "discrete" and not set(DECISIONS) <= set(facts.actions):
+        raise UserError(f"intervals need the actions {', '.join(DECISIONS)}, the world has {', '.join(facts.actions)}")
+    return DeadReckoning(facts.kinematics, 1 / facts.decision_hz, facts.actions, action_type)
+
+
+def corrected(observation: Tensor, ego: Ego, assumed: Assumed) -> Tensor:
+    """The observation [..., V, F] with the reckoned y, vx and vy in the ego's row."""
+    along, across = ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
+    own = assumed.normalised(torch.stack([torch.zeros_like(along), ego.y, along, across], -1))[..., 1:]
+    row = torch.cat((observation[..., :1, :2], own.unsqueeze(-2)), -1)
+    return torch.cat((row, observation[..., 1:, :]), -2)

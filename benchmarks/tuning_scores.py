@@ -1,0 +1,43 @@
+"""Scores on the tuning seeds, which are never reported: `python benchmarks/tuning_scores.py victim=planner episodes=16`.
+
+Takes the options of `bench run` that choose pairs, cells, training seeds and episodes, and keeps no records.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from bench.driving.drive import drive
+from bench.run.config import run_config
+from bench.run.process import settle
+from bench.run.unit import Unit
+from bench.scenarios import SeedBlock
+
+
+def main() -> None:
+    settle()
+    config = run_config([*sys.argv[1:], "reference=false"])
+    grid = replace(config.grid, first_seed=SeedBlock.TUNE)
+    for pair in config.pairs:
+        start, cells = time.process_time(), []
+        for cell in grid.cells():
+            units = [
+                Unit(pair=pair, training_seed=seed, weights_sha256="", cell=cell, seeds=grid.seeds())
+                for seed in (config.seeds if pair.is_seeded else (0,))
+            ]
+            columns = [drive(unit.job, ()).columns for unit in units]
+            cells.append(
+                [np.mean([each[name] for each in columns]) for name in ("safe_progress", "crashed", "assured")]
+            )
+            print(f"  {cell}: {cells[-1][0]:.3f}, crashed {cells[-1][1]:.0%}", flush=True)
+        score, crashed, assured = np.mean(cells, 0)
+        seconds = time.process_time() - start
+        print(f"{pair}: {score:.3f}, crashed {crashed:.1%}, assured {assured:.1%}, {seconds:.0f} CPU s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

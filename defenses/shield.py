@@ -1,0 +1,102 @@
+"""A safety filter around a driver: of its actions only those that the worst case of the intervals leaves safe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from annotated_types import Interval
+from tensordict import TensorDict
+from torch import Tensor
+
+from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, State
+from bench.driving.intervals.boxes import Boxes
+from bench.driving.intervals.margins import Caution, Judge, Margins
+from bench.driving.intervals.policy import IntervalPolicy, corrected
+from bench.driving.threat import Norm
+from bench.errors import UserError
+from bench.plugins.ranges import NotNegative
+
+SOFTNESS = 2.0
+"""Width in m over which the gradient of the filter is spread around its threshold."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shield(DrivingDefense):
+    """Masks the actions of a discrete victim that are unsafe in the worst case, and those that are needlessly slow.
+
+    The worst case is over the true values that an assumed perturbation set allows behind the shown ones. The ego's own motion
+    is reckoned from its actions; the victim receives the reckoned row. An action is safe if the gap to every car ahead lasts
+    when the ego brakes from the next decision on. Where FASTER leaves a margin of at least `band`, IDLE and SLOWER are masked,
+    so that an attack cannot make the car crawl. If no action is safe, it brakes.
+
+    Args:
+        assumed_budget: budget of the perturbation set that it assumes.
+        assumed_norm: kind of this set.
+        band: margin of FASTER in m from which on slower actions are masked.
+        braking: least deceleration that is assumed of a car ahead, in m/s2; it is higher behind a queue.
+        braking_s: how long a car ahead is assumed to brake, in s.
+        distance: room between two cars that is always kept, in m.
+    """
+
+    assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
+    assumed_norm: Norm = "relative"
+    band: NotNegative = 0.0
+    braking: NotNegative = 0.5
+    braking_s: NotNegative = 2.0
+    distance: NotNegative = 0.4
+
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
+        if victim.action_type != "discrete" or not victim.sees:
+            raise UserError("defense 'shield' needs a victim that sees and has discrete actions")
+        return Shielded(self, victim.load(seed, facts), facts).eval()
+
+
+class Shielded(IntervalPolicy):
+    """A policy behind the filter. Its state is the reckoned ego and the inner policy's state."""
+
+    def __init__(self, settings: Shield, policy: Policy, facts: DrivingFacts) -> None:
+        super().__init__(facts, "discrete", settings.assumed_norm, settings.assumed_budget)
+        self.policy, self.band = policy, settings.band
+        self.driver, self.weights_sha256 = policy.driver, policy.weights_sha256
+        caution = Caution(braking=settings.braking, seconds=settings.braking_s, distance=settings.distance)
+        self.judge = Judge(self.reckoning, self.period, caution)
+
+    def initial(self, episodes: Tensor) -> State:
+        own, inner = self.reckoning.unknown(episodes), self.policy.initial(episodes)
+        return TensorDict({"ego": own, **({} if inner is None else {"inner": inner})}, batch_size=episodes.shape)
+
+    def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
+        assert state is not None
+        ego = self.reckoning.now(boxes, state["ego"])
+        values = self.policy.scores(corrected(observation, ego, self.assumed), state.get("inner", None))
+        allowed = self.allowed(self.judge(ego, boxes))
+        # The masked values are below the others; no step of this hides the victim's gradient.
+        spread = (values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)).detach() + 1
+        return values - spread * (1 - allowed)
+
+    def safe(self, boxes: Boxes, state: State) -> Tensor:
+        assert state is not None
+        return self.judge(self.reckoning.now(boxes, state["ego"]), boxes).safe
+
+    def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
+        assert state is not None
+        ego = self.reckoning.now(boxes, state["ego"])
+        inner = self.policy.advance(corrected(observation, ego, self.assumed), action, state.get("inner", None))
+        own = self.reckoning.after(ego, action)
+        return TensorDict({"ego": own, **({} if inner is None else {"inner": inner})}, batch_size=state.batch_size)
+
+    def allowed(self, margins: Margins) -> Tensor:
+        """[..., A] 1 for the allowed actions and 0 for the others, with the gradient of a soft threshold (straight-through)."""
+        stay, change = margins.stay, margins.change
+        safe = stay >= 0
+        needless = stay[..., :1] >= self.band
+        keeps = torch.cat((safe[..., :1], safe[..., 1:] & ~needless), -1)
+        changes = (change >= 0) & margins.changeable
+        none = ~keeps.any(-1, keepdim=True) & ~changes.any(-1, keepdim=True)
+        slower = torch.tensor([False, False, True])
+        hard = torch.cat((keeps | (none & slower), changes), -1).to(stay)
+        soft = torch.cat((stay, change), -1).div(SOFTNESS).sigmoid()
+        ordered = hard + soft - soft.detach()
+        return ordered[..., self.reckoning.order]

@@ -1,0 +1,93 @@
+"""Components that act on intervals: the planner's decisions, the shield's mask, and the boxes of the tracker."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from tensordict import TensorDict
+
+from attacks.noise import Noise
+from bench.driving import ObservationThreat
+from bench.driving.enforcer import Enforcer
+from bench.driving.intervals.margins import Margins
+from bench.driving.victim import CountedPolicy
+from bench.victims.drivers.planner import IntervalPlanner, Planner
+from defenses.tracker import Tracked, Tracker
+from docs.figures import style
+from docs.figures.decisions import BLOCKED, CLOSING, DISTANCE, _map, _observations
+from docs.figures.driving import FACTS
+from envs.highway.config import ACTIONS
+from envs.highway.world import HighwayWorld
+
+BUDGETS = (0.0, 0.1)
+SEED, STEPS = 1_000_000, 90
+
+
+def planner() -> Figure:
+    """The action by distance and closing speed, boxed in, for two assumed budgets."""
+    made = style.figure(4.1, "planner: the larger the assumed budget, the earlier it brakes")
+    flat = _observations(BLOCKED).flatten(0, 1)
+    for axes, budget in zip(made.subplots(1, 2, sharey=True), BUDGETS, strict=True):
+        policy = Planner(assumed_budget=budget).load(0, FACTS)
+        with torch.no_grad():
+            action = policy.decide(flat, policy.initial(torch.arange(len(flat)))).view(len(CLOSING), len(DISTANCE))
+        colours = ListedColormap(list(style.ACTIONS.values()))
+        _map(axes, action, f"assumed budget {budget:.0%}", colours, (-0.5, len(ACTIONS) - 0.5))
+    made.axes[0].set_ylabel("closing speed (m/s), own: 25")
+    patches = [Patch(color=style.ACTIONS[name], label=name) for name in ACTIONS]
+    made.legend(handles=patches, loc="outside lower center", ncols=5, fontsize=9.5, handlelength=1, columnspacing=1)
+    return made
+
+
+def shield() -> Figure:
+    """The margin of FASTER and of SLOWER by distance and closing speed."""
+    made = style.figure(4.3, "shield: where FASTER is allowed, and where only SLOWER is left")
+    policy = Planner().load(0, FACTS)
+    assert isinstance(policy, IntervalPlanner)
+    flat = _observations(BLOCKED).flatten(0, 1)
+    boxes = policy.assumed.boxes(flat)
+    with torch.no_grad():
+        ego = policy.reckoning.now(boxes, policy.reckoning.unknown(torch.arange(len(flat))))
+        found: Margins = policy.judge(ego, boxes)
+    for place, (axes, name) in enumerate(zip(made.subplots(1, 2, sharey=True), ("FASTER", "SLOWER"), strict=True)):
+        margin = found.stay[:, 2 * place].view(len(CLOSING), len(DISTANCE)).clamp(-30, 30)
+        drawn = _map(axes, margin, f"margin of {name} (m)", "PuOr", (-30, 30))
+        axes.contour(DISTANCE, CLOSING, margin, levels=[0.0], colors=style.INK, linewidths=1.2)
+        made.colorbar(drawn, ax=axes, location="bottom", aspect=16)
+    made.axes[0].set_ylabel("closing speed (m/s), own: 25")
+    return made
+
+
+def tracker() -> Figure:
+    """The interval of the distance to the nearest car under noise, from one frame and from all frames so far."""
+    made = style.figure(3.8, "tracker: intervals from all frames so far")
+    axes = made.subplots()
+    world = HighwayWorld()
+    env = world.make([world.axes.cell(lanes=3, density=1.0, weather="clear")])
+    policy = Tracked(Tracker(), Planner().load(0, FACTS), FACTS)
+    threat = ObservationThreat()
+    generator = torch.Generator().manual_seed(0)
+    td = env.reset(TensorDict({"seed": torch.tensor([SEED])}, batch_size=[1]))
+    state, rows = policy.initial(torch.tensor([0])), []
+    with torch.no_grad():
+        for _ in range(STEPS):
+            truth = td["observation"]
+            enforcer = Enforcer(CountedPolicy(policy), threat, "oblivious", FACTS.features, generator)
+            shown = enforcer.project(Noise().perturb(truth, enforcer.begin(truth, state)))[0]
+            plain, boxes = policy.assumed.boxes(shown), policy.boxes(shown, state)
+            rows.append(
+                [float(truth[0, 1, 1]) * 100, *(float(side[0, 1, 0]) for each in (plain, boxes) for side in each[1:])]
+            )
+            action = policy.decide(shown, state)
+            state = policy.advance(shown, action, state)
+            td = env.step(td.set("action", action))["next"]
+    seconds, drawn = np.arange(STEPS) / FACTS.decision_hz, np.array(rows)
+    axes.fill_between(seconds, drawn[:, 1], drawn[:, 2], color=style.GREY, alpha=0.35, lw=0, label="one frame")
+    axes.fill_between(seconds, drawn[:, 3], drawn[:, 4], color=style.BLUE, alpha=0.6, lw=0, label="tracked")
+    axes.plot(seconds, drawn[:, 0], color=style.INK, lw=1.2, label="truth")
+    axes.set(xlabel="time (s)", ylabel="nearest car ahead\nor behind (m)", xlim=(0, seconds[-1]))
+    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3)
+    return made

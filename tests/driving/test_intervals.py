@@ -1,0 +1,230 @@
+"""Intervals hold the truth, dead reckoning is exact, and a shielded driver hits no car that keeps to the assumptions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+
+from attacks.noise import Noise
+from attacks.pgd import PGD
+from bench.driving import DrivingVictim, ObservationThreat, Policy
+from bench.driving.intervals.boxes import Assumed
+from bench.driving.intervals.ego import Ego
+from bench.driving.intervals.margins import Caution, Judge
+from bench.driving.intervals.policy import reckoning
+from bench.driving.rollout import rollout
+from bench.driving.threat import Norm
+from bench.errors import UserError
+from bench.plugins.pair import choose
+from bench.scenarios import SeedBlock
+from bench.victims.drivers.ddpg import DDPG
+from bench.victims.drivers.planner import IntervalPlanner, Planner
+from defenses.shield import Shield, Shielded
+from defenses.tracker import Tracked, Tracker
+from envs.highway.batched import BatchedHighway
+from envs.highway.world import HighwayWorld
+from tests.attacks.victims import observations
+from tests.framework.toy import ToyWorld
+
+WORLD = HighwayWorld()
+FACTS = WORLD.facts
+FAST = FACTS.actions.index("FASTER")
+SEEDS = range(SeedBlock.TRAIN, SeedBlock.TRAIN + 6)
+
+
+class Fastest(Policy):
+    """Always FASTER, with a gradient, so that only the filter keeps it from crashing."""
+
+    action_type = "discrete"
+
+    def forward(self, observation: Tensor) -> Tensor:
+        wanted = torch.eye(len(FACTS.actions))[FAST]
+        return wanted + 1e-3 * observation.flatten(-2).sum(-1, keepdim=True)
+
+
+def roads(world: HighwayWorld, episodes: int = len(SEEDS), **values: Any) -> BatchedHighway:
+    cell = world.axes.cell(**{"lanes": 3, "density": 1.0, "weather": "clear"} | values)
+    return world.make([cell] * episodes)  # type: ignore[return-value]
+
+
+def driven(world: HighwayWorld, policy: Policy, attack: Any, **values: Any) -> dict[str, Any]:
+    threat = ObservationThreat(budget=0.1 if attack else 0.0)
+    env = roads(world, **values)
+    return rollout(env, policy, attack, threat, list(SEEDS), facts=world.facts, attack_seed=0)
+
+
+@pytest.mark.parametrize("norm", ["relative", "linf"])
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), budget=st.sampled_from([0.0, 0.05, 0.1, 0.3]))
+def test_the_boxes_of_any_shown_observation_hold_the_truth(norm: Norm, seed: int, budget: float) -> None:
+    truth = observations(4, seed).clamp(-1, 1)
+    threat = ObservationThreat(norm=norm, budget=budget)
+    radius = threat.radius(truth, FACTS.features)
+    share = torch.rand(truth.shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+    shown = (truth + share.sign() * share.abs().sqrt() * radius).clamp(-1, 1)
+    boxes = Assumed(FACTS.features, norm, budget).boxes(shown)
+    physical = truth[..., 1:] * FACTS.features.half_range()
+    present = boxes.present.unsqueeze(-1)
+    assert bool(((boxes.low <= physical + 1e-4) & (physical <= boxes.high + 1e-4) | ~present).all())
+
+
+def test_dead_reckoning_is_exact_whatever_is_shown() -> None:
+    env = roads(WORLD, lanes=4)
+    moves, generator = reckoning(FACTS, "discrete"), torch.Generator().manual_seed(0)
+    assumed = Assumed(FACTS.features, "relative", 0.1)
+    td = env.reset(TensorDict({"seed": torch.tensor(SEEDS)}, batch_size=env.batch_size))
+    state = moves.unknown(torch.tensor(SEEDS))
+    compared = 0
+    for step in range(90):
+        truth, running = td["observation"], ~td["done"].squeeze(-1)
+        radius = ObservationThreat().radius(truth, FACTS.features)
+        shown = truth + radius * (2 * torch.rand(truth.shape, generator=generator) - 1)
+        ego = moves.now(assumed.boxes(shown), state)
+        on_road = running & (ego.edge < 64) if step > 60 else running & (ego.target_lane < 4)
+        cars = env.engine.vehicles[:, 0]
+        y = torch.from_numpy(cars["y"].copy())[on_road]
+        torch.testing.assert_close(ego.y[on_road].double(), y, atol=2e-3, rtol=0)
+        speed = torch.from_numpy(cars["speed"].copy())[on_road]
+        torch.testing.assert_close(ego.speed[on_road].double(), speed, atol=2e-3, rtol=0)
+        compared += int(on_road.sum())
+        # Every lane in turn to the left, FASTER and SLOWER in random order; LANE_LEFT stays on the road.
+        action = torch.tensor([0, 1, 3, 4])[torch.randint(0, 4, (len(SEEDS),), generator=generator)]
+        td = env.step(td.set("action", action))["next"]
+        state = moves.after(ego, action)
+    assert compared > 200
+
+
+def test_a_lane_that_does_not_exist_is_noticed() -> None:
+    env = roads(WORLD, lanes=3)
+    moves, assumed = reckoning(FACTS, "discrete"), Assumed(FACTS.features, "relative", 0.1)
+    td = env.reset(TensorDict({"seed": torch.tensor(SEEDS)}, batch_size=env.batch_size))
+    state = moves.unknown(torch.tensor(SEEDS))
+    found = torch.zeros(len(SEEDS), dtype=torch.bool)
+    for _ in range(75):
+        ego = moves.now(assumed.boxes(td["observation"]), state)
+        action = torch.full((len(SEEDS),), 2)
+        td = env.step(td.set("action", action))["next"]
+        state = moves.after(ego, action)
+        found |= ~td["done"].squeeze(-1) & (ego.edge == 2)
+    assert bool(found.any())
+
+
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_no_leader_that_brakes_as_assumed_is_hit(seed: int) -> None:
+    """FASTER whenever it is safe, behind leaders that brake at the assumed rate for the assumed time, each at its own moment."""
+    moves, period, rate, count = reckoning(FACTS, "discrete"), 1 / FACTS.decision_hz, 4.0, 256
+    judge = Judge(moves, period, Caution(braking=rate, seconds=1.5, distance=0.4))
+    assumed, generator = Assumed(FACTS.features, "relative", 0.1), torch.Generator().manual_seed(seed)
+
+    def drawn(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, generator=generator)
+
+    speed, leader, start, one = drawn(12, 30), drawn(17, 30), drawn(0, 60).floor(), torch.ones(count)
+    ego = Ego(y=4 * one, heading=0 * one, speed=speed, target_lane=one, target_speed=speed, edge=2 * one)
+    gap = 6.0 + judge.following(speed, leader, rate * one) + drawn(0, 20)
+    half, once = FACTS.features.half_range(), torch.zeros(count, dtype=torch.bool)
+    for step in range(120):
+        truth = torch.zeros(count, 2, 5)
+        truth[:, :, 0] = 1.0
+        truth[:, 0, 1:] = torch.stack([100 * one, 4 * one, ego.speed, 0 * one], -1) / half
+        truth[:, 1, 1:] = torch.stack([gap, 0 * one, leader - ego.speed, 0 * one], -1) / half
+        radius = ObservationThreat().radius(truth, FACTS.features)
+        shown = (truth + radius * (2 * torch.randint(0, 2, truth.shape, generator=generator) - 1)).clamp(-1, 1)
+        stay = judge(ego, assumed.boxes(shown)).stay
+        once |= (stay >= 0).any(-1)
+        gap = gap + (leader - ego.speed) * period
+        leader = leader - rate * period * ((start <= step) & (step < start + 22))
+        after = moves.after(ego, torch.where(stay[:, 0] >= 0, FAST, FACTS.actions.index("SLOWER")))
+        ego = Ego(*(after[name] for name in Ego._fields))
+        assert bool((gap > 5.0)[once].all())
+    assert once.float().mean() > 0.5
+
+
+@pytest.mark.parametrize("attack", [None, Noise(), PGD(objective="target", target_action=FAST, steps=3, restarts=1)])
+def test_the_shield_holds_the_guarantee_in_the_engine(attack: Any) -> None:
+    """Behind a single car, which never brakes, a driver that only accelerates does not crash, whatever it is shown."""
+    world = HighwayWorld(vehicles=1, max_steps=120)
+    policy = Shielded(Shield(), Fastest(), world.facts)
+    columns = driven(world, policy, attack, lanes=2)
+    assert not columns["crashed"].any()
+    assert (columns["assured"] > (0.6 if attack else 0.98)).all()
+    assert (columns["mean_speed"] > 20).all()
+
+
+def test_only_the_filter_keeps_that_driver_from_crashing() -> None:
+    world = HighwayWorld(max_steps=120)
+    bare = driven(world, Fastest(), None)
+    shielded = driven(world, Shielded(Shield(), Fastest(), world.facts), None)
+    assert bare["crashed"].mean() > 0.5
+    assert shielded["crashed"].mean() <= 0.17
+
+
+def test_the_gradient_passes_the_filter_and_reaches_the_victim() -> None:
+    policy = Shielded(Shield(), Fastest(), FACTS)
+    env = roads(WORLD)
+    td = env.reset(TensorDict({"seed": torch.tensor(SEEDS)}, batch_size=env.batch_size))
+    shown = td["observation"].clone().requires_grad_(True)
+    scores = policy.scores(shown, policy.initial(torch.tensor(SEEDS)))
+    (gradient,) = torch.autograd.grad(scores[:, FAST].sum(), shown)
+    assert bool(gradient.isfinite().all())
+    assert bool((gradient[:, 1:, 1:].abs().amax((1, 2)) > 0).all())
+
+
+def test_the_tracker_narrows_boxes_and_keeps_the_truth() -> None:
+    env = roads(WORLD, lanes=4)
+    policy = Tracked(Tracker(), IntervalPlanner(Planner(), FACTS), FACTS)
+    td = env.reset(TensorDict({"seed": torch.tensor(SEEDS)}, batch_size=env.batch_size))
+    state = policy.initial(torch.tensor(SEEDS))
+    generator, half = torch.Generator().manual_seed(0), FACTS.features.half_range()
+    held = narrower = rows = 0
+    for _ in range(60):
+        truth = td["observation"]
+        radius = ObservationThreat().radius(truth, FACTS.features)
+        shown = (truth + radius * (2 * torch.rand(truth.shape, generator=generator) - 1)).clamp(-1, 1)
+        plain, boxes = policy.assumed.boxes(shown), policy.boxes(shown, state)
+        physical = (truth[..., 1:] * half)[:, 1:]
+        inside = ((boxes.low[:, 1:] - 1e-2 <= physical) & (physical <= boxes.high[:, 1:] + 1e-2)).all(-1)
+        present = boxes.present[:, 1:] & ~td["done"]
+        present &= plain.high[:, 1:, 0].isfinite()
+        held, rows = held + int((inside & present).sum()), rows + int(present.sum())
+        width, before = boxes.high[:, 1:, 0] - boxes.low[:, 1:, 0], plain.high[:, 1:, 0] - plain.low[:, 1:, 0]
+        narrower += int(((width < before - 0.01) & present).sum())
+        action = policy.decide(shown, state)
+        state = policy.advance(shown, action, state)
+        td = env.step(td.set("action", action))["next"]
+    assert held / rows > 0.998
+    assert narrower / rows > 0.5
+
+
+def test_the_planner_drives() -> None:
+    world = HighwayWorld(max_steps=120)
+    columns = driven(world, Planner().load(0, world.facts), None)
+    assert not columns["crashed"].any()
+    assert columns["safe_progress"].mean() > 0.6
+    assert (columns["assured"] > 0.9).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Planner().load(0, ToyWorld().facts), "kinematics"),
+        (lambda: Tracker().load(Planner(), 0, ToyWorld().facts), "kinematics"),
+        (lambda: Shield().load(DDPG(), 0, FACTS), "discrete"),
+        (lambda: Shield().load(blind(), 0, FACTS), "sees"),
+    ],
+)
+def test_what_intervals_cannot_serve_is_refused_in_one_line(make: Any, said: str) -> None:
+    with pytest.raises(UserError, match=said) as refused:
+        make()
+    assert "\n" not in str(refused.value)
+
+
+def blind() -> DrivingVictim:
+    return choose("victim", "blind", policy="faster").component

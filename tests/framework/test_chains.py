@@ -1,0 +1,102 @@
+"""A chain of defences is a word of its own: on the command line, in records, and behind `bench list`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from bench.cli.listing import print_component
+from bench.errors import UserError
+from bench.plugins.options import configured
+from bench.plugins.pair import choose
+from bench.records import reading
+from bench.run.config import run_config
+from bench.run.plan import plan
+from bench.run.runner import run
+from bench.victims.drivers.networks import QPolicy
+from defenses.shield import Shielded
+from defenses.tracker import Tracked
+from envs.highway.world import HighwayWorld
+from tests.framework.test_runner import Silent
+
+FACTS = HighwayWorld().facts
+WORDS = (
+    "victim=dqn",
+    "attack=none",
+    "lanes=3",
+    "density=1",
+    "weather=clear",
+    "seeds=0",
+    "episodes=2",
+    "reference=false",
+)
+
+
+def test_the_observation_passes_the_links_in_their_order() -> None:
+    chain = choose("defense", "tracker+shield").component
+    policy = chain.load(choose("victim", "dqn").component, 0, FACTS)
+    assert isinstance(policy, Tracked)
+    assert isinstance(policy.policy, Shielded)
+    assert isinstance(policy.policy.policy, QPolicy)
+
+
+def test_a_trained_victim_stands_behind_the_filters() -> None:
+    victim = choose("victim", "dqn").component
+    trained = choose("defense", "advtrain").component.load(victim, 0, FACTS)
+    policy = choose("defense", "advtrain+shield").component.load(victim, 0, FACTS)
+    assert isinstance(policy, Shielded)
+    assert policy.policy.weights_sha256 == policy.weights_sha256 == trained.weights_sha256
+    assert choose("defense", "advtrain+shield").component.trains
+    assert not choose("defense", "tracker+shield").component.trains
+
+
+def test_each_link_has_its_own_parameters() -> None:
+    chosen = configured("defense", "tracker+shield", {"shield.band": "4", "tracker.assumed_norm": "linf"})
+    assert str(chosen) == "tracker+shield(tracker.assumed_norm=linf, shield.band=4.0)"
+    assert chosen.component.shield.band == 4.0
+    assert chosen.component.shield.assumed_norm == "relative"
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "said"),
+    [
+        ("tracker+shield", {"shield.bnd": "4"}, "did you mean 'shield.band'"),
+        ("tracker+shield", {"shield.band": "-1"}, "band must be at least 0"),
+        ("tracker+shield", {"shield.assumed_norm": "l2"}, "linf"),
+        ("shield+shield", {}, "different defences"),
+        ("shield+advtrain", {}, "must come first"),
+        ("tracker+nosuch", {}, "nosuch"),
+        ("tracker+jpeg", {}, "different tracks"),
+    ],
+)
+def test_bad_chains_are_refused_in_one_line(name: str, values: dict[str, str], said: str) -> None:
+    with pytest.raises(UserError, match=said) as refused:
+        configured("defense", name, values)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_chain_is_listed_with_the_parameters_of_its_links() -> None:
+    console = Console(width=200, record=True)
+    print_component("tracker+shield", console)
+    text = console.export_text()
+    assert "defenses.tracker:Tracker + defenses.shield:Shield" in text
+    assert "defense.shield.band" in text
+
+
+def test_a_chain_is_recorded_and_its_code_counts(tmp_path: Path) -> None:
+    config = run_config([*WORDS, "defense=tracker+shield", "executor=serial", f"out={tmp_path}"])
+    (unit,) = plan(config)
+    assert {"defenses.shield", "defenses.tracker"} <= set(unit.modules)
+    run(config, Silent())
+    (records,) = reading.read_all(tmp_path).values()
+    assert set(records["defense"].to_pylist()) == {"tracker+shield"}
+    assert all(share > 0.5 for share in records["assured"].to_pylist())
+    other = run_config([*WORDS, "defense=tracker+shield", "defense.shield.band=5", f"out={tmp_path}"])
+    assert plan(other)[0].fingerprint != unit.fingerprint
+
+
+def test_a_policy_that_promises_nothing_has_no_share_of_assured_frames() -> None:
+    assert choose("victim", "dqn").component.load(0, FACTS).assured(torch.zeros(1, 10, 5), None) is None
