@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import field, make_dataclass
+from dataclasses import field, fields, make_dataclass
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 from bench.errors import UserError
 from bench.plugins.contracts import ANY_TRACK, Defense, Victim
@@ -49,7 +49,8 @@ class Chain(Defense):
             raise UserError(f"train defense={trained[0]} by itself; the chain loads the trained victim")
 
     def zoo_name(self, victim: Any) -> str:
-        return next((link for link in self.links if link.trains), super()).zoo_name(victim)
+        trained = next((link for link in self.links if link.trains), None)
+        return trained.zoo_name(victim) if trained else super().zoo_name(victim)
 
     def load(self, victim: Victim, seed: int, facts: Any) -> Any:
         first, *others = self.links
@@ -60,11 +61,11 @@ class Chain(Defense):
 
     @classmethod
     def _fields(cls) -> tuple[str, ...]:
-        return tuple(cls.__dataclass_fields__)
+        return tuple(each.name for each in fields(cast(Any, cls)))
 
     @classmethod
     def _types(cls) -> list[type[Defense]]:
-        return [each.default_factory for each in cls.__dataclass_fields__.values()]  # type: ignore[misc]
+        return [cast("type[Defense]", each.default_factory) for each in fields(cast(Any, cls))]
 
 
 @cache
@@ -80,7 +81,7 @@ def chained(links: tuple[tuple[str, type[Defense]], ...]) -> type[Chain]:
     if late := [name for name, link in links[1:] if link.train is not Defense.train]:
         raise UserError(f"defense {MARK.join(names)!r}: {late[0]!r} trains its victim, so it must come first")
     parts: list[Any] = [(name, link, field(default_factory=link)) for name, link in links]
-    made = make_dataclass(MARK.join(names), parts, bases=(Chain,), frozen=True, kw_only=True)
+    made = cast("type[Chain]", make_dataclass(MARK.join(names), parts, bases=(Chain,), frozen=True, kw_only=True))
     made.__module__ = Chain.__module__
     made.__doc__ = "\n".join(["A chain of defences.", "", "Args:", *(f"    {name}: a link." for name in names)])
     made.libraries = tuple(sorted({library for _, link in links for library in link.libraries}))
