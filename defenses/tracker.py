@@ -73,7 +73,9 @@ class Tracked(PolicyWrapper):
             inner = self.policy.advance(self._estimate(observation, boxes, state), action, inner)
         ego = self.reckoning.now(boxes, state["ego"])
         after = self.reckoning.after(ego, action)
-        tracks = TensorDict(predicted(boxes, ego, after, self.period), batch_size=state.batch_size)
+        tracks = TensorDict(
+            predicted(boxes, ego, after, self.reckoning.kinematics, self.period), batch_size=state.batch_size
+        )
         own = {"ego": after, "tracks": tracks, **({} if inner is None else {"inner": inner})}
         return TensorDict(own, batch_size=state.batch_size)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 
 import matplotlib as mpl
@@ -58,6 +59,9 @@ STYLE = {
     "savefig.facecolor": GROUND,
 }
 
+LONG_NUMBER = re.compile(r"(?<=[\s\"])-?\d+\.\d{3,}(?=[\s\"])")
+"""A coordinate in an SVG file. Two decimals are enough."""
+
 
 def figure(height: float, title: str) -> Figure:
     """An empty figure of `height` inches with a title."""
@@ -75,7 +79,9 @@ def bare(axes: Axes) -> None:
 def save(made: Figure, path: Path) -> None:
     """Write a figure as SVG or PNG, the same bytes every time."""
     if path.suffix == ".svg":
-        made.savefig(path, metadata={"Date": None, "Creator": None})
+        drawn = io.StringIO()
+        made.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
+        path.write_text(LONG_NUMBER.sub(lambda number: f"{float(number[0]):.2f}", drawn.getvalue()))
         return
     drawn = io.BytesIO()
     made.savefig(drawn, format="png", dpi=PNG_DPI)

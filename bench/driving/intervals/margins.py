@@ -93,13 +93,11 @@ class _Cars(NamedTuple):
 
     @property
     def place(self) -> Tensor:
-        """The middle of x; its lower bound where the upper one is infinite."""
-        return torch.where(self.x[1].isfinite(), (self.x[0] + self.x[1]) / 2, self.x[0])
+        return _middle(*self.x)
 
     @property
     def speed(self) -> Tensor:
-        """The middle of vx; its lower bound where the upper one is infinite."""
-        return torch.where(self.vx[1].isfinite(), (self.vx[0] + self.vx[1]) / 2, self.vx[0])
+        return _middle(*self.vx)
 
 
 class Judge:
@@ -191,6 +189,12 @@ def _cars(ego: Ego, boxes: Boxes) -> _Cars:
         for place, value in enumerate(own)
     ]
     return _Cars(boxes.present[..., 1:], *bounds)
+
+
+def _middle(low: Tensor, high: Tensor) -> Tensor:
+    """The middle of an interval; where one bound is infinite, the other one; 0 where both are."""
+    first, last = low.nan_to_num(0.0, 0.0, 0.0), high.nan_to_num(0.0, 0.0, 0.0)
+    return (first + last) / (low.isfinite().to(low) + high.isfinite().to(low)).clamp(min=1)
 
 
 def _least(room: Tensor, counts: Tensor) -> Tensor:

@@ -8,20 +8,24 @@ from torch import Tensor
 
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import Ego
+from bench.driving.kinematics import Kinematics
 
 LONGITUDINAL, LATERAL = 6.0, 40.0
-"""Largest accelerations of another car along and across the road, in m/s2."""
+"""Largest accelerations of a car along its direction and across it, in m/s2 (of highway-env's IDMVehicle)."""
+LARGEST_SLIP = 0.66
+"""Sine of the largest angle between where a car points and where it moves (the bicycle model, steered by 60 degrees)."""
 ROUNDING = 1e-3
 """Predicted boxes are wider by this on every side, in m and m/s."""
 
 
-def predicted(boxes: Boxes, before: Ego, after: TensorDictBase, period: float) -> dict[str, Tensor]:
+def predicted(boxes: Boxes, before: Ego, after: TensorDictBase, car: Kinematics, period: float) -> dict[str, Tensor]:
     """The boxes of the other cars one decision later, relative to the ego: `present` [B, V - 1], `low`, `high` [B, V - 1, 4].
 
     Args:
         boxes: the boxes now, [B, V, 4].
         before: the ego now, [B] each.
         after: the ego's reckoned state one decision later.
+        car: kinematics of the world's cars.
         period: seconds per decision.
     """
     cos, sin = before.heading.cos(), before.heading.sin()
@@ -29,13 +33,30 @@ def predicted(boxes: Boxes, before: Ego, after: TensorDictBase, period: float) -
     heading = after["heading"]
     driven = (before.speed + after["speed"]) / 2 * cos * period
     then = torch.stack([driven, after["y"], after["speed"] * heading.cos(), after["speed"] * heading.sin()], -1)
-    reach = torch.tensor([LONGITUDINAL, LATERAL]).to(cos) * period
-    bounds = []
-    for side, bound in ((-1.0, boxes.low), (1.0, boxes.high)):
-        place, speed = (bound[..., 1:, :] + own).split(2, -1)
-        moved = place + (speed + side * reach) * period
-        bounds.append(torch.cat((moved, speed + side * reach), -1) - then.unsqueeze(-2) + side * ROUNDING)
-    return {"present": boxes.present[..., 1:], "low": bounds[0], "high": bounds[1]}
+    low, high = _later((boxes.low[..., 1:, :] + own), (boxes.high[..., 1:, :] + own), car, period)
+    then = then.unsqueeze(-2)
+    return {"present": boxes.present[..., 1:], "low": low - then - ROUNDING, "high": high - then + ROUNDING}
+
+
+def _later(low: Tensor, high: Tensor, car: Kinematics, period: float) -> tuple[Tensor, Tensor]:
+    """Bounds [..., 4] of x, y, vx and vy one decision later, in the road's frame.
+
+    A car's speed v changes by at most `LONGITUDINAL`, its lateral speed by at most `LATERAL`. As vx = sqrt(v^2 - vy^2), it
+    loses vx when it turns. A car that turns at the rate w slips sideways by w times half its length.
+    """
+    (x_low, y_low, vx_low, vy_low), (x_high, y_high, vx_high, vy_high) = low.unbind(-1), high.unbind(-1)
+    across = torch.maximum(-vy_low, vy_high)
+    slowest = torch.hypot(vx_low.clamp(min=0), torch.maximum(vy_low, -vy_high).clamp(min=0))
+    fastest = torch.hypot(vx_high, across) + LONGITUDINAL * period
+    slip = (car.length / 2 * LATERAL / slowest.clamp(min=0.1).square()).clamp(max=LARGEST_SLIP)
+    across = across + LATERAL * period
+    vx = ((slowest - LONGITUDINAL * period).clamp(min=0).square() - across.square()).clamp(min=0).sqrt()
+    vy_low, vy_high = vy_low - LATERAL * period, vy_high + LATERAL * period
+    x_low = x_low + (vx * (1 - slip.square()).sqrt() - across * slip) * period
+    y_low, y_high = y_low + (vy_low - fastest * slip) * period, y_high + (vy_high + fastest * slip) * period
+    return torch.stack([x_low, y_low, vx, vy_low], -1), torch.stack(
+        [x_high + fastest * period, y_high, fastest, vy_high], -1
+    )
 
 
 def narrowed(boxes: Boxes, tracks: TensorDictBase) -> Boxes:
