@@ -212,6 +212,20 @@ def test_a_copied_file_counts_once(written: Path, units: list[Unit]) -> None:
         assert records.num_rows == before[1][name].num_rows
 
 
+@pytest.mark.parametrize("name", ["victim=other", "a*b", "[ab]", "it's"])
+def test_the_name_of_a_results_folder_is_no_pattern_and_no_column(written: Path, units: list[Unit], name: str) -> None:
+    before = read(written), reading.read_compact(written, MEASURED)["driving"]
+    for beside in ("aXb", "a"):
+        results.prepare(written / beside)
+        for unit in units:
+            path = results.path_of(written, unit.fingerprint)
+            rewritten(path, lambda own: own.slice(0, 1), results.path_of(written / beside, unit.fingerprint))
+    shutil.copytree(written / "episodes", written / name / "episodes")
+    assert read(written / name).equals(before[0])
+    assert reading.read_compact(written / name, MEASURED)["driving"].equals(before[1])
+    assert len(results.finished(written / name, {unit.fingerprint: unit for unit in units})) == len(units)
+
+
 def test_a_record_from_the_future_is_not_the_newest(written: Path, units: list[Unit]) -> None:
     today = read(written)
     rows = read(written, [units[0].fingerprint]).to_pylist()
