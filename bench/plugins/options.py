@@ -1,4 +1,4 @@
-"""Command-line options such as `attack=zo,noise attack.steps=50 lanes=3,4`, read with hydra's grammar and type-checked by OmegaConf.
+"""Command-line options such as `attack=zo,noise attack.steps=50 lanes=3,4`: hydra's grammar, types checked by OmegaConf.
 
 Comma lists of seeds and of the axes of a world (lanes, weather) select values; all other comma lists sweep. A parameter is
 passed to those of the chosen components that have it.
