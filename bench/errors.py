@@ -49,7 +49,11 @@ def reason(error: BaseException) -> str:
     """The type and the first line of an exception: why something failed, in one line."""
     if isinstance(error, EscapeError):
         return str(error)
-    text = str(error).strip()
+    try:
+        text = str(error).strip()
+    # Foreign code may say how its exceptions are written, and may end the process there.
+    except BaseException:
+        text = ""
     return f"{type(error).__name__}: {text}".splitlines()[0] if text else type(error).__name__
 
 

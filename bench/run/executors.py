@@ -154,7 +154,7 @@ class ProcessExecutor:
                 if not busy:
                     return
                 watcher.working([work for task in busy.values() for work in (task.work, *task.others)])
-                wait([item for worker in busy for item in (worker.connection, worker.process.sentinel)], NEWS_S)
+                wait([source for worker in busy for source in worker.sources], NEWS_S)
                 for worker in list(busy):
                     for item in worker.news():
                         if not isinstance(item, Outcome | Failure):

@@ -60,6 +60,7 @@ class Outcome:
         recordings: contents of the `.rrd` files of a unit, by scenario seed.
         warnings: problems that do not affect the records.
         others: the results of the task's other units, in their order.
+        last: whether the settings of its process were changed, which must do no other work.
     """
 
     wall_s: float
@@ -69,6 +70,7 @@ class Outcome:
     recordings: Mapping[int, bytes] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     others: Sequence[Outcome | Failure] = ()
+    last: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,10 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -25,6 +26,11 @@ from bench.plugins.track import track
 from bench.run.blame import blamed
 from bench.run.process import context, follow_parent, resident_bytes, settle
 from bench.run.work import Failure, Outcome, Task, Tell, attempt
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 GB = 1e9
 READY = "ready"
@@ -60,7 +66,7 @@ class Worker:
         own = context(__name__, *_framework())
         self.limits = limits
         self.busy = self.ready = self.spent = False
-        self.printed = b""
+        self.heard, self.printed = True, b""
         self.connection, far = multiprocessing.Pipe()
         self.output, end = multiprocessing.Pipe(duplex=False)
         # Not daemonic: components may start processes of their own.
@@ -77,9 +83,15 @@ class Worker:
         with suppress(OSError):
             self.connection.send_bytes(content)
 
+    @property
+    def sources(self) -> list[Connection | int]:
+        """What to wait for: news, what is printed, and the end of the process."""
+        heard = [self.output] if self.heard else []
+        return [self.connection, *heard, self.process.sentinel]
+
     def wait(self, seconds: float) -> None:
         """Wait until there is news, or for so long."""
-        wait([self.connection, self.process.sentinel], seconds)
+        wait(self.sources, seconds)
 
     def news(self) -> list[Any]:
         """What the worker sent since: progress as (work, share, text), and at the end of a task an outcome or a failure.
@@ -105,7 +117,8 @@ class Worker:
             found += ends
         if ends:
             self.busy = False
-            self.spent = died or any(isinstance(item, Failure) and (item.lost or item.tampered) for item in ends)
+            # What failed may have left anything behind; the next task starts in a new process.
+            self.spent = died or any(item.last if isinstance(item, Outcome) else not item.bad_input for item in ends)
         return found
 
     def lines(self) -> list[str]:
@@ -133,6 +146,7 @@ class Worker:
             while self.output.poll():
                 content = os.read(self.output.fileno(), 1 << 16)
                 if not content:
+                    self.heard = False
                     return
                 self.printed += content[: max(0, KEPT_BYTES - len(self.printed))]
 
@@ -184,6 +198,7 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
         importlib.import_module(module)
     # Before any plug-in is imported.
     framework = Snapshot()
+    settings = _settings()
     connection.send_bytes(pickle.dumps(READY))
 
     def tell(work: str, share: float, text: str) -> None:
@@ -195,7 +210,21 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
         except (EOFError, OSError):
             return
         outcome = _carried_out(content, tell, framework)
+        if isinstance(outcome, Outcome) and _settings() != settings:
+            outcome = replace(outcome, last=True)
         connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
+
+
+def _settings() -> tuple[object, ...]:
+    """Settings of this process that a component may change, and that would harm the tasks after it."""
+    kinds = {number for name, number in vars(resource).items() if name.startswith("RLIMIT_")} if resource else set()
+    limits = {kind: resource.getrlimit(kind) for kind in kinds}
+    signals = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    try:
+        folder = os.getcwd()
+    except OSError:
+        folder = ""
+    return folder, limits, signals, sys.getrecursionlimit(), sys.gettrace(), sys.getprofile()
 
 
 @cache

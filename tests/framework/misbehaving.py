@@ -6,6 +6,7 @@ import ctypes
 import gc
 import os
 import random
+import resource
 import sys
 import time
 from dataclasses import dataclass
@@ -38,6 +39,9 @@ Deed = Literal[
     "print",
     "patch torch",
     "patch bench",
+    "limit",
+    "unprintable",
+    "print much",
 ]
 
 
@@ -95,7 +99,21 @@ class Rogue(DrivingAttack):
                 torch.Tensor.tanh = lambda tensor: tensor  # type: ignore[method-assign,assignment]
             case "patch bench":
                 bench.driving.meter.Meter.columns = lambda meter: {}  # type: ignore[method-assign,assignment]
+            case "limit":
+                resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))
+            case "unprintable":
+                raise UnprintableError
+            case "print much":
+                for _ in range(100):
+                    os.write(1, b"x" * 20_000)
         return observation + 0.1 * oracle.radius
+
+
+class UnprintableError(Exception):
+    """Ends the process when it is written."""
+
+    def __str__(self) -> str:
+        sys.exit(0)
 
 
 class BadPolicy(ToyPolicy):

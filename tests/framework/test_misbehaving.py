@@ -37,11 +37,13 @@ DEEDS = {
     "shape": "Rogue.perturb returned shape (2, 2, 1)",
     "weights": "is refused: ",
     "greedy": "asked for 3 queries in a step, the threat model allows 2",
+    "limit": "Too many open files",
+    "unprintable": "failed: UnprintableError",
     "patch torch": "is refused: torch.Tensor.tanh was replaced",
     "patch bench": "is refused: bench.driving.meter.Meter.columns was replaced",
 }
 """What the line says about each deed that fails a unit."""
-HARMLESS = ("none", "reseed", "print")
+HARMLESS = ("none", "reseed", "print", "print much")
 
 
 @pytest.fixture(scope="module")
@@ -138,15 +140,21 @@ def test_a_victim_that_cannot_answer_is_named_and_drives_nothing(site: Path, tmp
 
 @pytest.mark.slow
 def test_one_process_alone_survives_what_can_be_survived(site: Path, tmp_path: Path) -> None:
-    deeds = "none,'system exit',interrupt,hang,'patch torch'"
+    deeds = "none,'system exit',interrupt,unprintable,hang,'patch torch'"
     words = (f"attack.deed={deeds}", "victim=toy", *CELL, "executor=serial", "unit_timeout=15", f"out={tmp_path}")
     said = ran(site, "run", "attack=rogue", *words)
     assert said.code == 2
-    for why in ("SystemExit: 0", "KeyboardInterrupt", "unit_timeout=15", "torch.Tensor.tanh was replaced"):
+    for why in (
+        "SystemExit: 0",
+        "KeyboardInterrupt",
+        "failed: UnprintableError",
+        "unit_timeout=15",
+        "torch.Tensor.tanh was replaced",
+    ):
         assert why in said.err
     # After a patch nothing else can be trusted in this process.
     assert "changed this process; use executor=processes" in said.err
-    assert "error: 5 of 6 units are not finished, the others are kept" in said.err
+    assert "error: 6 of 7 units are not finished, the others are kept" in said.err
 
 
 def comparable(records: pa.Table) -> pa.Table:
