@@ -49,12 +49,17 @@ def reason(error: BaseException) -> str:
     """The type and the first line of an exception: why something failed, in one line."""
     if isinstance(error, EscapeError):
         return str(error)
+    text = message(error)
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def message(error: BaseException) -> str:
+    """The first line of an exception's message; empty if it has none, or cannot be written."""
     try:
-        text = str(error).strip()
+        return next(iter(str(error).strip().splitlines()), "")
     # Foreign code may say how its exceptions are written, and may end the process there.
     except BaseException:
-        text = ""
-    return f"{type(error).__name__}: {text}".splitlines()[0] if text else type(error).__name__
+        return ""
 
 
 class Notice(UserWarning):

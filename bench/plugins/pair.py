@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from bench.errors import PluginError, UserError, reason
+from bench.errors import PluginError, UserError, message, reason
 from bench.plugins import registry, sources
 from bench.plugins.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
 from bench.plugins.fingerprint import canonical, digest, state_digest
@@ -65,7 +65,7 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
         with contained():
             return Chosen(kind=kind, name=name, component=component(**params))
     except (ValueError, TypeError) as error:
-        raise UserError(f"{kind} {name!r}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
+        raise UserError(f"{kind} {name!r}: {message(error) or type(error).__name__}") from error
     # The checks of a plug-in may raise anything else.
     except Exception as error:
         raise PluginError(

@@ -44,17 +44,38 @@ def follow_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    _die_with_parent()
     if not parent.is_alive():
         os._exit(1)
+    # What a component forks ends with this process in the same way.
+    os.register_at_fork(after_in_child=_die_with_parent)
 
     def follow() -> None:
         parent.join()
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
+
+
+def _die_with_parent() -> None:
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+
+def end_copy(process: int) -> None:
+    """End this process at once if it is a copy of that one, which foreign code made by `os.fork`: two must not do one work."""
+    if os.getpid() != process:
+        os._exit(1)
+
+
+def children() -> frozenset[int]:
+    """The processes that this one started and that are there; empty where that cannot be read."""
+    found: set[int] = set()
+    for listed in Path("/proc/self/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            found.update(int(number) for number in listed.read_text().split())
+    return frozenset(found)
 
 
 def context(*modules: str) -> BaseContext:

@@ -12,7 +12,7 @@ from functools import partial
 import pyarrow as pa
 
 from bench import files
-from bench.errors import PluginError, UserError, reason
+from bench.errors import PluginError, UserError, message, reason
 from bench.plugins.fingerprint import canonical
 from bench.plugins.foreign import contained
 from bench.plugins.framework import Snapshot
@@ -145,9 +145,9 @@ def _alone(task: Task, tell: Tell) -> Outcome | Failure:
         with contained():
             return _performed(task, tell)
     except TamperError as error:
-        return Failure(why=f"is refused: {error}{blamed(work.pair, error)}", trace=traceback.format_exc())
+        return Failure(why=f"is refused: {message(error)}{blamed(work.pair, error)}", trace=traceback.format_exc())
     except UserError as error:
-        why, bad_input = f"failed: {error}{blamed(work.pair, error)}", not isinstance(error, PluginError)
+        why, bad_input = f"failed: {message(error)}{blamed(work.pair, error)}", not isinstance(error, PluginError)
         return Failure(why=why, bad_input=bad_input, trace=traceback.format_exc())
     # Third-party code may raise anything: name the component that failed.
     except Exception as error:

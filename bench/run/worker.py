@@ -24,7 +24,7 @@ from bench.plugins.foreign import contained, ended
 from bench.plugins.framework import Snapshot
 from bench.plugins.track import track
 from bench.run.blame import blamed
-from bench.run.process import context, follow_parent, resident_bytes, settle
+from bench.run.process import children, context, end_copy, follow_parent, resident_bytes, settle
 from bench.run.work import Failure, Outcome, Task, Tell, attempt
 
 try:
@@ -118,7 +118,7 @@ class Worker:
         if ends:
             self.busy = False
             # What failed may have left anything behind; the next task starts in a new process.
-            self.spent = died or any(item.last if isinstance(item, Outcome) else not item.bad_input for item in ends)
+            self.spent = died or any(_is_harmful(part) for item in ends for part in (item, *item.others))
         return found
 
     def lines(self) -> list[str]:
@@ -171,6 +171,11 @@ class Worker:
         return ""
 
 
+def _is_harmful(item: Outcome | Failure) -> bool:
+    """Whether the process that did this work must do no other."""
+    return item.last if isinstance(item, Outcome) else not item.bad_input
+
+
 def packed(task: Task) -> bytes | Failure:
     """A task as a worker is sent it; a failure if a component does not survive pickling."""
     try:
@@ -190,6 +195,7 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
     # Components may start processes of their own: the group ends with the worker.
     with suppress(OSError):
         os.setpgid(0, 0)
+    own = os.getpid()
     for stream in (1, 2):
         os.dup2(output.fileno(), stream)
     output.close()
@@ -202,21 +208,25 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
     connection.send_bytes(pickle.dumps(READY))
 
     def tell(work: str, share: float, text: str) -> None:
+        end_copy(own)
         connection.send_bytes(pickle.dumps((work, share, text)))
 
     while True:
         try:
             content = connection.recv_bytes()
         except (EOFError, OSError):
+            if os.getpgrp() == own:
+                os.killpg(0, signal.SIGKILL)
             return
         outcome = _carried_out(content, tell, framework)
+        end_copy(own)
         if isinstance(outcome, Outcome) and _settings() != settings:
             outcome = replace(outcome, last=True)
         connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
 
 
 def _settings() -> tuple[object, ...]:
-    """Settings of this process that a component may change, and that would harm the tasks after it."""
+    """Settings of this process, and processes that it started: what a component may change or leave to the tasks after it."""
     kinds = {number for name, number in vars(resource).items() if name.startswith("RLIMIT_")} if resource else set()
     limits = {kind: resource.getrlimit(kind) for kind in kinds}
     signals = {number: signal.getsignal(number) for number in signal.valid_signals()}
@@ -224,7 +234,7 @@ def _settings() -> tuple[object, ...]:
         folder = os.getcwd()
     except OSError:
         folder = ""
-    return folder, limits, signals, sys.getrecursionlimit(), sys.gettrace(), sys.getprofile()
+    return folder, limits, signals, sys.getrecursionlimit(), sys.gettrace(), sys.getprofile(), children()
 
 
 @cache

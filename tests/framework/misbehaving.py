@@ -10,6 +10,7 @@ import resource
 import sys
 import time
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -42,6 +43,8 @@ Deed = Literal[
     "limit",
     "unprintable",
     "print much",
+    "fork",
+    "fork and stay",
 ]
 
 
@@ -106,7 +109,19 @@ class Rogue(DrivingAttack):
             case "print much":
                 for _ in range(100):
                     os.write(1, b"x" * 20_000)
+            case "fork":
+                forked()
+            case "fork and stay":
+                if (copy := forked()) == 0:
+                    time.sleep(600)
+                print(f"copy {copy}")  # noqa: T201
         return observation + 0.1 * oracle.radius
+
+
+@cache
+def forked() -> int:
+    """Copy this process, once."""
+    return os.fork()
 
 
 class UnprintableError(Exception):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import typing
 from pathlib import Path
 
@@ -43,7 +44,7 @@ DEEDS = {
     "patch bench": "is refused: bench.driving.meter.Meter.columns was replaced",
 }
 """What the line says about each deed that fails a unit."""
-HARMLESS = ("none", "reseed", "print", "print much")
+HARMLESS = ("none", "reseed", "print", "print much", "fork", "fork and stay")
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def swept(site: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Said, P
     out = tmp_path_factory.mktemp("swept")
     deeds = ",".join([f"'{deed}'" for deed in (*HARMLESS, *DEEDS)])
     attacks = ",".join(["rogue", "noise", *ON_IMPORT])
-    limits = ("unit_timeout=15", "unit_memory=2.5", "threat.queries=2")
+    limits = ("unit_timeout=15", "unit_memory=1.5", "threat.queries=2")
     words = (f"attack={attacks}", f"attack.deed={deeds}", "victim=toy", "workers=2", *limits, *CELL)
     return ran(site, "run", *words, f"out={out}"), out
 
@@ -74,7 +75,10 @@ def test_a_sweep_goes_on_and_names_whatever_fails_with_its_package(swept: tuple[
     said, _ = swept
     assert said.code == 2
     errors = [line for line in said.err.splitlines() if line.startswith("error: ")]
-    assert errors[-1] == f"error: {len(DEEDS)} of {len(DEEDS) + 5} units are not finished, the others are kept"
+    assert (
+        errors[-1]
+        == f"error: {len(DEEDS)} of {len(DEEDS) + len(HARMLESS) + 2} units are not finished, the others are kept"
+    )
     assert len(errors) == len(ON_IMPORT) + len(DEEDS) + 1
     for deed, why in DEEDS.items():
         (line,) = (line for line in errors if f"rogue(deed={deed})" in line)
@@ -126,6 +130,17 @@ def test_what_components_print_does_not_reach_the_table(swept: tuple[Said, Path]
     assert "from" not in said.out
     for line in ("hello from rogue", "and from below", "complaint"):
         assert f"clear, seed 0 prints: {line}" in said.err
+
+
+@pytest.mark.slow
+def test_copies_of_a_worker_do_no_work_and_end_with_it(swept: tuple[Said, Path]) -> None:
+    said, _ = swept
+    copies = re.findall(r"prints: copy (\d+)", said.err)
+    assert copies
+    for copy in copies:
+        state = Path(f"/proc/{copy}/stat")
+        # One that ended may wait for its end to be read.
+        assert not state.exists() or state.read_text().rpartition(") ")[2].startswith("Z")
 
 
 @pytest.mark.slow
