@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
+import faulthandler
 import os
 import select
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
 from bench.errors import EscapeError, reason
 from bench.plugins.framework import Snapshot
 
-IMPORT_S = 120
-"""Seconds that the import of a module may take."""
+HARM_S = 120
+"""Seconds that the import of a module, or reading a file, may take."""
 SURVIVED = b"survived"
 
 
@@ -60,43 +60,46 @@ def contained() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def harm(module: str, seconds: float = IMPORT_S) -> str:
-    """Import a module in a copy of this process, and say what that does to the copy; empty if it does no harm.
+def harm(act: Callable[[], object], seconds: float = HARM_S) -> str:
+    """Do something in a copy of this process, and say what that does to the copy; empty if it does no harm.
 
-    Exceptions are no harm: the import in this process reports them.
+    Exceptions are no harm: the same act in this process reports them.
 
     Args:
-        module: name of the module.
+        act: imports a module, or reads a file.
         seconds: how long it may take.
 
     Returns:
-        That the module ends the process, never finishes, or replaces functions of the framework; empty without `os.fork`.
+        That it ends the process, does not end, or replaces functions of the framework; empty without `os.fork`.
     """
     if sys.platform != "linux":
         return ""
     read, write = os.pipe()
     with warnings.catch_warnings():
-        # Python warns of threads in the parent; the child only imports a module and ends.
+        # Python warns of threads in the parent; the child does this one thing and ends.
         warnings.simplefilter("ignore", DeprecationWarning)
         child = os.fork()
     if not child:
-        _import_and_end(module, write)
+        _act_and_end(act, write)
     os.close(write)
     said = _said(read, seconds)
+    # What it started ends, too.
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(child, signal.SIGKILL)
     if said is None:
         os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     if said is None:
-        return f"its import does not end within {seconds:g} s"
+        return f"does not end within {seconds:g} s"
     if not said.startswith(SURVIVED):
         code = os.waitstatus_to_exitcode(status)
-        return f"its import ends the process ({ended(code)})"
+        return f"ends the process ({ended(code)})"
     changed = said.removeprefix(SURVIVED).decode(errors="replace")
-    return f"its import replaces {changed}" if changed else ""
+    return f"replaces {changed}" if changed else ""
 
 
-def _import_and_end(module: str, write: int) -> None:
-    """In the copy: import the module without a word on the terminal, report, and end."""
+def _act_and_end(act: Callable[[], object], write: int) -> None:
+    """In the copy: do it without a word on the terminal, report, and end."""
     try:
         os.setsid()
         silence = os.open(os.devnull, os.O_RDWR)
@@ -105,9 +108,11 @@ def _import_and_end(module: str, write: int) -> None:
         if "torch" in sys.modules:
             # The threads of the parent are not in the copy: waiting for them would never end.
             sys.modules["torch"].set_num_threads(1)
+        # A crash is reported in our own words.
+        faulthandler.disable()
         framework = Snapshot()
         with suppress(BaseException):
-            importlib.import_module(module)
+            act()
         os.write(write, SURVIVED + framework.changed().encode())
     finally:
         os._exit(0)

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import importlib
 import inspect
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
+from functools import cache, partial
 from importlib import metadata
 from typing import Any, Literal, get_args
 
@@ -159,7 +160,8 @@ def resolve(group: str, name: str, noun: str) -> Any:
 @cache
 def _harm(module: str) -> str:
     """What importing a module does to a process; empty for nothing, or if it is imported already."""
-    return "" if module in sys.modules else harm(module)
+    why = "" if module in sys.modules else harm(partial(importlib.import_module, module))
+    return f"its import {why}" if why else ""
 
 
 def declared(kind: Kind, name: str) -> type[Any]:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import io
 import json
 import os
 import pickle
 import struct
+import sys
 import zipfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -21,6 +24,8 @@ from bench.archive import Archive
 from bench.errors import UserError
 from bench.run.config import component
 from bench.victims.detectors import yolov5_file
+from bench.victims.drivers.from_file import FileDriver, FilePolicy, RefusedError
+from bench.victims.drivers.torch_operations import operation
 from envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts
@@ -187,6 +192,19 @@ def changes_a_weight(members: Members, harm: Path) -> None:
     edited(members, PROGRAM, change)
 
 
+def changes_a_view(members: Members, harm: Path) -> None:
+    view, zero = {"as_tensor": {"name": "view"}}, {"as_tensor": {"name": "zero"}}
+    calls("torch.ops.aten.zero_.default", view)(members, harm)
+    weight = json.loads(members[PROGRAM])["graph_module"]["graph"]["inputs"][0]
+    calls("torch.ops.aten.view.default", weight, {"as_ints": [-1]})(members, harm)
+
+    def change(found: Any) -> None:
+        for node, output in zip(found["graph_module"]["graph"]["nodes"], (view, zero), strict=False):
+            node["outputs"] = [output]
+
+    edited(members, PROGRAM, change)
+
+
 def long_name(members: Members, harm: Path) -> None:
     members["q" * 60_000] = b""
 
@@ -240,16 +258,28 @@ CRAFTED: dict[str, tuple[Callable[[Members, Path], None], str]] = {
     ),
     "a number that fills the memory": (
         calls("_operator.mul", {"as_int": 2**62}, {"as_int": 8}),
-        "fails on 1 observations",
+        "is refused: _operator.mul makes a number that is too large",
+    ),
+    "an operation that fails": (
+        calls("torch.ops.aten.view.default", {"as_tensor": {"name": "observation"}}, {"as_ints": [7]}),
+        "fails on 1 observation: the operation aten.view.default fails",
     ),
     "a member with a long name": (long_name, "it holds 'qqq"),
     "a batch norm past the end of its statistics": (
         norm("native_batch_norm"),
         "'torch.ops.aten.native_batch_norm.default'",
     ),
-    "the same in eval mode": (norm("_native_batch_norm_legit_no_training"), "fails on 1 observations"),
+    "the same in eval mode": (
+        norm("_native_batch_norm_legit_no_training"),
+        "is refused: a batch norm has weights or statistics of another size than its input",
+    ),
     "a sparse tensor": (calls("torch.ops.aten.to_sparse.default"), "'torch.ops.aten.to_sparse.default', which is not"),
     "another layer's weights": (changes_a_weight, "changes its own weights: export it in eval mode"),
+    "a view of a weight": (changes_a_view, "changes its own weights: export it in eval mode"),
+    "an LSTM, whose sizes torch does not check": (
+        calls("torch.ops.aten.lstm.input"),
+        "'torch.ops.aten.lstm.input', which is not",
+    ),
 }
 
 
@@ -279,6 +309,58 @@ def test_the_crafted_programs_do_harm_when_torch_loads_them(what: str, honest: P
     with contextlib.suppress(Exception):
         torch.export.load(path)
     assert harm.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "sizes", "numbers", "why"),
+    [
+        ("batch_norm", [[4, 9], [1], [1], [9], [9]], [False, 0.1, 1e-5, False], "a batch norm has weights"),
+        ("batch_norm", [[4, 9], [9], [9], [9], [9]], [True, 0.1, 1e-5, False], "changes its own weights"),
+        ("instance_norm", [[4, 9, 2], [9], [9], [9], [9]], [True, 0.1, 1e-5, False], "changes its own weights"),
+        ("native_group_norm", [[1, 4, 2], [4], [4]], [1000, 4, 1000, 2, 1e-5], "a group norm has other sizes"),
+        ("_weight_norm", [[9, 4], [1, 1]], [0], "a weight norm has lengths of another size"),
+        ("scaled_dot_product_attention", [[2, 1, 9, 4], [2, 1, 9, 4], [2, 1, 2, 4]], [], "an attention has queries"),
+        ("scaled_dot_product_attention", [[2, 1, 9, 4]] * 3 + [[2, 9]], [], "an attention has a mask"),
+        ("_scaled_dot_product_flash_attention_for_cpu", [[2, 3, 9, 4], [1, 1, 9, 4], [1, 1, 9, 4]], [], "has queries"),
+    ],
+)
+def test_sizes_that_torch_does_not_check_are_checked(
+    name: str, sizes: list[list[int]], numbers: list[float], why: str
+) -> None:
+    _, call = operation(f"torch.ops.aten.{name}.default")
+    with pytest.raises(RefusedError, match=why):
+        call(*(torch.ones(size) for size in sizes), *numbers)
+
+
+def test_sizes_that_fit_are_computed_as_by_torch() -> None:
+    query, mask = torch.rand(2, 1, 9, 4), torch.rand(9, 9)
+    for name, given in {
+        "batch_norm": [torch.rand(4, 9), *[torch.rand(9)] * 4, False, 0.1, 1e-5, False],
+        "native_group_norm": [torch.rand(3, 4, 2), torch.rand(4), torch.rand(4), 3, 4, 2, 2, 1e-5],
+        "_weight_norm": [torch.rand(9, 4), torch.rand(9, 1), 0],
+        "scaled_dot_product_attention": [query, query, query, mask],
+    }.items():
+        found, call = operation(f"torch.ops.aten.{name}.default")
+        torch.testing.assert_close(call(*given), found(*given), rtol=0, atol=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crashing(FileDriver):
+    """A victim whose library crashes on its file."""
+
+    format: ClassVar[str] = "a file that crashes"
+
+    def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
+        ctypes.string_at(0)
+        raise AssertionError
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the file is tried in a copy of the process on Linux only")
+def test_a_file_that_crashes_its_library_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "crash.bin"
+    path.write_bytes(b"crash")
+    with pytest.raises(UserError, match=r"crash.bin is refused: reading and trying it ends the process \(SIGSEGV\)"):
+        Crashing(path=str(path)).load(0, FACTS)
 
 
 def code_in_text(members: Members, harm: Path) -> None:

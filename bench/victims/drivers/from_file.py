@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import multiprocessing
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -14,12 +16,21 @@ from torch import Tensor, nn
 
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from bench.errors import UserError
+from bench.plugins.foreign import harm
 from bench.plugins.ranges import Count
 
 CONTROLS = 2
 """Size of a continuous action: acceleration and steering."""
 TRIED = (1, 2, 1500)
 """Batch sizes on which a policy is tested: attacks query many points of many episodes at once."""
+
+
+class RefusedError(Exception):
+    """A part of a file that is not carried out. The message completes "the file is refused:"."""
+
+
+class OperationError(Exception):
+    """An operation of a network failed. The message is its name."""
 
 
 class FilePolicy(Policy):
@@ -109,8 +120,19 @@ class FileDriver(DrivingVictim):
         if not path.is_file():
             raise UserError(f"there is no file {self.path}; set victim.path=… to the policy's file")
         try:
-            width = len(facts.actions) if self.action_type == "discrete" else CONTROLS
-            policy = self.read(path, hashlib.sha256(path.read_bytes()).hexdigest(), width)
+            sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise UserError(f"{self.path} cannot be read: {error.strerror}") from error
+        # A worker is itself a process that may end.
+        if multiprocessing.parent_process() is None and (why := _harm(self, facts, sha256)):
+            raise UserError(f"{self.path} is refused: reading and trying it {why}")
+        return self._loaded(facts, sha256)
+
+    def _loaded(self, facts: DrivingFacts, sha256: str) -> FilePolicy:
+        """The policy, which was tried. Its kernels may crash on a crafted file."""
+        width = len(facts.actions) if self.action_type == "discrete" else CONTROLS
+        try:
+            policy = self.read(Path(self.path).expanduser(), sha256, width)
         except UserError:
             raise
         # A truncated file, or one in another format, can fail anywhere in the library that reads it.
@@ -147,12 +169,31 @@ class FileDriver(DrivingVictim):
             try:
                 with torch.no_grad():
                     scores = policy.scores(torch.zeros(batch, *observation))
+            except RefusedError as error:
+                raise UserError(f"{self.path} is refused: {error}") from error
             except Exception as error:
-                raise UserError(
-                    f"{self.path} fails on {batch} observations: export it with a dynamic batch size"
-                ) from error
+                raise UserError(f"{self.path} fails on {_observations(batch)}: {_what(error, batch)}") from error
             wanted = [batch, policy.width]
             if list(scores.shape) != wanted:
                 raise UserError(
-                    f"{self.path} returns {list(scores.shape)} for {batch} observations, {self.action_type} actions need {wanted}"
+                    f"{self.path} returns {list(scores.shape)} for {_observations(batch)}, "
+                    f"{self.action_type} actions need {wanted}"
                 )
+
+
+@cache
+def _harm(driver: FileDriver, facts: DrivingFacts, sha256: str) -> str:
+    """What reading and trying a file does to a copy of this process; empty for nothing."""
+    return harm(partial(driver._loaded, facts, sha256))
+
+
+def _observations(batch: int) -> str:
+    return "1 observation" if batch == TRIED[0] else f"{batch} observations"
+
+
+def _what(error: Exception, batch: int) -> str:
+    """What failed, and what may help."""
+    operation = f"the operation {error}" if isinstance(error, OperationError) else type(error).__name__
+    if batch == TRIED[0]:
+        return f"{operation} fails; if its batch size is fixed, export it with a dynamic one"
+    return f"{operation} fails, but not on fewer: export it with a dynamic batch size"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from bench.errors import UserError
 from bench.plugins.contracts import Access
-from bench.victims.drivers.from_file import FileDriver, FilePolicy
+from bench.victims.drivers.from_file import FileDriver, FilePolicy, OperationError
 from bench.victims.drivers.onnx_file import companions
 
 
@@ -52,7 +53,12 @@ class ONNX(FileDriver):
         name, output = inputs[0].name, session.get_outputs()[0].name
 
         def network(observation: Tensor) -> Tensor:
-            (answer,) = session.run([output], {name: observation.detach().contiguous().numpy()})
+            try:
+                (answer,) = session.run([output], {name: observation.detach().contiguous().numpy()})
+            # ONNX Runtime has many exceptions; their text names the operation.
+            except Exception as error:
+                node = re.search(r"running (\w+) node", str(error))
+                raise OperationError(node[1]) if node else error from error
             return torch.from_numpy(answer)
 
         return FilePolicy(network, shape, self.action_type, width, sha256)

@@ -1,7 +1,7 @@
 """A program as a list of ATen operations, carried out one after the other. Nothing else can be called.
 
-An operation is found by its name among ATen's. Its arguments are values of the graph, numbers, types and a few words, so
-that none can name a file or code.
+An operation is found by its name among those of `torch_operations`. Its arguments are values of the graph, numbers, types and
+a few words, so that none can name a file or code.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch._ops import OpOverload, OpOverloadPacket
+from torch._ops import OpOverload
+
+from bench.victims.drivers.from_file import OperationError, RefusedError
+from bench.victims.drivers.torch_operations import operation
 
 DTYPES = {
     1: torch.uint8, 2: torch.int8, 3: torch.int16, 4: torch.int32, 5: torch.int64, 6: torch.float16, 7: torch.float32,
@@ -46,17 +49,6 @@ WORDS = (
     "amin",
 )
 """Words that may be arguments, for instance how a division is rounded. Others could be names of files."""
-REFUSED = re.compile(
-    r"from_file|set_?|set_data|resize\w*|record_stream|requires_grad_|backward|retain_grad|item|.*_out"
-    r"|_?native_batch_norm(_legit)?|.*(sparse|quantize|fbgemm).*"
-)
-"""Operations that reach files, or memory beyond their arguments, or are not part of a forward pass.
-
-The batch norms of training and the sparse tensors trust the sizes and indices that they are given.
-"""
-UNCHECKED_NORM = "torch.ops.aten._native_batch_norm_legit_no_training.default"
-PRIVATE = ("_unsafe_view", "_weight_norm", "_scaled_dot_product_flash_attention_for_cpu", "_trilinear")
-"""Operations with an underscore, beside those of ATen's core, that exported programs contain."""
 ASSERTIONS = re.compile(r"torch\.ops\.aten\.(_assert_\w+|sym_constrain_range\w*)\.\w+")
 """Operations that check a size of the sample inputs; they compute nothing."""
 NO_GRAD = "torch.ops.higher_order.wrap_with_set_grad_enabled"
@@ -71,10 +63,6 @@ NUMBERS: Mapping[str, Callable[..., Any]] = {
     "torch.sym_not": operator.not_,
 }  # fmt: skip
 """Operations on sizes."""
-
-
-class RefusedError(Exception):
-    """A part of a program that is not carried out. The message completes "the file is refused:"."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +81,7 @@ class Device:
 class Step:
     """An operation with its arguments, and the names of its results: one, a sequence of them, or None for no name."""
 
+    name: str
     call: Callable[..., Any]
     args: tuple[Any, ...]
     kwargs: Mapping[str, Any]
@@ -117,24 +106,38 @@ class Graph(nn.Module):
         self.names = {f"weight_{number}": name for number, name in enumerate(weights)}
         for place, name in self.names.items():
             self.register_buffer(place, weights[name])
-        self.steps = _steps(graph, frozenset(weights))
+        self.steps = _steps(graph)
         ((output,),) = (list(value.values()) for value in graph["outputs"])
         self.output = str(output["name"])
 
     def forward(self, observation: Tensor) -> Tensor:
         values: dict[str, Any] = {name: self._buffers[place] for place, name in self.names.items()}
         values[self.observation] = observation
+        versions = self._versions()
         _run(self.steps, values, observation.device)
+        # Also by a view of a weight: all tensors that share their memory count together.
+        if self._versions() != versions:
+            raise RefusedError("it changes its own weights: export it in eval mode")
         found = values[self.output]
         assert isinstance(found, Tensor)
         return found
+
+    def _versions(self) -> list[int]:
+        """How often each weight was changed in place."""
+        return [weight._version for weight in self._buffers.values() if weight is not None]
 
 
 def _run(steps: Sequence[Step], values: dict[str, Any], device: torch.device) -> None:
     for step in steps:
         args = [_given(argument, values, device) for argument in step.args]
         kwargs = {name: _given(argument, values, device) for name, argument in step.kwargs.items()}
-        _keep(step.results, step.call(*args, **kwargs), values)
+        try:
+            found = step.call(*args, **kwargs)
+        except (RefusedError, OperationError):
+            raise
+        except Exception as error:
+            raise OperationError(step.name) from error
+        _keep(step.results, found, values)
 
 
 def _given(argument: Any, values: Mapping[str, Any], device: torch.device) -> Any:
@@ -153,48 +156,36 @@ def _keep(names: Any, results: Any, values: dict[str, Any]) -> None:
             _keep(name, result, values)
 
 
-def _steps(graph: Mapping[str, Any], weights: frozenset[str]) -> tuple[Step, ...]:
+def _steps(graph: Mapping[str, Any]) -> tuple[Step, ...]:
     return tuple(
-        _no_grad(node, weights) if node["target"] == NO_GRAD else _step(node, weights)
+        _no_grad(node) if node["target"] == NO_GRAD else _step(node)
         for node in graph["nodes"]
         if not ASSERTIONS.fullmatch(node["target"])
     )
 
 
-def _step(node: Mapping[str, Any], weights: frozenset[str]) -> Step:
+def _step(node: Mapping[str, Any]) -> Step:
     args: list[Any] = []
     kwargs: dict[str, Any] = {}
-    call = _number(node["target"]) or _operation(node["target"])
+    target = node["target"]
+    found, call = (None, number) if (number := _number(target)) else operation(target)
     for given in node["inputs"]:
         value = _argument(given["arg"])
         # 2 is KEYWORD. A file of an older torch says nothing; then every name is one of the operation's schema.
-        if given.get("kind") == 2 or (given.get("kind") is None and isinstance(call, OpOverload)):
+        if given.get("kind") == 2 or (given.get("kind") is None and isinstance(found, OpOverload)):
             kwargs[str(given["name"])] = value
         else:
             args.append(value)
-    changed = args[0] if args else None
-    mutable = isinstance(call, OpOverload) and call._schema.is_mutable
-    call = _batch_norm if node["target"] == UNCHECKED_NORM else call
-    if mutable and not (isinstance(changed, Value) and changed.name not in weights):
-        raise RefusedError(f"{node['target']} changes its own weights: export it in eval mode")
-    return Step(call, tuple(args), kwargs, _results(node["outputs"]))
+    return Step(target.removeprefix("torch.ops."), call, tuple(args), kwargs, _results(node["outputs"]))
 
 
-def _batch_norm(input: Tensor, *given: Any, **named: Any) -> Any:
-    """Batch norm in eval mode, with sizes that are checked: torch reads one number for each channel, even if there are fewer."""
-    for one in (*given, *named.values()):
-        if isinstance(one, Tensor) and one.shape != input.shape[1:2]:
-            raise RefusedError("a batch norm has weights or statistics of another size than its input")
-    return torch.ops.aten._native_batch_norm_legit_no_training.default(input, *given, **named)
-
-
-def _no_grad(node: Mapping[str, Any], weights: frozenset[str]) -> Step:
+def _no_grad(node: Mapping[str, Any]) -> Step:
     """A part of a program under `torch.no_grad()`."""
     enabled, graph, *given = (entry["arg"] for entry in node["inputs"])
     inner = graph["as_graph"]["graph"]
     names = [str(value["as_tensor"]["name"]) for value in inner["inputs"]]
     outputs = [_argument(value) for value in inner["outputs"]]
-    steps, arguments = _steps(inner, weights), [_argument(argument) for argument in given]
+    steps, arguments = _steps(inner), [_argument(argument) for argument in given]
     single = bool(inner.get("is_single_tensor_return"))
 
     def call(device: torch.device, *args: Any) -> Any:
@@ -206,7 +197,7 @@ def _no_grad(node: Mapping[str, Any], weights: frozenset[str]) -> Step:
 
     results = _results(node["outputs"])
     alone = isinstance(results, str) and not single
-    return Step(call, (Device(), *arguments), {}, [results] if alone else results)
+    return Step("torch.no_grad", call, (Device(), *arguments), {}, [results] if alone else results)
 
 
 def _number(target: str) -> Callable[..., Any] | None:
@@ -224,25 +215,6 @@ def _number(target: str) -> Callable[..., Any] | None:
         return found
 
     return call
-
-
-def _operation(target: str) -> OpOverload[..., Any]:
-    """The operation of ATen with this name.
-
-    Raises:
-        RefusedError: if there is none, or it is not one of a forward pass.
-    """
-    named = re.fullmatch(r"torch\.ops\.aten\.(\w+)\.(\w+)", target)
-    packet = getattr(torch.ops.aten, named[1], None) if named and not named[1].startswith("__") else None
-    found = getattr(packet, named[2], None) if named and isinstance(packet, OpOverloadPacket) else None
-    if not named or not isinstance(found, OpOverload):
-        raise RefusedError(
-            f"it calls {target!r}; only the operations of ATen on tensors (torch.ops.aten) are carried out"
-        )
-    private = named[1].startswith("_") and named[1] not in PRIVATE and torch.Tag.core not in found.tags
-    if private or REFUSED.fullmatch(named[1]) or named[2].endswith("out"):
-        raise RefusedError(f"it calls {target!r}, which is not an operation of a forward pass")
-    return found
 
 
 def _results(outputs: Sequence[Mapping[str, Any]]) -> Any:

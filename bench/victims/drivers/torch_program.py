@@ -24,7 +24,8 @@ from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from bench.archive import Archive
 from bench.errors import UserError, short
-from bench.victims.drivers.torch_graph import DTYPES, Graph, RefusedError
+from bench.victims.drivers.from_file import RefusedError
+from bench.victims.drivers.torch_graph import DTYPES, Graph
 
 SCHEMA = 8
 """Major version of the format that is read."""
