@@ -64,6 +64,8 @@ def check(path: Path, *, thoroughly: bool = False) -> tuple[Track, pa.Schema]:
     Raises:
         UserError: if the file is missing, truncated, or not a file of records.
     """
+    if path.exists() and not path.is_file():
+        raise UserError(f"the record {path} is not a file; delete it and run again to recreate it")
     try:
         found = pq.read_table(path).schema if thoroughly else pq.read_schema(path)
     except (pa.ArrowException, OSError) as error:
@@ -96,6 +98,8 @@ def _encoded(generation: pa.Schema) -> tuple[bytes, ...]:
 def _footer(path: Path) -> bytes:
     """The footer of a Parquet file, which names its columns; empty if it cannot be read."""
     try:
+        if not path.is_file():
+            return b""
         with path.open("rb") as file:
             file.seek(-8, os.SEEK_END)
             size = int.from_bytes(file.read(4), "little")

@@ -15,6 +15,7 @@ from typing import Protocol
 from bench import files
 from bench.errors import UserError
 from bench.records import store
+from bench.records.finished import finished
 from bench.run import artefacts
 from bench.run.batches import batches
 from bench.run.config import RunConfig
@@ -61,15 +62,15 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
         if not any(key_of(loading) in weights for loading in loadings(config, baselines=False)):
             raise failures.error((), 0)
         units = {unit.fingerprint: unit for unit in units_of(config, weights)}
-        done = store.finished(config.out, units)
+        done = finished(config.out, units)
         missing = [unit for key, unit in units.items() if key not in done]
         episodes = len(config.grid.seeds())
         watcher.begin(episodes=episodes * len(units), finished=episodes * len(done))
         driving = _Driving(config.out, _recorded(config, units.values()), back_end, watcher, failures)
         driving.carry_out(missing)
     if failures:
-        finished = [key for key, unit in units.items() if key in done or key in driving.finished]
-        raise failures.error(finished, len(units) - len(finished))
+        kept = [key for key, unit in units.items() if key in done or key in driving.finished]
+        raise failures.error(kept, len(units) - len(kept))
     return list(units)
 
 

@@ -18,6 +18,7 @@ from bench.errors import Notice, UserError
 from bench.plugins.track import Columns, track
 from bench.records import reading
 from bench.records import store as results
+from bench.records.finished import finished
 from bench.records.generations import AXES_OF_V1, generations
 from bench.records.schema import schema
 from bench.run.config import run_config
@@ -189,16 +190,33 @@ def rewritten(path: Path, change: Callable[[pa.Table], pa.Table], to: Path | Non
     pq.write_table(change(pq.read_table(path)), to or path)
 
 
+def replaced(own: pa.Table, name: str, value: object) -> pa.Table:
+    field = own.schema.field(name)
+    values = pa.array([value] * own.num_rows, field.type)
+    return own.set_column(own.schema.get_field_index(name), field, values)
+
+
 UNFINISHED: dict[str, tuple[Callable[[pa.Table, pa.Table], pa.Table], str]] = {
     "no rows": (lambda own, other: own.slice(0, 0), "it has 0 rows, the unit has 3 episodes"),
     "two rows": (lambda own, other: own.slice(0, 2), "it has 2 rows, the unit has 3 episodes"),
     "another unit": (lambda own, other: other, "it has the rows of another unit"),
     "an episode twice": (lambda own, other: own.take([0, 1, 1]), "it has other scenarios"),
     "impossible": (
-        lambda own, other: own.set_column(
-            own.schema.get_field_index("return"), own.schema.field("return"), pa.array([float("nan")] * 3)
-        ),
+        lambda own, other: replaced(own, "return", float("nan")),
         "return must be between -1e+15 and 1e+15, got nan",
+    ),
+    "impossible, in an older format": (
+        lambda own, other: replaced(own, "return", float("nan")).drop_columns(["threat_share"]),
+        "return must be between -1e+15 and 1e+15, got nan",
+    ),
+    "another pair": (lambda own, other: replaced(own, "pair", "other-none-toy"), "it has the rows of another pair"),
+    "another cell": (
+        lambda own, other: replaced(own, "cell", other["cell"][0].as_py()),
+        "it has the rows of another cell",
+    ),
+    "another training seed": (
+        lambda own, other: replaced(own, "training_seed", 7),
+        "it has the rows of another training seed",
     ),
 }
 
@@ -207,13 +225,13 @@ UNFINISHED: dict[str, tuple[Callable[[pa.Table, pa.Table], pa.Table], str]] = {
 def test_a_unit_is_finished_if_its_own_rows_are_there(written: Path, units: list[Unit], what: str) -> None:
     change, why = UNFINISHED[what]
     wanted = {unit.fingerprint: unit for unit in units}
-    assert results.finished(written, wanted) == set(wanted)
+    assert finished(written, wanted) == set(wanted)
     first, second = (results.path_of(written, unit.fingerprint) for unit in units[:2])
     other = pq.read_table(second)
     rewritten(first, lambda own: change(own, other))
     content = first.read_bytes()
     with pytest.warns(Notice) as told:
-        assert results.finished(written, wanted) == set(wanted) - {units[0].fingerprint}
+        assert finished(written, wanted) == set(wanted) - {units[0].fingerprint}
     (line,) = (str(one.message) for one in told)
     assert line.startswith(f"the record {first} does not count as finished: {why}; its unit is driven again")
     assert not first.exists()
@@ -226,9 +244,31 @@ def test_a_truncated_file_is_not_finished(written: Path, units: list[Unit], shar
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     for number in range(2):
         with pytest.warns(Notice, match="does not count as finished: it is truncated or not Parquet"):
-            assert results.finished(written, {units[1].fingerprint: units[1]}) == set()
+            assert finished(written, {units[1].fingerprint: units[1]}) == set()
         assert len(list((written / "set_aside").iterdir())) == number + 1
         path.write_bytes(b"PAR1")
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo], ids=["folder", "pipe"])
+def test_what_is_no_file_is_not_read(written: Path, units: list[Unit], make: Callable[[Path], None]) -> None:
+    path = results.path_of(written, units[0].fingerprint)
+    path.unlink()
+    make(path)
+    for reads in (read, lambda out: reading.read_compact(out, MEASURED)):
+        with pytest.raises(UserError, match=f"the record {path} is not a file"):
+            reads(written)
+    with pytest.warns(Notice, match="does not count as finished: it is not a file"):
+        assert finished(written, {units[0].fingerprint: units[0]}) == set()
+    assert not path.exists()
+
+
+def test_a_file_that_states_more_rows_than_the_unit_has_is_not_read(
+    written: Path, units: list[Unit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rewritten(results.path_of(written, units[0].fingerprint), lambda own: pa.concat_tables([own] * 1000))
+    monkeypatch.setattr(pq, "read_table", None)
+    with pytest.warns(Notice, match="it has 3000 rows, the unit has 3 episodes"):
+        assert finished(written, {units[0].fingerprint: units[0]}) == set()
 
 
 def test_a_copied_file_counts_once(written: Path, units: list[Unit]) -> None:
@@ -253,7 +293,7 @@ def test_the_name_of_a_results_folder_is_no_pattern_and_no_column(written: Path,
     shutil.copytree(written / "episodes", written / name / "episodes")
     assert read(written / name).equals(before[0])
     assert reading.read_compact(written / name, MEASURED)["driving"].equals(before[1])
-    assert len(results.finished(written / name, {unit.fingerprint: unit for unit in units})) == len(units)
+    assert len(finished(written / name, {unit.fingerprint: unit for unit in units})) == len(units)
 
 
 def test_a_record_from_the_future_is_not_the_newest(written: Path, units: list[Unit]) -> None:
