@@ -220,12 +220,12 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
     "two scores": (
         "torch",
         lambda path: {"path": torch_file(path, Scores(2))},
-        "returns [1, 2] for 1 observations, discrete actions need [1, 5]",
+        "returns [1, 2] for 1 observation, discrete actions need [1, 5]",
     ),
     "other actions": (
         "torch",
         lambda path: {"path": torch_file(path), "actions": "continuous"},
-        "returns [1, 5] for 1 observations, continuous actions need [1, 2]",
+        "returns [1, 5] for 1 observation, continuous actions need [1, 2]",
     ),
     "no rows": ("torch", lambda path: {"path": str(path), "rows": "0"}, "rows must be at least 1"),
     "no onnx": ("onnx", bad_text, "cannot be read"),

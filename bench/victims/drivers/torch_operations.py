@@ -18,37 +18,39 @@ from torch._ops import OpOverload, OpOverloadPacket
 from bench.victims.drivers.from_file import RefusedError
 
 NAMES = """
-    abs absolute acos acosh add addcdiv addcmul arccos arcsin arctan arctan2 asin asinh atan atan2 atanh bitwise_and bitwise_not
-    bitwise_or bitwise_xor ceil clamp clamp_max clamp_min clip copysign cos cosh deg2rad div divide erf erfc erfinv exp exp2 expm1
-    fix floor floor_divide fmax fmin fmod frac hypot isclose isfinite isinf isnan isneginf isposinf lerp log log10 log1p log2
-    logaddexp logical_and logical_not logical_or logical_xor logit maximum minimum mul multiply nan_to_num neg negative positive
-    pow rad2deg reciprocal remainder round rsqrt rsub sgn sign sin sinc sinh sqrt square sub subtract tan tanh true_divide trunc
-    where xlogy
-    eq equal ge greater greater_equal gt le less less_equal lt ne not_equal
-    celu elu gelu glu hardshrink hardsigmoid hardswish hardtanh leaky_relu log_sigmoid log_softmax mish prelu relu relu6 selu
-    sigmoid silu softmax softplus softshrink softsign threshold _log_softmax _safe_softmax _softmax
-    all amax amin aminmax any argmax argmin argsort count_nonzero cummax cummin cumprod cumsum kthvalue linalg_norm
-    linalg_vector_norm logcumsumexp logsumexp max mean median min nanmean nansum norm prod sort std std_mean sum topk var var_mean
-    addbmm addmm addmv addr baddbmm bilinear bmm chain_matmul cosine_similarity dot einsum inner kron linear linalg_cross
-    linalg_multi_dot matmul mm mv outer pairwise_distance tensordot trace _trilinear
-    _convolution conv1d conv2d conv3d conv_transpose1d conv_transpose2d convolution
-    adaptive_avg_pool1d adaptive_avg_pool2d adaptive_max_pool1d adaptive_max_pool2d avg_pool1d avg_pool2d max_pool1d
-    max_pool1d_with_indices max_pool2d max_pool2d_with_indices _adaptive_avg_pool2d
-    alpha_dropout batch_norm dropout feature_dropout group_norm instance_norm layer_norm native_group_norm native_layer_norm
-    rms_norm _native_batch_norm_legit_no_training _weight_norm
-    gru.input scaled_dot_product_attention _scaled_dot_product_flash_attention_for_cpu
-    alias as_strided atleast_1d atleast_2d atleast_3d block_diag broadcast_tensors broadcast_to cat channel_shuffle chunk clone
-    column_stack concat concatenate constant_pad_nd contiguous copy detach diag diag_embed diagonal dstack expand expand_as
-    flatten flip fliplr flipud hstack im2col lift_fresh lift_fresh_copy meshgrid movedim moveaxis narrow numpy_T pad permute
-    pixel_shuffle pixel_unshuffle ravel reflection_pad1d reflection_pad2d repeat repeat_interleave.self_int replication_pad1d
-    replication_pad2d reshape reshape_as roll rot90 select slice split split_with_sizes squeeze stack swapaxes swapdims t tile
-    to transpose tril triu type_as unbind unflatten unfold unsafe_chunk unsafe_split unsqueeze view view_as vstack _to_copy
-    _unsafe_view
-    embedding gather index index_add index_copy index_fill index_put index_select masked_fill one_hot scatter scatter_add
-    scatter_reduce select_scatter slice_scatter take_along_dim
-    arange eye fill full full_like linspace new_full new_ones new_zeros ones ones_like scalar_tensor tril_indices triu_indices
-    zero zeros zeros_like
-    sym_numel sym_size sym_storage_offset sym_stride
+abs absolute acos acosh adaptive_avg_pool1d _adaptive_avg_pool2d adaptive_avg_pool2d adaptive_max_pool1d adaptive_max_pool2d
+add addbmm addcdiv addcmul addmm addmv addr adjoint alias all alpha_dropout amax amin aminmax __and__ any arange arccos
+arccosh arcsin arcsinh arctan arctan2 arctanh argmax argmin argsort argwhere as_strided asin asinh atan atan2 atanh atleast_1d
+atleast_2d atleast_3d avg_pool1d avg_pool2d baddbmm batch_norm bilinear bitwise_and bitwise_left_shift bitwise_not bitwise_or
+bitwise_right_shift bitwise_xor block_diag bmm broadcast_tensors broadcast_to bucketize cartesian_prod cat ceil celu
+chain_matmul channel_shuffle chunk clamp clamp_max clamp_min clip clone column_stack combinations concat concatenate
+constant_pad_nd contiguous conv1d conv2d conv3d conv_transpose1d conv_transpose2d _convolution convolution copy copysign
+corrcoef cos cosh cosine_similarity count_nonzero cov cross cummax cummin cumprod cumsum cumulative_trapezoid deg2rad det
+detach diag diag_embed diagflat diagonal diagonal_scatter diff digamma dist div divide dot dropout dsplit dstack einsum elu
+embedding eq equal erf erfc erfinv exp exp2 expand expand_as expm1 eye feature_dropout fill fix flatten flip fliplr flipud
+float_power floor floor_divide fmax fmin fmod frac frobenius_norm full full_like gather ge gelu ger glu greater greater_equal
+group_norm gru.input gt hardshrink hardsigmoid hardswish hardtanh heaviside hsplit hstack huber_loss hypot im2col index
+index_add index_copy index_fill index_put index_select inner instance_norm isclose isfinite isin isinf isnan isneginf isposinf
+isreal kron kthvalue l1_loss layer_norm ldexp le leaky_relu lerp less less_equal lgamma lift_fresh lift_fresh_copy
+linalg_cross linalg_det linalg_diagonal linalg_inv linalg_matmul linalg_matrix_norm linalg_multi_dot linalg_norm linalg_solve
+linalg_vecdot linalg_vector_norm linear linspace log log10 log1p log2 log_sigmoid _log_softmax log_softmax logaddexp
+logaddexp2 logcumsumexp logical_and logical_not logical_or logical_xor logit logsumexp lt mH mT masked_fill masked_scatter
+masked_select matmul max max_pool1d max_pool1d_with_indices max_pool2d max_pool2d_with_indices maximum mean median meshgrid
+min minimum mish mm mode moveaxis movedim mse_loss msort mul multiply mv nan_to_num nanmean nanmedian nanquantile nansum
+narrow _native_batch_norm_legit_no_training native_group_norm native_layer_norm ne neg negative new_full new_ones new_zeros
+nonzero norm not_equal numpy_T one_hot ones ones_like __or__ outer pad pairwise_distance permute pixel_shuffle pixel_unshuffle
+positive pow prelu prod quantile rad2deg ravel real reciprocal reflection_pad1d reflection_pad2d relu relu6 remainder renorm
+repeat repeat_interleave.self_int replication_pad1d replication_pad2d reshape reshape_as resolve_conj resolve_neg rms_norm
+rnn_relu.input rnn_tanh.input roll rot90 round row_stack rsqrt rsub _safe_softmax scalar_tensor scaled_dot_product_attention
+_scaled_dot_product_flash_attention_for_cpu scatter scatter_add scatter_reduce select select_scatter selu sgn sigmoid sign
+signbit silu sin sinc sinh slice slice_scatter smooth_l1_loss _softmax softmax softplus softshrink sort special_entr
+special_erf special_erfc special_exp2 special_expit special_expm1 special_log1p special_log_ndtr special_log_softmax
+special_logit special_logsumexp special_ndtr special_round special_sinc special_softmax special_xlog1py special_xlogy split
+split_with_sizes sqrt square squeeze stack std std_mean sub subtract sum sum_to_size swapaxes swapdims sym_numel sym_size
+sym_storage_offset sym_stride t take take_along_dim tan tanh tensor_split tensordot threshold tile to _to_copy topk trace
+transpose trapezoid tril tril_indices _trilinear triu triu_indices true_divide trunc type_as unbind unflatten unfold
+unsafe_chunk unsafe_split _unsafe_view unsqueeze vander var var_mean vdot view view_as vsplit vstack _weight_norm where xlogy
+__xor__ zero zeros zeros_like
 """
 """Names of operations, with the overload where only that is allowed. Each may also change its first argument: `relu_`."""
 FORWARD = frozenset(NAMES.split())
@@ -64,14 +66,14 @@ def operation(target: str) -> tuple[OpOverload[..., Any], Callable[..., Any]]:
         RefusedError: if there is none, or it is not one of a forward pass.
     """
     named = re.fullmatch(r"torch\.ops\.aten\.(\w+)\.(\w+)", target)
-    packet = getattr(torch.ops.aten, named[1], None) if named and not named[1].startswith("__") else None
+    packet = getattr(torch.ops.aten, named[1], None) if named else None
     found = getattr(packet, named[2], None) if named and isinstance(packet, OpOverloadPacket) else None
     if not named or not isinstance(found, OpOverload):
         raise RefusedError(
             f"it calls {target!r}; only the operations of ATen on tensors (torch.ops.aten) are carried out"
         )
     plain = named[1].removesuffix("_")
-    if not {plain, f"{plain}.{named[2]}"} & FORWARD or named[2].endswith("out"):
+    if not {named[1], plain, f"{plain}.{named[2]}"} & FORWARD or named[2].endswith("out"):
         raise RefusedError(f"it calls {target!r}, which is not an operation of a forward pass")
     return found, _checked(found, CHECKS[plain]) if plain in CHECKS else found
 
