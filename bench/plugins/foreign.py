@@ -27,15 +27,16 @@ class StopUnitError(BaseException):
 
 @contextmanager
 def contained() -> Iterator[None]:
-    """Run foreign code that must not end this process by an exception.
+    """Run foreign code that must not end this process by an exception, nor copy it.
 
-    The user's Ctrl-C goes through, even if the foreign code catches it.
+    A copy that it makes by `os.fork` ends here: two processes must not do one work. The user's Ctrl-C goes through, even if the
+    foreign code catches it.
 
     Raises:
         EscapeError: for a SystemExit, a GeneratorExit, a KeyboardInterrupt that is not the user's, and any other exception that
             is no `Exception`.
     """
-    pressed = False
+    pressed, own = False, os.getpid()
 
     def press(number: int, frame: FrameType | None) -> None:
         nonlocal pressed
@@ -54,6 +55,8 @@ def contained() -> Iterator[None]:
             raise
         raise EscapeError(reason(error)) from error
     finally:
+        if os.getpid() != own:
+            os._exit(1)
         if listens:
             signal.signal(signal.SIGINT, before)
     if pressed:

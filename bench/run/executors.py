@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import signal
 import threading
 from collections import deque
@@ -18,7 +17,7 @@ from typing import Protocol
 from bench.plugins.foreign import StopUnitError
 from bench.plugins.framework import Snapshot
 from bench.run.blame import blamed
-from bench.run.process import cores, end_copy, settle
+from bench.run.process import cores, settle
 from bench.run.unit import Loading, Preparation, Unit
 from bench.run.work import Failure, Outcome, Task, attempt
 from bench.run.worker import Limits, Worker, packed
@@ -75,7 +74,7 @@ class SerialExecutor:
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
         settle()
-        framework, culprit, own = Snapshot(), "", os.getpid()
+        framework, culprit = Snapshot(), ""
         waiting, parts = iter(tasks), deque[Task]()
         while (task := parts.popleft() if parts else next(waiting, None)) is not None:
             if culprit:
@@ -83,7 +82,6 @@ class SerialExecutor:
                 continue
             watcher.working([task.work, *task.others])
             outcome, text = self._carried_out(task, watcher, framework)
-            end_copy(own)
             if lines := [line for line in text.splitlines() if line.strip()]:
                 watcher.printed(task.work, lines)
             if isinstance(outcome, Failure) and outcome.tampered:

@@ -63,12 +63,6 @@ def _die_with_parent() -> None:
             ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
 
-def end_copy(process: int) -> None:
-    """End this process at once if it is a copy of that one, which foreign code made by `os.fork`: two must not do one work."""
-    if os.getpid() != process:
-        os._exit(1)
-
-
 def children() -> frozenset[int]:
     """The processes that this one started and that are there; empty where that cannot be read."""
     found: set[int] = set()

@@ -24,7 +24,7 @@ from bench.plugins.foreign import contained, ended
 from bench.plugins.framework import Snapshot
 from bench.plugins.track import track
 from bench.run.blame import blamed
-from bench.run.process import children, context, end_copy, follow_parent, resident_bytes, settle
+from bench.run.process import children, context, follow_parent, resident_bytes, settle
 from bench.run.work import Failure, Outcome, Task, Tell, attempt
 
 try:
@@ -208,7 +208,9 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
     connection.send_bytes(pickle.dumps(READY))
 
     def tell(work: str, share: float, text: str) -> None:
-        end_copy(own)
+        # A copy of this process may prepare something, too.
+        if os.getpid() != own:
+            os._exit(1)
         connection.send_bytes(pickle.dumps((work, share, text)))
 
     while True:
@@ -219,7 +221,6 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
                 os.killpg(0, signal.SIGKILL)
             return
         outcome = _carried_out(content, tell, framework)
-        end_copy(own)
         if isinstance(outcome, Outcome) and _settings() != settings:
             outcome = replace(outcome, last=True)
         connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
