@@ -17,8 +17,13 @@ from typing import BinaryIO
 from bench.errors import UserError
 
 
-def check_folder(folder: Path, what: str) -> None:
+def check_folder(folder: Path, what: str, option: str = "out") -> None:
     """Create a folder, and check that files can be written to it; call it before the work whose results go there.
+
+    Args:
+        folder: the folder.
+        what: its name in the error.
+        option: the option of the command line that chooses it.
 
     Raises:
         UserError: if it is a file, or cannot be written.
@@ -29,7 +34,7 @@ def check_folder(folder: Path, what: str) -> None:
             pass
     except OSError as error:
         reason = "it is a file" if folder.is_file() else error.strerror or str(error)
-        raise UserError(f"{what} {folder} cannot be written: {reason}; choose another with out=") from None
+        raise UserError(f"{what} {folder} cannot be written: {reason}; choose another with {option}=") from None
 
 
 @contextmanager

@@ -6,6 +6,7 @@ A command imports what it needs when it is called, so that `bench list` and `--h
 from __future__ import annotations
 
 import os
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -18,7 +19,7 @@ from bench import __version__
 from bench.cli.axes_help import AxesHelp
 from bench.cli.completion import completed
 from bench.cli.terminal import Console
-from bench.errors import Notice, UnfinishedError, UserError, bounded
+from bench.errors import Notice, UnfinishedError, UserError, bounded, short
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -346,7 +347,7 @@ def main() -> None:
         except (UserError, typer.TyperException) as error:
             if debug:
                 raise
-            reason = error.format_message() if isinstance(error, typer.TyperException) else str(error)
+            reason = _typed(error) if isinstance(error, typer.TyperException) else str(error)
             sys.exit(_complain(reason))
         # Unexpected errors are mostly in plug-ins: tell their authors how to see the traceback.
         except Exception as error:
@@ -359,6 +360,32 @@ def main() -> None:
                 reason = full if _is_full(error) else f"{type(error).__name__}: {error}"
             sys.exit(_complain(f"{reason} (--debug shows the traceback)"))
     sys.exit(status or 0)
+
+
+def _typed(error: typer.TyperException) -> str:
+    """What was typed wrong, in our own words; those of Typer for what has none."""
+    message, context = error.format_message(), getattr(error, "ctx", None)
+    if message.endswith("requires an argument."):
+        return f"option {error.option_name} needs a value"  # type: ignore[attr-defined]
+    if context is None:
+        return message
+    if found := re.match(
+        r"No such command '(.*?)'\.|Got unexpected extra argument\(?s?\)? \((.*)\)", message, re.DOTALL
+    ):
+        from bench.plugins.registry import unknown
+
+        if found[2]:
+            return f"cannot read {short(found[2])}: `bench {context.info_name} --help` says what it takes"
+        return unknown(f"command '{short(found[1])}'", found[1], sorted(context.command.commands))
+    options = [option for one in context.command.get_params(context) for option in one.opts if option.startswith("-")]
+    match type(error).__name__:
+        case "NoSuchOption":
+            return f"unknown option {short(error.option_name)!r}; known: {', '.join(options)}"  # type: ignore[attr-defined]
+        case "MissingParameter":
+            name = str(error.param.metavar or error.param.name.upper())  # type: ignore[attr-defined]
+            return f"{name.split()[0].rstrip('.')} is missing; `bench {context.info_name} --help` says what it is"
+        case _:
+            return message
 
 
 def _is_full(error: Exception) -> bool:

@@ -15,7 +15,7 @@ from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from bench.errors import UserError
+from bench.errors import UserError, short
 from bench.run.executors import NEWS_S, Finished, Retries, Watcher
 from bench.run.process import cores
 from bench.run.work import Failure, Outcome, Task
@@ -70,9 +70,11 @@ class Host:
 
 def _check_answers(address: str) -> None:
     """Raise UserError if nothing answers at HOST:PORT: Ray itself tries for minutes."""
-    host, colon, port = address.rpartition(":")
-    if not (colon and port.isdecimal()):
+    if address in ("local", "auto"):
         return
+    host, colon, port = address.rpartition(":")
+    if not (host and colon and port.isascii() and port.isdecimal()):
+        raise UserError(f"ray.address must be local, auto or HOST:PORT, got {short(address)}")
     try:
         socket.create_connection((host.rpartition("/")[2], int(port)), ANSWER_S).close()
     except (OSError, OverflowError) as error:

@@ -46,7 +46,7 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         UserError: if there are no records, or nothing can be written.
     """
     page = page / NAME if page.is_dir() else page
-    check_folder(page.parent, "the folder of the page")
+    check_folder(page.parent, "the folder of the page", "html")
     if folders := [target for target in _files(page) if target.is_dir()]:
         raise UserError(f"the page {page} cannot be written: {folders[0]} is a folder; choose another with html=")
     # The thesis' tables are made of other records, and so in a process of their own meanwhile.

@@ -71,11 +71,29 @@ def test_an_unknown_component_has_no_page(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("words", "part"),
     [
+        (("shwo",), "unknown command 'shwo'; did you mean 'show'? known: audit, check"),
+        (("list", "--jsn"), "unknown option '--jsn'; known: --json"),
+        (("list", "a", "b"), "cannot read b: `bench list --help` says what it takes"),
+        (("verify",), "FOLDER is missing; `bench verify --help` says what it is"),
+        (("show", "--out"), "option --out needs a value"),
+        (
+            ("report", "html=/dev/null/page.html"),
+            "the folder of the page /dev/null cannot be written: File exists; choose another with html=",
+        ),
+    ],
+)
+def test_what_is_typed_wrong_is_said_in_our_own_words(bench: Bench, words: tuple[str, ...], part: str) -> None:
+    assert_one_line(bench(*words), part)
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
         (("attack=nugde",), "unknown attack 'nugde'; did you mean 'nudge'?"),
         (("attack=nudge", "attack.pause=long"), "attack.pause must be a number, got long"),
         (("threat.budget=-1",), "threat.budget must be between 0 and 2, got -1"),
         (("attack=steer", "victim=toy"), "attack 'steer' does not fit victim 'toy'"),
-        (("--fast",), "No such option"),
+        (("--fast",), "unknown option '--fast'; known: --help"),
     ],
 )
 def test_bad_input_is_refused_before_any_work(bench: Bench, tmp_path: Path, words: tuple[str, ...], part: str) -> None:
@@ -121,7 +139,7 @@ def test_show_prints_the_provenance_of_the_records(bench: Bench, tmp_path: Path)
         for part in (pair, "nudge(mood=calm, pause=0.0, scale=0.5)  cavbench-toy 1.0", "relative 0.1", "torch "):
             assert part in said.out
     assert_one_line(bench("show", "nothing", "--out", str(tmp_path)), "unknown pair 'nothing'", pair)
-    assert_one_line(bench("show", "no/where", "--out", str(tmp_path)), "the folder no/where does not exist")
+    assert_one_line(bench("show", "no/where", "--out", str(tmp_path)), "there is no folder no/where")
 
 
 def test_report_prints_a_report_by_name(bench: Bench, tmp_path: Path) -> None:
