@@ -58,7 +58,7 @@ def located(run: str, out: Path) -> tuple[Path, str]:
     if Path(run) == out and out == Path("results"):
         raise UserError("there is no folder results; create one with `bench run`, or choose another with out=")
     if "/" in run or Path(run) == out:
-        raise UserError(f"there is no folder {run}")
+        raise UserError(f"there is no {'recording' if run.endswith('.rrd') else 'folder'} {run}")
     return out, run
 
 

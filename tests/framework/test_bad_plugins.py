@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from bench.plugins.foreign import contained
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.framework.test_check import CROOKED, POINTS
@@ -152,3 +154,12 @@ def test_a_plugin_that_fails_in_a_run_is_reported_and_other_records_are_kept(
     assert FAILS_AT_WORK[words] in said.err
     assert "Traceback" not in said.err
     assert all(path.read_bytes() == blob for path, blob in kept.items())
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
+def test_a_copy_of_the_process_ends_where_foreign_code_ends() -> None:
+    with contained():
+        copy = os.fork()
+    if not copy:
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(copy, 0)[1]) == 1

@@ -182,7 +182,7 @@ def test_without_a_display_view_says_how_to_open_a_recording(
     path = tmp_path / "some.rrd"
     path.write_bytes(b"")
     assert f"rerun {path}" in bench("view", str(path)).out
-    assert_one_line(bench("view", str(tmp_path / "other.rrd")), "does not exist")
+    assert_one_line(bench("view", str(tmp_path / "other.rrd")), "there is no recording")
 
 
 def test_debug_shows_the_traceback(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
