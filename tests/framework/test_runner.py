@@ -47,8 +47,9 @@ class Silent:
         if len(self.done) == self.stop_after:
             raise KeyboardInterrupt
 
-    def preparing(self, work: str, share: float, text: str) -> None:
-        self.told.append((work, share, text))
+    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
+        if not episodes:
+            self.told.append((work, share, text))
 
     def finished(self, work: Work, wall_s: float) -> None:
         self.done.append(work)
