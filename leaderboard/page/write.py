@@ -55,7 +55,7 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         records = _read(out)
         thesis = beside.submit(chapters.chapters, chapters.needed(records))
         boards, comparisons = read_boards(records)
-        made = document(boards, comparisons, out)
+        made = document(boards, comparisons, out, _link(out, page))
         texts = {
             _files(page)[0]: json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
             _files(page)[1]: table(made),
