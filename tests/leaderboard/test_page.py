@@ -242,13 +242,13 @@ def test_numbers_are_copied_as_csv_and_as_latex(opened: Open) -> None:
         float(line["Worst case low"]) <= float(line["Worst case"]) <= float(line["Worst case high"]) for line in lines
     )
     assert {"Crashed low", "Worst cell high", "Clean low"} <= set(lines[0])
+    assert f"{float(lines[0]['Worst case']):.2f}" == column(page, "ranks", 4)[0].split()[0]
+    assert page.locator("#said").inner_text() == "CSV copied"
     page.locator("[data-table=ranks] button", has_text="LaTeX").click()
     ranks = page.evaluate("navigator.clipboard.readText()")
     best = page.locator("#ranks tr.best").count()
     assert 0 < best == ranks.count("\\textbf{") < page.locator("#ranks tbody tr").count()
     assert "{\\scriptsize [" in ranks
-    assert f"{float(lines[0]['Worst case']):.2f}" == column(page, "ranks", 4)[0].split()[0]
-    assert page.locator("#said").inner_text() == "CSV copied"
     page.locator("[data-table=matrix] button", has_text="LaTeX").click()
     latex = page.evaluate("navigator.clipboard.readText()")
     assert latex.startswith("\\begin{tabular}{ll")
@@ -275,9 +275,9 @@ def test_one_plot_has_a_line_for_each_defended_victim(opened: Open) -> None:
     assert len(texts(page, "#curves figure:first-child .key li")) == 4
     # Without an attack, and at two budgets.
     assert page.locator("#curves figure:first-child svg[role=img] circle").count() == 4 * 3
-    ticks = [float(text) for text in texts(page, "#curves figure:first-child text.tick")]
+    ticks = [float(text) for text in page.locator("#curves figure:first-child text.tick").all_text_contents()]
     assert ticks == [0, 0.05, 0.1]
-    for text in texts(page, "#curves text.tick"):
+    for text in page.locator("#curves text.tick").all_text_contents():
         assert len(text.replace("0.", "").strip("0")) == 1, f"{text} is no round number"
 
 

@@ -423,11 +423,16 @@ function part(pair, row) {
   const own = kept(pair.cells).length, all = row ? kept(row.cells).length : own;
   return own < all ? `${own} of ${all} cells` : "";
 }
+/* An attack, with its threat model where it is not that of the board. */
+function attackName(pair) {
+  const t = current().threat, same = ["budget", "access", "queries"].every((name) => pair.threat[name] === t[name]);
+  return pair.attack.label + (same ? "" : ` (${threatShort(pair.threat)}, ${pair.threat.queries} queries)`);
+}
 function drawMatrix(board) {
   const rows = board.rows.filter(chosen);
   const all = within(board).filter(chosen);
   const controls = all.filter((pair) => pair.attack.name === "none");
-  const label = (pair) => (pair.attack.name === "none" ? "no attack" : pair.attack.label + (pair.threat.budget === board.threat.budget && pair.threat.access === board.threat.access && pair.threat.queries === board.threat.queries ? "" : ` (${threatShort(pair.threat)}, ${pair.threat.queries})`));
+  const label = (pair) => (pair.attack.name === "none" ? "no attack" : attackName(pair));
   const driven = (attack) => all.reduce((sum, pair) => sum + (label(pair) === attack ? pair.cells.length : 0), 0);
   const attacks = [...new Set([...controls, ...all.filter((pair) => pair.attack.name !== "none")].map(label))]
     .sort((a, b) => (b === "no attack") - (a === "no attack") || driven(b) - driven(a));
@@ -546,7 +551,7 @@ function rowCard(row) {
     ...(row.failed ? fact(said().failure_title, `${percent(row.failed.estimate)} (${bounds(row.failed)})`) : []),
     ...fact("worst cell", ...worstCell({ row })),
     ...(row.clean ? fact("without an attack", ...estimate(row.clean)) : []),
-    ...fact("attacks", ...row.pairs.map((key) => el("div", {}, cardLink(pairs.get(key), pairs.get(key).attack.label), " ", ...estimate(pairs.get(key).score)))),
+    ...fact("attacks", ...row.pairs.map((key) => el("div", {}, cardLink(pairs.get(key), attackName(pairs.get(key))), " ", ...estimate(pairs.get(key).score), " ", el("small", { class: "quiet" }, part(pairs.get(key), row))))),
     ...fact("flags", doubts(row)),
     ...works(strongest.card, ["defense", "victim", "world"]),
     ...fact("strongest attack", pairs.get(row.strongest).attack.label),
