@@ -278,7 +278,7 @@ def test_one_plot_has_a_line_for_each_defended_victim(opened: Open) -> None:
     ticks = [float(text) for text in page.locator("#curves figure:first-child text.tick").all_text_contents()]
     assert ticks == [0, 0.05, 0.1]
     for text in page.locator("#curves text.tick").all_text_contents():
-        assert len(text.replace("0.", "").strip("0")) == 1, f"{text} is no round number"
+        assert float(f"{float(text):.0e}") == float(text), f"{text} is no round number"
 
 
 @pytest.mark.parametrize("track", ["driving", "detection", "thesis", "method"])
