@@ -59,7 +59,7 @@ def throughput(name: str, count: int) -> tuple[float, float]:
         for _ in back_end.map([Task(work=work) for _ in range(2 * cores())], Silent()):  # type: ignore[arg-type]
             pass
         start, used = time.perf_counter(), time.process_time()
-        outcomes = [outcome for _, outcome in back_end.map((Task(work=work) for _ in range(count)), Silent())]  # type: ignore[arg-type]
+        outcomes = [outcome for some in back_end.map((Task(work=work) for _ in range(count)), Silent()) for _, outcome in some]  # type: ignore[arg-type]
         seconds, used = time.perf_counter() - start, time.process_time() - used
     assert all(isinstance(outcome, Outcome) for outcome in outcomes)
     return count / seconds, count / used

@@ -122,19 +122,20 @@ class RayExecutor:
         self.size = self._cores()
         self.make = ray.remote(num_cpus=1, max_concurrency=2, max_restarts=0)(Host)
 
-    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
+    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         waiting, retries = iter(tasks), Retries()
         lost: dict[int, int] = {}
         alive = time.monotonic()
         following: Task | None = retries.next(waiting)
         try:
             while following is not None or any(actor.task for actor in self.actors):
+                ended: list[Finished] = []
                 self._grow()
                 for actor in self._idle():
                     while following is not None and actor.task is None:
                         content = packed(following)
                         if isinstance(content, Failure):
-                            yield following, content
+                            ended.append((following, content))
                         else:
                             actor.task = following
                             actor.pending = actor.handle.carry_out.remote(content)
@@ -147,12 +148,14 @@ class RayExecutor:
                         self.actors.remove(actor)
                         if task is not None and lost.setdefault(id(task), 1) >= LOST:
                             why = f"failed: the machine that drove it was lost {LOST} times"
-                            yield from retries.ended(task, Failure(why=why, lost=True), (), watcher)
+                            ended += retries.ended(task, Failure(why=why, lost=True), (), watcher)
                         elif task is not None:
                             lost[id(task)] += 1
                             retries.put_back(task)
                     elif task is not None:
-                        yield from retries.ended(task, pickle.loads(answer[0]), answer[1], watcher)
+                        ended += retries.ended(task, pickle.loads(answer[0]), answer[1], watcher)
+                if ended:
+                    yield ended
                 following = following or retries.next(waiting)
                 if any(actor.task for actor in self.actors):
                     alive = time.monotonic()
