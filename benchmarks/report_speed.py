@@ -1,6 +1,6 @@
 """Measures `bench report html=PAGE` on a million episode records of ten thousand units: time, memory and size of the page.
 
-    python benchmarks/report_speed.py                    # in one file, packed as `bench run` leaves them, and a file for each unit
+    python benchmarks/report_speed.py                      # in one file, packed as `bench run` does, a file for each unit
     python benchmarks/report_speed.py --episodes 100000 --rounds 1
 
 The three are measured in turns; the ratios are of CPU time, each to one file in the same round, and their median. The records are
@@ -148,7 +148,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as root:
         folders, page = write(Path(root), arguments.episodes), Path(root) / "leaderboard.html"
         rounds = [{name: measure(out, page) for name, out in folders.items()} for _ in range(arguments.rounds)]
-        print("| records | files | bytes a unit | wall, s | CPU, s | memory, GB | to one file |\n|---|---|---|---|---|---|---|")
+        print(
+            "| records | files | bytes a unit | wall, s | CPU, s | memory, GB | to one file |\n|---|---|---|---|---|---|---|"
+        )
         for name, out in folders.items():
             paths = list((out / store.FOLDER).glob("*.parquet"))
             size = sum(path.stat().st_size for path in paths) * EPISODES // arguments.episodes

@@ -40,7 +40,7 @@ def _keys() -> list[str]:
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     threat = [f"threat.{name}" for name in ("norm", "budget", "access", "queries", "share")]
     settings = ["grid", "episodes", "seeds", "executor", "workers", "out", "record", "reference"]
-    settings += ["shard", "ray.address", "unit_timeout", "unit_memory"]
+    settings += ["shard", "until", "ray.address", "unit_timeout", "unit_memory"]
     return [*registry.KINDS, *axes, *threat, *settings]
 
 

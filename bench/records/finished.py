@@ -1,4 +1,4 @@
-"""Finds out which units of a run are finished, from the rows of their records, and sets aside records that are not what they should be."""
+"""Finds out which units of a run are finished, from the rows of their records, and sets wrong records aside."""
 
 from __future__ import annotations
 
@@ -108,7 +108,9 @@ def _packed(out: Path, path: Path, units: Mapping[str, Wanted]) -> set[str]:
         records = pq.read_table(path, read_dictionary=text)
     except (pa.ArrowException, OSError, UserError):
         if path.exists():
-            notice(f"the record {path} is truncated or not Parquet; its units are driven again, it is {_aside(out, path)}")
+            notice(
+                f"the record {path} is truncated or not Parquet; its units are driven again, it is {_aside(out, path)}"
+            )
         return set()
     wrong = _wrong(records, track, {key: units[key] for key in wanted}, generation.equals(schema(track)))
     for key, why in wrong.items():

@@ -1,8 +1,8 @@
 """Packs the records of many units into one file, so that a results folder of 100,000 units stays quick to read.
 
-A packed file is synced to the disk before the files are deleted whose rows it has. A process that is killed in between leaves units in
-two files; reading counts them once, and the next packing deletes the second. A run neither changes nor deletes a packed file, so
-two runs that pack the same folder at the same time lose nothing.
+A packed file is synced to the disk before the files are deleted whose rows it has. A process that is killed in between leaves
+units in two files; reading counts them once. A packing neither changes nor deletes packed files, so two runs that pack the same
+folder at the same time lose nothing.
 """
 
 from __future__ import annotations

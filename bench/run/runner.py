@@ -28,8 +28,9 @@ from bench.run.config import RunConfig
 from bench.run.executors import EXECUTORS, Executor, Finished, Watcher
 from bench.run.failures import Failures
 from bench.run.plan import Weights, key_of, loadings, units_of
+from bench.run.rounds import drive_until, rounds
 from bench.run.unit import Loading, Preparation, Unit, is_foreign
-from bench.run.work import Failure, Outcome, Task
+from bench.run.work import Outcome, Task
 from bench.run.worker import Limits
 from bench.scenarios import Cell
 from bench.scenarios.axes import written
@@ -52,7 +53,7 @@ class RunWatcher(Watcher, Protocol):
 
 
 def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
-    """Carry out the unfinished units of a run, and return the fingerprints of all its units.
+    """Carry out the unfinished units of a run, and return the fingerprints of its units; with `until`, of those it needed.
 
     Raises:
         UserError: if the results folder cannot be written, weights are missing, or no pair can be driven.
@@ -67,18 +68,22 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
         weights = _loaded(config, back_end, watcher, failures)
         if not any(key_of(loading) in weights for loading in loadings(config, baselines=False)):
             raise failures.error((), 0)
-        units = {unit.fingerprint: unit for unit in units_of(config, weights)}
-        done = finished_units(config.out, units)
-        packing.pack(config.out)
-        missing = [unit for key, unit in units.items() if key not in done]
-        episodes = len(config.grid.seeds())
-        watcher.begin(episodes=episodes * len(units), finished=episodes * len(done))
+        units = {unit.fingerprint: unit for part in rounds(config) for unit in units_of(part, weights)}
         driving = _Driving(config.out, _recorded(config, units.values()), back_end, watcher, failures)
-        driving.carry_out(missing)
+        driving.finished |= finished_units(config.out, units)
+        packing.pack(config.out)
+        episodes = {key: len(unit.seeds) for key, unit in units.items()}
+        done = sum(episodes[key] for key in driving.finished)
+        watcher.begin(episodes=sum(episodes.values()), finished=done)
+        if config.until is None:
+            driving.carry_out(list(units.values()))
+            wanted = list(units)
+        else:
+            wanted = drive_until(config, weights, driving.carry_out)
     if failures:
-        finished = [key for key, unit in units.items() if key in done or key in driving.finished]
-        raise failures.error(finished, len(units) - len(finished))
-    return list(units)
+        finished = [key for key in wanted if key in driving.finished]
+        raise failures.error(finished, len(wanted) - len(finished))
+    return wanted
 
 
 def _loaded(config: RunConfig, back_end: Executor, watcher: RunWatcher, failures: Failures) -> Weights:
@@ -131,12 +136,12 @@ class _Driving:
         self.unpacked = 0
         self._read = cache(artefacts.read)
 
-    def carry_out(self, units: Iterable[Unit]) -> None:
-        """Prepare what is missing, and drive the units."""
+    def carry_out(self, units: Sequence[Unit]) -> set[str]:
+        """Prepare what is missing, drive the units that are not finished, and return the fingerprints of those that are now."""
         absent: dict[str, Preparation] = {}
         ready: list[Unit] = []
         waits: list[Unit] = []
-        for unit in units:
+        for unit in (unit for unit in units if unit.fingerprint not in self.finished):
             needed = unit.preparation
             if needed and not artefacts.path_of(self.out, needed).exists():
                 absent[needed.fingerprint] = needed
@@ -147,6 +152,7 @@ class _Driving:
             with closing(self.back_end.map(self._tasks(together), self.watcher)) as finished:
                 for some in finished:
                     self._end(some)
+        return self.finished
 
     def _tasks(self, together: Iterable[Sequence[Preparation | Unit]]) -> Iterator[Task]:
         """The tasks of batches, without those of a pair that was given up, and without those whose preparation failed."""
@@ -225,7 +231,8 @@ def _recorded(config: RunConfig, units: Iterable[Unit]) -> dict[str, Sequence[in
     recorded: dict[str, Sequence[int]] = {}
     for unit in units:
         first = first_units[unit.pair.id]
-        wanted = unit.pair.id in requested and unit.training_seed == first.training_seed
+        first_round = unit.seeds.start == config.grid.first_seed
+        wanted = first_round and unit.pair.id in requested and unit.training_seed == first.training_seed
         if wanted and (config.record is not None or unit is first):
             count = 1 if config.record is None else config.record
             recorded[unit.fingerprint] = unit.seeds[:count]
