@@ -3,16 +3,15 @@
     python benchmarks/executor_speed.py
     python benchmarks/executor_speed.py --tasks 500 --episodes 50 --rounds 1
 
-Prints the figures that docs/scale.md and `benchmarks/cluster_cost.py` use. Capacity is the number of tasks for which one second of the
-driver's CPU time is enough: on a busy machine wall time says little. Ray and processes drive the pair in turns; the ratio of wall
-time is the median over the rounds.
+Prints the figures that docs/scale.md and `benchmarks/cluster_cost.py` use. Capacity is the number of tasks for which one second of
+the driver's CPU time is enough: on a busy machine wall time says little. Ray and processes drive the pair in turns; the ratio of
+wall time is the median over the rounds.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
-import io
 import pickle
 import statistics
 import sys
@@ -101,7 +100,9 @@ def of_records() -> None:
         records = reading.read(out, units[:1], track=track("driving"))
         sent = pickle.dumps(Outcome(wall_s=1.0, records=records), pickle.HIGHEST_PROTOCOL)
         many = [_renamed(records, number) for number in range(packing.UNITS)]
-        print(f"{len(sent) / 1e3:.0f} kB are sent back, unpickled in {milliseconds(lambda: pickle.loads(sent), 50):.1f} ms")
+        print(
+            f"{len(sent) / 1e3:.0f} kB are sent back, unpickled in {milliseconds(lambda: pickle.loads(sent), 50):.1f} ms"
+        )
         print(f"written to a file of its own in {milliseconds(lambda: store.write(out, records), 30):.1f} ms")
         together = milliseconds(lambda: store.write_all(out, many), 1) / len(many)
         size = max(path.stat().st_size for path in packing.packed_files(out)) / len(many)
@@ -139,12 +140,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Measure the back ends of `bench run`.")
     parser.add_argument("--tasks", type=int, default=2000, help="tasks that do nothing")
     parser.add_argument("--episodes", type=int, default=100, help="episodes of a unit of the pair")
-    parser.add_argument("--rounds", type=int, default=3, help="runs of the pair with each back end, in turns; 0 for none")
+    parser.add_argument(
+        "--rounds", type=int, default=3, help="runs of the pair with each back end, in turns; 0 for none"
+    )
     arguments = parser.parse_args()
     names = ["processes", *(["ray"] if importlib.util.find_spec("ray") else [])]
     for name in names:
         wall, capacity = throughput(name, arguments.tasks)
-        print(f"{name}: {wall:.0f} tasks that do nothing a second on {cores()} cores; capacity of the driver {capacity:.0f}")
+        print(
+            f"{name}: {wall:.0f} tasks that do nothing a second on {cores()} cores; capacity of the driver {capacity:.0f}"
+        )
     framework, task = Snapshot(), nothing()
     print(f"a worker takes {milliseconds(lambda: attempt(task, lambda *news: None, framework), 100):.1f} ms a task")
     of_records()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -150,7 +150,7 @@ def _wrong(records: pa.Table, track: Track, units: Mapping[str, Wanted], current
     return found
 
 
-def _without(out: Path, path: Path, units: object) -> None:
+def _without(out: Path, path: Path, units: Collection[str]) -> None:
     """Write a file of many units again without some of them, and move the old one aside."""
     records = pq.read_table(path)
     rest = records.filter(pc.invert(pc.is_in(records["unit"], pa.array(list(units)))))

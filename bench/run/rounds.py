@@ -182,7 +182,7 @@ def _rule_out(config: RunConfig, rows: Sequence[_Row], going: Sequence[_Row]) ->
     _, cells, _ = scores.shape
     tail = (1 - CONFIDENCE) / (cells * (len(rows) - 1))
     higher = shown_higher((1 + scores[:, None] - scores[None]) / 2, tail)
-    weaker = higher.any(1).all(-1)
+    weaker = np.asarray(higher.any(1).all(-1))
     # A contradiction, which chance allows: nothing is known.
     if weaker.all():
         return

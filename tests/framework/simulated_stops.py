@@ -2,7 +2,7 @@
 
     python -m tests.framework.simulated_stops [STUDIES]
 
-Each study draws scenario after scenario, looks after every ten, and stops when the interval is narrow or 100 scenarios are driven.
+Each study draws scenario after scenario, looks after every ten, and stops if the interval is narrow or 100 scenarios are driven.
 `always` is the share of studies in which the interval held the truth at every look; `at the stop` that of the interval that is
 printed; `ordinary` that of Student's interval at the same stop, which is made for a fixed number of scenarios.
 """
@@ -75,13 +75,16 @@ def _part(scores: Array, truth: float, until: float) -> Array:
 def main() -> None:
     """Print the table of docs/metrics.md."""
     studies = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
-    print("| scores of scenarios | until | always | at the stop | ordinary | scenarios | ± at the stop |")
-    print("|---|---|---|---|---|---|---|")
+    lines = [
+        "| scores of scenarios | until | always | at the stop | ordinary | scenarios | ± at the stop |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for name in SCORES:
         for until in (0.05, 0.02):
             found = studied(name, until, studies)
             shares = " | ".join(f"{100 * share:.1f} %" for share in (found.always, found.at_stop, found.ordinary))
-            print(f"| {name} | {until:g} | {shares} | {found.scenarios:.0f} | {found.width:.3f} |")
+            lines.append(f"| {name} | {until:g} | {shares} | {found.scenarios:.0f} | {found.width:.3f} |")
+    sys.stdout.write("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":
