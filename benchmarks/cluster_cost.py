@@ -3,17 +3,20 @@
     python benchmarks/cluster_cost.py
     python benchmarks/cluster_cost.py --cores 16 256 --price 0.02 --driver-ms 3
 
-Every core takes the longest unit that is left, sends it back when it is done, and asks for the next one. The driver does one thing
-at a time: it sends tasks, receives outcomes and writes records. Not simulated: cores of different speed, machines that are lost,
-and a network that is too slow for 0.2 MB a unit.
+Every core takes the longest task that is left, sends it back when it is done, and asks for the next one. Tasks are batches as
+`bench run` makes them; the work that units of a batch share is left out. The driver does one thing at a time: it sends tasks, gets
+outcomes and writes records. Not simulated: slow cores, lost machines, and networks that are too slow for 0.2 MB a unit.
 """
 
 from __future__ import annotations
 
 import argparse
 import heapq
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+
+from bench.run.batches import EPISODES, TASKS
 
 MEMBERS_S = {
     "none": 0.4,
@@ -35,6 +38,8 @@ SCENARIOS = 30
 DENSITY_2 = 1.5
 """A unit at density 2 takes so much longer: `python benchmarks/unit_cost.py`."""
 VICTIMS, TRAINING_SEEDS, ROADS_AND_WEATHERS = 14, 10, 9
+ALONE = ("plan", "pessimist")
+"""Members that are not driven in batches."""
 DRIVER_MS = 1.0 + 1.1 + 0.3
 """What a unit costs the driver with Ray: the task, its outcome, its records (`benchmarks/executor_speed.py`)."""
 WORKER_MS = 5.0
@@ -52,24 +57,38 @@ class Cluster:
     worker_s: float
 
 
-def units() -> Iterator[float]:
-    """CPU seconds of every unit of the leaderboard: victims x members of the suite x training seeds x cells of standard-v2."""
-    for seconds in MEMBERS_S.values():
+def units() -> Iterator[tuple[str, float]]:
+    """Member and CPU seconds of each unit: victims x members of the suite x training seeds x cells of standard-v2."""
+    for member, seconds in MEMBERS_S.items():
         for factor in (1.0, DENSITY_2):
-            yield from [seconds * factor * SCENARIOS / 10] * (VICTIMS * TRAINING_SEEDS * ROADS_AND_WEATHERS)
+            yield from [(member, seconds * factor * SCENARIOS / 10)] * (VICTIMS * TRAINING_SEEDS * ROADS_AND_WEATHERS)
 
 
-def makespan(longest_first: list[float], cluster: Cluster) -> tuple[float, float]:
+def tasks(cores: int) -> list[tuple[float, int]]:
+    """Seconds and number of units of each task, the longest first (`bench.run.batches`)."""
+    found = []
+    counts = Counter(units())
+    most = max(1, counts.total() // (TASKS * cores))
+    for (member, seconds), count in counts.items():
+        size = 1 if member in ALONE else max(1, min(most, EPISODES // SCENARIOS, ROADS_AND_WEATHERS))
+        found += [(size * seconds, size)] * (count // size)
+        found += [(count % size * seconds, count % size)] * bool(count % size)
+    return sorted(found, reverse=True)
+
+
+def makespan(longest_first: list[tuple[float, int]], cluster: Cluster) -> tuple[float, float]:
     """Seconds from the first task to the last record, and the share of them in which the driver works."""
     free = [0.0] * cluster.cores
     driver = 0.0
-    for seconds in longest_first:
+    busy = 0.0
+    for seconds, count in longest_first:
         asked = heapq.heappop(free)
         # The driver serves those who ask one after the other.
-        driver = max(driver, asked) + cluster.driver_s
+        driver = max(driver, asked) + count * cluster.driver_s
+        busy += count * cluster.driver_s
         heapq.heappush(free, driver + cluster.worker_s + seconds)
     end = max(free)
-    return end, len(longest_first) * cluster.driver_s / end
+    return end, busy / end
 
 
 def main() -> None:
@@ -79,14 +98,14 @@ def main() -> None:
     parser.add_argument("--price", type=float, default=0.04, help="of a core for an hour")
     parser.add_argument("--driver-ms", type=float, default=DRIVER_MS)
     arguments = parser.parse_args()
-    longest_first = sorted(units(), reverse=True)
-    work = sum(longest_first)
-    print(f"{len(longest_first)} units, {work / 3600:.0f} CPU hours, the longest unit {longest_first[0]:.0f} s\n")
+    every = [seconds for _, seconds in units()]
+    work = sum(every)
+    print(f"{len(every)} units, {work / 3600:.0f} CPU hours, the longest unit {max(every):.0f} s\n")
     print(
         "| cores | hours | price | of the cores busy | of the driver busy | units a second |\n|---|---|---|---|---|---|"
     )
     for cores in arguments.cores:
-        seconds, driver = makespan(longest_first, Cluster(cores, arguments.driver_ms / 1e3, WORKER_MS / 1e3))
+        seconds, driver = makespan(tasks(cores), Cluster(cores, arguments.driver_ms / 1e3, WORKER_MS / 1e3))
         hours = (seconds + START_S) / 3600
         cells = (
             f"{cores}",
@@ -94,7 +113,7 @@ def main() -> None:
             f"{hours * cores * arguments.price:.0f}",
             f"{100 * work / cores / (seconds + START_S):.0f} %",
             f"{100 * driver:.1f} %",
-            f"{len(longest_first) / seconds:.1f}",
+            f"{len(every) / seconds:.1f}",
         )
         print(f"| {' | '.join(cells)} |")
 

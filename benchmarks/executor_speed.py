@@ -3,7 +3,7 @@
     python benchmarks/executor_speed.py
     python benchmarks/executor_speed.py --tasks 500 --episodes 50 --rounds 1
 
-Prints the figures that docs/scale.md and `benchmarks/cluster_cost.py` use. Capacity is the number of tasks for which one second of
+Prints the figures that docs/scale.md and `benchmarks/cluster_cost.py` use. Capacity is the number of tasks for which a second of
 the driver's CPU time is enough: on a busy machine wall time says little. Ray and processes drive the pair in turns; the ratio of
 wall time is the median over the rounds.
 """
