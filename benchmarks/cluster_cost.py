@@ -4,8 +4,8 @@
     python benchmarks/cluster_cost.py --cores 16 256 --price 0.02 --driver-ms 3
 
 Every core takes the longest task that is left, sends it back when it is done, and asks for the next one. Tasks are batches as
-`bench run` makes them; the work that units of a batch share is left out. The driver does one thing at a time: it sends tasks, gets
-outcomes and writes records. Not simulated: slow cores, lost machines, and networks that are too slow for 0.2 MB a unit.
+`bench run` makes them; the work that units of a batch share is left out. The driver does one thing at a time: it sends tasks,
+gets outcomes and writes records. Not simulated: slow cores, lost machines, and networks that are too slow for 0.2 MB a unit.
 """
 
 from __future__ import annotations
