@@ -54,6 +54,9 @@ class RunOptions:
         default_factory=half_of_memory,
         metadata=_meaning("GB that a worker may use; 0 for no limit.", "half of the machine's"),
     )
+    until: float | None = field(
+        default=None, metadata=_meaning("Drives scenarios until a row is known to +- this.", "the whole grid")
+    )
 
 
 @dataclass

@@ -18,6 +18,7 @@ from bench.errors import Notice, UserError
 from bench.plugins.track import Columns, track
 from bench.records import reading
 from bench.records import store as results
+from bench.records.finished import finished
 from bench.records.generations import AXES_OF_V1, generations
 from bench.records.schema import schema
 from bench.run.config import run_config
@@ -207,13 +208,13 @@ UNFINISHED: dict[str, tuple[Callable[[pa.Table, pa.Table], pa.Table], str]] = {
 def test_a_unit_is_finished_if_its_own_rows_are_there(written: Path, units: list[Unit], what: str) -> None:
     change, why = UNFINISHED[what]
     wanted = {unit.fingerprint: unit for unit in units}
-    assert results.finished(written, wanted) == set(wanted)
+    assert finished(written, wanted) == set(wanted)
     first, second = (results.path_of(written, unit.fingerprint) for unit in units[:2])
     other = pq.read_table(second)
     rewritten(first, lambda own: change(own, other))
     content = first.read_bytes()
     with pytest.warns(Notice) as told:
-        assert results.finished(written, wanted) == set(wanted) - {units[0].fingerprint}
+        assert finished(written, wanted) == set(wanted) - {units[0].fingerprint}
     (line,) = (str(one.message) for one in told)
     assert line.startswith(f"the record {first} does not count as finished: {why}; its unit is driven again")
     assert not first.exists()
@@ -226,7 +227,7 @@ def test_a_truncated_file_is_not_finished(written: Path, units: list[Unit], shar
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     for number in range(2):
         with pytest.warns(Notice, match="does not count as finished: it is truncated or not Parquet"):
-            assert results.finished(written, {units[1].fingerprint: units[1]}) == set()
+            assert finished(written, {units[1].fingerprint: units[1]}) == set()
         assert len(list((written / "set_aside").iterdir())) == number + 1
         path.write_bytes(b"PAR1")
 
@@ -253,7 +254,7 @@ def test_the_name_of_a_results_folder_is_no_pattern_and_no_column(written: Path,
     shutil.copytree(written / "episodes", written / name / "episodes")
     assert read(written / name).equals(before[0])
     assert reading.read_compact(written / name, MEASURED)["driving"].equals(before[1])
-    assert len(results.finished(written / name, {unit.fingerprint: unit for unit in units})) == len(units)
+    assert len(finished(written / name, {unit.fingerprint: unit for unit in units})) == len(units)
 
 
 def test_a_record_from_the_future_is_not_the_newest(written: Path, units: list[Unit]) -> None:
