@@ -50,9 +50,6 @@ class DDPG(LearningDriver):
     def action_type(self) -> ActionType:
         return "continuous"
 
-    def zoo_name(self) -> str:
-        return "ddpg"
-
     def learner(self, env: EnvBase, hooks: TrainingHooks) -> Learner:
         return _ActorCriticLearner(self, env, hooks)
 

@@ -6,6 +6,7 @@ import math
 import time
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -16,6 +17,7 @@ from bench.plugins.contracts import Progress, Trained
 from bench.plugins.ranges import Count, Share, Width
 from bench.scenarios import SeedBlock
 from bench.victims import zoo
+from bench.victims.drivers.behind import AttackMix, Guard, GuardedPractice, defense_of
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
 from bench.victims.drivers.practice import Practice, roads
 from bench.victims.drivers.selection import Best
@@ -48,6 +50,9 @@ class LearningDriver(DrivingVictim):
         tau: rate of the target networks' soft update.
         checkpoints: number of candidates for the final weights, spread over the last share `fine` of the training.
         trained_in: non-default parameters of the training world, for instance `vehicles=5`; set by `bench train`.
+        behind: the defence that it is trained behind, with its parameters, for instance `tracker+shield shield.band=6`; empty for
+            none. It only says which weights are meant; `defense` says what it drives behind.
+        behind_decisions: length of the training behind the defence, which continues from the weights without one.
     """
 
     learns: ClassVar[bool] = True
@@ -72,6 +77,12 @@ class LearningDriver(DrivingVictim):
     tau: Share = 0.005
     checkpoints: Count = 8
     trained_in: str = ""
+    behind: str = ""
+    behind_decisions: Count = 4_000
+
+    def zoo_name(self) -> str:
+        name = type(self).__name__.lower()
+        return f"{name}-behind-{self.behind.split()[0]}" if self.behind.strip() else name
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         return zoo.load(zoo.Recipe.of(self), seed, self.policy_type)
@@ -106,8 +117,14 @@ class LearningDriver(DrivingVictim):
         """Train on all roads of the world's default grid at once, and keep the best checkpoint."""
         torch.manual_seed(seed)
         started = time.process_time()
+        guard = Guard(defense_of(self.behind), self, world.facts) if self.behind else None
+        if guard is not None and hooks is None:
+            start = replace(self, behind="", behind_decisions=type(self).behind_decisions).load(seed, world.facts)
+            hooks = AttackMix(start, self.behind_decisions, world.facts, seed)
         hooks = hooks or TrainingHooks()
         best, learner, done = Best(world, hooks, self.selection_episodes, self.sign), None, 0
+        if guard is not None:
+            best.defended = guard.around
         phases = self.phases(hooks)
         total = sum(phase.decisions for phase in phases)
         for number, phase in enumerate(phases):
@@ -115,7 +132,8 @@ class LearningDriver(DrivingVictim):
             env.set_seed(SeedBlock.TRAIN * (seed + 1) + number * SeedBlock.REPORT)
             learner = learner or self.learner(env, hooks)
             learner.enter(phase)
-            practice = Practice(
+            practiced = Practice if guard is None else partial(GuardedPractice, guard=guard)
+            practice = practiced(
                 env,
                 learner,
                 phase,
@@ -131,7 +149,9 @@ class LearningDriver(DrivingVictim):
                 learner.anneal()
                 if taken > WARM_UP:
                     rate = self.learning_rate * max(0.05, min(1.0 if hooks.start is None else 0.5, 2 * (1 - share)))
-                    for _ in range(CHUNK * self.updates):
+                    if learner.on_policy:
+                        learner.learn(rate, share)
+                    for _ in range(0 if learner.on_policy else CHUNK * self.updates):
                         learner.update(practice.sample(share), rate)
                 if phase.repeat == 1 and self._due(done / total, len(best.history), hooks):
                     best.offer(learner.averaged(), done / total)
