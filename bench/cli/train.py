@@ -14,8 +14,8 @@ from bench.cli.progress import TrainingProgress
 from bench.cli.terminal import Console
 from bench.errors import UserError
 from bench.files import check_folder
-from bench.plugins.contracts import Trained, World
 from bench.plugins.chain import Chain
+from bench.plugins.contracts import Trained, World
 from bench.plugins.pair import Chosen, choose
 from bench.plugins.track import track
 from bench.run.config import TrainConfig, train_config
@@ -75,7 +75,9 @@ def _behind(config: TrainConfig) -> TrainConfig:
     return replace(
         config,
         victim=replace(config.victim, component=replace(victim, behind=text)),
-        defense=choose("defense", "none") if first is None else Chosen(kind="defense", name=first[0], component=first[1]),
+        defense=choose("defense", "none")
+        if first is None
+        else Chosen(kind="defense", name=first[0], component=first[1]),
     )
 
 

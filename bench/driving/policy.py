@@ -20,8 +20,8 @@ class Passed(NamedTuple):
 
     Args:
         observation: the observation that the policy receives, [..., V, F].
-        allowed: the actions that are left to it: bool [..., A] for discrete ones, float [..., 2, 2] for continuous ones (the lowest
-            values of both controls, then the highest); None for all.
+        allowed: the actions that are left to it: bool [..., A] for discrete ones, float [..., 2, 2] for continuous ones (the
+            lowest values of both controls, then the highest); None for all.
     """
 
     observation: Tensor

@@ -36,7 +36,7 @@ class Chain(Defense):
 
     @property
     def parted(self) -> tuple[tuple[str, Defense] | None, tuple[str, Defense] | None]:
-        """The link that trains its victim, and the links at run time, as one defence; each with its name, None if there is none."""
+        """The link that trains its victim, and those at run time as one defence: each with its name, or None."""
         named = [(name, getattr(self, name)) for name in self._fields()]
         first, others = (named[0], named[1:]) if named[0][1].trains else (None, named)
         if len(others) < 2:

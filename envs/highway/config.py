@@ -69,8 +69,8 @@ class HighwayConfig:
         max_steps: number of decisions until an episode is truncated.
         action_type: `discrete` lane-changing actions (`ACTIONS`), or `continuous` [acceleration, steering] in [-1, 1], mapped to
             -5 to 5 m/s2 and -45 to 45 degrees.
-        driver: `agent` executes the actions; `idm` replaces the ego with highway-env's IDMVehicle and ignores them, `oracle` drives
-            it by plans that were tried in copies of the simulator.
+        driver: `agent` executes the actions; `idm` replaces the ego with highway-env's IDMVehicle and ignores them, `oracle`
+            drives it by plans that were tried in copies of the simulator.
         action_repeat: number of decisions for which an action is held: lane changes are sent once, then IDLE; other actions are
             repeated.
         target_speeds: increasing speeds in m/s for FASTER and SLOWER; highway-env assumes that they are uniform.

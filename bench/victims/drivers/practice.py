@@ -12,7 +12,6 @@ from bench.plugins import registry
 from bench.scenarios import Cell
 from bench.victims.drivers.learner import Learner, Phase
 
-
 ALLOWED = "allowed"
 """The key of the actions that a defence leaves to the policy behind it."""
 
