@@ -31,6 +31,7 @@ from bench.run.config import RunConfig
 from bench.run.replay import Repeated, pair_of, repeat
 from bench.run.submission import Submission
 from bench.scenarios import Cell, Grid, SeedBlock
+from bench.statistics.unpaired import ENOUGH_SCENARIOS
 
 SAMPLE, EPISODES = 3, 20
 """Units that are replayed, and scenarios in each cell that are drawn, if nothing else is said."""
@@ -74,6 +75,8 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
     if not names:
         raise UserError("name the folder of the submission: bench verify FOLDER")
     salt, episodes = (_number(options, key) for key in ("salt", "episodes"))
+    if episodes is not None and episodes < ENOUGH_SCENARIOS:
+        raise UserError(f"episodes must be at least {ENOUGH_SCENARIOS}, got {episodes}: fewer are no evidence")
     found = submission.read(Path(names[0]).expanduser())
     packages = submission.installed(found)
     console.print(
@@ -162,6 +165,10 @@ def _audited(found: Submission, salt: int | None, episodes: int, console: Consol
     if not world.redraws:
         console.print(Text(f"World {pair.world.name!r} has a fixed set of scenarios: it is not audited."))
         return True
+    given = len(set(found.own["seed"].to_pylist()))
+    if given < ENOUGH_SCENARIOS:
+        console.print(Text(f"Not audited: it has {given} scenarios a cell, an audit needs {ENOUGH_SCENARIOS}."))
+        return False
     seeds = sorted(set(found.own["training_seed"].to_pylist()))
     cells = [Cell(**cell) for cell in _cells(found.own)]
     values = {axis: tuple(dict.fromkeys(cell[axis] for cell in cells)) for axis in world.axes}

@@ -1,4 +1,4 @@
-"""Command-line options such as `attack=zo,noise attack.steps=50 lanes=3,4`, parsed and type-checked by hydra's compose API.
+"""Command-line options such as `attack=zo,noise attack.steps=50 lanes=3,4`: hydra's grammar, types checked by OmegaConf.
 
 Comma lists of seeds and of the axes of a world (lanes, weather) select values; all other comma lists sweep. A parameter is
 passed to those of the chosen components that have it.
@@ -18,8 +18,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
-from hydra import compose, initialize
-from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -89,8 +87,6 @@ class Options:
 
     def settings(self) -> dict[str, Any]:
         """The values of the keys that choose neither a component nor a cell."""
-        store = ConfigStore.instance()
-        store.store(name="settings", node=self.schema)
         lists = {item.name for item in fields(self.schema) if "list" in str(item.type)}
         overrides = []
         for key, values in self.values.items():
@@ -100,7 +96,7 @@ class Options:
                 raise UserError(f"{key} takes one value, got {short(','.join(values))}")
             whole = values[0] if len(values) == 1 and values[0].startswith("[") else f"[{','.join(values)}]"
             overrides.append(f"{key}={whole if key in lists else values[0]}")
-        found = OmegaConf.to_container(_composed(overrides, self.schema, config_name="settings"))
+        found = OmegaConf.to_container(_composed(OmegaConf.structured(self.schema), overrides, self.schema))
         assert isinstance(found, dict)
         return {str(key): value for key, value in found.items()} | ({"out": self.out} if self.out else {})
 
@@ -333,24 +329,23 @@ def _axis_value(axis: Axis, text: str) -> Value:
 NOUNS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "text"}
 
 
-def _composed(overrides: list[str], schema: type[Any], config_name: str | None = None) -> DictConfig:
-    """The values of a structured config.
+def _composed(config: DictConfig, overrides: list[str], schema: type[Any]) -> DictConfig:
+    """A structured config with other values.
 
     Raises:
         UserError: if one of them has another type than its field.
     """
     try:
-        with initialize(version_base="1.3", config_path=None):
-            found = compose(config_name, overrides=overrides)
-            OmegaConf.resolve(found)
-            return found
+        for override in OverridesParser.create().parse_overrides(overrides):
+            OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
+        OmegaConf.resolve(config)
+        return config
     except (HydraException, OmegaConfBaseException) as error:
-        cause = error if error.__cause__ is None else error.__cause__
-        full = str(getattr(cause, "full_key", "") or "").partition("[")[0]
+        full = str(getattr(error, "full_key", "") or "").partition("[")[0]
         word = next((word for word in overrides if full and word.startswith(f"{full}=")), " ".join(overrides))
         key, _, value = word.partition("=")
         names = {item.name for item in fields(schema)}
-        wanted = re.search(r"could not be converted to (\w+)", str(cause))
+        wanted = re.search(r"could not be converted to (\w+)", str(error))
         noun = NOUNS.get(wanted[1]) if wanted else None
         if key.rpartition(".")[2] in names and noun:
             listed = "whole numbers, for instance 0,1,2" if "[" in value and noun == NOUNS["Integer"] else noun
@@ -392,12 +387,12 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
     if not given:
         return {}
     try:
-        ConfigStore.instance().store(group=kind, name=name, node=_schema(owned))
+        config = OmegaConf.create({kind: OmegaConf.structured(_schema(owned))})
     except OmegaConfBaseException as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"the parameters of {kind} {name!r} cannot be set on the command line: {reason}") from error
-    overrides = [f"+{kind}={name}", *(f"{kind}.{key}={value}" for key, value in given.items())]
-    composed = _composed(overrides, _schema(owned))[kind]
+    overrides = [f"{kind}.{key}={value}" for key, value in given.items()]
+    composed = _composed(config, overrides, _schema(owned))[kind]
     arguments = OmegaConf.to_object(composed)
     return _read(kind, owned, arguments)
 

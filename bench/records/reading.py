@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -166,9 +167,10 @@ def _records(out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track) -
     """A connection with the view `records` of the files of one track; UserError with the name of an unreadable file."""
     by_columns: dict[pa.Schema, list[str]] = {}
     for path, generation in known:
-        by_columns.setdefault(generation, []).append("'" + str(path).replace("'", "''") + "'")
+        by_columns.setdefault(generation, []).append("'" + glob.escape(str(path)).replace("'", "''") + "'")
     parts = [
-        f"select {selection(track, generation)}, filename as file from read_parquet([{', '.join(paths)}], filename = true)"
+        f"select {selection(track, generation)}, filename as file "
+        f"from read_parquet([{', '.join(paths)}], filename = true, hive_partitioning = false)"
         for generation, paths in by_columns.items()
     ]
     try:

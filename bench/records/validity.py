@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from functools import partial
 from typing import get_args
 
@@ -15,10 +16,14 @@ from numpy.typing import NDArray
 from bench.errors import short
 from bench.plugins.contracts import Access
 from bench.plugins.track import Track
-from bench.records.schema import schema
+from bench.records.schema import LARGEST, schema
 from bench.scenarios import Axes
 
 JSON = ("attack_params", "defense_params", "victim_params", "world_params", "libraries")
+LONGEST_TEXT = 100_000
+"""Most bytes of a text: a table with a name of millions of characters takes minutes."""
+FACTS: Mapping[str, object] = {"decision_hz": 0, "max_steps": 0, "actions": [""]}
+"""Facts that every world has, with values of their types."""
 
 
 def complaint(records: pa.Table, track: Track) -> tuple[int, str] | None:
@@ -28,8 +33,8 @@ def complaint(records: pa.Table, track: Track) -> tuple[int, str] | None:
         records: columns of `bench.records.schema`, maybe not all; text may be dictionary-encoded.
         track: track of the records.
     """
-    problems = [*_out_of_range(records, schema(track)), *_unreadable(records, track)]
-    return min(problems, default=None)
+    problems = [*_out_of_range(records, schema(track)), *_too_long(records), *_not_a_date(records)]
+    return min(problems, default=None) or min(_unreadable(records, track), default=None)
 
 
 def _out_of_range(records: pa.Table, columns: pa.Schema) -> Iterator[tuple[int, str]]:
@@ -69,7 +74,7 @@ def _facts(column: pa.ChunkedArray, name: str) -> NDArray[np.float64]:
         try:
             fact = json.loads(text)[name]
         # `_unreadable` complains of facts that cannot be read.
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             fact = 0
         found.append(float(fact) if isinstance(fact, int | float) and fact else np.inf)
     return np.array(found)[encoded.indices.to_numpy(zero_copy_only=False)]
@@ -81,9 +86,32 @@ def _range(low: float, high: float) -> str:
     return f"between {low:g} and {high:g}"
 
 
+def _too_long(records: pa.Table) -> Iterator[tuple[int, str]]:
+    for name, column in zip(records.column_names, records.columns, strict=True):
+        whole = column.combine_chunks()
+        encoded = pa.types.is_dictionary(whole.type)
+        texts = whole.dictionary if encoded else whole
+        if not pa.types.is_string(texts.type):
+            continue
+        long = pc.fill_null(pc.greater(pc.binary_length(texts), LONGEST_TEXT), False).to_numpy(zero_copy_only=False)
+        rows = long[whole.indices.to_numpy()] if encoded else long
+        if rows.any():
+            yield int(rows.argmax()), f"{name} has more than {LONGEST_TEXT} bytes"
+
+
+def _not_a_date(records: pa.Table) -> Iterator[tuple[int, str]]:
+    """Times that Python cannot hold."""
+    if "created_at" not in records.column_names:
+        return
+    first, last = (int(end.replace(tzinfo=UTC).timestamp()) * 10**6 for end in (datetime.min, datetime.max))
+    created = records["created_at"].cast(pa.int64()).to_numpy()
+    if (wrong := (created < first) | (created > last)).any():
+        yield int(wrong.argmax()), "created_at must be in the years 1 to 9999"
+
+
 def _unreadable(records: pa.Table, track: Track) -> Iterator[tuple[int, str]]:
     """Problems of texts and cells; each distinct value is checked once."""
-    yield from _refused(records, ("cell", "world_facts"), _cell)
+    yield from _refused(records, ("cell", "world_facts"), partial(_cell, example={**FACTS, **track.facts_of_v1}))
     yield from _refused(records, ("threat_access",), partial(_known, known=get_args(Access)))
     if track.norms:
         yield from _refused(records, ("threat_norm",), partial(_known, known=track.norms))
@@ -107,13 +135,31 @@ def _refused(records: pa.Table, names: Sequence[str], check: Callable[..., objec
             check(*values)
         except ValueError as error:
             yield row, f"{names[0]} {short(str(values[0]))}: {error}"
+        except RecursionError:
+            yield row, f"{names[0]} {short(str(values[0]))}: nested too deeply"
 
 
-def _cell(cell: str, facts: str) -> None:
+def _cell(cell: str, facts: str, example: Mapping[str, object]) -> None:
     values, world = json.loads(cell), json.loads(facts)
     if not (isinstance(values, dict) and isinstance(world, dict) and isinstance(world.get("axes"), list)):
         raise ValueError("not a cell, or world_facts has no axes")
     Axes.read(world["axes"]).cell(**values)
+    for name, value in example.items():
+        if name in FACTS and name not in world:
+            raise ValueError(f"world_facts has no {name}")
+        if name in world and name != "axes" and not _alike(world[name], value):
+            raise ValueError(f"world_facts has a wrong {name}: {short(str(world[name]))}")
+
+
+def _alike(value: object, example: object) -> bool:
+    """Whether a JSON value has the types of an example. Numbers are finite and at least 0; a list or an object may be empty."""
+    if isinstance(example, Mapping):
+        return isinstance(value, dict) and all(_alike(value[key], example[key]) for key in example if key in value)
+    if isinstance(example, list):
+        return isinstance(value, list) and all(_alike(one, example[0]) for one in value if example)
+    if isinstance(example, str):
+        return isinstance(value, str)
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= LARGEST
 
 
 def _known(name: str, known: Sequence[str]) -> None:

@@ -10,6 +10,7 @@ from bench.errors import UserError
 from bench.records.schema import AUDIT
 from bench.run.config import RunConfig, run_config
 from bench.scenarios import SeedBlock
+from bench.statistics.unpaired import ENOUGH_SCENARIOS
 
 SALTS = 2**50
 
@@ -44,8 +45,8 @@ def audit_config(words: Sequence[str]) -> AuditConfig:
     for pair in public.pairs:
         if not pair.world.component.redraws:
             raise UserError(f"world {pair.world.name!r} has a fixed set of scenarios: an audit cannot draw new ones")
-    if public.grid.episodes < 2:
-        raise UserError("an audit needs at least 2 episodes per cell")
+    if public.grid.episodes < ENOUGH_SCENARIOS:
+        raise UserError(f"an audit needs at least {ENOUGH_SCENARIOS} episodes per cell")
     salt = int(salts[0]) if salts else secrets.randbelow(SALTS)
     grid = replace(public.grid, name=AUDIT, first_seed=SeedBlock.AUDIT + salt)
     return AuditConfig(public=public, drawn=replace(public, grid=grid, reference=False, record=0), salt=salt)

@@ -175,8 +175,8 @@ class Axes(Mapping[str, Axis]):
         """
         try:
             return cls(tuple(Axis(**{**axis, "choices": tuple(axis.get("choices", ()))}) for axis in written))
-        except TypeError as error:
-            raise ValueError(f"not axes: {error}") from None
+        except (TypeError, AttributeError):
+            raise ValueError("not axes: each needs a name, a kind and a meaning, and no unknown property") from None
 
     def cell(self, **values: Value) -> Cell:
         """A cell with a checked value on every axis; missing values take the default.

@@ -6,6 +6,9 @@ import math
 
 from bench.statistics.estimates import CONFIDENCE, Array, Interval, t_quantile
 
+ENOUGH_SCENARIOS = 10
+"""A side with fewer scenarios is no evidence: where scores hardly vary, its variance says too little."""
+
 
 def unpaired(first: Array, second: Array, *, comparisons: int = 1) -> Interval:
     """Mean of `first` minus mean of `second`, with a Welch t interval over scenarios.
@@ -22,12 +25,12 @@ def unpaired(first: Array, second: Array, *, comparisons: int = 1) -> Interval:
         comparisons: number of intervals of which none shall fail (Bonferroni); the interval is wider with more.
 
     Raises:
-        ValueError: if training seeds or cells differ, or a side has fewer than two scenarios.
+        ValueError: if training seeds or cells differ, or a side has fewer than `ENOUGH_SCENARIOS` scenarios.
     """
     if first.shape[:2] != second.shape[:2]:
         raise ValueError(f"the two sides differ in training seeds or cells: {first.shape[:2]} and {second.shape[:2]}")
-    if min(first.shape[2], second.shape[2]) < 2:
-        raise ValueError("an unpaired difference needs two scenarios a side")
+    if min(first.shape[2], second.shape[2]) < ENOUGH_SCENARIOS:
+        raise ValueError(f"an unpaired difference needs at least {ENOUGH_SCENARIOS} scenarios a side")
     means = first.mean((0, 1)), second.mean((0, 1))
     errors = [float(side.var(ddof=1)) / len(side) for side in means]
     estimate, error = float(means[0].mean() - means[1].mean()), math.sqrt(sum(errors))

@@ -17,7 +17,7 @@ from bench.plugins import registry
 from bench.plugins.track import Track
 from bench.scenarios import Grid
 from bench.statistics.estimates import Interval
-from bench.statistics.unpaired import unpaired
+from bench.statistics.unpaired import ENOUGH_SCENARIOS, unpaired
 from leaderboard.comparisons.alignment import align
 from leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison, mean
 from leaderboard.ranking.curves import ENOUGH_CELLS, Curve
@@ -259,13 +259,13 @@ def public_only(of: Subject) -> Finding:
     audited = [one for one in of.attacks if one.audit]
     found = [gain for one in audited if (gain := public_gain(one, len(audited)))]
     if not found:
-        return None, "Not measured: no audit was driven (`bench audit`)."
+        return None, f"Not measured: no audit with {ENOUGH_SCENARIOS} scenarios a cell was driven (`bench audit`)."
     largest = max(found, key=lambda gain: gain.low)
     return largest.low > 0, f"Public score minus the score on newly drawn scenarios: {_signed(largest)}."
 
 
 def public_gain(one: Comparison, comparisons: int = 1) -> Interval | None:
-    """The public score minus the audit's, on the training seeds and cells of both; None where they share none.
+    """The public score minus the audit's, on the training seeds and cells of both; None where these or the scenarios are too few.
 
     Args:
         one: an attack on a defended victim.
@@ -277,7 +277,9 @@ def public_gain(one: Comparison, comparisons: int = 1) -> Interval | None:
     if not runs or not cells:
         return None
     sides = [side.only(runs=runs, cells=cells).column(one.track.metric) for side in (one.own, one.audit)]
-    return unpaired(sides[0], sides[1], comparisons=comparisons) if min(side.shape[2] for side in sides) > 1 else None
+    if min(side.shape[2] for side in sides) < ENOUGH_SCENARIOS:
+        return None
+    return unpaired(sides[0], sides[1], comparisons=comparisons)
 
 
 FLAGS: dict[str, tuple[str, Callable[[Subject], Finding]]] = {

@@ -68,13 +68,13 @@ def test_a_defence_that_knows_the_public_scenarios_is_caught_and_the_honest_vict
 
 
 def test_every_audit_draws_other_scenarios_and_can_be_repeated() -> None:
-    words = ["attack=noise", "victim=dqn", "episodes=5"]
+    words = ["attack=noise", "victim=dqn", "episodes=10"]
     first, second = audit_config(words), audit_config(words)
     assert first.drawn.grid.seeds() != second.drawn.grid.seeds()
     again = audit_config([*words, f"salt={first.salt}"])
     assert again.drawn.grid.seeds() == first.drawn.grid.seeds()
     assert again.drawn.grid.cells() == first.public.grid.cells()
-    assert first.public.grid.seeds() == range(SeedBlock.REPORT, SeedBlock.REPORT + 5)
+    assert first.public.grid.seeds() == range(SeedBlock.REPORT, SeedBlock.REPORT + 10)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_every_audit_draws_other_scenarios_and_can_be_repeated() -> None:
     [
         (["attack=noise", "salt=abc"], "salt must be one whole number"),
         (["attack=noise", "salt=1", "salt=2"], "salt must be one whole number"),
-        (["attack=noise", "episodes=1"], "at least 2 episodes"),
+        (["attack=noise", "episodes=9"], "at least 10 episodes"),
         (["attack=noise_patch", "victim=yolov3_tiny"], "fixed set of scenarios"),
     ],
 )
@@ -104,12 +104,12 @@ def test_honest_scores_raise_a_false_alarm_in_2_5_percent_of_audits(comparisons:
     assert np.mean(alarms) == pytest.approx(0.025 / comparisons, abs=0.008)
 
 
-def test_a_difference_needs_the_same_cells_and_two_scenarios() -> None:
+def test_a_difference_needs_the_same_cells_and_enough_scenarios() -> None:
     with pytest.raises(ValueError, match="differ in training seeds or cells"):
-        unpaired(np.zeros((1, 2, 5)), np.zeros((1, 3, 5)))
-    with pytest.raises(ValueError, match="two scenarios"):
-        unpaired(np.zeros((1, 2, 5)), np.zeros((1, 2, 1)))
-    assert unpaired(np.ones((1, 1, 3)), np.zeros((1, 1, 3))).low == 1
+        unpaired(np.zeros((1, 2, 10)), np.zeros((1, 3, 10)))
+    with pytest.raises(ValueError, match="at least 10 scenarios"):
+        unpaired(np.zeros((1, 2, 10)), np.zeros((1, 2, 9)))
+    assert unpaired(np.ones((1, 1, 10)), np.zeros((1, 1, 10))).low == 1
 
 
 def test_every_drawn_seed_can_be_recorded() -> None:

@@ -129,6 +129,9 @@ CANNOT_BE = {
     "changed": (float("nan"), "changed must be between 0 and 1, got nan"),
     "cell": ('{"lanes":-1,"density":1.0,"weather":"clear"}', "lanes must be "),
     "world_facts": ("{}", "not a cell, or world_facts has no axes"),
+    "attack": ("x" * 100_001, "attack has more than 100000 bytes"),
+    "created_at": (2**63 - 1, "created_at must be in the years 1 to 9999"),
+    "defense_params": ("[" * 20_000 + "]" * 20_000, "(40000 characters): nested too deeply"),
     "attack_params": ("{scale: 1}", "attack_params {scale: 1}: Expecting property name"),
     "world_params": ("[1]", "world_params [1]: not a JSON object"),
     "threat_access": ("all", "threat_access all: known: oblivious, decisions, scores, gradients, dynamics"),
@@ -153,6 +156,33 @@ def test_an_invalid_value_is_reported_with_its_record(written: Path, units: list
             reads(written)
         assert str(raised.value).startswith(f"the record {path} is invalid: ")
         assert why in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("fact", "value", "why"),
+    [
+        ("max_steps", None, "world_facts has no max_steps"),
+        ("max_steps", "x", "world_facts has a wrong max_steps: x"),
+        ("decision_hz", -1, "world_facts has a wrong decision_hz: -1"),
+        ("features", 0, "world_facts has a wrong features: 0"),
+        ("axes", [1], "not axes: each needs a name, a kind and a meaning"),
+        ("axes", [{"name": "lanes"}], "not axes: each needs a name, a kind and a meaning"),
+    ],
+)
+def test_wrong_facts_of_a_world_are_reported_with_their_record(
+    written: Path, units: list[Unit], fact: str, value: object, why: str
+) -> None:
+    path = results.path_of(written, units[0].fingerprint)
+    place = SCHEMA.get_field_index("world_facts")
+
+    def change(own: pa.Table) -> pa.Table:
+        facts = json.loads(own["world_facts"][0].as_py()) | {fact: value}
+        text = json.dumps({name: found for name, found in facts.items() if found is not None})
+        return own.set_column(place, SCHEMA.field(place), pa.array([text] * own.num_rows))
+
+    rewritten(path, change)
+    with pytest.raises(UserError, match=f"the record {path} is invalid: cell .*: {why}"):
+        read(written)
 
 
 def rewritten(path: Path, change: Callable[[pa.Table], pa.Table], to: Path | None = None) -> None:
@@ -210,6 +240,20 @@ def test_a_copied_file_counts_once(written: Path, units: list[Unit]) -> None:
     assert read(written, [units[0].fingerprint]).num_rows == 3
     for name, records in reading.read_compact(written, MEASURED).items():
         assert records.num_rows == before[1][name].num_rows
+
+
+@pytest.mark.parametrize("name", ["victim=other", "a*b", "[ab]", "it's"])
+def test_the_name_of_a_results_folder_is_no_pattern_and_no_column(written: Path, units: list[Unit], name: str) -> None:
+    before = read(written), reading.read_compact(written, MEASURED)["driving"]
+    for beside in ("aXb", "a"):
+        results.prepare(written / beside)
+        for unit in units:
+            path = results.path_of(written, unit.fingerprint)
+            rewritten(path, lambda own: own.slice(0, 1), results.path_of(written / beside, unit.fingerprint))
+    shutil.copytree(written / "episodes", written / name / "episodes")
+    assert read(written / name).equals(before[0])
+    assert reading.read_compact(written / name, MEASURED)["driving"].equals(before[1])
+    assert len(results.finished(written / name, {unit.fingerprint: unit for unit in units})) == len(units)
 
 
 def test_a_record_from_the_future_is_not_the_newest(written: Path, units: list[Unit]) -> None:

@@ -17,7 +17,7 @@ from tests.framework.conftest import Said
 Bench = Callable[..., Said]
 RUN = (
     "run", "attack=nudge", "defense=guard", "defense.digits=2", "victim=toy", "world=toy", "lanes=3,4", "density=1",
-    "weather=clear", "episodes=4", "seeds=0,1", "executor=serial", "record=0",
+    "weather=clear", "episodes=10", "seeds=0,1", "executor=serial", "record=0",
 )  # fmt: skip
 
 
@@ -46,10 +46,20 @@ def test_a_submission_is_verified_and_becomes_a_row(bench: Bench, submission: Pa
 
 
 def test_fresh_scenarios_are_compared_with_the_submitted_ones(bench: Bench, submission: Path) -> None:
-    """The toy's cars are placed by the seed alone, so a few public scenarios may differ from the drawn ones."""
-    said = bench("verify", str(submission), "sample=1", "episodes=3", "salt=7")
-    assert "Fresh scenarios (salt=7), 3 a cell" in said.out
+    said = bench("verify", str(submission), "sample=1", "episodes=10", "salt=7")
+    assert "Fresh scenarios (salt=7), 10 a cell" in said.out
+    # The toy's episodes depend on hardly more than the parity of the seed, so that the drawn ones may differ.
     assert ("public_only" in said.out) == (said.code == 1)
+
+
+def test_too_few_scenarios_are_no_evidence(bench: Bench, tmp_path: Path) -> None:
+    results, folder = tmp_path / "results", tmp_path / "submission"
+    few = [word.replace("episodes=10", "episodes=4") for word in RUN]
+    assert bench(*few, f"out={results}").code == 0
+    assert bench("submit", "nudge-guard", f"results={results}", f"out={folder}").code == 0
+    said = bench("verify", str(folder), "sample=1")
+    assert (said.code, "Not audited: it has 4 scenarios a cell" in said.out) == (1, True)
+    assert "at least 10, got 3" in bench("verify", str(folder), "episodes=3").err
 
 
 def test_its_command_drives_the_same_records(bench: Bench, submission: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Bad places and bad company: a full disk, a folder that cannot be written, two writers, bad input."""
+"""Bad places and bad company: a full disk, a folder that cannot be written, two writers, a wrong clock, bad input."""
 
 from __future__ import annotations
 
@@ -6,9 +6,15 @@ import os
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
 from tests.framework.conftest import ran, started
+from tests.soak.bad_inputs import bad_inputs
 from tests.soak.subjects import RUN, SUBJECTS, Condition
 
 BAD_INPUTS = 1000
@@ -46,12 +52,26 @@ def two_writers(site: Path, place: Path) -> str:
     return f"exit codes {codes}, records {'equal' if same else 'DIFFERENT'} to those of one writer"
 
 
+def clock_skew(site: Path, place: Path) -> str:
+    """Records of a machine whose clock is a day ahead: the same command drives nothing again, and a report says so."""
+    ran(site, *RUN, f"out={place}")
+    for path in place.glob("episodes/*.parquet"):
+        records = pq.read_table(path)
+        column = records.column_names.index("created_at")
+        later = pc.add(records["created_at"], pa.scalar(timedelta(days=1)))
+        pq.write_table(records.set_column(column, records.schema.field("created_at"), later), path)
+    before = SUBJECTS["run"].finished(place)
+    again = ran(site, *RUN, f"out={place}")
+    driven = sum(content != before.get(name) for name, content in SUBJECTS["run"].finished(place).items())
+    told = ran(site, "report", "leaderboard", f"out={place}")
+    return (
+        f"exit code {again.code}, {driven} of {len(before)} units driven again; "
+        f"report: exit code {told.code}, {told.err.strip().splitlines()[-1:]}"
+    )
+
+
 def bad_input(site: Path, place: Path) -> str:
     """Every bad command line ends with one line and a code other than 0."""
-    try:
-        from tests.soak.bad_inputs import bad_inputs
-    except ImportError:
-        return "skipped: tests/soak/bad_inputs.py is not there"
     wrong = []
     for argv in bad_inputs(BAD_INPUTS, seed=0, folder=place):
         said = ran(site, *argv)
@@ -78,5 +98,6 @@ CONDITIONS: Mapping[str, Condition] = {
     "full disk": full_disk,
     "read-only folder": read_only,
     "two writers": two_writers,
+    "clock a day ahead": clock_skew,
     "bad input": bad_input,
 }

@@ -187,6 +187,23 @@ def changes_a_weight(members: Members, harm: Path) -> None:
     edited(members, PROGRAM, change)
 
 
+def long_name(members: Members, harm: Path) -> None:
+    members["q" * 60_000] = b""
+
+
+def norm(name: str) -> Callable[[Members, Path], None]:
+    """A batch norm of a weight with 128 channels, with the statistics of one: torch's kernels write past their end."""
+
+    def craft(members: Members, harm: Path) -> None:
+        inputs = json.loads(members[PROGRAM])["graph_module"]["graph"]["inputs"]
+        none, short = {"as_none": True}, inputs[-2]
+        training = [{"as_bool": True}] if name != "_native_batch_norm_legit_no_training" else []
+        given = [inputs[0], none, none, short, short, *training, {"as_float": 0.5}, {"as_float": 0.1}]
+        calls(f"torch.ops.aten.{name}.default", *given)(members, harm)
+
+    return craft
+
+
 HARM = {"as_string": "HARM"}
 CRAFTED: dict[str, tuple[Callable[[Members, Path], None], str]] = {
     "a pickled weight": (pickled_weight, "'net.1.bias' is pickled: only plain tensors are loaded"),
@@ -225,6 +242,13 @@ CRAFTED: dict[str, tuple[Callable[[Members, Path], None], str]] = {
         calls("_operator.mul", {"as_int": 2**62}, {"as_int": 8}),
         "fails on 1 observations",
     ),
+    "a member with a long name": (long_name, "it holds 'qqq"),
+    "a batch norm past the end of its statistics": (
+        norm("native_batch_norm"),
+        "'torch.ops.aten.native_batch_norm.default'",
+    ),
+    "the same in eval mode": (norm("_native_batch_norm_legit_no_training"), "fails on 1 observations"),
+    "a sparse tensor": (calls("torch.ops.aten.to_sparse.default"), "'torch.ops.aten.to_sparse.default', which is not"),
     "another layer's weights": (changes_a_weight, "changes its own weights: export it in eval mode"),
 }
 

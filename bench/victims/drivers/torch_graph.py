@@ -48,8 +48,13 @@ WORDS = (
 """Words that may be arguments, for instance how a division is rounded. Others could be names of files."""
 REFUSED = re.compile(
     r"from_file|set_?|set_data|resize\w*|record_stream|requires_grad_|backward|retain_grad|item|.*_out"
+    r"|_?native_batch_norm(_legit)?|.*(sparse|quantize|fbgemm).*"
 )
-"""Operations that reach files, or memory beyond their arguments, or are not part of a forward pass."""
+"""Operations that reach files, or memory beyond their arguments, or are not part of a forward pass.
+
+The batch norms of training and the sparse tensors trust the sizes and indices that they are given.
+"""
+UNCHECKED_NORM = "torch.ops.aten._native_batch_norm_legit_no_training.default"
 PRIVATE = ("_unsafe_view", "_weight_norm", "_scaled_dot_product_flash_attention_for_cpu", "_trilinear")
 """Operations with an underscore, beside those of ATen's core, that exported programs contain."""
 ASSERTIONS = re.compile(r"torch\.ops\.aten\.(_assert_\w+|sym_constrain_range\w*)\.\w+")
@@ -169,9 +174,18 @@ def _step(node: Mapping[str, Any], weights: frozenset[str]) -> Step:
             args.append(value)
     changed = args[0] if args else None
     mutable = isinstance(call, OpOverload) and call._schema.is_mutable
+    call = _batch_norm if node["target"] == UNCHECKED_NORM else call
     if mutable and not (isinstance(changed, Value) and changed.name not in weights):
         raise RefusedError(f"{node['target']} changes its own weights: export it in eval mode")
     return Step(call, tuple(args), kwargs, _results(node["outputs"]))
+
+
+def _batch_norm(input: Tensor, *given: Any, **named: Any) -> Any:
+    """Batch norm in eval mode, with sizes that are checked: torch reads one number for each channel, even if there are fewer."""
+    for one in (*given, *named.values()):
+        if isinstance(one, Tensor) and one.shape != input.shape[1:2]:
+            raise RefusedError("a batch norm has weights or statistics of another size than its input")
+    return torch.ops.aten._native_batch_norm_legit_no_training.default(input, *given, **named)
 
 
 def _no_grad(node: Mapping[str, Any], weights: frozenset[str]) -> Step:

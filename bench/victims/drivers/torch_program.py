@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from bench.archive import Archive
-from bench.errors import UserError
+from bench.errors import UserError, short
 from bench.victims.drivers.torch_graph import DTYPES, Graph, RefusedError
 
 SCHEMA = 8
@@ -81,7 +81,7 @@ def _members(archive: Archive, name: str) -> dict[str, bytes]:
         raise UserError(f"{name} cannot be read: it is not written by torch.export.save of torch 2.8 or later")
     for member in found:
         if not MEMBERS.fullmatch(member):
-            raise UserError(f"{name} is refused: it holds {member!r}; {_why(member)}")
+            raise UserError(f"{name} is refused: it holds {short(member)!r}; {_why(member)}")
     if found.get("byteorder", b"little") != sys.byteorder.encode():
         raise UserError(f"{name} cannot be read: it was written on a machine with another byte order")
     return found
