@@ -14,7 +14,8 @@ from torch import Tensor
 from bench.driving import DrivingWorld, Policy, State, TrainingHooks
 from bench.plugins import registry
 from bench.victims import zoo
-from bench.victims.drivers.behind import AttackMix, Guard, GuardedPractice, defense_of
+from bench.victims.drivers.attack_mix import AttackMix
+from bench.victims.drivers.behind import Guard, GuardedPractice, defense_of
 from bench.victims.drivers.ddpg import DDPG
 from bench.victims.drivers.dqn import DQN
 from bench.victims.drivers.networks import ActorPolicy, QPolicy

@@ -17,7 +17,8 @@ from bench.plugins.contracts import Progress, Trained
 from bench.plugins.ranges import Count, Share, Width
 from bench.scenarios import SeedBlock
 from bench.victims import zoo
-from bench.victims.drivers.behind import AttackMix, Guard, GuardedPractice, defense_of
+from bench.victims.drivers.attack_mix import AttackMix
+from bench.victims.drivers.behind import Guard, GuardedPractice, defense_of
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
 from bench.victims.drivers.practice import Practice, roads
 from bench.victims.drivers.selection import Best
