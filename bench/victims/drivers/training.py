@@ -150,9 +150,7 @@ class LearningDriver(DrivingVictim):
                 learner.anneal()
                 if taken > WARM_UP:
                     rate = self.learning_rate * max(0.05, min(1.0 if hooks.start is None else 0.5, 2 * (1 - share)))
-                    if learner.on_policy:
-                        learner.learn(rate, share)
-                    for _ in range(0 if learner.on_policy else CHUNK * self.updates):
+                    for _ in range(CHUNK * self.updates):
                         learner.update(practice.sample(share), rate)
                 if phase.repeat == 1 and self._due(done / total, len(best.history), hooks):
                     best.offer(learner.averaged(), done / total)
