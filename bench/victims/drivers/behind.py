@@ -52,7 +52,9 @@ class Guard:
         """The network behind the defence; it keeps its mode and its gradients."""
         other, mode = copy.copy(self.victim), network.training
         object.__setattr__(other, "load", lambda seed, facts: network)
-        return self.defense.load(other, 0, self.facts).train(mode)
+        defended: Policy = self.defense.load(other, 0, self.facts)
+        defended.train(mode)
+        return defended
 
 
 class GuardedPractice(Practice):
