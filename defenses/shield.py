@@ -26,12 +26,13 @@ SOFTNESS = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Shield(DrivingDefense):
-    """Masks the actions of a discrete victim that are unsafe in the worst case, and those that are needlessly slow.
+    """Leaves only actions that are safe in the worst case and not needlessly slow: a mask, or a projection of continuous ones.
 
     The worst case is over the true values that an assumed perturbation set allows behind the shown ones. The ego's own motion
     is reckoned from its actions; the victim receives the reckoned row. An action is safe if the gap to every car ahead lasts
     when the ego brakes from the next decision on. Where FASTER leaves a margin of at least `band`, IDLE and SLOWER are masked,
-    so that an attack cannot make the car crawl. If no action is safe, it brakes.
+    so that an attack cannot make the car crawl. If no action is safe, it brakes. Continuous actions are clipped to
+    what this leaves of acceleration and steering.
 
     Args:
         assumed_budget: budget of the perturbation set that it assumes.
