@@ -37,6 +37,7 @@ class DDPG(LearningDriver):
         actor_delay: critic updates per actor update.
     """
 
+    algorithm = "ddpg"
     policy_type = ActorPolicy
 
     # Smaller and shorter than for DQN, because training actor and critic in turns takes longer.

@@ -33,6 +33,7 @@ class DQN(LearningDriver):
         final_epsilon: share of random actions after the first 30 % of the training; it falls linearly from 1 until then.
     """
 
+    algorithm = "dqn"
     policy_type = QPolicy
 
     final_epsilon: Share = 0.02

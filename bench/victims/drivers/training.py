@@ -57,6 +57,8 @@ class LearningDriver(DrivingVictim):
     """
 
     learns: ClassVar[bool] = True
+    algorithm: ClassVar[str]
+    """The name of its entries in the zoo."""
     policy_type: ClassVar[type[Policy]]
     sign: ClassVar[float] = 1.0
     """-1 for an adversary: its reward is minus the driver's, and its best checkpoint has the lowest `safe_progress`."""
@@ -82,8 +84,7 @@ class LearningDriver(DrivingVictim):
     behind_decisions: Count = 4_000
 
     def zoo_name(self) -> str:
-        name = type(self).__name__.lower()
-        return f"{name}-behind-{self.behind.split()[0]}" if self.behind.strip() else name
+        return f"{self.algorithm}-behind-{self.behind.split()[0]}" if self.behind.strip() else self.algorithm
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         return zoo.load(zoo.Recipe.of(self), seed, self.policy_type)
