@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import shlex
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -52,7 +52,7 @@ class Guard:
         """The network behind the defence; it keeps its mode and its gradients."""
         other, mode = copy.copy(self.victim), network.training
         object.__setattr__(other, "load", lambda seed, facts: network)
-        defended: Policy = self.defense.load(other, 0, self.facts)
+        defended = cast(Policy, self.defense.load(other, 0, self.facts))
         defended.train(mode)
         return defended
 
