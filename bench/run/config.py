@@ -18,7 +18,7 @@ from bench.plugins.pair import Chosen, Pair, check_track
 from bench.plugins.registry import KINDS, Kind
 from bench.plugins.suites import Suite
 from bench.run.executors import EXECUTORS
-from bench.run.process import machine_bytes
+from bench.run.options import RunOptions, TrainOptions, half_of_memory
 from bench.scenarios import Grid
 
 
@@ -60,7 +60,7 @@ class RunConfig:
     broken: tuple[str, ...] = ()
     shard: tuple[int, int] = (1, 1)
     unit_timeout: float = 3600.0
-    unit_memory: float = field(default_factory=lambda: half_of_memory())
+    unit_memory: float = field(default_factory=half_of_memory)
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
@@ -114,44 +114,6 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
         raise ValueError(
             f"seeds must be distinct whole numbers of at least 0, got {short(','.join(map(str, seeds))) or 'none'}"
         )
-
-
-def half_of_memory() -> float:
-    """Half of the machine's memory in GB; 0 if it cannot be read."""
-    return machine_bytes() / 2e9
-
-
-@dataclass
-class RayOptions:
-    """The options of `executor=ray`."""
-
-    address: str = "local"
-
-
-@dataclass
-class RunOptions:
-    """The options of `bench run` that choose neither a component nor a cell, with types and defaults."""
-
-    grid: str | None = None
-    episodes: int | None = None
-    seeds: list[int] | None = None
-    executor: str = "processes"
-    workers: int | None = None
-    ray: RayOptions = field(default_factory=RayOptions)
-    out: str = "results"
-    record: int | None = None
-    reference: bool = True
-    shard: str = "1/1"
-    unit_timeout: float = 3600.0
-    unit_memory: float = field(default_factory=half_of_memory)
-
-
-@dataclass
-class TrainOptions:
-    """The options of `bench train` that do not choose a component, with types and defaults."""
-
-    seeds: list[int] = field(default_factory=lambda: [0])
-    out: str | None = None
 
 
 def run_config(words: Sequence[str]) -> RunConfig:

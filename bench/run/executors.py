@@ -33,8 +33,8 @@ class Watcher(Protocol):
     def working(self, works: Sequence[Unit | Preparation | Loading]) -> None:
         """Called with the work in progress."""
 
-    def preparing(self, work: str, share: float, text: str) -> None:
-        """Called with the share of a preparation done in [0, 1], and a text of the attack."""
+    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
+        """Called with the share of some work done in [0, 1]; of a preparation with a text, of units with their episodes."""
 
     def printed(self, work: Unit | Preparation | Loading, lines: Sequence[str]) -> None:
         """Called with what the components printed while they worked."""

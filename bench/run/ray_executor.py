@@ -39,13 +39,13 @@ class Host:
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.worker: Worker | None = None
-        self.told: list[tuple[str, float, str]] = []
+        self.told: list[tuple[str, float, str, int]] = []
 
     def ready(self) -> bool:
         """Answers when the actor has a core."""
         return True
 
-    def progress(self) -> list[tuple[str, float, str]]:
+    def progress(self) -> list[tuple[str, float, str, int]]:
         """The progress of a preparation since the last call."""
         told, self.told = self.told, []
         return told
@@ -200,7 +200,7 @@ class RayExecutor:
             return None
 
     def _ask(self, watcher: Watcher) -> None:
-        """Pass on the progress of preparations."""
+        """Pass on the progress of the work."""
         for actor in self.actors:
             if actor.task is None:
                 continue

@@ -82,7 +82,7 @@ class Worker:
         wait([self.connection, self.process.sentinel], seconds)
 
     def news(self) -> list[Any]:
-        """What the worker sent since: progress as (work, share, text), and at the end of a task an outcome or a failure.
+        """What the worker sent since: progress as (work, share, text, episodes); at the end of a task an outcome or a failure.
 
         A worker that died, or used more time or memory than allowed, has failed its task, and is `spent`.
         """
@@ -186,8 +186,8 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
     framework = Snapshot()
     connection.send_bytes(pickle.dumps(READY))
 
-    def tell(work: str, share: float, text: str) -> None:
-        connection.send_bytes(pickle.dumps((work, share, text)))
+    def tell(work: str, share: float, text: str, episodes: int = 0) -> None:
+        connection.send_bytes(pickle.dumps((work, share, text, episodes)))
 
     while True:
         try:
