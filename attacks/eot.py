@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from annotated_types import Interval
@@ -18,6 +18,10 @@ SEEN = 0.5
 """Frames in which a smaller share of the sign is visible are not used."""
 REPORT_EVERY = 5
 """Steps between two progress reports."""
+SUREST = 1e-6
+"""Scores closer to 0 or 1 than this have the log-odds of this."""
+JUDGED = 0.2
+"""Share of the steps, the last ones, whose mean loss says which start is the best."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +32,14 @@ class EOT(PatchAttack):
     views of the training places and random transformations of the image, plus `tv` times the patch's total variation. Uses Adam
     with a cosine schedule and clamps the patch to [0, 1]. White box: access `gradients`. 0 disables a transformation.
 
+    Where a detector is sure, the gradient of a probability vanishes; the log-odds log(p / (1 - p)) keep it (as the margin loss of
+    Carlini and Wagner 2017 does). Of several restarts, the patch with the lowest loss in the last steps is kept.
+
     Args:
         texels: side of the patch in texels, from 8 to 512 (default 100, as in the thesis, which also uses 32 and 64).
-        steps: optimiser steps, at least 1 (default 150).
+        steps: optimiser steps of each start, at least 1 (default 150).
+        restarts: number of random starts, at least 1 (default 1).
+        loss: what is minimised: the mean of the score, or of its log-odds (default probability).
         batch: views per step, at least 1 (default 8).
         learning_rate: learning rate of Adam, above 0 (default 0.05).
         tv: weight of the total variation: mean absolute difference of neighbouring texels, in both directions (default 0.1).
@@ -43,7 +52,7 @@ class EOT(PatchAttack):
         hue: largest rotation of the hue, as a share of the full circle, up to 0.5 (default 0.05).
         noise: standard deviation of Gaussian noise on the sRGB scale (default 0.02).
 
-    Queries: steps * batch images.
+    Queries: restarts * steps * batch images.
 
     Example:
         >>> from attacks.eot import EOT
@@ -54,6 +63,8 @@ class EOT(PatchAttack):
 
     texels: Texels = 100
     steps: Count = 150
+    restarts: Count = 1
+    loss: Literal["probability", "log_odds"] = "probability"
     batch: Count = 8
     learning_rate: Positive = 0.05
     tv: NotNegative = 0.1
@@ -69,6 +80,20 @@ class EOT(PatchAttack):
     noise: NotNegative = 0.02
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
+        best, least = None, torch.inf
+        for start in range(self.restarts):
+
+            def share(done: float, text: str, start: int = start) -> None:
+                progress((start + done) / self.restarts, text)
+
+            patch, loss = self._optimised(oracle, scenes, share)
+            if best is None or loss < least:
+                best, least = patch, loss
+        assert best is not None
+        return best
+
+    def _optimised(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> tuple[Tensor, float]:
+        """A patch [3, P, P] from a random start, and its mean loss in the last steps; infinite if no query was left for one."""
         from attacks.transformations import Transformations
 
         seen = (scenes.visible >= SEEN).nonzero().squeeze(1)
@@ -87,22 +112,33 @@ class EOT(PatchAttack):
             hue=self.hue,
             noise=self.noise,
         )
+        losses = []
         for step in range(min(self.steps, oracle.remaining // self.batch)):
             frames = seen[torch.randint(len(seen), (self.batch,), generator=oracle.generator)]
             corners = self._corners(scenes.boxes[frames], scenes.size, oracle.generator)
             windows = scenes.windows(frames, patch, oracle.threat.budget, corners, size)
             predictions = oracle.differentiable(transform(windows, reach[frames] - corners.repeat(1, 2)))
-            found, variation = predictions.scores_of(oracle.label).amax(-1).mean(), total_variation(patch)
+            scores = predictions.scores_of(oracle.label).amax(-1)
+            found, variation = scores.mean(), total_variation(patch)
             oracle.report(patch[0], found=found, total_variation=variation)
+            loss = self._of(scores) + self.tv * variation
             adam.zero_grad()
-            (found + self.tv * variation).backward()
+            loss.backward()
             adam.step()
             schedule.step()
+            losses.append(loss.item())
             with torch.no_grad():
                 patch.clamp_(0, 1)
             if step % REPORT_EVERY == 0:
                 progress(step / self.steps, f"stop sign {found.item():.2f}")
-        return patch.detach()[0]
+        last = losses[-max(1, round(JUDGED * self.steps)) :]
+        return patch.detach()[0], sum(last) / len(last) if len(losses) == self.steps else torch.inf
+
+    def _of(self, scores: Tensor) -> Tensor:
+        """The loss of scores [N] in [0, 1]."""
+        if self.loss == "probability":
+            return scores.mean()
+        return scores.clamp(SUREST, 1 - SUREST).logit().mean()
 
     def _corners(self, boxes: Tensor, picture: tuple[int, int], generator: torch.Generator) -> Tensor:
         """int64 [N, 2] column and row of the first pixel of windows around the signs, shifted by up to `translation`."""

@@ -1,32 +1,45 @@
 """Measures the back ends: what a driver sustains with tasks that do nothing, and Ray against processes on one pair.
 
-python benchmarks/executor_speed.py                  # both
-python benchmarks/executor_speed.py --tasks 5000     # more tasks that do nothing
+    python benchmarks/executor_speed.py
+    python benchmarks/executor_speed.py --tasks 500 --episodes 50 --rounds 1
+
+Prints the figures that docs/scale.md and `benchmarks/cluster_cost.py` use. Capacity is the number of tasks for which a second of
+the driver's CPU time is enough: on a busy machine wall time says little. Ray and processes drive the pair in turns; the ratio of
+wall time is the median over the rounds.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+import pickle
+import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
+from itertools import chain
 from pathlib import Path
 
+import psutil
+import pyarrow as pa
+
+from bench.plugins.framework import Snapshot
 from bench.plugins.pair import Pair, choose
-from bench.records import store
+from bench.plugins.track import track
+from bench.records import packing, reading, store
 from bench.run import runner
 from bench.run.config import run_config
 from bench.run.executors import EXECUTORS
 from bench.run.process import cores
 from bench.run.unit import Loading
-from bench.run.work import Outcome, Task
+from bench.run.work import Outcome, Task, attempt
 from bench.run.worker import Limits
 from bench.victims.drivers.reference import Blind
 
 PAIR = ("attack=noise", "defense=none", "victim=dqn", "lanes=3,4", "density=1", "weather=clear,fog", "seeds=0,1")
+QUIET = ("record=0", "reference=false")
 
 
 class Silent:
@@ -39,11 +52,8 @@ class Silent:
         return lambda *arguments: None
 
 
-def throughput(name: str, count: int) -> tuple[float, float]:
-    """Finished tasks a second of wall time, and of the driver's CPU time.
-
-    Each task loads a victim without weights, and nothing is written.
-    """
+def nothing() -> Task:
+    """A task that loads a victim without weights."""
     blind = choose("victim", "blind")
     assert isinstance(blind.component, Blind)
     pair = Pair(
@@ -53,43 +63,76 @@ def throughput(name: str, count: int) -> tuple[float, float]:
         world=choose("world", "highway"),
         threat=blind.component.threat.of_nobody(),
     )
-    work = Loading(pair=pair, training_seed=0)
+    return Task(work=Loading(pair=pair, training_seed=0))
+
+
+def throughput(name: str, count: int) -> tuple[float, float]:
+    """Finished tasks a second of wall time, and of the driver's CPU time. Nothing is written."""
+    task = nothing()
     with closing(EXECUTORS[name](None, Limits(seconds=600), "local")) as back_end:
         # The first tasks wait for the workers to start.
-        for _ in back_end.map([Task(work=work) for _ in range(2 * cores())], Silent()):  # type: ignore[arg-type]
-            pass
+        list(back_end.map([Task(work=task.work) for _ in range(2 * cores())], Silent()))  # type: ignore[arg-type]
         start, used = time.perf_counter(), time.process_time()
-        outcomes = [outcome for _, outcome in back_end.map((Task(work=work) for _ in range(count)), Silent())]  # type: ignore[arg-type]
+        tasks = (Task(work=task.work) for _ in range(count))
+        ended = list(chain.from_iterable(back_end.map(tasks, Silent())))  # type: ignore[arg-type]
         seconds, used = time.perf_counter() - start, time.process_time() - used
-    assert all(isinstance(outcome, Outcome) for outcome in outcomes)
+    assert len(ended) == count
+    assert all(isinstance(outcome, Outcome) for _, outcome in ended)
     return count / seconds, count / used
 
 
-def written(count: int) -> float:
-    """Records of units written a second, one file each."""
+def milliseconds(work: Callable[[], object], count: int) -> float:
+    """CPU time of each of `count` calls."""
+    work()
+    start = time.process_time()
+    for _ in range(count):
+        work()
+    return 1e3 * (time.process_time() - start) / count
+
+
+def of_records() -> None:
+    """Print what the records of a unit of 100 episodes cost the driver."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        runner.run(
-            run_config([*PAIR, "episodes=4", "executor=serial", "record=0", "reference=false", f"out={out}"]), Silent()
-        )  # type: ignore[arg-type]
-        from bench.plugins.track import track
-        from bench.records import reading
+        words = [word for word in PAIR if not word.startswith(("lanes", "weather", "seeds"))]
+        more = ("lanes=3", "weather=clear", "seeds=0", "episodes=100", "executor=serial", *QUIET)
+        units = runner.run(run_config([*words, *more, f"out={out}"]), Silent())
+        records = reading.read(out, units[:1], track=track("driving"))
+        sent = pickle.dumps(Outcome(wall_s=1.0, records=records), pickle.HIGHEST_PROTOCOL)
+        many = [_renamed(records, number) for number in range(packing.UNITS)]
+        print(
+            f"{len(sent) / 1e3:.0f} kB are sent back, unpickled in {milliseconds(lambda: pickle.loads(sent), 50):.1f} ms"
+        )
+        print(f"written to a file of its own in {milliseconds(lambda: store.write(out, records), 30):.1f} ms")
+        together = milliseconds(lambda: store.write_all(out, many), 1) / len(many)
+        size = max(path.stat().st_size for path in packing.packed_files(out)) / len(many)
+        alone = store.path_of(out, units[0]).stat().st_size
+        print(f"written with {len(many)} in {together:.2f} ms; {alone / 1e3:.0f} kB alone, {size / 1e3:.1f} kB packed")
 
-        path = next((out / store.FOLDER).glob("*.parquet"))
-        records = reading.read(out, [path.stem], track=track("driving"))
-        start = time.perf_counter()
-        for _ in range(count):
-            store.write(out, records)
-        return count / (time.perf_counter() - start)
+
+def _renamed(records: pa.Table, number: int) -> pa.Table:
+    place = records.schema.get_field_index("unit")
+    column = pa.array([f"{number:064x}"] * records.num_rows)
+    return records.set_column(place, records.schema.field("unit"), column)
 
 
-def pair_seconds(name: str, episodes: int) -> float:
-    """Wall time of one pair, with the start of the workers."""
+def pair_seconds(name: str, episodes: int) -> tuple[float, float]:
+    """Wall time of one pair, with the start of the workers, and the megabytes of this process and its largest child."""
     with tempfile.TemporaryDirectory() as folder:
-        words: Sequence[str] = [*PAIR, f"episodes={episodes}", f"executor={name}", "record=0", "reference=false"]
+        words: Sequence[str] = [*PAIR, *QUIET, f"episodes={episodes}", f"executor={name}", f"out={folder}"]
+        largest = 0.0
+
+        class Watching(Silent):
+            def working(self, works: object) -> None:
+                nonlocal largest
+                # Ray's own processes have a few hundred MB as well.
+                children = psutil.Process().children(recursive=True)
+                sizes = [child.memory_info().rss for child in children if child.is_running()]
+                largest = max(largest, max(sizes, default=0) / 1e6)
+
         start = time.perf_counter()
-        runner.run(run_config([*words, f"out={folder}"]), Silent())  # type: ignore[arg-type]
-        return time.perf_counter() - start
+        runner.run(run_config(words), Watching())
+        return time.perf_counter() - start, largest
 
 
 def main() -> None:
@@ -97,18 +140,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Measure the back ends of `bench run`.")
     parser.add_argument("--tasks", type=int, default=2000, help="tasks that do nothing")
     parser.add_argument("--episodes", type=int, default=100, help="episodes of a unit of the pair")
-    parser.add_argument("--rounds", type=int, default=3, help="runs of the pair with each back end, in turns")
+    parser.add_argument(
+        "--rounds", type=int, default=3, help="runs of the pair with each back end, in turns; 0 for none"
+    )
     arguments = parser.parse_args()
     names = ["processes", *(["ray"] if importlib.util.find_spec("ray") else [])]
     for name in names:
-        wall, used = throughput(name, arguments.tasks)
-        print(f"{name}: {wall:.0f} tasks that do nothing a second; the driver's CPU time is enough for {used:.0f}")
-    print(f"records of {written(300):.0f} units written a second")
+        wall, capacity = throughput(name, arguments.tasks)
+        print(
+            f"{name}: {wall:.0f} tasks that do nothing a second on {cores()} cores; capacity of the driver {capacity:.0f}"
+        )
+    framework, task = Snapshot(), nothing()
+    print(f"a worker takes {milliseconds(lambda: attempt(task, lambda *news: None, framework), 100):.1f} ms a task")
+    of_records()
     rounds = [{name: pair_seconds(name, arguments.episodes) for name in names} for _ in range(arguments.rounds)]
-    best = {name: min(one[name] for one in rounds) for name in names}
-    print(", ".join(f"{name} {seconds:.1f} s" for name, seconds in best.items()), f"(best of {arguments.rounds})")
-    if "ray" in best:
-        print(f"Ray takes {best['ray'] / best['processes']:.2f} x of processes, with the start of the workers")
+    for name in names if rounds else ():
+        seconds, memory = (statistics.median(one[name][at] for one in rounds) for at in (0, 1))
+        print(f"{name}: {seconds:.1f} s for the pair, {memory:.0f} MB the largest worker")
+    print(f"driver: {psutil.Process().memory_info().rss / 1e6:.0f} MB")
+    if rounds and len(names) > 1:
+        ratio = statistics.median(one["ray"][0] / one["processes"][0] for one in rounds)
+        print(f"Ray takes {ratio:.2f} x of processes, with the start of the workers")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""Measures `bench report html=PAGE` on a million episode records: wall time, memory and size of the page.
+"""Measures `bench report html=PAGE` on a million episode records of ten thousand units: time, memory and size of the page.
 
-    python benchmarks/report_speed.py                    # a thousand files of a thousand records
-    python benchmarks/report_speed.py --units 1          # as `bench run` writes them: ten thousand files, one per unit
+    python benchmarks/report_speed.py                      # in one file, packed as `bench run` does, a file for each unit
+    python benchmarks/report_speed.py --episodes 100000 --rounds 1
 
-The records are synthetic: measurements are random, and provenance texts are as long as in real records.
+The three are measured in turns; the ratios are of CPU time, each to one file in the same round, and their median. The records are
+synthetic: measurements are random, and provenance texts are as long as in real records. The time of the packing is printed, too.
 """
 
 from __future__ import annotations
@@ -12,10 +13,13 @@ import argparse
 import hashlib
 import itertools
 import json
+import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -25,13 +29,14 @@ import pyarrow.parquet as pq
 
 from bench.plugins.contracts import Facts
 from bench.plugins.track import track
+from bench.records import packing, store
 from bench.records.schema import schema
-from bench.records.store import FOLDER
 from bench.scenarios import Cell
 from bench.statistics.episodes import as_text
 from envs.highway.axes import STANDARD_V1
 
 SEEDS, EPISODES, ATTACKS = 3, 100, 8
+ROW_GROUP = 100_000
 SCHEMA = schema(track("driving"))
 FACTS = json.dumps(Facts(axes=STANDARD_V1.axes, decision_hz=15, max_steps=450).written())
 POLICY = {f"parameter_{number}": 0.125 for number in range(15)}
@@ -81,6 +86,7 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: Cell, rng: np.
         "crashed": rng.random(EPISODES) < 0.3,
         "offroad": np.zeros(EPISODES, bool),
         "steps": rng.integers(30, 450, EPISODES),
+        "entropy": rng.integers(0, 2**62, EPISODES),
         "action_counts": rng.integers(0, 100, (EPISODES, 5)).tolist(),
     }
     columns = []
@@ -90,38 +96,68 @@ def unit(number: int, defense: str, attack: str, seed: int, cell: Cell, rng: np.
     return pa.table(columns, schema=SCHEMA)
 
 
-def write(out: Path, episodes: int, units: int) -> int:
-    """Write records, `units` of work per file, and return the number of files."""
-    folder = out / FOLDER
-    folder.mkdir(parents=True)
+def units(episodes: int) -> Iterator[pa.Table]:
+    """The records of one unit after the other."""
     rng = np.random.default_rng(0)
     attacks = ["none", *(f"attack_{number}" for number in range(ATTACKS))]
     combinations = itertools.product(range(episodes // EPISODES), attacks, range(SEEDS), STANDARD_V1.cells())
-    waiting, files = [], 0
     for number, (place, attack, seed, cell) in enumerate(itertools.islice(combinations, episodes // EPISODES)):
-        waiting.append(unit(number, f"defense_{place}", attack, seed, cell, rng))
-        if len(waiting) == units:
-            pq.write_table(pa.concat_tables(waiting), folder / f"{number:06d}.parquet", compression="zstd")
-            waiting, files = [], files + 1
-    return files
+        yield unit(number, f"defense_{place}", attack, seed, cell, rng)
+
+
+def write(root: Path, episodes: int) -> dict[str, Path]:
+    """Write the same records in three ways, and return the folders."""
+    folders = {name: root / name for name in ("one file", "packed", "a file for each unit")}
+    for folder in folders.values():
+        store.prepare(folder)
+    single = folders["a file for each unit"] / store.FOLDER
+    with pq.ParquetWriter(folders["one file"] / store.FOLDER / "all.parquet", SCHEMA, compression="zstd") as whole:
+        waiting: list[pa.Table] = []
+        for records in units(episodes):
+            pq.write_table(records, single / f"{records['unit'][0]}.parquet", compression="zstd")
+            waiting.append(records)
+            # Row groups of the size that a table written at once has.
+            if len(waiting) == ROW_GROUP // EPISODES:
+                whole.write_table(pa.concat_tables(waiting))
+                waiting = []
+        if waiting:
+            whole.write_table(pa.concat_tables(waiting))
+    shutil.copytree(single, folders["packed"] / store.FOLDER, dirs_exist_ok=True)
+    start = time.process_time()
+    packing.pack(folders["packed"])
+    used = time.process_time() - start
+    print(f"packing: {1e3 * used * EPISODES / episodes:.1f} ms of CPU time a unit")
+    return folders
+
+
+def measure(out: Path, page: Path) -> tuple[float, float, float]:
+    """Wall time and CPU time in seconds, and memory in GB, of a report."""
+    command = [sys.executable, "-c", MEASURE, f"out={out}", f"html={page}"]
+    code, wall, cpu, memory = map(float, subprocess.run(command, capture_output=True, text=True).stdout.split())
+    if code:
+        sys.exit("bench report failed")
+    return wall, cpu, memory
 
 
 def main() -> None:
-    """Write the records, measure the report and print the results."""
+    """Write the records, measure the reports and print the results."""
     parser = argparse.ArgumentParser(description="Measure `bench report html=PAGE` on a million records.")
     parser.add_argument("--episodes", type=int, default=1_000_000)
-    parser.add_argument("--units", type=int, default=10, help="units of work (100 episodes each) per file")
+    parser.add_argument("--rounds", type=int, default=3)
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        out, page = Path(folder) / "results", Path(folder) / "leaderboard.html"
-        start = time.perf_counter()
-        files = write(out, arguments.episodes, arguments.units)
-        print(f"{arguments.episodes} records in {files} files, written in {time.perf_counter() - start:.0f} s")
-        command = [sys.executable, "-c", MEASURE, f"out={out}", f"html={page}"]
-        code, wall, cpu, memory = map(float, subprocess.run(command, capture_output=True, text=True).stdout.split())
-        if code:
-            sys.exit("bench report failed")
-        print(f"page in {wall:.1f} s ({cpu:.1f} s of CPU time), {memory:.2f} GB, {page.stat().st_size / 1e6:.2f} MB")
+    with tempfile.TemporaryDirectory() as root:
+        folders, page = write(Path(root), arguments.episodes), Path(root) / "leaderboard.html"
+        rounds = [{name: measure(out, page) for name, out in folders.items()} for _ in range(arguments.rounds)]
+        print(
+            "| records | files | bytes a unit | wall, s | CPU, s | memory, GB | to one file |\n|---|---|---|---|---|---|---|"
+        )
+        for name, out in folders.items():
+            paths = list((out / store.FOLDER).glob("*.parquet"))
+            size = sum(path.stat().st_size for path in paths) * EPISODES // arguments.episodes
+            wall, cpu, memory = (statistics.median(one[name][at] for one in rounds) for at in range(3))
+            ratio = statistics.median(one[name][1] / one["one file"][1] for one in rounds)
+            print(f"| {name} | {len(paths)} | {size} | {wall:.1f} | {cpu:.1f} | {memory:.2f} | {ratio:.2f} x |")
+        print(f"page of {page.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

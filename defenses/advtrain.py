@@ -19,9 +19,11 @@ from bench.driving import (
     DrivingWorld,
     ObservationThreat,
     Policy,
+    State,
     TrainingHooks,
 )
 from bench.driving.enforcer import Enforcer
+from bench.driving.policy import rows_of
 from bench.driving.threat import Norm
 from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
@@ -139,8 +141,8 @@ class AttackInLoop(TrainingHooks):
         self.skips, self.noise = (torch.Generator().manual_seed(seed) for _ in range(2))
         self.attacked = 0
 
-    def acting(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
-        return observation if self.recipe.where == "replay" else self.shown(observation, policy, share)
+    def acting(self, observation: Tensor, policy: Policy, share: float, state: State = None) -> Tensor:
+        return observation if self.recipe.where == "replay" else self.shown(observation, policy, share, state)
 
     def remembered(self, observation: Tensor, shown: Tensor) -> Tensor:
         return shown if self.recipe.where == "acting" else observation
@@ -148,7 +150,7 @@ class AttackInLoop(TrainingHooks):
     def replayed(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
         return observation if self.recipe.where == "acting" else self.shown(observation, policy, share)
 
-    def shown(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
+    def shown(self, observation: Tensor, policy: Policy, share: float, state: State = None) -> Tensor:
         """o' [B, V, F]: each of the B observations attacked with probability 1 - skip, with the current budget of the ramp."""
         recipe = self.recipe
         if recipe.skip >= 1 or share < recipe.ramp_from:
@@ -158,17 +160,19 @@ class AttackInLoop(TrainingHooks):
             return observation
         scale = min(1.0, (share - recipe.ramp_from) / max(recipe.ramp_to - recipe.ramp_from, 1e-9))
         result = observation.clone()
-        result[hit] = self.perturbed(observation[hit], policy, scale)
+        result[hit] = self.perturbed(observation[hit], policy, rows_of(state, hit), scale)
         self.attacked += int(hit.sum())
         return result
 
-    def perturbed(self, observation: Tensor, policy: Policy, scale: float = 1.0) -> Tensor:
+    def perturbed(self, observation: Tensor, policy: Policy, state: State = None, scale: float = 1.0) -> Tensor:
         """attack(policy, o) [B, V, F], with a budget multiplied by `scale`."""
         enforcer = Enforcer(CountedPolicy(policy), self.threat, self.attack.access, self.facts.features, self.noise)
-        return enforcer.project(self.attack.perturb(observation, enforcer.begin(observation, scale=scale)))[0]
+        return enforcer.project(self.attack.perturb(observation, enforcer.begin(observation, state, scale)))[0]
 
-    def selection(self, policy: Policy) -> dict[str, Callable[[Tensor], Tensor]]:
-        return {"attacked": lambda observation: self.perturbed(observation, policy)} if self.recipe.skip < 1 else {}
+    def selection(self, policy: Policy) -> dict[str, Callable[[Tensor, State], Tensor]]:
+        if self.recipe.skip >= 1:
+            return {}
+        return {"attacked": lambda observation, state: self.perturbed(observation, policy, state)}
 
     def loss(self, policy: Policy, sample: TensorDictBase, own: Callable[[TensorDictBase], Tensor]) -> Tensor:
         """Discrete: the victim's own loss on (o', a, r, s'). Continuous: -Q(o, mu(o')), with the critic on the true observation.

@@ -7,11 +7,13 @@ from typing import Annotated
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, State
+from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, State
 from bench.driving.intervals.boxes import Boxes
+from bench.driving.intervals.corridor import Corridor, CorridorJudge
+from bench.driving.intervals.ego import Ego
 from bench.driving.intervals.margins import Caution, Judge, Margins
 from bench.driving.intervals.policy import IntervalPolicy, corrected
 from bench.driving.threat import Norm
@@ -24,12 +26,13 @@ SOFTNESS = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Shield(DrivingDefense):
-    """Masks the actions of a discrete victim that are unsafe in the worst case, and those that are needlessly slow.
+    """Leaves only actions that are safe in the worst case and not needlessly slow: a mask, or a projection of continuous ones.
 
     The worst case is over the true values that an assumed perturbation set allows behind the shown ones. The ego's own motion
     is reckoned from its actions; the victim receives the reckoned row. An action is safe if the gap to every car ahead lasts
     when the ego brakes from the next decision on. Where FASTER leaves a margin of at least `band`, IDLE and SLOWER are masked,
-    so that an attack cannot make the car crawl. If no action is safe, it brakes.
+    so that an attack cannot make the car crawl. If no action is safe, it brakes. Continuous actions are clipped to
+    what this leaves of acceleration and steering.
 
     Args:
         assumed_budget: budget of the perturbation set that it assumes.
@@ -48,44 +51,71 @@ class Shield(DrivingDefense):
     distance: NotNegative = 0.4
 
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
-        if victim.action_type != "discrete" or not victim.sees:
-            raise UserError("defense 'shield' needs a victim that sees and has discrete actions")
-        return Shielded(self, victim.load(seed, facts), facts).eval()
+        if not victim.sees:
+            raise UserError("defense 'shield' needs a victim that sees")
+        shielded = Shielded if victim.action_type == "discrete" else ShieldedControls
+        return shielded(self, victim.load(seed, facts), facts).eval()
 
 
-class Shielded(IntervalPolicy):
-    """A policy behind the filter. Its state is the reckoned ego and the inner policy's state."""
+class Filter(IntervalPolicy):
+    """A policy behind a filter. Its state is the reckoned ego, the highest lane that was seen, and the inner policy's state."""
 
     def __init__(self, settings: Shield, policy: Policy, facts: DrivingFacts) -> None:
-        super().__init__(facts, "discrete", settings.assumed_norm, settings.assumed_budget)
+        super().__init__(facts, policy.action_type, settings.assumed_norm, settings.assumed_budget)
         self.policy, self.band = policy, settings.band
         self.driver, self.weights_sha256 = policy.driver, policy.weights_sha256
-        caution = Caution(braking=settings.braking, seconds=settings.braking_s, distance=settings.distance)
-        self.judge = Judge(self.reckoning, self.period, caution)
+        self.caution = Caution(braking=settings.braking, seconds=settings.braking_s, distance=settings.distance)
 
     def initial(self, episodes: Tensor) -> State:
-        own, inner = self.reckoning.unknown(episodes), self.policy.initial(episodes)
-        return TensorDict({"ego": own, **({} if inner is None else {"inner": inner})}, batch_size=episodes.shape)
+        own = {"ego": self.reckoning.unknown(episodes), "edge": torch.zeros(len(episodes))}
+        return _with_inner(own, self.policy.initial(episodes), episodes.shape)
+
+    def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
+        assert state is not None
+        ego = self.ego(boxes, state)
+        inner = self.policy.advance(corrected(observation, ego, self.assumed), action, state.get("inner", None))
+        own = {"ego": self.reckoning.after(ego, action), "edge": self.edge(ego, boxes, state)}
+        return _with_inner(own, inner, state.batch_size)
+
+    def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
+        assert state is not None
+        ego = self.ego(self.assumed.boxes(observation), state)
+        return self.policy.value(corrected(observation, ego, self.assumed), action, state.get("inner", None))
+
+    def ego(self, boxes: Boxes, state: TensorDictBase) -> Ego:
+        return self.reckoning.now(boxes, state["ego"])
+
+    def edge(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Tensor:
+        """The highest lane [...] that is known to exist: the ego was in it, or a car surely was."""
+        place = torch.where(boxes.present[..., 1:], boxes.low[..., 1:, 1] + ego.y.unsqueeze(-1), 0.0).amax(-1)
+        lane = (place / self.reckoning.kinematics.lane_width).round()
+        return torch.maximum(torch.maximum(lane, ego.target_lane), state["edge"])
+
+
+class Shielded(Filter):
+    """The filter for discrete actions: a mask."""
+
+    def __init__(self, settings: Shield, policy: Policy, facts: DrivingFacts) -> None:
+        super().__init__(settings, policy, facts)
+        self.judge = Judge(self.reckoning, self.period, self.caution)
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        ego = self.reckoning.now(boxes, state["ego"])
+        ego = self.ego(boxes, state)
         values = self.policy.scores(corrected(observation, ego, self.assumed), state.get("inner", None))
         allowed = self.allowed(self.judge(ego, boxes))
         # The masked values are below the others; no step of this hides the victim's gradient.
         spread = (values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)).detach() + 1
         return values - spread * (1 - allowed)
 
+    def filtered(self, observation: Tensor, boxes: Boxes, state: State) -> Passed:
+        assert state is not None
+        ego = self.ego(boxes, state)
+        return Passed(corrected(observation, ego, self.assumed), self.allowed(self.judge(ego, boxes)) > 0.5)
+
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        return self.judge(self.reckoning.now(boxes, state["ego"]), boxes).safe
-
-    def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
-        assert state is not None
-        ego = self.reckoning.now(boxes, state["ego"])
-        inner = self.policy.advance(corrected(observation, ego, self.assumed), action, state.get("inner", None))
-        own = self.reckoning.after(ego, action)
-        return TensorDict({"ego": own, **({} if inner is None else {"inner": inner})}, batch_size=state.batch_size)
+        return self.judge(self.ego(boxes, state), boxes).safe
 
     def allowed(self, margins: Margins) -> Tensor:
         """[..., A] 1 for the allowed actions and 0 for the others, with the gradient of a soft threshold (straight-through)."""
@@ -100,3 +130,36 @@ class Shielded(IntervalPolicy):
         soft = torch.cat((stay, change), -1).div(SOFTNESS).sigmoid()
         ordered = hard + soft - soft.detach()
         return ordered[..., self.reckoning.order]
+
+
+class ShieldedControls(Filter):
+    """The filter for continuous actions: a projection onto what is left of acceleration and steering."""
+
+    def __init__(self, settings: Shield, policy: Policy, facts: DrivingFacts) -> None:
+        super().__init__(settings, policy, facts)
+        self.judge = CorridorJudge(self.reckoning, self.period, self.caution, self.band)
+
+    def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
+        assert state is not None
+        ego = self.ego(boxes, state)
+        wanted = self.policy.scores(corrected(observation, ego, self.assumed), state.get("inner", None))
+        left = self.corridor(ego, boxes, state)
+        # The gradient of the bound that holds, and that of the victim as if there were none (straight-through).
+        return torch.minimum(torch.maximum(wanted.detach(), left.low), left.high) + wanted - wanted.detach()
+
+    def filtered(self, observation: Tensor, boxes: Boxes, state: State) -> Passed:
+        assert state is not None
+        ego = self.ego(boxes, state)
+        left = self.corridor(ego, boxes, state)
+        return Passed(corrected(observation, ego, self.assumed), torch.stack([left.low, left.high], -2))
+
+    def safe(self, boxes: Boxes, state: State) -> Tensor:
+        assert state is not None
+        return self.corridor(self.ego(boxes, state), boxes, state).safe
+
+    def corridor(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Corridor:
+        return self.judge(ego, boxes, self.edge(ego, boxes, state))
+
+
+def _with_inner(own: dict[str, Tensor | TensorDictBase], inner: State, shape: torch.Size) -> State:
+    return TensorDict({**own, **({} if inner is None else {"inner": inner})}, batch_size=shape)

@@ -10,7 +10,7 @@ from annotated_types import Interval
 from tensordict import TensorDict
 from torch import Tensor
 
-from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, PolicyWrapper, State
+from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, PolicyWrapper, State
 from bench.driving.intervals.boxes import Assumed, Boxes
 from bench.driving.intervals.policy import IntervalPolicy, corrected, reckoning
 from bench.driving.intervals.tracks import narrowed, predicted
@@ -78,6 +78,13 @@ class Tracked(PolicyWrapper):
         )
         own = {"ego": after, "tracks": tracks, **({} if inner is None else {"inner": inner})}
         return TensorDict(own, batch_size=state.batch_size)
+
+    def passed(self, observation: Tensor, state: State = None) -> Passed:
+        assert state is not None
+        boxes, inner = self.boxes(observation, state), state.get("inner", None)
+        if isinstance(self.policy, IntervalPolicy):
+            return self.policy.filtered(observation, boxes, inner)
+        return self.policy.passed(self._estimate(observation, boxes, state), inner)
 
     def assured(self, observation: Tensor, state: State) -> Tensor | None:
         assert state is not None

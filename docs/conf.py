@@ -23,7 +23,8 @@ autodoc_inherit_docstrings = False
 default_role = "code"
 
 html_theme = "furo"
-html_title = "cavbench"
+html_title = f"cavbench {release}"
+html_show_search_summary = True
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sourcelink = False

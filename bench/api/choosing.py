@@ -109,7 +109,7 @@ def pairs_of(
     """Every combination of attacks and defences, as `bench.run.config.combined`."""
     own_track = victim.component.tracks()[0]
     names = suites.names()
-    chosen_suites = [suites.suite(one) for one in several(attack) if isinstance(one, str) and one in names]
+    chosen_suites = [suites.suite(one, own_track) for one in several(attack) if isinstance(one, str) and one in names]
     attacks = [
         chosen("attack", one, own_track) for one in several(attack) if not isinstance(one, str) or one not in names
     ]

@@ -135,7 +135,7 @@ class _Silent:
     def working(self, works: object) -> None:
         pass
 
-    def preparing(self, work: str, share: float, text: str) -> None:
+    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
         pass
 
     def finished(self, work: object, wall_s: float) -> None:

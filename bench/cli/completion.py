@@ -35,13 +35,13 @@ def _fitting(incomplete: str) -> list[str]:
 
 
 def _keys() -> list[str]:
+    from bench.cli.options_help import settings
     from bench.plugins import registry
+    from bench.run.options import RunOptions
 
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     threat = [f"threat.{name}" for name in ("norm", "budget", "access", "queries", "share")]
-    settings = ["grid", "episodes", "seeds", "executor", "workers", "out", "record", "reference"]
-    settings += ["shard", "ray.address", "unit_timeout", "unit_memory"]
-    return [*registry.KINDS, *axes, *threat, *settings]
+    return [*registry.KINDS, *axes, *threat, *(name for name, _, _ in settings(RunOptions))]
 
 
 def _values(key: str) -> Iterator[str]:

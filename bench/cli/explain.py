@@ -12,7 +12,7 @@ from bench.cli.terminal import Console
 from bench.errors import UserError
 from bench.plugins import registry, suites
 from bench.plugins.registry import GROUPS, KINDS
-from bench.plugins.track import tracks
+from bench.plugins.track import Measure, tracks
 from bench.records.schema import IDENTITY, PROVENANCE
 
 GLOSSARY = Path(__file__).with_name("glossary.toml")
@@ -36,7 +36,7 @@ def print_term(term: str, console: Console) -> None:
     Raises:
         UserError: if nothing has this name.
     """
-    found = [*_of_the_glossary(term), *_of_the_records(term), *_of_a_parameter(term)]
+    found = [*_of_the_glossary(term), *_of_the_records(term), *_of_the_tables(term), *_of_a_parameter(term)]
     for line in found:
         console.print(line, highlight=False)
     kinds = [kind for kind in KINDS if term.partition(":")[0] in registry.entries(GROUPS[kind])]
@@ -81,6 +81,28 @@ def _columns() -> dict[str, Text]:
 
 def _of_the_records(term: str) -> list[Text]:
     return [text for name, text in _columns().items() if _plain(name) == _plain(term)]
+
+
+def _of_the_tables(term: str) -> list[Text]:
+    """The measurement that a column of the tables shows, by its heading: `frames seen`, `off road`, `over-run m`."""
+    columns = _columns()
+    return [
+        Text.assemble((heading, "bold"), "  in tables: ", columns[measure.column])
+        for track in tracks()
+        for measure in track.measures
+        if measure.column != term and _plain(term) in _spellings(heading := heading_of(measure))
+    ]
+
+
+def heading_of(measure: Measure) -> str:
+    """The heading of a measure in one line, without facts of the world: `return`, `queries / step`."""
+    joined = " ".join(measure.heading.replace("-\n", "").split())
+    return joined.partition(" of {")[0]
+
+
+def _spellings(heading: str) -> set[str]:
+    """How people write a heading: with and without its unit."""
+    return {_plain(heading), _plain(heading.partition(" /")[0]), _plain(re.sub(r" (m|s)$", "", heading))}
 
 
 def _of_a_parameter(term: str) -> list[Text]:

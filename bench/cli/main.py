@@ -9,6 +9,9 @@ import os
 import re
 import sys
 import warnings
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,8 +19,8 @@ import typer
 from rich.text import Text
 
 from bench import __version__
-from bench.cli.axes_help import AxesHelp
 from bench.cli.completion import completed
+from bench.cli.options_help import RunHelp, TrainHelp
 from bench.cli.terminal import Console
 from bench.errors import Notice, UnfinishedError, UserError, bounded, short
 
@@ -138,35 +141,41 @@ def check(
     raise typer.Exit(cli_check.print_checks(name, words or [], Console()))
 
 
-@app.command(cls=AxesHelp)
-def run(words: Words = None) -> None:
+Cells = Annotated[bool, typer.Option("--cells", help="Show every cell, parameter and threat model, too.")]
+
+
+@app.command(cls=RunHelp)
+def run(words: Words = None, cells: Cells = False) -> None:
     """Score attacks on defended victims over a grid of scenarios. Run the same command again to continue an interrupted run.
 
     For instance: bench run attack=zo defense=advtrain
     """
-    from bench.cli import run as cli_run
+    with _known(words, "RunOptions"):
+        from bench.cli import run as cli_run
 
-    cli_run.run(words or [], Console(), _print_report)
+    cli_run.run(words or [], Console(), partial(_print_report, cells=cells))
 
 
-@app.command()
+@app.command(cls=RunHelp)
 def audit(words: Words = None) -> None:
     """Score pairs again on scenarios drawn at this moment. A pair that scores higher on the public ones is flagged, exit code 1.
 
     The options are those of bench run; salt=NUMBER repeats an audit. For instance: bench audit attack=pgd defense=advtrain
     """
-    from bench.cli import audit as cli_audit
+    with _known([word for word in words or [] if not word.startswith("salt=")], "RunOptions"):
+        from bench.cli import audit as cli_audit
 
     raise typer.Exit(cli_audit.audit(words or [], Console()))
 
 
-@app.command()
+@app.command(cls=TrainHelp)
 def train(words: Words = None) -> None:
     """Train a victim, with or without a defence, and save it to the zoo.
 
     For instance: bench train victim=dqn seeds=0,1,2, or bench train defense=advtrain defense.skip=0.3 victim=dqn
     """
-    from bench.cli import train as cli_train
+    with _known(words, "TrainOptions"):
+        from bench.cli import train as cli_train
 
     cli_train.train(words or [], Console())
 
@@ -203,6 +212,7 @@ def show(
         list[str] | None, typer.Argument(metavar="[RUN] [out=…]", help="A results folder, or the name of a pair.")
     ] = None,
     out: Out = None,
+    cells: Cells = False,
 ) -> None:
     """Show a run: its configuration, provenance, table and recordings. out=FOLDER is the results folder, by default results."""
     from bench.cli import show as cli_show
@@ -210,7 +220,8 @@ def show(
 
     names, values = split(words or [], ("out",), names=1)
     folder = _folder(values, out) or Path("results")
-    cli_show.print_run(names[0] if names else str(folder), folder, Console(), _print_report)
+    report = partial(_print_report, cells=cells)
+    cli_show.print_run(names[0] if names else str(folder), folder, Console(), report)
 
 
 @app.command()
@@ -321,11 +332,19 @@ def fetch(
     cli_fetch.print_fetched(names, Console()) if names else cli_fetch.print_downloads(Console())
 
 
-def _print_report(track: Track, records: pa.Table) -> None:
+def _print_report(track: Track, records: pa.Table, *, cells: bool = False) -> None:
     from bench.plugins import registry
 
-    report = registry.resolve(registry.REPORTS, "run", "report")
-    report({track.name: records}, Console())
+    for name in ("run", "cells") if cells else ("run",):
+        registry.resolve(registry.REPORTS, name, "report")({track.name: records}, Console())
+
+
+def _known(words: Sequence[str] | None, settings: str) -> AbstractContextManager[object]:
+    """Refuses unknown names at once, and shows that something happens while torch is imported, which takes seconds."""
+    from bench.cli.early import check_names, starting
+
+    check_names(words or [], settings)
+    return starting(Console(stderr=True))
 
 
 def main() -> None:

@@ -14,11 +14,11 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     SpinnerColumn,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 from rich.text import Text
 
 from bench.cli.terminal import Console
@@ -39,10 +39,11 @@ class RunProgress:
 
     def __init__(self, console: Console) -> None:
         self.console = console
-        self.bar = _bar(console, MofNCompleteColumn(), TextColumn("episodes"))
-        self.task: TaskID | None = None
+        self.bar = _bar(console, MofNCompleteColumn())
+        self.task = self.bar.add_task("starting", total=None)
         self.total = self.done = 0
         self.working_on: dict[str, str] = {}
+        self.under_way: dict[str, float] = {}
 
     def __enter__(self) -> Self:
         if self.console.is_terminal:
@@ -57,23 +58,28 @@ class RunProgress:
 
     def begin(self, *, episodes: int, finished: int) -> None:
         self.total, self.done = episodes, finished
-        self.task = self.bar.add_task("", total=episodes, completed=finished)
+        self.bar.reset(self.task, total=episodes, completed=finished, description="")
         if finished:
             self.console.print(f"{finished} of {episodes} episodes are already done", style="dim", highlight=False)
 
     def working(self, works: Sequence[Unit | Preparation | Loading]) -> None:
         self.working_on = {str(work): self.working_on.get(str(work), "") for work in works}
+        self.under_way = {work: done for work, done in self.under_way.items() if work in self.working_on}
         self._describe()
 
-    def preparing(self, work: str, share: float, text: str) -> None:
+    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
+        if episodes:
+            self.under_way[work] = share * episodes
+            self._advance()
+            return
         self.working_on[work] = f" {share:.0%} {text}"
         self._describe()
 
     def finished(self, work: Unit | Preparation, wall_s: float) -> None:
         # Only units have episodes; a preparation has none.
         self.done += len(work.seeds) if hasattr(work, "grid") else 0
-        if self.task is not None:
-            self.bar.update(self.task, completed=self.done)
+        self.under_way.pop(str(work), None)
+        self._advance()
         if not self.console.is_terminal:
             line = f"{self.done}/{self.total} episodes | {work} | {wall_s:.1f} s"
             self.console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -86,8 +92,13 @@ class RunProgress:
     def failed(self, line: str) -> None:
         self.console.print(Text(f"failed: {line}", style="red"), soft_wrap=True)
 
+    def _advance(self) -> None:
+        """Move the bar, also within a unit; it never moves back."""
+        done = max(self.done + int(sum(self.under_way.values())), int(self.bar.tasks[0].completed))
+        self.bar.update(self.task, completed=min(done, self.total))
+
     def _describe(self) -> None:
-        if self.task is not None and self.working_on:
+        if self.working_on:
             first, *others = (f"{work}{news}" for work, news in self.working_on.items())
             self.bar.update(self.task, description=f"{first} (+{len(others)})" if others else first)
 
@@ -162,12 +173,14 @@ def show_downloads() -> None:
 def _bar(console: Console, *counts: ProgressColumn) -> Progress:
     return Progress(
         SpinnerColumn(),
-        BarColumn(bar_width=24),
+        BarColumn(bar_width=16),
         *counts,
         TimeElapsedColumn(),
         TextColumn("ETA"),
         TimeRemainingColumn(),
-        TextColumn("{task.description}", markup=False),
+        # Only the description gives way on a narrow terminal.
+        TextColumn("{task.description}", markup=False, table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
         console=console,
         transient=True,
+        expand=True,
     )

@@ -12,7 +12,7 @@ from bench.cli.terminal import Console
 from bench.errors import UnfinishedError, UserError
 from bench.plugins.track import Track, track_of
 from bench.records import reading
-from bench.run import runner
+from bench.run import rounds, runner
 from bench.run.config import run_config
 
 
@@ -43,6 +43,8 @@ def run(words: Sequence[str], console: Console, report: Callable[[Track, pa.Tabl
     track = track_of(config.pairs[0])
     if units:
         report(track, reading.read(config.out, units, track=track))
+    for stop in rounds.read(config.out, [pair.id for pair in config.pairs]) if config.until else ():
+        console.print(Text(str(stop)), soft_wrap=True)
     if unfinished is not None:
         raise unfinished
     console.print(

@@ -18,6 +18,7 @@ from bench.plugins import registry, suites
 from bench.plugins.track import Track, track
 from bench.records import reading
 from bench.records.schema import IDENTITY
+from bench.run import rounds
 from bench.scenarios import Value
 from bench.scenarios.axes import written
 
@@ -43,6 +44,8 @@ def print_run(run: str, out: Path, console: Console, report: Report) -> None:
         shown = records.filter(pc.field("pair") == name if name else pc.field("sees"))
         _print_facts(shown if shown.num_rows else records, console)
         report(own, _with_controls(shown, records, own) if name else records)
+        for stop in rounds.read(folder, pc.unique(shown["pair"]).to_pylist()):
+            console.print(Text(str(stop)), soft_wrap=True)
     for path in recordings(folder, name):
         console.print(Text(f"recording: bench view {path}"), soft_wrap=True)
 

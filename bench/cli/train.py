@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -13,8 +14,9 @@ from bench.cli.progress import TrainingProgress
 from bench.cli.terminal import Console
 from bench.errors import UserError
 from bench.files import check_folder
+from bench.plugins.chain import Chain
 from bench.plugins.contracts import Trained, World
-from bench.plugins.pair import Chosen
+from bench.plugins.pair import Chosen, choose
 from bench.plugins.track import track
 from bench.run.config import TrainConfig, train_config
 from bench.run.process import settle
@@ -28,7 +30,8 @@ def train(words: Sequence[str], console: Console) -> None:
         UserError: if an option is invalid, there is nothing to train, or the zoo cannot be written.
     """
     settle()
-    config = train_config(words)
+    asked = train_config(words)
+    config = _behind(asked)
     trained = config.trained
     if trained.kind != "defense" and not trained.component.learns:
         raise UserError(f"there is nothing to train: {trained.kind} {trained.name!r} does not learn")
@@ -48,7 +51,47 @@ def train(words: Sequence[str], console: Console) -> None:
         seconds = time.perf_counter() - start
         line = f"{recipe.name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"
         console.print(Text(line), soft_wrap=True)
-    console.print(Text(f"To use it: {recipe.use}"), soft_wrap=True)
+    use = recipe.use if config is asked else _use(config, component, asked.defense)
+    console.print(Text(f"To use it: {use}"), soft_wrap=True)
+
+
+def _behind(config: TrainConfig) -> TrainConfig:
+    """To train a defence that works at run time is to train the victim behind it; the same holds for such links of a chain.
+
+    Raises:
+        UserError: if the victim is to be trained behind another defence.
+    """
+    chosen, victim = config.defense, config.victim.component
+    if config.trained is not chosen or "behind" not in {field.name for field in fields(victim)}:
+        return config
+    first, rest = None, None if chosen.component.trains else (chosen.name, chosen.component)
+    if isinstance(chosen.component, Chain):
+        first, rest = chosen.component.parted
+    if rest is None or chosen.name == "none":
+        return config
+    text = zoo.written(*rest)
+    if victim.behind not in ("", text):
+        raise UserError(f"victim.behind={victim.behind} is not the defence of this training, {text}: leave it out")
+    return replace(
+        config,
+        victim=replace(config.victim, component=replace(victim, behind=text)),
+        defense=choose("defense", "none")
+        if first is None
+        else Chosen(kind="defense", name=first[0], component=first[1]),
+    )
+
+
+def _use(config: TrainConfig, component: Any, defense: Chosen[Any]) -> str:
+    """The command that drives behind `defense` with the `component` that was trained for it."""
+    trained, whole = config.trained, defense.component
+    victim = config.victim.component if trained.kind == "defense" else component
+    if trained.kind == "defense":
+        whole = replace(whole, **{trained.name: component})
+    words = ["bench", "run"]
+    for kind, name, part in (("victim", config.victim.name, victim), ("defense", defense.name, whole)):
+        _, *options = shlex.split(zoo.written(name, part))
+        words += [f"{kind}={name}", *(f"{kind}.{option}" for option in options)]
+    return shlex.join(words)
 
 
 def _parts(config: TrainConfig) -> list[Chosen[Any]]:

@@ -5,7 +5,7 @@ from bench.driving.dynamics import Dynamics, Forecast
 from bench.driving.features import ActionType, Driver, DrivingFacts, Features
 from bench.driving.kinematics import Kinematics
 from bench.driving.oracle import Oracle, Part, parts_of
-from bench.driving.policy import Policy, PolicyWrapper, State
+from bench.driving.policy import Passed, Policy, PolicyWrapper, State
 from bench.driving.threat import ObservationThreat
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "ObservationThreat",
     "Oracle",
     "Part",
+    "Passed",
     "Policy",
     "PolicyWrapper",
     "State",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
@@ -78,7 +78,8 @@ class DrivingWorld(World):
         Args:
             cells: the cell of each episode of the batch.
             action_type: discrete lane-changing actions, or continuous [acceleration, steering] in [-1, 1].
-            driver: `agent` executes the actions; `idm` ignores them and uses the world's own rule-based driver.
+            driver: `agent` executes the actions; the others ignore them: `idm` is the world's own rule-based driver, `oracle` a
+                planner that knows its hidden state.
             action_repeat: number of frames for which a decision is held (training only). A lane change is sent once, other
                 actions are repeated. Reward and progress are summed over the frames; an episode may end between them.
         """
@@ -98,7 +99,7 @@ class DrivingVictim(Victim):
     network: ClassVar[type[Policy]] = Policy
     threat: ClassVar[type[ThreatModel]] = ObservationThreat
     driver: ClassVar[Driver] = "agent"
-    """Who is at the wheel; its policies must have the same. Only a victim that does not see may leave it to the world (`idm`)."""
+    """Who is at the wheel; its policies must have the same. Only a victim that does not see may leave it to the world."""
     policy_type: ClassVar[type[Policy] | None] = None
     """The class of its trained policies; the zoo builds it from a card."""
 
@@ -130,7 +131,8 @@ class TrainingHooks:
     """The changes that a defence may make to the training of a driving policy; the defaults change nothing.
 
     Observations are [B, V, F], `share` is the finished share of the training, in [0, 1], and `policy` is the network in
-    training: its `scores` have gradients to the weights, its `value` is a copy of the critic.
+    training: its `scores` have gradients to the weights, its `value` is a copy of the critic. Where it acts it is behind the
+    defence that it is trained behind, if any, and `state` is its state.
     """
 
     start: Policy | None = None
@@ -142,7 +144,7 @@ class TrainingHooks:
     checkpoints: float = 1.0
     """Share of the victim's checkpoints that are scored, in (0, 1]; for hooks with expensive scoring."""
 
-    def acting(self, observation: Tensor, policy: Policy, share: float) -> Tensor:
+    def acting(self, observation: Tensor, policy: Policy, share: float, state: State = None) -> Tensor:
         """The observation on which the learner acts."""
         return observation
 
@@ -164,9 +166,13 @@ class TrainingHooks:
         """
         return own(sample)
 
-    def selection(self, policy: Policy) -> dict[str, Callable[[Tensor], Tensor]]:
-        """Additional perturbations of the observation for scoring a checkpoint, by name; its score is the mean over all."""
+    def selection(self, policy: Policy) -> dict[str, Callable[[Tensor, State], Tensor]]:
+        """Additional perturbations of the observation for scoring a checkpoint, by name; arguments: observation and state."""
         return {}
+
+    def ranked(self, scores: Mapping[str, float]) -> float:
+        """The score of a checkpoint, from its scores without a perturbation (`clean`) and with those of `selection`."""
+        return sum(scores.values()) / len(scores)
 
 
 class DrivingAttack(Attack):

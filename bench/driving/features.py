@@ -12,7 +12,7 @@ from bench.driving.kinematics import Kinematics
 from bench.plugins.contracts import Facts
 
 ActionType = Literal["discrete", "continuous"]
-Driver = Literal["agent", "idm"]
+Driver = Literal["agent", "idm", "oracle"]
 CONSTANT_CONTROLS = {"throttle": (1.0, 0.0), "coast": (0.0, 0.0), "brake": (-1.0, 0.0)}
 """[acceleration, steering] in [-1, 1] of the constant policies, by name."""
 RIGHT_THEN_SLOWER = "right_then_slower"
@@ -57,7 +57,8 @@ class DrivingFacts(Facts):
 
     Args:
         features: features of the observation.
-        drivers: supported drivers: `agent` executes the policy's actions; `idm` is the world's own rule-based driver, if any.
+        drivers: supported drivers: `agent` executes the policy's actions; `idm` is the world's own rule-based driver, if any, and
+            `oracle` a planner that knows the world's hidden state, if any.
         kinematics: how its cars move; None if the world does not say.
         flat: whether the observation is one row, which the world's own environment gives as a flat array in physical units.
     """

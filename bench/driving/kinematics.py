@@ -43,6 +43,7 @@ class Kinematics:
         frames: physics frames per decision.
         lane_width, length, width: of a lane and of a car, in m.
         target_speeds: speeds of FASTER and SLOWER in m/s, increasing and uniform.
+        top_speed: no car drives faster, in m/s.
         start_speed: the ego's speed at the start, in m/s; it starts in the middle of a lane.
         speed_gain, heading_gain, lateral_gain: gains of the controllers, in 1/s.
         max_heading: largest heading of a lane change, in rad.
@@ -57,6 +58,7 @@ class Kinematics:
     length: float
     width: float
     target_speeds: tuple[float, ...]
+    top_speed: float
     start_speed: float
     speed_gain: float
     heading_gain: float

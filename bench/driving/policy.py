@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -13,6 +13,19 @@ from bench.driving.features import ActionType, Driver
 
 State: TypeAlias = TensorDictBase | None
 """The state of B episodes: a TensorDict of batch size [B]; None for stateless policies and attacks."""
+
+
+class Passed(NamedTuple):
+    """What a defence passes on to the policy behind it.
+
+    Args:
+        observation: the observation that the policy receives, [..., V, F].
+        allowed: the actions that are left to it: bool [..., A] for discrete ones, float [..., 2, 2] for continuous ones (the
+            lowest values of both controls, then the highest); None for all.
+    """
+
+    observation: Tensor
+    allowed: Tensor | None = None
 
 
 class Policy(nn.Module, ABC):
@@ -72,6 +85,13 @@ class Policy(nn.Module, ABC):
         """
         return None
 
+    def passed(self, observation: Tensor, state: State = None) -> Passed:
+        """What reaches the innermost policy, and what is left to it; arguments as in `scores`.
+
+        A policy is trained behind a defence by this alone.
+        """
+        return Passed(observation)
+
     def choose(self, scores: Tensor) -> Tensor:
         """The action for given scores: the greedy one, int64 [...] (discrete), or float [..., 2] in [-1, 1] (continuous)."""
         return scores.argmax(-1) if self.action_type == "discrete" else scores
@@ -109,6 +129,9 @@ class PolicyWrapper(Policy):
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         return self.policy.advance(observation, action, state)
+
+    def passed(self, observation: Tensor, state: State = None) -> Passed:
+        raise NotImplementedError(f"{type(self).__name__} does not say what it passes on")
 
     def choose(self, scores: Tensor) -> Tensor:
         return self.policy.choose(scores)

@@ -22,6 +22,7 @@ from bench.driving.probes import Probe
 from bench.driving.threat import ObservationThreat
 from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
+from bench.plugins.progress import share_done
 from bench.trust.identifiers import opaque
 from bench.trust.streams import Stream
 from bench.trust.watch import Watch
@@ -111,7 +112,8 @@ def rollout(
         if several:
             gradients = attack is not None and attack.access in ("gradients", "dynamics")
             _check_rows(subject, td["observation"], state, gradients)
-        for _ in range(facts.max_steps):
+        for step in range(facts.max_steps):
+            share_done(step / facts.max_steps)
             truth, running = td["observation"], ~td["done"].squeeze(-1)
             probing = probe.due()
             attacker.enforcer.asked = [] if probing else None

@@ -35,6 +35,16 @@ class Chain(Defense):
         return tuple(getattr(self, name) for name in self._fields())
 
     @property
+    def parted(self) -> tuple[tuple[str, Defense] | None, tuple[str, Defense] | None]:
+        """The link that trains its victim, and those at run time as one defence: each with its name, or None."""
+        named = [(name, getattr(self, name)) for name in self._fields()]
+        first, others = (named[0], named[1:]) if named[0][1].trains else (None, named)
+        if len(others) < 2:
+            return first, next(iter(others), None)
+        whole = chained(tuple((name, type(link)) for name, link in others))
+        return first, (MARK.join(name for name, _ in others), whole(**dict(others)))
+
+    @property
     def trains(self) -> bool:
         return any(link.trains for link in self.links)
 

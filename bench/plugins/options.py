@@ -191,7 +191,7 @@ class Options:
         Raises:
             UserError: if a suite is broken, or is not for the track of the victims.
         """
-        found = [suites.suite(name) for name in self.values.get("attack", ()) if name in suites.names()]
+        found = [suites.suite(name, self.track) for name in self.values.get("attack", ()) if name in suites.names()]
         for suite in found:
             if suite.track != self.track:
                 fitting = [one for one in suites.names() if suites.suite(one).track == self.track]

@@ -1,6 +1,7 @@
 """Suites: fixed, versioned lists of attacks, found by their entry points `cavbench.suites` and written as TOML.
 
-`attack=standard` means every member of the newest suite `standard-N`; `attack=standard-1` is fixed. Each member that fits the
+`attack=standard` means every member of the newest suite `standard-N`, on another track than driving of the newest
+`standard-TRACK-N`; `attack=standard-1` is fixed. Each member that fits the
 victim is run and recorded as the ordinary pair that it is.
 """
 
@@ -113,13 +114,16 @@ def names() -> list[str]:
     return sorted({*versioned, *(_family(name) for name in versioned)})
 
 
-def suite(name: str) -> Suite:
-    """The suite of this name; without a version, the newest.
+def suite(name: str, track: str = "") -> Suite:
+    """The suite of this name; without a version, the newest: of `NAME-TRACK` if a track is given that has one, else of `NAME`.
 
     Raises:
         UserError: if there is no such suite, or its entry point is not a suite of that name.
     """
-    versions = [known for known in registry.entries(registry.SUITES) if _family(known) == name != known]
+    known = list(registry.entries(registry.SUITES))
+    for family in (f"{name}-{track}", name):
+        if versions := [one for one in known if _family(one) == family != one]:
+            break
     newest = max(versions, key=_version, default=name)
     found = registry.resolve(registry.SUITES, newest, "suite")
     if not isinstance(found, Suite) or found.name != newest:

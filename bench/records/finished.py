@@ -1,23 +1,26 @@
-"""Says which units are finished: their files hold what these units measure, whatever else may lie under their names."""
+"""Finds out which units of a run are finished, from the rows of their records, and sets wrong records aside."""
 
 from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from bench.errors import UserError, notice
 from bench.plugins.track import Track
 from bench.records import validity
 from bench.records.generations import check
+from bench.records.packing import packed_files
 from bench.records.reading import upgraded
 from bench.records.schema import schema
-from bench.records.store import path_of
+from bench.records.store import path_of, write_packed
 from bench.scenarios import Cell
 
 SET_ASIDE = "set_aside"
@@ -55,26 +58,32 @@ class Wanted(Protocol):
 def finished(out: Path, units: Mapping[str, Wanted]) -> set[str]:
     """The fingerprints among `units` that have records: of this unit, one row for each of its seeds, with possible values.
 
-    Whatever else has the name of a unit's file is moved to `OUT/set_aside`, with a notice, so that the unit is driven again.
+    A file under the name of a unit that is anything else is moved to `OUT/set_aside`, with a notice, so that the unit is driven
+    again. So is a file of many units with such a unit; its other units are kept in a new file.
 
     Args:
         out: results folder.
         units: the units by their fingerprints.
 
     Raises:
-        UserError: if a file cannot be moved.
+        UserError: if a file cannot be moved or written.
     """
+    there = {path.stem for path in path_of(out, "").parent.glob("[!.]*.parquet")}
     done = set()
-    for key, unit in units.items():
+    for key in units.keys() & there:
         path = path_of(out, key)
-        if not (path.exists() or path.is_symlink()):
+        why = _incomplete(path, key, units[key])
+        # Another run may have packed it just now: then it is in a packed file, which is looked at next.
+        if not path.exists():
             continue
-        if why := _incomplete(path, key, unit):
+        if why:
             notice(
                 f"the record {path} does not count as finished: {why}; its unit is driven again, it is {_aside(out, path)}"
             )
         else:
             done.add(key)
+    for path in packed_files(out) if done != units.keys() else ():
+        done |= _packed(out, path, {key: unit for key, unit in units.items() if key not in done})
     return done
 
 
@@ -95,15 +104,12 @@ def _incomplete(path: Path, key: str, unit: Wanted) -> str:
         return "it is truncated or not Parquet"
     if set(records["unit"].to_pylist()) != {key}:
         return "it has the rows of another unit"
-    if sorted(records["seed"].to_pylist()) != list(unit.seeds):
-        return "it has other scenarios"
-    if problem := validity.complaint(records, unit.track):
-        return problem[1]
-    return _of_another(records, unit)
+    other = _other_rows(records["seed"].to_numpy(), unit)
+    return other or _invalid(records, unit.track) or _of_another(records, unit)
 
 
 def _of_another(records: pa.Table, unit: Wanted) -> str:
-    """Which of its columns are not the unit's; empty if none."""
+    """Which columns of a unit's valid records are not its own; empty if none."""
     if set(records["pair"].to_pylist()) != {unit.pair.id}:
         return "it has the rows of another pair"
     if set(records["training_seed"].to_pylist()) != {unit.training_seed}:
@@ -111,6 +117,89 @@ def _of_another(records: pa.Table, unit: Wanted) -> str:
     if any(json.loads(cell) != dict(unit.cell) for cell in set(records["cell"].to_pylist())):
         return "it has the rows of another cell"
     return ""
+
+
+def _other_rows(seeds: np.ndarray, unit: Wanted) -> str:
+    """Why rows with these scenario seeds are not those of a unit; empty if they are."""
+    if len(seeds) != len(unit.seeds):
+        return f"it has {len(seeds)} rows, the unit has {len(unit.seeds)} episodes"
+    return "" if np.array_equal(np.sort(seeds), np.asarray(unit.seeds)) else "it has other scenarios"
+
+
+def _invalid(records: pa.Table, track: Track) -> str:
+    problem = validity.complaint(records, track)
+    return problem[1] if problem else ""
+
+
+def _packed(out: Path, path: Path, units: Mapping[str, Wanted]) -> set[str]:
+    """The fingerprints among `units` that have records in a file of many units."""
+    try:
+        inside = pc.unique(pq.read_table(path, columns=["unit"])["unit"]).to_pylist()
+        wanted = units.keys() & set(inside)
+        if not wanted:
+            return set()
+        track, generation = check(path)
+        text = [column.name for column in generation if pa.types.is_string(column.type)]
+        if generation.equals(schema(track)):
+            records = pq.read_table(path, read_dictionary=text)
+        else:
+            records = upgraded(path)
+            place = records.schema.get_field_index("unit")
+            records = records.set_column(place, "unit", records["unit"].dictionary_encode())
+    except (pa.ArrowException, OSError, UserError):
+        if path.exists():
+            notice(
+                f"the record {path} is truncated or not Parquet; its units are driven again, it is {_aside(out, path)}"
+            )
+        return set()
+    wrong = _wrong(records, track, {key: units[key] for key in wanted})
+    for key, why in wrong.items():
+        notice(f"unit {key} in the record {path} does not count as finished: {why}; it is driven again")
+    if wrong:
+        _without(out, path, wrong.keys())
+    return set(wanted) - wrong.keys()
+
+
+def _wrong(records: pa.Table, track: Track, units: Mapping[str, Wanted]) -> dict[str, str]:
+    """The units whose rows are not theirs or are invalid, with the reason.
+
+    Args:
+        records: of these and other units, text as dictionaries.
+        track: of the records.
+        units: the units by their fingerprints.
+    """
+    encoded = records["unit"].combine_chunks()
+    codes, names = encoded.indices.to_numpy(), encoded.dictionary.to_pylist()
+    order = np.argsort(codes, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
+    seeds = records["seed"].to_numpy()
+    found = {}
+    for rows in parts:
+        key = names[codes[rows[0]]]
+        if key in units:
+            other = units[key].track.name != track.name
+            why = f"it is of the {track.name} track" if other else _other_rows(seeds[rows], units[key])
+            if why:
+                found[key] = why
+    suspect = validity.complaint(records, track)
+    whose = records.select(["pair", "training_seed", "cell"])
+    for rows in parts:
+        key, place = names[codes[rows[0]]], pa.array(rows)
+        if key in units and key not in found:
+            invalid = _invalid(records.take(place), track) if suspect else ""
+            if why := invalid or _of_another(whose.take(place), units[key]):
+                found[key] = why
+    return found
+
+
+def _without(out: Path, path: Path, units: Collection[str]) -> None:
+    """Write a file of many units again without some of them, and move the old one aside."""
+    records = pq.read_table(path)
+    rest = records.filter(pc.invert(pc.is_in(records["unit"], pa.array(list(units)))))
+    if rest.num_rows:
+        # Before the old file is moved: a run that is killed in between leaves both.
+        write_packed(out, [rest.filter(pc.equal(rest["unit"], key)) for key in pc.unique(rest["unit"])])
+    notice(f"the record {path} is {_aside(out, path)}; its other units are kept in a new file")
 
 
 def _aside(out: Path, path: Path) -> str:
@@ -121,6 +210,8 @@ def _aside(out: Path, path: Path) -> str:
         names = (folder / f"{path.stem}{f'-{number}' if number else ''}.parquet" for number in itertools.count())
         free = next(name for name in names if not name.exists())
         path.rename(free)
+    except FileNotFoundError:
+        return "moved by another run"
     except OSError as error:
         raise UserError(f"the record {path} is not complete, and cannot be moved: {error.strerror or error}") from error
     return f"kept as {free}"

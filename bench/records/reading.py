@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import duckdb
 import numpy as np
@@ -19,11 +21,16 @@ from bench.plugins import track as of
 from bench.plugins.track import Track
 from bench.records import validity
 from bench.records.generations import check, glance, selection
+from bench.records.packing import units_in
 from bench.records.schema import IDENTITY, PROVENANCE, schema
-from bench.records.store import FOLDER, path_of
+from bench.records.store import FOLDER, MANY, path_of
+
+T = TypeVar("T")
 
 SKEW = timedelta(hours=1)
 """Clocks of machines may differ so much; a record that is dated further ahead is not believed to be the newest."""
+TRIES = 5
+"""Most attempts to read a folder in which a run packs files."""
 
 
 def read_all(out: Path) -> dict[str, pa.Table]:
@@ -32,8 +39,12 @@ def read_all(out: Path) -> dict[str, pa.Table]:
     Raises:
         UserError: as `read`.
     """
+    return _settled(out, partial(_read_all, out))
+
+
+def _read_all(out: Path) -> dict[str, pa.Table]:
     present = {check(path)[0].name for path in _paths(out)}
-    return {track.name: read(out, track=track) for track in of.tracks() if track.name in present}
+    return {track.name: _read(out, None, track) for track in of.tracks() if track.name in present}
 
 
 def read(out: Path, units: Collection[str] | None = None, *, track: Track) -> pa.Table:
@@ -48,14 +59,20 @@ def read(out: Path, units: Collection[str] | None = None, *, track: Track) -> pa
     Raises:
         UserError: if there are no records, or a file is truncated, foreign, or has invalid values.
     """
-    paths = _paths(out) if units is None else [path_of(out, unit) for unit in sorted(set(units))]
+    return _settled(out, partial(_read, out, units, track))
+
+
+def _read(out: Path, units: Collection[str] | None, track: Track) -> pa.Table:
+    paths = _paths(out) if units is None else _paths_of(out, set(units))
     known = [(path, generation) for path in paths for found, generation in [check(path)] if found.name == track.name]
     if not known:
         raise UserError(_NOTHING.format(out=out))
     names = ", ".join(f'"{name}"' for name in schema(track).names)
     query = f"select {names} from records" + (_NEWEST if units is None else _OF_UNITS) + _ORDER
     with _records(out, known, track) as connection:
-        records = connection.sql(query, params=None if units is None else [sorted(units)]).to_arrow_table()
+        if units is not None:
+            connection.register("wanted", pa.table({"unit": sorted(units)}))
+        records = connection.sql(query).to_arrow_table()
     return _valid(records.cast(schema(track)), out, track)
 
 
@@ -71,10 +88,42 @@ def upgraded(path: Path) -> pa.Table:
 
 
 def _paths(out: Path) -> list[Path]:
-    paths = sorted((out / FOLDER).glob("[!.]*.parquet"))
+    """The files of records. Listed until nothing changes: during a packing, a listing may miss the new file and the old ones."""
+    paths, before = _listing(out), None
+    while paths != before:
+        paths, before = _listing(out), paths
     if not paths:
         raise UserError(_NOTHING.format(out=out))
     return paths
+
+
+def _listing(out: Path) -> list[Path]:
+    return sorted((out / FOLDER).glob("[!.]*.parquet"))
+
+
+def _paths_of(out: Path, units: set[str]) -> list[Path]:
+    """The files that hold these units; a unit that is nowhere is looked for under its own name."""
+    there = {path.stem: path for path in _paths(out)}
+    single = [there[unit] for unit in sorted(units & there.keys())]
+    missing = units - there.keys()
+    packed = []
+    for path in there.values():
+        if missing and path.name.startswith(MANY) and (here := missing & units_in(path)):
+            packed.append(path)
+            missing -= here
+    return [*single, *packed, *(path_of(out, unit) for unit in sorted(missing))]
+
+
+def _settled(out: Path, reads: Callable[[], T]) -> T:
+    """What `reads` returns; it is repeated if it fails while a run packs files."""
+    for _ in range(TRIES):
+        before = _listing(out)
+        try:
+            return reads()
+        except UserError:
+            if _listing(out) == before:
+                raise
+    return reads()
 
 
 def _valid(records: pa.Table, out: Path, track: Track) -> pa.Table:
@@ -82,8 +131,9 @@ def _valid(records: pa.Table, out: Path, track: Track) -> pa.Table:
     if problem := validity.complaint(records, track):
         row, why = problem
         path = path_of(out, records["unit"][row].as_py())
-        named = f"the record {path}" if path.exists() else f"a record in {out} (unit {path.stem})"
-        raise UserError(f"{named} is invalid: {why}; delete it and run again to recreate it")
+        if path.exists():
+            raise UserError(f"the record {path} is invalid: {why}; delete it and run again to recreate it")
+        raise UserError(f"a record in {out} (unit {path.stem}) is invalid: {why}; run again to recreate it")
     return records
 
 
@@ -110,6 +160,10 @@ def read_compact(out: Path, measurements: Collection[str]) -> dict[str, pa.Table
     Raises:
         UserError: if there are no records, or a file is truncated, foreign, or has invalid values.
     """
+    return _settled(out, partial(_read_all_compact, out, measurements))
+
+
+def _read_all_compact(out: Path, measurements: Collection[str]) -> dict[str, pa.Table]:
     known: dict[str, list[tuple[Path, pa.Schema]]] = {}
     for path in _paths(out):
         track, generation = glance(path)
@@ -200,11 +254,11 @@ _NEWEST = f"""
 """
 _NEWEST_UNITS = f" qualify {_WHOSE}"
 """The same for units; if two of them drove a scenario, the caller keeps the last."""
-_OF_UNITS = " where list_contains(?, unit) qualify row_number() over (partition by unit, seed order by file) = 1"
-_ONCE = """
-    qualify row_number() over (
-        partition by unit order by ends_with(file, '/' || unit || '.parquet') desc, file) = 1
-"""
+_BY_FILE = "ends_with(file, '/' || unit || '.parquet') desc, file"
 """Of a unit in several files, for instance copies: the file of its name, or the first."""
+_OF_UNITS = f"""
+    where unit in (select unit from wanted) qualify row_number() over (partition by unit, seed order by {_BY_FILE}) = 1
+"""
+_ONCE = f" qualify row_number() over (partition by unit order by {_BY_FILE}) = 1"
 _UNIT_ORDER = " order by pair, training_seed, cell, created_at <= getvariable('latest'), created_at"
 _ORDER = " order by pair, training_seed, cell, seed"

@@ -10,6 +10,8 @@ VERSION = "2"
 """Version of the format. 1 had the columns lanes, density and weather; 2 has `cell` and `world_facts`."""
 AUDIT = "audit"
 """`grid` of records on scenarios that were drawn for an audit; no score contains them."""
+SEQUENTIAL = "sequential"
+"""`grid` of records that were driven in rounds until a score was known (`until=`): their number depends on what they showed."""
 TEXT, FLOAT, INT = pa.string(), pa.float64(), pa.int64()
 
 
@@ -65,7 +67,9 @@ IDENTITY: tuple[pa.Field, ...] = (
     field("threat_access", TEXT, "highest access allowed to the attacker"),
     field("threat_queries", INT, "query budget of a step or of a patch", "queries", low=0),
     field("threat_share", FLOAT, "share of the frames of an episode that may be attacked", "share, 0 to 1"),
-    field("grid", TEXT, "name of the grid; `audit` for scenarios that an audit drew"),
+    field(
+        "grid", TEXT, "name of the grid; `audit` for scenarios that an audit drew, `sequential` for those of `until=`"
+    ),
     field("cell", TEXT, "JSON: the value on each axis of the world"),
     field("world_facts", TEXT, "JSON: axes, decision rate, episode length and actions of the world"),
     field("seed", INT, "scenario seed of the episode", low=0, high=2**53),

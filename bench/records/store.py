@@ -1,11 +1,13 @@
-"""Episode records: an append-only Parquet data set with one file per finished unit of work and one row per episode.
+"""Episode records: a Parquet data set with one row per episode; a unit of work is in a file of its own, or in one of many units.
 
-Files are written atomically, so a killed run leaves only finished units (`bench.records.finished`).
+Files are written atomically, so a killed run leaves only finished units. Whether a unit is finished is read from its rows
+(`bench.records.finished`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -17,7 +19,10 @@ from bench.plugins.track import Columns, Track
 from bench.records import validity
 from bench.records.schema import schema
 
-FOLDER = "episodes"
+FOLDER, MANY = "episodes", "packed-"
+"""The folder of the records, and the beginning of the names of files with many units."""
+TOGETHER = 16
+"""So many units that are finished at once are written to one file: a file of its own for each takes ten times as long."""
 
 
 def prepare(out: Path) -> None:
@@ -31,7 +36,7 @@ def prepare(out: Path) -> None:
 
 
 def path_of(out: Path, unit: str) -> Path:
-    """The file of a unit's records, by its fingerprint."""
+    """The file of a unit's records, by its fingerprint; there is none if the unit is in a file of many."""
     return out / FOLDER / f"{unit}.parquet"
 
 
@@ -41,7 +46,34 @@ def write(out: Path, records: pa.Table) -> Path:
     Raises:
         UserError: if it cannot be written.
     """
-    path = path_of(out, records["unit"][0].as_py())
+    return _written(path_of(out, records["unit"][0].as_py()), records)
+
+
+def write_all(out: Path, units: Sequence[pa.Table]) -> None:
+    """Write the records of several units of a track: a file for each, or one file for `TOGETHER` and more.
+
+    Raises:
+        UserError: if a file cannot be written.
+    """
+    if len(units) >= TOGETHER:
+        write_packed(out, units)
+        return
+    for records in units:
+        write(out, records)
+
+
+def write_packed(out: Path, units: Sequence[pa.Table]) -> Path:
+    """Write the records of many units of a track to one file atomically. Its name depends on nothing but the units.
+
+    Raises:
+        UserError: if it cannot be written.
+    """
+    names = sorted(records["unit"][0].as_py() for records in units)
+    name = hashlib.sha256("\n".join(names).encode()).hexdigest()
+    return _written(out / FOLDER / f"{MANY}{name}.parquet", pa.concat_tables(units))
+
+
+def _written(path: Path, records: pa.Table) -> Path:
     try:
         with files.whole(path) as file:
             pq.write_table(records, file, compression="zstd")

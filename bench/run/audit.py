@@ -42,6 +42,8 @@ def audit_config(words: Sequence[str]) -> AuditConfig:
             f"salt must be one whole number from 0 to {SALTS - 1}, got {', '.join(salts)}; leave it out to draw one"
         )
     public = run_config([word for word in words if not word.startswith("salt=")])
+    if public.until is not None:
+        raise UserError("an audit drives as many scenarios as the grid has: leave out until")
     for pair in public.pairs:
         if not pair.world.component.redraws:
             raise UserError(f"world {pair.world.name!r} has a fixed set of scenarios: an audit cannot draw new ones")

@@ -18,7 +18,7 @@ from bench.plugins.pair import Chosen, Pair, check_track
 from bench.plugins.registry import KINDS, Kind
 from bench.plugins.suites import Suite
 from bench.run.executors import EXECUTORS
-from bench.run.process import machine_bytes
+from bench.run.options import RunOptions, TrainOptions, half_of_memory
 from bench.scenarios import Grid
 
 
@@ -42,6 +42,7 @@ class RunConfig:
         shard: (3, 10) drives the third of ten equal parts of the units.
         unit_timeout: seconds that a unit or preparation may take; 0 for no limit.
         unit_memory: GB of memory that a worker process may use; 0 for no limit.
+        until: half the width of the interval at which a row has enough scenarios (`bench.run.rounds`); None drives them all.
 
     Raises:
         ValueError: if a number is out of range.
@@ -60,7 +61,8 @@ class RunConfig:
     broken: tuple[str, ...] = ()
     shard: tuple[int, int] = (1, 1)
     unit_timeout: float = 3600.0
-    unit_memory: float = field(default_factory=lambda: half_of_memory())
+    unit_memory: float = field(default_factory=half_of_memory)
+    until: float | None = None
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
@@ -73,6 +75,17 @@ class RunConfig:
                 raise ValueError(f"{name} must be a number of at least 0 (0: no limit), got {getattr(self, name):g}")
         if self.record is not None and not 0 <= self.record <= self.grid.episodes:
             raise ValueError(f"record must be between 0 and the {self.grid.episodes} episodes, got {self.record}")
+        if self.until is not None:
+            self._check_until(self.until)
+
+    def _check_until(self, until: float) -> None:
+        if not 0.001 <= until < 0.5:
+            raise ValueError(f"until must be between 0.001 and 0.5 (half the width of the interval), got {until:g}")
+        if self.shard != (1, 1):
+            raise ValueError("until looks at all units of a row: leave out shard, or leave out until")
+        for pair in self.pairs:
+            if not pair.world.component.redraws:
+                raise ValueError(f"world {pair.world.name!r} has a fixed set of scenarios: leave out until")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,44 +129,6 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
         )
 
 
-def half_of_memory() -> float:
-    """Half of the machine's memory in GB; 0 if it cannot be read."""
-    return machine_bytes() / 2e9
-
-
-@dataclass
-class RayOptions:
-    """The options of `executor=ray`."""
-
-    address: str = "local"
-
-
-@dataclass
-class RunOptions:
-    """The options of `bench run` that choose neither a component nor a cell, with types and defaults."""
-
-    grid: str | None = None
-    episodes: int | None = None
-    seeds: list[int] | None = None
-    executor: str = "processes"
-    workers: int | None = None
-    ray: RayOptions = field(default_factory=RayOptions)
-    out: str = "results"
-    record: int | None = None
-    reference: bool = True
-    shard: str = "1/1"
-    unit_timeout: float = 3600.0
-    unit_memory: float = field(default_factory=half_of_memory)
-
-
-@dataclass
-class TrainOptions:
-    """The options of `bench train` that do not choose a component, with types and defaults."""
-
-    seeds: list[int] = field(default_factory=lambda: [0])
-    out: str | None = None
-
-
 def run_config(words: Sequence[str]) -> RunConfig:
     """The configuration of `bench run` with these options.
 
@@ -182,6 +157,7 @@ def run_config(words: Sequence[str]) -> RunConfig:
             shard=_shard(settings["shard"]),
             unit_timeout=settings["unit_timeout"],
             unit_memory=settings["unit_memory"],
+            until=settings["until"],
         )
 
 

@@ -1,4 +1,4 @@
-"""Back ends that carry out tasks: `map(tasks)` yields each outcome as soon as it is finished, in any order."""
+"""Back ends that carry out tasks: `map(tasks)` yields the outcomes as soon as they are finished, in any order."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Watcher(Protocol):
     def working(self, works: Sequence[Unit | Preparation | Loading]) -> None:
         """Called with the work in progress."""
 
-    def preparing(self, work: str, share: float, text: str) -> None:
-        """Called with the share of a preparation done in [0, 1], and a text of the attack."""
+    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
+        """Called with the share of some work done in [0, 1]; of a preparation with a text, of units with their episodes."""
 
     def printed(self, work: Unit | Preparation | Loading, lines: Sequence[str]) -> None:
         """Called with what the components printed while they worked."""
@@ -45,8 +45,10 @@ class Executor(Protocol):
 
     size: int
 
-    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
+    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         """Carry out all tasks, and yield each with its outcome, or why it failed, as soon as it is finished.
+
+        Tasks that finished at about the same time come together, so that their records can be written together.
 
         A task is taken when there is room for it. One whose process dies is tried a second time, because the first may have been
         an accident. Closing the generator stops the tasks in progress.
@@ -72,13 +74,14 @@ class SerialExecutor:
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
 
-    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
+    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         settle()
         framework, culprit = Snapshot(), ""
         waiting, parts = iter(tasks), deque[Task]()
         while (task := parts.popleft() if parts else next(waiting, None)) is not None:
             if culprit:
-                yield task, Failure(why=f"was not driven: {culprit} changed this process; use executor=processes")
+                why = f"was not driven: {culprit} changed this process; use executor=processes"
+                yield [(task, Failure(why=why))]
                 continue
             watcher.working([task.work, *task.others])
             outcome, text = self._carried_out(task, watcher, framework)
@@ -90,7 +93,7 @@ class SerialExecutor:
                 # Each unit alone says which one it was.
                 parts.extend(task.parts())
                 continue
-            yield task, outcome
+            yield [(task, outcome)]
 
     def _carried_out(self, task: Task, watcher: Watcher, framework: Snapshot) -> tuple[Outcome | Failure, str]:
         """The outcome of a task, and what it printed to standard output."""
@@ -138,19 +141,23 @@ class ProcessExecutor:
         self.size, self.limits = workers, limits
         self.idle: list[Worker] = []
 
-    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
+    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         waiting, retries = iter(tasks), Retries()
         busy: dict[Worker, Task] = {}
         try:
             while True:
+                ended: list[Finished] = []
                 while len(busy) < self.size and (task := retries.next(waiting)) is not None:
                     content = packed(task)
                     if isinstance(content, Failure):
-                        yield task, content
+                        ended.append((task, content))
                         continue
                     worker = self.idle.pop() if self.idle else Worker(self.limits)
                     worker.give(content)
                     busy[worker] = task
+                if ended:
+                    yield ended
+                    ended = []
                 if not busy:
                     return
                 watcher.working([work for task in busy.values() for work in (task.work, *task.others)])
@@ -165,7 +172,9 @@ class ProcessExecutor:
                             worker.close()
                         else:
                             self.idle.append(worker)
-                        yield from retries.ended(task, item, lines, watcher)
+                        ended += retries.ended(task, item, lines, watcher)
+                if ended:
+                    yield ended
         finally:
             # Those still busy were stopped by the caller.
             for worker in busy:

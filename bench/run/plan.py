@@ -9,6 +9,7 @@ from typing import Any
 from bench.plugins.fingerprint import canonical
 from bench.plugins.pair import Chosen, Pair
 from bench.plugins.track import track_of
+from bench.records.schema import SEQUENTIAL
 from bench.run.config import RunConfig
 from bench.run.unit import Loading, Unit
 from bench.scenarios import Axes, Cell
@@ -64,6 +65,7 @@ def units_of(config: RunConfig, weights: Weights) -> list[Unit]:
                 seeds=config.grid.seeds(),
                 weights_sha256=loaded[0],
                 adversary_sha256=loaded[1],
+                sequential=config.grid.name == SEQUENTIAL,
             )
             units += [replace(first, cell=cell) for cell in mine]
     return units

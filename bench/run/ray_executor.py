@@ -7,6 +7,7 @@ and plug-ins that end their process are treated as on one machine. cavbench and 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import pickle
 import socket
@@ -39,13 +40,13 @@ class Host:
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.worker: Worker | None = None
-        self.told: list[tuple[str, float, str]] = []
+        self.told: list[tuple[str, float, str, int]] = []
 
     def ready(self) -> bool:
         """Answers when the actor has a core."""
         return True
 
-    def progress(self) -> list[tuple[str, float, str]]:
+    def progress(self) -> list[tuple[str, float, str, int]]:
         """The progress of a preparation since the last call."""
         told, self.told = self.told, []
         return told
@@ -111,6 +112,7 @@ class RayExecutor:
             raise UserError("executor=ray needs Ray: pip install 'cavbench[ray]'") from None
         self.ray, self.limits, self.most = ray, limits, workers
         self.actors: list[_Actor] = []
+        self.looked = -math.inf
         own = {"num_cpus": workers or cores(), "include_dashboard": False} if address == "local" else {}
         self.started = not ray.is_initialized()
         if self.started:
@@ -124,19 +126,20 @@ class RayExecutor:
         self.size = self._cores()
         self.make = ray.remote(num_cpus=1, max_concurrency=2, max_restarts=0)(Host)
 
-    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[Finished, None, None]:
+    def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         waiting, retries = iter(tasks), Retries()
         lost: dict[int, int] = {}
         alive = time.monotonic()
         following: Task | None = retries.next(waiting)
         try:
             while following is not None or any(actor.task for actor in self.actors):
+                ended: list[Finished] = []
                 self._grow()
                 for actor in self._idle():
                     while following is not None and actor.task is None:
                         content = packed(following)
                         if isinstance(content, Failure):
-                            yield following, content
+                            ended.append((following, content))
                         else:
                             actor.task = following
                             actor.pending = actor.handle.carry_out.remote(content)
@@ -149,12 +152,14 @@ class RayExecutor:
                         self.actors.remove(actor)
                         if task is not None and lost.setdefault(id(task), 1) >= LOST:
                             why = f"failed: the machine that drove it was lost {LOST} times"
-                            yield from retries.ended(task, Failure(why=why, lost=True), (), watcher)
+                            ended += retries.ended(task, Failure(why=why, lost=True), (), watcher)
                         elif task is not None:
                             lost[id(task)] += 1
                             retries.put_back(task)
                     elif task is not None:
-                        yield from retries.ended(task, pickle.loads(answer[0]), answer[1], watcher)
+                        ended += retries.ended(task, pickle.loads(answer[0]), answer[1], watcher)
+                if ended:
+                    yield ended
                 following = following or retries.next(waiting)
                 if any(actor.task for actor in self.actors):
                     alive = time.monotonic()
@@ -170,7 +175,10 @@ class RayExecutor:
         return min(self.most or there, there)
 
     def _grow(self) -> None:
-        """An actor for every core of the cluster; those of new machines, too."""
+        """An actor for every core of the cluster; those of new machines, too. Asking the cluster takes as long as a task."""
+        if time.monotonic() - self.looked < NEWS_S and self.actors:
+            return
+        self.looked = time.monotonic()
         while len(self.actors) < self._cores():
             handle = self.make.remote(self.limits)
             self.actors.append(_Actor(handle, handle.ready.remote()))
@@ -184,10 +192,10 @@ class RayExecutor:
         if not owed:
             time.sleep(NEWS_S)
             return []
-        done, _ = self.ray.wait(list(owed), num_returns=1, timeout=NEWS_S)
-        more, _ = self.ray.wait(list(owed), num_returns=len(owed), timeout=0)
+        done, others = self.ray.wait(list(owed), num_returns=1, timeout=NEWS_S)
+        more = self.ray.wait(others, num_returns=len(others), timeout=0)[0] if done and others else []
         found = []
-        for reference in dict.fromkeys([*done, *more]):
+        for reference in [*done, *more]:
             actor = owed[reference]
             actor.pending = None
             found.append((actor, self._answer(reference)))
@@ -202,7 +210,7 @@ class RayExecutor:
             return None
 
     def _ask(self, watcher: Watcher) -> None:
-        """Pass on the progress of preparations."""
+        """Pass on the progress of the work."""
         for actor in self.actors:
             if actor.task is None:
                 continue

@@ -19,7 +19,7 @@ from bench.plugins.framework import Snapshot
 from bench.plugins.pair import IN_PROCESS, Chosen, Pair, choose
 from bench.plugins.track import track
 from bench.records import reading, store
-from bench.records.schema import IDENTITY
+from bench.records.schema import IDENTITY, SEQUENTIAL
 from bench.run import artefacts
 from bench.run.process import settle
 from bench.run.runner import keep_recording, recording_path, stem
@@ -235,6 +235,7 @@ def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
         seeds=range(min(seeds), max(seeds) + 1),
         weights_sha256=pair.weights_sha256(record["training_seed"]),
         adversary_sha256=pair.adversary_sha256(record["training_seed"]),
+        sequential=record["grid"] == SEQUENTIAL,
     )
     return unit, before
 

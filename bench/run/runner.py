@@ -1,5 +1,7 @@
 """Carries out a run: passes its units of work to an executor, and writes the outcomes to files.
 
+Finished units are packed as the run goes on (`bench.records.packing`).
+
 Preparations (patches) are made first and kept as files for their units. A unit is a pure function of its configuration: results
 do not depend on the executor, the number of workers or the order of work.
 """
@@ -9,21 +11,26 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
+import pyarrow as pa
+
 from bench import files
 from bench.errors import UserError
-from bench.records import store
-from bench.records.finished import finished
+from bench.plugins.track import Track
+from bench.records import packing, store
+from bench.records.finished import finished as finished_units
 from bench.run import artefacts
 from bench.run.batches import batches
 from bench.run.config import RunConfig
-from bench.run.executors import EXECUTORS, Executor, Watcher
+from bench.run.executors import EXECUTORS, Executor, Finished, Watcher
 from bench.run.failures import Failures
 from bench.run.plan import Weights, key_of, loadings, units_of
+from bench.run.rounds import drive_until, rounds
 from bench.run.unit import Loading, Preparation, Unit, is_foreign
-from bench.run.work import Failure, Outcome, Task
+from bench.run.work import Outcome, Task
 from bench.run.worker import Limits
 from bench.scenarios import Cell
 from bench.scenarios.axes import written
@@ -46,7 +53,7 @@ class RunWatcher(Watcher, Protocol):
 
 
 def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
-    """Carry out the unfinished units of a run, and return the fingerprints of all its units.
+    """Carry out the unfinished units of a run, and return the fingerprints of its units; with `until`, of those it needed.
 
     Raises:
         UserError: if the results folder cannot be written, weights are missing, or no pair can be driven.
@@ -61,17 +68,22 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
         weights = _loaded(config, back_end, watcher, failures)
         if not any(key_of(loading) in weights for loading in loadings(config, baselines=False)):
             raise failures.error((), 0)
-        units = {unit.fingerprint: unit for unit in units_of(config, weights)}
-        done = finished(config.out, units)
-        missing = [unit for key, unit in units.items() if key not in done]
-        episodes = len(config.grid.seeds())
-        watcher.begin(episodes=episodes * len(units), finished=episodes * len(done))
+        units = {unit.fingerprint: unit for part in rounds(config) for unit in units_of(part, weights)}
         driving = _Driving(config.out, _recorded(config, units.values()), back_end, watcher, failures)
-        driving.carry_out(missing)
+        driving.finished |= finished_units(config.out, units)
+        packing.pack(config.out)
+        episodes = {key: len(unit.seeds) for key, unit in units.items()}
+        done = sum(episodes[key] for key in driving.finished)
+        watcher.begin(episodes=sum(episodes.values()), finished=done)
+        if config.until is None:
+            driving.carry_out(list(units.values()))
+            wanted = list(units)
+        else:
+            wanted = drive_until(config, weights, driving.carry_out)
     if failures:
-        kept = [key for key, unit in units.items() if key in done or key in driving.finished]
-        raise failures.error(kept, len(units) - len(kept))
-    return list(units)
+        finished = [key for key in wanted if key in driving.finished]
+        raise failures.error(finished, len(wanted) - len(finished))
+    return wanted
 
 
 def _loaded(config: RunConfig, back_end: Executor, watcher: RunWatcher, failures: Failures) -> Weights:
@@ -88,7 +100,7 @@ def _loaded(config: RunConfig, back_end: Executor, watcher: RunWatcher, failures
         else:
             weights[key_of(loading)] = loading.weights()
     with closing(back_end.map(foreign, watcher)) as finished:
-        for task, outcome in finished:
+        for task, outcome in chain.from_iterable(finished):
             assert isinstance(task.work, Loading)
             if isinstance(outcome, Outcome):
                 assert outcome.weights is not None
@@ -121,14 +133,15 @@ class _Driving:
     ) -> None:
         self.out, self.recorded, self.back_end, self.watcher, self.failures = out, recorded, back_end, watcher, failures
         self.finished: set[str] = set()
+        self.unpacked = 0
         self._read = cache(artefacts.read)
 
-    def carry_out(self, units: Iterable[Unit]) -> None:
-        """Prepare what is missing, and drive the units."""
+    def carry_out(self, units: Sequence[Unit]) -> set[str]:
+        """Prepare what is missing, drive the units that are not finished, and return the fingerprints of those that are now."""
         absent: dict[str, Preparation] = {}
         ready: list[Unit] = []
         waits: list[Unit] = []
-        for unit in units:
+        for unit in (unit for unit in units if unit.fingerprint not in self.finished):
             needed = unit.preparation
             if needed and not artefacts.path_of(self.out, needed).exists():
                 absent[needed.fingerprint] = needed
@@ -137,8 +150,9 @@ class _Driving:
         for works in (first, sorted(waits, key=_longest_first)):
             together = batches(works, self.recorded, self.back_end.size)
             with closing(self.back_end.map(self._tasks(together), self.watcher)) as finished:
-                for task, outcome in finished:
-                    self._end(task, outcome)
+                for some in finished:
+                    self._end(some)
+        return self.finished
 
     def _tasks(self, together: Iterable[Sequence[Preparation | Unit]]) -> Iterator[Task]:
         """The tasks of batches, without those of a pair that was given up, and without those whose preparation failed."""
@@ -152,31 +166,43 @@ class _Driving:
                 units = [other for other in others if isinstance(other, Unit)]
                 yield Task(work=work, artefact=artefact, recorded=self.recorded.get(work.fingerprint, ()), others=units)
 
-    def _end(self, task: Task, outcome: Outcome | Failure) -> None:
-        # A batch may fail as a whole: then none of its units has an outcome of its own.
-        others = outcome.others or [outcome] * len(task.others)
-        for work, one in zip((task.work, *task.others), (outcome, *others), strict=True):
-            assert not isinstance(work, Loading)
-            if isinstance(one, Failure):
-                if line := self.failures.add(work, one):
+    def _end(self, some: Iterable[Finished]) -> None:
+        """Write the outcomes of tasks that finished at about the same time, then tell the watcher."""
+        kept: list[tuple[Unit | Preparation, Outcome]] = []
+        for task, outcome in some:
+            # A batch may fail as a whole: then none of its units has an outcome of its own.
+            others = outcome.others or [outcome] * len(task.others)
+            for work, one in zip((task.work, *task.others), (outcome, *others), strict=True):
+                assert not isinstance(work, Loading)
+                if isinstance(one, Outcome):
+                    kept.append((work, one))
+                elif line := self.failures.add(work, one):
                     self.watcher.failed(line)
-                continue
-            self._keep(work, one)
+        self._keep(kept)
+        for work, one in kept:
             self.finished.add(work.fingerprint)
             self.watcher.finished(work, one.wall_s)
             for warning in one.warnings:
                 self.watcher.warn(warning)
 
-    def _keep(self, work: Unit | Preparation, outcome: Outcome) -> None:
-        """Write the outcome of a task: the records last, because they mark it as finished."""
-        if isinstance(work, Preparation):
-            assert outcome.artefact is not None
-            artefacts.write(self.out, work, outcome.artefact)
-            return
-        for seed, recording in outcome.recordings.items():
-            keep_recording(recording_path(self.out, work, seed), recording)
-        assert outcome.records is not None
-        store.write(self.out, outcome.records)
+    def _keep(self, kept: Sequence[tuple[Unit | Preparation, Outcome]]) -> None:
+        """Write the outcomes of tasks: the records last, because they mark a unit as finished."""
+        records: dict[Track, list[pa.Table]] = {}
+        for work, outcome in kept:
+            if isinstance(work, Preparation):
+                assert outcome.artefact is not None
+                artefacts.write(self.out, work, outcome.artefact)
+                continue
+            for seed, recording in outcome.recordings.items():
+                keep_recording(recording_path(self.out, work, seed), recording)
+            assert outcome.records is not None
+            records.setdefault(work.track, []).append(outcome.records)
+        for units in records.values():
+            store.write_all(self.out, units)
+            self.unpacked += len(units)
+        if self.unpacked >= packing.UNITS:
+            packing.pack(self.out)
+            self.unpacked = 0
 
 
 def keep_recording(path: Path, content: bytes) -> None:
@@ -205,7 +231,8 @@ def _recorded(config: RunConfig, units: Iterable[Unit]) -> dict[str, Sequence[in
     recorded: dict[str, Sequence[int]] = {}
     for unit in units:
         first = first_units[unit.pair.id]
-        wanted = unit.pair.id in requested and unit.training_seed == first.training_seed
+        first_round = unit.seeds.start == config.grid.first_seed
+        wanted = first_round and unit.pair.id in requested and unit.training_seed == first.training_seed
         if wanted and (config.record is not None or unit is first):
             count = 1 if config.record is None else config.record
             recorded[unit.fingerprint] = unit.seeds[:count]

@@ -22,8 +22,8 @@ from bench.plugins import registry
 from bench.plugins.fingerprint import libraries, machine
 from bench.plugins.pair import IN_PROCESS, Pair
 from bench.plugins.track import Track, track
-from bench.records import reading
-from bench.records.store import FOLDER, path_of
+from bench.records import packing, reading
+from bench.records.store import FOLDER
 from bench.run.replay import pair_of
 from bench.scenarios import Cell
 from bench.scenarios.axes import written
@@ -96,8 +96,7 @@ def write(results: Path, pair: str, out: Path, *, own: Track) -> Submission:
         if out.exists() and any(out.iterdir()):
             raise UserError(f"{out} is not empty: choose a new folder with out=")
         (out / FOLDER).mkdir(parents=True, exist_ok=True)
-        for unit in pc.unique(records["unit"]).to_pylist():
-            shutil.copyfile(path_of(results, unit), path_of(out, unit))
+        packing.copy(results, pc.unique(records["unit"]).to_pylist(), out)
         _copy_artefacts(results, records, own, out)
         for seed in pc.unique(asked["training_seed"]).to_pylist():
             _copy_weights(pair_of(first), seed, out)

@@ -12,7 +12,7 @@ from bench.plugins import registry
 from bench.plugins.fingerprint import canonical, code_digest, digest, libraries, machine
 from bench.plugins.pair import Chosen, Pair
 from bench.plugins.track import Job, Track, track_of
-from bench.records.schema import AUDIT
+from bench.records.schema import AUDIT, SEQUENTIAL
 from bench.scenarios import Cell, SeedBlock
 
 
@@ -154,7 +154,13 @@ class Preparation(Work):
 
 @dataclass(frozen=True, kw_only=True)
 class Unit(Work):
-    """One batch of episodes: a pair on every scenario seed of a cell, with one training seed."""
+    """One batch of episodes: a pair on every scenario seed of a cell, with one training seed.
+
+    Args:
+        sequential: whether it is part of a round (`bench.run.rounds`).
+    """
+
+    sequential: bool = False
 
     @property
     def module(self) -> str:
@@ -189,11 +195,17 @@ class Unit(Work):
         """sha256 of everything that determines the result."""
         before = {"artefact": self.artefact} if self.artefact else {}
         scenarios = {"cell": canonical(self.cell), "seeds": [self.seeds.start, self.seeds.stop]}
-        return digest(self.origin | scenarios | before)
+        rule = {"rule": SEQUENTIAL} if self.sequential else {}
+        return digest(self.origin | scenarios | before | rule)
 
     @property
     def grid(self) -> str:
-        """Name of the grid of its world with this cell and these seeds; `audit` for drawn seeds, `custom` for others."""
+        """Name of the grid of its world with this cell and these seeds; `audit` for drawn seeds, `custom` for others.
+
+        `sequential` for those of a round.
+        """
+        if self.sequential:
+            return SEQUENTIAL
         if self.seeds.start >= SeedBlock.AUDIT:
             return AUDIT
         grids = registry.grids(self.pair.world.name)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import secrets
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Protocol
 
 import pyarrow as pa
 
@@ -16,13 +18,24 @@ from bench.errors import PluginError, UserError, message, reason
 from bench.plugins.fingerprint import canonical
 from bench.plugins.foreign import contained
 from bench.plugins.framework import Snapshot
+from bench.plugins.progress import listening
 from bench.records.store import table
 from bench.run.blame import blamed
 from bench.run.unit import Loading, Preparation, Unit
 from bench.trust.watch import TamperError
 
-Tell = Callable[[str, float, str], None]
-"""Called with the name of the work, the share done in [0, 1], and a short text."""
+
+class Tell(Protocol):
+    """Is told how far a piece of work is.
+
+    Args:
+        work: its name.
+        share: share done, in [0, 1].
+        text: of an attack that is prepared.
+        episodes: of the units of the work; 0 for a preparation.
+    """
+
+    def __call__(self, work: str, share: float, text: str, episodes: int = 0) -> None: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +114,7 @@ def attempt(task: Task, tell: Tell, framework: Snapshot) -> Outcome | Failure:
 
     Args:
         task: the task.
-        tell: called with the progress of a preparation.
+        tell: called with the progress.
         framework: the functions of the framework as they should be.
     """
     outcome = _together(task, tell) if task.others else _alone(task, tell)
@@ -114,7 +127,7 @@ def _together(task: Task, tell: Tell) -> Outcome | Failure:
     """The outcomes of a task with several units: one after the other, if one batch gives no results."""
     try:
         with contained():
-            outcomes: Sequence[Outcome | Failure] = _in_one_batch(task)
+            outcomes: Sequence[Outcome | Failure] = _in_one_batch(task, tell)
     # Each unit alone says what is wrong with it.
     except Exception:
         outcomes = []
@@ -122,12 +135,13 @@ def _together(task: Task, tell: Tell) -> Outcome | Failure:
     return replace(first, others=others)
 
 
-def _in_one_batch(task: Task) -> list[Outcome]:
+def _in_one_batch(task: Task, tell: Tell) -> list[Outcome]:
     """The outcomes of units that are driven together; none if they must be driven one by one."""
     assert isinstance(task.work, Unit)
     units = (task.work, *task.others)
     start, entropy = time.perf_counter(), secrets.randbits(62)
-    driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units])
+    with _heard(units, tell):
+        driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units])
     if driven is None:
         return []
     per_episode = (time.perf_counter() - start) / sum(len(unit.seeds) for unit in units)
@@ -137,6 +151,12 @@ def _in_one_batch(task: Task) -> list[Outcome]:
         records = table(unit.constants(wall_s), result.columns, track=unit.track)
         outcomes.append(Outcome(wall_s=wall_s, records=records))
     return outcomes
+
+
+def _heard(units: Sequence[Unit], tell: Tell) -> AbstractContextManager[None]:
+    """Passes on how far units are that are driven together."""
+    name, episodes = str(units[0]), sum(len(unit.seeds) for unit in units)
+    return listening(lambda share: tell(name, share, "", episodes))
 
 
 def _alone(task: Task, tell: Tell) -> Outcome | Failure:
@@ -159,7 +179,8 @@ def _performed(task: Task, tell: Tell) -> Outcome:
     start = time.perf_counter()
     match task.work:
         case Unit() as unit:
-            return _driven(unit, task)
+            with _heard([unit], tell):
+                return _driven(unit, task)
         case Preparation() as work:
             artefact = work.track.prepare(work.job, canonical(work.origin), partial(tell, str(work)))
             return Outcome(wall_s=time.perf_counter() - start, artefact=artefact)

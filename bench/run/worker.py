@@ -94,7 +94,7 @@ class Worker:
         wait(self.sources, seconds)
 
     def news(self) -> list[Any]:
-        """What the worker sent since: progress as (work, share, text), and at the end of a task an outcome or a failure.
+        """What the worker sent since: progress as (work, share, text, episodes); at the end of a task an outcome or a failure.
 
         A worker that died, or used more time or memory than allowed, has failed its task, and is `spent`.
         """
@@ -207,11 +207,11 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
     settings = _settings()
     connection.send_bytes(pickle.dumps(READY))
 
-    def tell(work: str, share: float, text: str) -> None:
+    def tell(work: str, share: float, text: str, episodes: int = 0) -> None:
         # A copy of this process may prepare something, too.
         if os.getpid() != own:
             os._exit(1)
-        connection.send_bytes(pickle.dumps((work, share, text)))
+        connection.send_bytes(pickle.dumps((work, share, text, episodes)))
 
     while True:
         try:

@@ -22,7 +22,7 @@ from bench.plugins.parameters import parameters
 from bench.plugins.registry import GROUPS, Kind
 
 LEADERBOARD = ("leaderboard/index.html", "leaderboard/index.json", "leaderboard/index.csv")
-"""Files of the repository that are copied to the same path in the site."""
+"""Files of the repository that are copied to the same path in the site, with the films beside them."""
 
 logger = logging.getLogger(__name__)
 
@@ -108,6 +108,9 @@ def _copy_leaderboard(app: Sphinx, failure: Exception | None) -> None:
         if source.exists():
             target.parent.mkdir(exist_ok=True)
             shutil.copyfile(source, target)
+    films = app.srcdir.parent / "leaderboard" / "clips"
+    if failure is None and films.is_dir():
+        shutil.copytree(films, Path(app.outdir) / "leaderboard" / "clips", dirs_exist_ok=True)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -33,6 +33,7 @@ FIGURES = {
     "defense_jpeg.png": "filters:jpeg",
     "victim_dqn.svg": "decisions:dqn",
     "victim_ddpg.svg": "decisions:ddpg",
+    "victim_oracle_planner.svg": "references:oracle_planner",
     "victim_planner.svg": "intervals:planner",
     "victim_blind.svg": "references:blind",
     "victim_random.svg": "references:random",

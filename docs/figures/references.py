@@ -71,10 +71,18 @@ def random() -> Figure:
 
 def idm() -> Figure:
     """Speed and lane of the traffic driver and of `dqn` on one scenario."""
-    title = "idm: highway-env's own driver is safe, and slow"
+    return _beside_dqn("idm", "idm: highway-env's own driver is safe, and slow")
+
+
+def oracle_planner() -> Figure:
+    """Speed and lane of the planner with perfect information and of `dqn` on one scenario."""
+    return _beside_dqn("oracle_planner", "oracle_planner: it finds the gaps, and knows that they stay")
+
+
+def _beside_dqn(name: str, title: str) -> Figure:
     made = style.figure(4.2, title)
     speed, lane = made.subplots(2, 1, sharex=True, height_ratios=(1.4, 1))
-    for victim, colour, dashes in (("idm", style.BLUE, "-"), ("dqn", style.RED, "--")):
+    for victim, colour, dashes in ((name, style.BLUE, "-"), ("dqn", style.RED, "--")):
         columns, steps = episode("attack=none", f"victim={victim}")
         seconds = np.arange(len(steps["speed"])) / FACTS.decision_hz
         label = f"{victim}: {columns['distance_m'][0]:.0f} m, safe progress {columns['safe_progress'][0]:.0%}"

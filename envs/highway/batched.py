@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from envs.highway.config import HighwayConfig
 from envs.highway.engine import HighwayEngine
 from envs.highway.environment import HighwayEnv
+from envs.highway.oracle import OraclePlanner
 
 
 class BatchedHighway(HighwayEnv):
@@ -20,12 +21,13 @@ class BatchedHighway(HighwayEnv):
     def __init__(self, config: HighwayConfig) -> None:
         super().__init__(config)
         self.engine = HighwayEngine(config)
+        self.oracle = OraclePlanner(self.engine) if config.driver == "oracle" else None
 
     def _start(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
         self.engine.reset(chosen, seeds)
 
     def _drive(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None) -> None:
-        self.engine.step(action, paused)
+        self.engine.step(action if self.oracle is None else self.oracle.actions(), paused)
 
     def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         return self.engine.observation, self.engine.numbers, self.engine.flags

@@ -42,6 +42,7 @@ KINEMATICS: Mapping[str, Any] = {
     "lane_width": 4.0,
     "length": 5.0,
     "width": 2.0,
+    "top_speed": 40.0,
     "start_speed": 25.0,
     "speed_gain": 1 / 0.6,
     "heading_gain": 1 / 0.2,
@@ -68,7 +69,8 @@ class HighwayConfig:
         max_steps: number of decisions until an episode is truncated.
         action_type: `discrete` lane-changing actions (`ACTIONS`), or `continuous` [acceleration, steering] in [-1, 1], mapped to
             -5 to 5 m/s2 and -45 to 45 degrees.
-        driver: `agent` executes the actions; `idm` replaces the ego with highway-env's IDMVehicle and ignores them.
+        driver: `agent` executes the actions; `idm` replaces the ego with highway-env's IDMVehicle and ignores them, `oracle`
+            drives it by plans that were tried in copies of the simulator.
         action_repeat: number of decisions for which an action is held: lane changes are sent once, then IDLE; other actions are
             repeated.
         target_speeds: increasing speeds in m/s for FASTER and SLOWER; highway-env assumes that they are uniform.

@@ -53,7 +53,7 @@ class HighwayWorld(DrivingWorld):
     grid: ClassVar[str] = STANDARD_V1.name
     features: ClassVar[Features] = STANDARD_FEATURES
     actions: ClassVar[tuple[str, ...]] = ACTIONS
-    drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm")
+    drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm", "oracle")
 
     preset: Preset = "standard"
     vehicles: int = 20
@@ -80,6 +80,8 @@ class HighwayWorld(DrivingWorld):
             if find_spec("highway_env") is None:
                 raise ValueError(f"backend=reference needs {REFERENCE}: pip install 'cavbench[reference]'")
             object.__setattr__(self, "libraries", (REFERENCE,))
+            # The oracle copies the state of our engine.
+            object.__setattr__(self, "drivers", ("agent", "idm"))
         self.config((AXES.cell(lanes=3, density=1.0),))
 
     @property

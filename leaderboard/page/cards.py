@@ -6,16 +6,19 @@ import json
 import re
 import shlex
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from bench.plugins import registry
+from bench.plugins.registry import KINDS, Kind
+from bench.plugins.sources import summary
 from leaderboard.comparisons.comparison import THREAT, Comparison, parameters
 from leaderboard.comparisons.reading import codes_of
 
-KINDS = ("attack", "defense", "victim", "world")
 PLAIN = re.compile(r"[\w./+-]+")
 
 
@@ -35,6 +38,7 @@ def card(one: Comparison, folder: Path | None) -> dict[str, object]:
         "components": {
             kind: {"name": identity[kind], "params": parameters(identity[f"{kind}_params"])} for kind in KINDS
         },
+        "about": {kind: about(kind, str(identity[kind])) for kind in KINDS},
         "shipped_by": {kind: _values(records, f"{kind}_shipped_by") for kind in KINDS},
         "grid": _values(records, "grid"),
         "training_seeds": list(one.own.runs),
@@ -52,6 +56,16 @@ def card(one: Comparison, folder: Path | None) -> dict[str, object]:
         "replay": replay_command(one, pair, folder),
         "recording": _recording(pair, folder),
     }
+
+
+@cache
+def about(kind: Kind, name: str) -> str:
+    """What a component is, with the paper that its author names, and where its code is; empty if it is not installed."""
+    claims = registry.entries(registry.GROUPS[kind]).get(name.partition(":")[0], ())
+    if len(claims) != 1:
+        return ""
+    said = summary(claims[0].target)
+    return f"{said}. Code: {claims[0].target}" if said else f"Code: {claims[0].target}"
 
 
 def run_command(one: Comparison) -> str:

@@ -9,6 +9,7 @@ from importlib import metadata
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -41,13 +42,16 @@ def schema() -> dict[str, Any]:
     return dict(json.loads(text))
 
 
-def document(boards: Sequence[Board], comparisons: Sequence[Comparison], folder: Path | None) -> dict[str, Any]:
+def document(
+    boards: Sequence[Board], comparisons: Sequence[Comparison], folder: Path | None, link: str = ""
+) -> dict[str, Any]:
     """Everything that leaderboards say, as JSON values.
 
     Args:
         boards: the leaderboards.
         comparisons: all that was driven.
         folder: the results folder; None where records are published.
+        link: the beginning of a link from the page to the results folder.
     """
     everything = [*comparisons, *_controls(comparisons)]
     called = {kind: labels(everything, kind) for kind in ("attack", "defense", "victim")}
@@ -58,7 +62,7 @@ def document(boards: Sequence[Board], comparisons: Sequence[Comparison], folder:
         "cavbench": metadata.version("cavbench"),
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "tracks": {name: _track(track) for name, track in tracks.items()},
-        "boards": [_board(board, keys, called) for board in boards],
+        "boards": [_board(board, keys, called, folder, link) for board in boards],
         "pairs": [_pair(one, keys[id(one)], called, folder) for one in everything],
         "curves": [
             _curve(found, kind, aligned, keys)
@@ -128,7 +132,23 @@ def _curve(curve: Curve, kind: str, aligned: Aligned, keys: Mapping[int, int]) -
     }
 
 
-def _board(board: Board, keys: Mapping[int, int], called: Labels) -> dict[str, Any]:
+def clip(row: Row, board: Board, folder: Path | None, link: str) -> str | None:
+    """The film of a row, as a link from the page: `clips/NORM-BUDGET-DEFENCE+VICTIM.webp` in the results folder; None for none.
+
+    Published records have theirs beside the published page.
+    """
+    norm, budget, *_ = board.threat
+    name = f"clips/{norm}-{budget:g}-{row.identity['defense']}+{row.identity['victim']}.webp"
+    home = folder or Path(str(files("leaderboard")))
+    first = board.rows.index(next(one for one in board.rows if _plain_name(one) == _plain_name(row)))
+    return link + quote(name, safe="/+") if (home / name).is_file() and board.rows[first] is row else None
+
+
+def _plain_name(row: Row) -> tuple[object, object]:
+    return row.identity["defense"], row.identity["victim"]
+
+
+def _board(board: Board, keys: Mapping[int, int], called: Labels, folder: Path | None, link: str) -> dict[str, Any]:
     first = board.rows[0].attacks[0]
     cells = {cell for row in board.rows for cell in row.worst.cells}
     norm, budget, *_ = board.threat
@@ -139,7 +159,7 @@ def _board(board: Board, keys: Mapping[int, int], called: Labels) -> dict[str, A
         "grid": board.grid,
         "threat": {**_threat(board.threat), "allowed": allowed},
         "axes": _axes(first.axes, cells),
-        "rows": [_row(row, keys, called) for row in board.rows],
+        "rows": [{**_row(row, keys, called), "clip": clip(row, board, folder, link)} for row in board.rows],
         "baselines": [
             {
                 "name": name,

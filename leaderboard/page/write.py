@@ -10,7 +10,7 @@ from importlib.resources import files
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 import jinja2
 import pyarrow as pa
@@ -55,7 +55,7 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         records = _read(out)
         thesis = beside.submit(chapters.chapters, chapters.needed(records))
         boards, comparisons = read_boards(records)
-        made = document(boards, comparisons, out)
+        made = document(boards, comparisons, out, _link(out, page))
         texts = {
             _files(page)[0]: json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
             _files(page)[1]: table(made),
@@ -65,11 +65,25 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         for path, text in texts.items():
             with whole(path) as file:
                 file.write(text.encode())
+        if out is None:
+            _copy_films(made, page.parent)
     except OSError as error:
         raise UserError(f"the page {page} cannot be written: {error.strerror}") from error
     print_boards(boards, console)
     for path in sorted(texts):
         console.print(Text(f" {path} ({path.stat().st_size / 1e6:.2f} MB)"), soft_wrap=True)
+
+
+def _copy_films(made: Mapping[str, Any], folder: Path) -> None:
+    """Put the published films where the page expects them: beside it."""
+    names = {row["clip"] for board in made["boards"] for row in board["rows"] if row["clip"]}
+    for name in sorted(map(unquote, names)):
+        film, target = (files("leaderboard") / name).read_bytes(), folder / name
+        if target.exists() and target.read_bytes() == film:
+            continue
+        target.parent.mkdir(exist_ok=True)
+        with whole(target) as file:
+            file.write(film)
 
 
 def _files(page: Path) -> tuple[Path, Path, Path]:

@@ -29,15 +29,17 @@ def measure_columns(
         value: makes what a column of a measure shows.
     """
     first = comparisons[0]
+    crowded = table == "overview" and any(len(one.cells) > 1 for one in comparisons)
     attacked = any(one.is_attacked for one in comparisons)
     return [
         Column(
             _heading(measure, table).format_map(first.facts),
             value(measure),
             "left" if measure.with_interval and table == "overview" else "right",
-            spare=measure.spare,
+            # The overview's worst cell is worth more than any measure but the rate of failure.
+            spare=measure.spare or int(crowded and measure.column != first.track.failure),
         )
-        for measure in first.track.measures
+        for measure in sorted(first.track.measures, key=lambda one: crowded and one.column != first.track.failure)
         if measure.tables in (table, "both") and (attacked or not measure.of_attack)
     ]
 

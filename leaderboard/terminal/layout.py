@@ -48,8 +48,17 @@ class Section(Generic[Subject]):
     title: Text | None = None
 
 
-def fitted(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], console: Console) -> Table:
-    """The table with as many of the columns as the console has room for, and a space between them where there is room."""
+def fitted(
+    columns: Sequence[Column[Subject]], sections: Sequence[Section[Subject]], console: Console, *, apart: bool = True
+) -> Table:
+    """The table with as many of the columns as the console has room for, and a space between them where there is room.
+
+    Args:
+        columns: from left to right.
+        sections: from top to bottom.
+        console: where the table is printed.
+        apart: whether there is an empty line between the sections.
+    """
     room = console.width - 2
     rows = [
         [[_text(column.value(subject)) for column in columns] for subject in section.subjects] for section in sections
@@ -59,7 +68,7 @@ def fitted(columns: Sequence[Column[Subject]], sections: Sequence[Section[Subjec
     for names, limit, gap in product((None, console.width // 3), limits, (1, 0)):
         kept = [place for place, column in enumerate(columns) if column.spare <= limit]
         texts = [[[row[place] for place in kept] for row in section] for section in rows]
-        made = _table([columns[place] for place in kept], list(zip(titles, texts, strict=True)), gap, names)
+        made = _table([columns[place] for place in kept], list(zip(titles, texts, strict=True)), gap, names, apart)
         if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= room:
             break
     return made
@@ -70,6 +79,7 @@ def _table(
     sections: Sequence[tuple[Text | None, Sequence[Sequence[Text]]]],
     gap: int,
     names: int | None,
+    apart: bool,
 ) -> Table:
     """With `gap` characters between the columns; names that fold are at most `names` wide."""
     made = Table(box=box.SIMPLE_HEAD, header_style="dim", padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
@@ -87,7 +97,8 @@ def _table(
             made.add_row(title)
         for row in rows:
             made.add_row(*row)
-        made.add_section()
+        if apart:
+            made.add_section()
     return made
 
 

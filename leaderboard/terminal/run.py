@@ -1,8 +1,8 @@
-"""`bench run`'s report: the overview of all comparisons, then each cell by cell, with its threat model."""
+"""The reports of a run: the overview of all comparisons, on one screen; and each cell by cell, with its threat model."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -13,19 +13,21 @@ from rich.text import Text
 
 from bench.plugins.track import Track, track
 from bench.statistics.episodes import step_mean
-from leaderboard.comparisons.comparison import Comparison
-from leaderboard.comparisons.naming import component, defended
+from leaderboard.comparisons.comparison import THREAT, Comparison
+from leaderboard.comparisons.naming import component, defended, varying
 from leaderboard.comparisons.reading import read_comparisons
 from leaderboard.terminal.cells import cell_by_cell
 from leaderboard.terminal.overview import overview
-from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MARKS, counted, size, threat
+from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MARKS, counted, of_frames, size, threat
 
+SCREEN, AROUND, NOTES = 24, 7, 2
+"""Lines of a terminal; those for the title, the headings, the gap, the folder and the prompt; and how many notes are shown."""
 OUTSIDE = 1e-5
 """How far outside its set an attack may answer before a note says so: rounding."""
 
 
 def run_report(records: Mapping[str, pa.Table], console: Console) -> None:
-    """Print what the records of a run say.
+    """Print what the records of a run say, in `SCREEN` lines where the pairs are few.
 
     Args:
         records: by track (`bench.records.schema`), clean controls and baselines among them.
@@ -33,14 +35,70 @@ def run_report(records: Mapping[str, pa.Table], console: Console) -> None:
     """
     for name, table in records.items():
         comparisons = read_comparisons(table, track(name))
-        console.print(Padding(Text(size(comparisons), style="bold"), (1, 1)))
-        console.print(Padding(overview(comparisons, console), (0, 1)))
+        below = list(_below(comparisons))
+        taken = sum(len(line.wrap(console, console.width - 2)) for line in below)
+        console.print(Padding(Text(size(comparisons), style="bold"), (0, 1)))
+        console.print(Padding(overview(comparisons, console, SCREEN - AROUND - taken), (0, 1)))
+        console.print()
+        for line in below:
+            console.print(Padding(line, (0, 1)))
+
+
+def cells_report(records: Mapping[str, pa.Table], console: Console) -> None:
+    """Print every comparison cell by cell, with all parameters, its threat model and what the numbers mean.
+
+    Args:
+        records: as of `run_report`.
+        console: likewise.
+    """
+    for name, table in records.items():
+        comparisons = read_comparisons(table, track(name))
         only_baselines = all(one.is_baseline for one in comparisons)
         for one in comparisons:
             if only_baselines or not one.is_baseline:
                 console.print(Padding(heading(one), (1, 1)))
                 console.print(Padding(cell_by_cell(one, console), (0, 1)))
         console.print(Padding(legend(track(name)), (1, 1)))
+
+
+def _below(comparisons: Sequence[Comparison]) -> Iterator[Text]:
+    """The lines below the overview: marks, threat model, notes, and where to read more."""
+    own = [one for one in comparisons if one.is_attacked and not one.is_baseline]
+    contrast = comparisons[0].track.contrast
+    if any(one.lead for one in own) and contrast and contrast.side == "victim":
+        yield marks(contrast.title)
+    threats = list(dict.fromkeys(_short_threat(one) for one in own))
+    if len(threats) == 1:
+        yield Text(threats[0], style="dim")
+    notes: dict[str, list[str]] = {}
+    shown = {kind: varying(comparisons, kind) for kind in ("attack", "defense", "victim")}
+    for one in comparisons:
+        for remark in _doubts(one):
+            attack = f"{component(one, 'attack', shown['attack'])} on " if one.is_attacked else ""
+            notes.setdefault(remark, []).append(f"{attack}{defended(one, shown)}")
+    for remark, about in list(notes.items())[:NOTES]:
+        others = f" and {len(about) - 1} more" if len(about) > 1 else ""
+        yield Text(f"{about[0]}{others}: {remark}", style="yellow")
+    if len(notes) > NOTES:
+        yield Text(f"{counted(len(notes) - NOTES, 'more note')}: --cells", style="yellow")
+    yield Text("--cells shows every cell and parameter; `bench help TERM` explains a column.", style="dim")
+
+
+def _short_threat(one: Comparison) -> str:
+    norm, budget, access, queries, share = (one.identity[name] for name in THREAT)
+    return f"threat: {norm} {budget:g}, access {access}, {queries} {one.track.queries_title}{of_frames(share)}"
+
+
+def marks(baseline: str) -> Text:
+    """What the marks of a comparison with a baseline mean."""
+    text = Text(style="dim")
+    for mark, style, meaning in (
+        ("✓", "green", f"better than {baseline}"),
+        ("≈", "yellow", "no significant difference"),
+        ("✗", "bold red", "not better"),
+    ):
+        text.append(f"{mark} ", style=f"not dim {style}").append(f"{meaning}  ")
+    return text
 
 
 def heading(one: Comparison) -> Table:
@@ -59,6 +117,16 @@ def heading(one: Comparison) -> Table:
 
 def remarks(one: Comparison) -> list[str]:
     """What a reader must know before trusting the numbers of a comparison."""
+    contrast, found = one.track.contrast, _doubts(one)
+    if contrast and contrast.side == "victim" and one.is_attacked and not one.is_baseline:
+        below = [cell for cell in one.cells if (lead := one.only(cells=[cell]).lead) and lead.estimate <= 0]
+        if below:
+            found.append(f"no better than {contrast.title} in {len(below)} of {len(one.cells)} cells (✗)")
+    return found
+
+
+def _doubts(one: Comparison) -> list[str]:
+    """The remarks that no column of the overview makes."""
     found = list(_of_the_attack(one)) if one.is_attacked else []
     left_out = sum(episodes.left_out for episodes in (one.own, one.clean if one.is_attacked else None) if episodes)
     if left_out:
@@ -76,13 +144,9 @@ def _of_the_attack(one: Comparison) -> Iterator[str]:
     if one.clean is None:
         yield "the clean control was not driven on these scenarios"
     contrast = track.contrast
-    if contrast is None or one.is_baseline:
+    if contrast is None or one.is_baseline or contrast.side == "victim":
         return
-    if contrast.side == "victim":
-        below = [cell for cell in one.cells if (lead := one.only(cells=[cell]).lead) and lead.estimate <= 0]
-        if below:
-            yield f"no better than {contrast.title} in {len(below)} of {len(one.cells)} cells (✗)"
-    elif one.lead is None:
+    if one.lead is None:
         yield "compared with no baseline attack, which knows nothing of the victim: part of the drop may be its effect"
     elif one.lead.high >= 0:
         yield f"does not lower the score more than {track.baseline_kinds[one.rival].title}, which knows nothing of the victim"
@@ -92,18 +156,12 @@ def legend(track: Track) -> Text:
     """What the marks and the numbers mean."""
     text = Text(style="dim")
     contrast = track.contrast
-    marks = [(CLEAN, "no attack"), (ATTACKED, "attacked")]
-    marks += [(BASELINE, contrast.title)] if contrast else []
-    for colour, meaning in marks:
+    dots = [(CLEAN, "no attack"), (ATTACKED, "attacked")]
+    dots += [(BASELINE, contrast.title)] if contrast else []
+    for colour, meaning in dots:
         text.append(f"{MARKS[colour]} ", style=f"not dim {colour}").append(f"{meaning}   ")
     if contrast and contrast.side == "victim":
-        text.append("\n")
-        for mark, style, meaning in (
-            ("✓", "green", f"better than {contrast.title} of the cell"),
-            ("≈", "yellow", "no significant difference"),
-            ("✗", "bold red", "not better: its input is worth nothing"),
-        ):
-            text.append(f"{mark} ", style=f"not dim {style}").append(f"{meaning}   ")
+        text.append("\n").append_text(marks(contrast.title))
     scores = (
         f"Scores: mean over {track.run}s, cells and {track.episode[1]}, with the 95 % interval for other {track.run}s and other "
         f"{track.episode[1]}. Attacked, clean and baselines have the same {track.episode[1]}."

@@ -57,6 +57,34 @@ def test_the_patch_depends_on_the_seed_only() -> None:
     assert not torch.equal(first, other)
 
 
+def test_log_odds_lead_to_the_optimum_too() -> None:
+    plain, odds = (
+        crafted(EOT(texels=8, steps=30, batch=4, window=32, loss=loss))[0] for loss in ("probability", "log_odds")
+    )
+    assert red(odds) <= red(plain) + 0.05
+
+
+def test_log_odds_keep_the_gradient_where_the_detector_is_sure() -> None:
+    scores = torch.tensor([0.9999, 0.5], requires_grad=True)
+    (gradient,) = torch.autograd.grad(EOT(loss="log_odds")._of(scores), scores)
+    assert gradient[0] > 1000 * gradient[1]
+
+
+def test_of_several_starts_the_best_is_kept() -> None:
+    """The first start of three is the only start of one: with more starts, the patch hides the sign at least as well."""
+    several, oracle = crafted(EOT(texels=8, steps=4, batch=4, window=32, restarts=3))
+    assert oracle.spent == 3 * 4 * 4
+    single = crafted(EOT(texels=8, steps=4, batch=4, window=32))[0]
+    assert red(several) <= red(single) + 0.02
+
+
+def test_a_start_without_the_queries_for_it_is_not_kept() -> None:
+    attack = EOT(texels=8, steps=10, batch=4, window=32, restarts=2)
+    patch, oracle = crafted(attack, queries=60)
+    assert oracle.spent == 60
+    assert torch.equal(patch, crafted(EOT(texels=8, steps=10, batch=4, window=32))[0])
+
+
 def test_it_reports_its_losses_without_changing_the_patch(monkeypatch: pytest.MonkeyPatch) -> None:
     attack = EOT(texels=8, steps=6, batch=2, window=32)
     patch, oracle = crafted(attack)

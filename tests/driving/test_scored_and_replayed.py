@@ -37,7 +37,7 @@ class Warned:
     def working(self, works: Sequence[Unit | Preparation]) -> None:
         pass
 
-    def preparing(self, work: str, share: float, text: str) -> None:
+    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
         pass
 
     def finished(self, work: Unit | Preparation, wall_s: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ import torch
 from rich.console import Console
 
 from bench.cli.listing import print_component
+from bench.cli.train import train
+from bench.driving.drive import drive
 from bench.errors import UserError
 from bench.plugins.options import configured
 from bench.plugins.pair import choose
@@ -16,6 +19,7 @@ from bench.records import reading
 from bench.run.config import run_config
 from bench.run.plan import plan
 from bench.run.runner import run
+from bench.victims.drivers.dqn import DQN
 from bench.victims.drivers.networks import QPolicy
 from defenses.shield import Shielded
 from defenses.tracker import Tracked
@@ -100,3 +104,47 @@ def test_a_chain_is_recorded_and_its_code_counts(tmp_path: Path) -> None:
 
 def test_a_policy_that_promises_nothing_has_no_share_of_assured_frames() -> None:
     assert choose("victim", "dqn").component.load(0, FACTS).assured(torch.zeros(1, 10, 5), None) is None
+
+
+SMALL = ("decisions=16", "copies=1", "hidden=8", "batch=16", "memory=2000", "checkpoints=1")
+SHORT = ["world.max_steps=20", *(f"victim.{word}" for word in SMALL)]
+
+
+def test_a_driver_is_trained_behind_a_chain_and_drives_behind_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`bench train defense=CHAIN` says which command uses the result; its weights are another driver's."""
+    monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
+    monkeypatch.setattr(DQN, "selection_episodes", 3)
+    parameters = ["victim.behind_decisions=48", "defense.shield.band=3", "defense.tracker.assumed_budget=0.08"]
+
+    def trained(*words: str) -> list[str]:
+        console = Console(width=400, record=True)
+        train(["victim=dqn", *SHORT, *words], console)
+        return shlex.split(console.export_text().partition("To use it: ")[2])[2:]
+
+    plain, world = trained(), "victim.trained_in=max_steps=20"
+    behind = trained("defense=tracker+shield", *parameters)
+    hardened = trained("defense=advtrain+tracker+shield", "defense.advtrain.decisions=48", world, *parameters)
+    units = [plan(run_config([*WORDS[1:], "world.max_steps=20", *used]))[0] for used in (plain, behind, hardened)]
+    assert len({unit.weights_sha256 for unit in units}) == 3
+    assert 'victim.behind="tracker+shield tracker.assumed_budget=0.08 shield.band=3.0"' in behind
+    assert {"defense=advtrain+tracker+shield", "defense.shield.band=3.0"} <= set(hardened)
+    columns = drive(units[1].job, ()).columns
+    assert (columns["assured"] >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["defense=frame_stack"], "does not say what it passes on"),
+        (["victim.behind=shield", "defense=tracker+shield"], "leave it out"),
+        (["victim.behind=advtrain"], "trains its victim"),
+        (["victim.behind=nosuch"], "nosuch"),
+        (["victim.behind=jpeg"], "another track"),
+    ],
+)
+def test_what_nobody_can_be_trained_behind_is_refused_in_one_line(words: list[str], said: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=said) as refused:
+        train(["victim=dqn", *words, f"out={tmp_path}"], Console(quiet=True))
+    assert "\n" not in str(refused.value)

@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import fields
+from io import StringIO
 
 import pytest
+from rich.console import Console
 
 import bench as package
+from bench.cli.explain import heading_of, print_term
+from bench.cli.options_help import THREAT, settings
+from bench.cli.progress import RunProgress
+from bench.detection.threat import PatchThreat
+from bench.driving.threat import ObservationThreat
 from bench.plugins.registry import GROUPS, KINDS, entries
+from bench.plugins.track import tracks
+from bench.run.options import RunOptions
 from tests.framework.conftest import Said
 
 Bench = Callable[..., Said]
@@ -99,3 +110,62 @@ def test_the_shell_completes_options(words: str, place: int, found: set[str]) ->
         [sys.executable, "-c", COMMAND], env=os.environ | asked, capture_output=True, text=True, check=False
     )
     assert set(said.stdout.split()) == found, said.stderr
+
+
+def test_every_column_of_the_tables_is_explained() -> None:
+    for one in tracks():
+        for measure in one.measures:
+            console = Console(file=StringIO(), width=300)
+            print_term(heading_of(measure), console)
+            assert console.file.getvalue()  # type: ignore[attr-defined]
+    for heading in ("kept", "worst cell", "strongest per cell", "against best blind", "best blind", "[95 %]"):
+        print_term(heading, Console(quiet=True))
+
+
+def test_help_names_every_option_with_the_default_that_it_has() -> None:
+    shown = {name: default for name, default, _ in settings(RunOptions)}
+    defaults = RunOptions()
+    assert set(shown) - {"ray.address"} == {item.name for item in fields(RunOptions)} - {"ray"}
+    for name in ("executor", "out", "reference", "shard", "unit_timeout"):
+        assert shown[name] == str(getattr(defaults, name)).lower()
+    for name, (text, _) in THREAT.items():
+        driving, _, detection = text.partition("; ")
+        for threat, default in ((ObservationThreat(), driving), (PatchThreat(), detection or driving)):
+            if hasattr(threat, name):
+                assert default == f"{value:g}" if isinstance(value := getattr(threat, name), float) else str(value)
+
+
+def test_an_unknown_name_is_refused_before_torch_is_imported() -> None:
+    command = (
+        "import sys; sys.argv = ['bench', 'run', 'attack=zzo']; from cavbench import main\n"
+        "try:\n    main()\nfinally:\n    print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "False\n")
+    assert "unknown attack 'zzo'; did you mean 'zo'?" in done.stderr
+
+
+def test_the_bar_moves_within_a_unit_and_never_back() -> None:
+    progress = RunProgress(Console(file=StringIO(), force_terminal=True, width=80))
+    progress.begin(episodes=100, finished=10)
+    (task,) = progress.bar.tasks
+    for share, expected in ((0.25, 20), (0.5, 30), (0.1, 30)):
+        progress.preparing("a unit", share, "", 40)
+        assert task.completed == expected
+
+
+def test_a_narrow_bar_keeps_its_count_and_eta() -> None:
+    out = StringIO()
+    console = Console(file=out, force_terminal=True, width=80)
+    with RunProgress(console) as progress:
+        progress.begin(episodes=12345, finished=0)
+        progress.bar.update(progress.task, completed=77, description="a very long name of a unit " * 5)
+        progress.bar.refresh()
+    line = next(
+        line
+        for line in re.split(r"[\r\n]", re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", out.getvalue()))
+        if "77/12345" in line
+    )
+    assert len(line) <= 80
+    assert "ETA" in line
+    assert "━" in line

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from importlib import metadata
 from pathlib import Path
 
 import pytest
 
+from bench.cli.explain import GLOSSARY
 from bench.plugins.registry import GROUPS, KINDS, Kind, entries
 
 ROOT = Path(__file__).parents[2]
@@ -71,3 +73,13 @@ def test_the_site_reads_the_code_and_refuses_unknown_names(tmp_path: Path) -> No
     complaints = warned.read_text()
     assert "unknown attack 'nois'; did you mean 'noise'?" in complaints
     assert r'Unknown LaTeX command "\nosuchcommand"' in complaints
+
+
+def test_the_glossary_is_that_of_bench_help() -> None:
+    terms = tomllib.loads(GLOSSARY.read_text(encoding="utf-8"))
+    rows = re.findall(r"^\| (.+?) \| (.+) \[More\]\((.+)\.md\) \|$", (DOCS / "glossary.md").read_text(), re.M)
+    assert {name: (meaning.replace("&lt;", "<"), page) for name, meaning, page in rows} == {
+        name: (entry["meaning"], entry["page"]) for name, entry in terms.items()
+    }
+    for entry in terms.values():
+        assert (DOCS / f"{entry['page']}.md").is_file()

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 
 from bench.errors import UnfinishedError, UserError
-from bench.plugins import registry
+from bench.plugins import progress, registry
 from bench.plugins.track import track
 from bench.records import reading
 from bench.records.schema import PROBES
@@ -35,6 +35,7 @@ class Silent:
     def __init__(self, stop_after: int | None = None) -> None:
         self.done: list[Work] = []
         self.told: list[tuple[str, float, str]] = []
+        self.shares: list[tuple[float, int]] = []
         self.warnings: list[str] = []
         self.failures: list[str] = []
         self.said: list[str] = []
@@ -47,8 +48,11 @@ class Silent:
         if len(self.done) == self.stop_after:
             raise KeyboardInterrupt
 
-    def preparing(self, work: str, share: float, text: str) -> None:
-        self.told.append((work, share, text))
+    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
+        if episodes:
+            self.shares.append((share, episodes))
+        else:
+            self.told.append((work, share, text))
 
     def finished(self, work: Work, wall_s: float) -> None:
         self.done.append(work)
@@ -72,6 +76,15 @@ def run(out: Path, *more: str, line: str = SMALL, watcher: Silent | None = None)
 
 def comparable(records: pa.Table) -> pa.Table:
     return records.drop_columns(list(BESIDE))
+
+
+def test_a_unit_says_how_far_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "EVERY_S", 0.0)
+    _, watcher = run(tmp_path, "lanes=3", "weather=clear", "seeds=0", "reference=false")
+    shares = [share for share, _ in watcher.shares]
+    assert shares
+    assert 0 <= min(shares) < max(shares) < 1
+    assert {episodes for _, episodes in watcher.shares} == {4}
 
 
 def test_a_run_has_the_pair_its_clean_control_and_the_reference_drivers(tmp_path: Path) -> None:

@@ -31,6 +31,14 @@ def test_a_suite_expands_to_the_members_meant_for_the_victim(victim: str, action
     assert not config.skipped
 
 
+def test_each_track_has_its_standard() -> None:
+    config = run_config(["attack=standard", "victim=yolov5", "weather=clear", "lanes=3", "density=1", "seeds=0"])
+    assert [pair.attack for pair in config.pairs] == [
+        one.chosen for one in suites.suite("standard-detection-1").members
+    ]
+    assert {pair.threat.access for pair in config.pairs} == {"gradients"}
+
+
 def test_a_member_is_the_pair_that_its_own_options_make() -> None:
     words = ["attack=pgd", "attack.objective=target", "attack.target_action=4", "threat.access=dynamics", *SMALL]
     (alone,) = run_config(words).pairs
@@ -57,7 +65,7 @@ def test_what_cannot_be_is_refused_in_one_line() -> None:
     with pytest.raises(UserError, match=r"suite standard-1 have fixed parameters, got attack\.steps"):
         run_config(["attack=standard", "attack.steps=3", *SMALL])
     with pytest.raises(UserError, match="suite 'standard-1' is for the driving track; suites for the detection track"):
-        run_config(["attack=standard", "victim=yolov5"])
+        run_config(["attack=standard-1", "victim=yolov5"])
 
 
 def test_a_file_that_is_no_suite_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -52,8 +52,9 @@ def test_a_run_is_driven_recorded_reported_and_resumed(bench: Bench, tmp_path: P
     said = bench(*RUN, f"out={out}")
     assert said.code == 0, said.err
     assert "tones heard" in said.out
-    assert "highest" in said.out
-    assert "pitch" in said.out
+    shown = bench("show", str(out), "--cells").out
+    assert "highest" in shown
+    assert "pitch" in shown
     files = sorted(out.glob("episodes/*.parquet"))
     assert len(files) == 4
     records = pq.read_table(files[0])
@@ -77,7 +78,7 @@ def test_its_axes_are_keys_of_the_command_line(bench: Bench, tmp_path: Path) -> 
     assert refused.err.startswith("error: unknown axis 'lanes' of the world; ")
     assert refused.err.endswith("known: pitch, tones\n")
     assert "pitch must be a number above 0, got -1" in bench(*RUN, "pitch=-1", f"out={tmp_path / 'results'}").err
-    assert "pitch (of the lower tone)" in " ".join(bench("run", "--help").out.split())
+    assert "pitch a number above 0 of the lower tone" in " ".join(bench("run", "--help").out.split())
 
 
 def test_its_records_are_shown_on_the_page(bench: Bench, tmp_path: Path) -> None:

@@ -15,7 +15,10 @@ import pyarrow.compute as pc
 import pytest
 from full_house import driving
 from synthetic import CLEAR, drive
+from typer.main import get_command
 
+from bench.cli.main import app
+from bench.cli.words import split
 from bench.errors import UserError
 from bench.plugins.track import tracks
 from bench.records import reading
@@ -105,6 +108,14 @@ def test_every_published_run_command_makes_the_same_pair_on_the_same_scenarios()
             assert (chosen.name, same) == (component["name"], component["params"]), card["run"]
         assert {name: found.threat.columns[f"threat_{name}"] for name in pair["threat"]} == pair["threat"]
         assert list(config.seeds) == card["training_seeds"]
+        verb, *words = shlex.split(card["replay"])[1:]
+        options = get_command(app).commands[verb].make_context("view", words).params
+        names, where = split(options["words"], (), names=1)
+        assert names == [card["pair"]]
+        first = pair["cells"][0]["cell"]
+        assert {name: where[name] for name in first} == {
+            name: f"{value:g}" if isinstance(value, float) else str(value) for name, value in first.items()
+        }
         assert {cell for one in pair["cells"] for cell in [Cell(**one["cell"])]} <= set(config.grid.cells())
 
 

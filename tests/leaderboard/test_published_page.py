@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -25,6 +26,14 @@ def remade(tmp_path_factory: pytest.TempPathFactory) -> Path:
     page = tmp_path_factory.mktemp("remade") / "index.html"
     write(None, page, Console(quiet=True))
     return page
+
+
+def test_the_films_of_the_published_rows_lie_beside_the_page(remade: Path) -> None:
+    made = json.loads(remade.with_suffix(".json").read_text())
+    clips = {row["clip"] for board in made["boards"] for row in board["rows"] if row["clip"]}
+    assert len(clips) >= 4
+    for clip in clips:
+        assert 10_000 < (remade.parent / clip).stat().st_size < 300_000
 
 
 def test_without_records_the_leaderboard_on_the_terminal_is_the_published_one() -> None:

@@ -22,7 +22,8 @@ from bench.tracks.driving import BEST_BLIND
 from envs.highway.axes import STANDARD_V1
 from leaderboard.comparisons.comparison import Comparison
 from leaderboard.comparisons.reading import read_comparisons
-from leaderboard.terminal.run import remarks, run_report
+from leaderboard.ranking.boards import read_boards
+from leaderboard.terminal.run import SCREEN, cells_report, remarks, run_report
 from leaderboard.terminal.text import CLEAN, estimate, strip, threat
 
 SCHEMA = schema(track("driving"))
@@ -30,8 +31,19 @@ ZO = {"objective": "expected", "steps": 50}
 
 
 def printed(records: pa.Table, width: int = 120) -> str:
+    """The overview, then cell by cell."""
+    return overview(records, width) + cells(records, width)
+
+
+def overview(records: pa.Table, width: int = 120) -> str:
     out = io.StringIO()
     run_report({"driving": records}, Console(file=out, width=width))
+    return out.getvalue()
+
+
+def cells(records: pa.Table, width: int = 120) -> str:
+    out = io.StringIO()
+    cells_report({"driving": records}, Console(file=out, width=width))
     return out.getvalue()
 
 
@@ -52,7 +64,7 @@ def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut_off(width: int)
 
 
 def test_every_cell_has_a_row_grouped_by_weather() -> None:
-    rows = [line.strip() for line in printed(one_pair()).splitlines()]
+    rows = [line.strip() for line in cells(one_pair()).splitlines()]
     for weather in ("clear", "rain", "fog"):
         place = next(i for i, row in enumerate(rows) if row.startswith(weather))
         assert [row[:5] for row in rows[place + 1 : place + 7]] == [
@@ -66,7 +78,7 @@ def test_every_cell_has_a_row_grouped_by_weather() -> None:
 
 
 def test_the_threat_model_and_the_attacks_parameters_are_stated() -> None:
-    text = " ".join(printed(one_pair()).split())
+    text = " ".join(cells(one_pair()).split())
     assert "zo objective=expected steps=50" in text
     assert "relative 0.1: each measured value may be off by 10 % of itself" in text
     assert "at most 1000 queries a step" in text
@@ -120,10 +132,10 @@ def test_a_sweep_has_one_row_a_pair_the_strongest_attack_first() -> None:
     assert [(pair.identity["defense"], pair.identity["attack"]) for pair in pairs] == [
         ("none", "zo"), ("none", "zo"), ("none", "noise"), ("advtrain", "zo"),
     ]  # fmt: skip
-    overview = printed(records).split("victim ")[0]
-    assert overview.index("zo steps=50") < overview.index("zo steps=10") < overview.index("noise")
-    assert overview.index("noise") < overview.index("dqn + advtrain")
-    assert "objective" not in overview
+    text = overview(records)
+    assert text.index("zo steps=50") < text.index("zo steps=10") < text.index("noise")
+    assert text.index("noise") < text.index("dqn + advtrain")
+    assert "objective" not in text
 
 
 def test_attacked_and_clean_are_measured_on_the_same_scenarios() -> None:
@@ -156,7 +168,7 @@ def test_the_newest_record_of_a_scenario_counts() -> None:
 
 
 def test_clean_runs_and_baseline_drivers_alone_can_be_reported() -> None:
-    assert "queries" not in printed(pa.concat_tables([drive(), baseline_drivers()])).split("safe progress: 0")[0]
+    assert "queries" not in overview(pa.concat_tables([drive(), baseline_drivers()]))
     assert "idm" in printed(drive("idm", runs=(0,), cells=CLEAR, sees=False))
 
 
@@ -175,5 +187,29 @@ def test_numbers_are_written_short_and_strips_to_scale() -> None:
 
 def test_brackets_in_parameters_are_printed_as_they_are() -> None:
     sweep = [drive(attack="zo", attack_params={"speeds": speeds}, skill=0.2) for speeds in (["bold"], ["red"])]
-    text = printed(pa.concat_tables([drive(), *sweep]))
-    assert "zo speeds=['bold']" in text.split("victim ")[0]
+    assert "zo speeds=['bold']" in overview(pa.concat_tables([drive(), *sweep]))
+
+
+@pytest.mark.parametrize("attacks", [1, 3, 16])
+def test_a_run_is_told_on_one_screen_of_80_by_24(attacks: int) -> None:
+    records = [drive(), drive(defense="advtrain"), baseline_drivers()]
+    for steps in range(1, attacks + 1):
+        for defense in ("none", "advtrain"):
+            own = {"attack": "zo", "attack_params": {"steps": steps}, "skill": 0.6 - 0.03 * steps, "cells": CLEAR}
+            records.append(drive(defense=defense, **own))  # type: ignore[arg-type]
+    lines = overview(pa.concat_tables(records), 80).splitlines()
+    # The command adds a line, and the prompt is one.
+    assert len(lines) + 2 <= SCREEN
+    assert max(map(len, lines)) <= 80
+    text = "\n".join(lines)
+    for word in ("worst cell", "crashed", "best blind policy", "IDM and MOBIL", f"zo steps={attacks}"[:2]):
+        assert word in text
+    assert ("weaker attacks" in text) == (attacks == 16)
+    assert ("strongest per cell" in text) == (attacks > 1)
+
+
+def test_the_headline_of_several_attacks_is_the_score_that_leaderboards_rank_by() -> None:
+    records = pa.concat_tables([one_pair(), drive(attack="noise", skill=0.3)])
+    (board, *_), _ = read_boards({"driving": records})
+    (line,) = (line for line in overview(records).splitlines() if "strongest per cell" in line)
+    assert estimate(board.rows[0].worst.score).plain in line

@@ -120,7 +120,7 @@ def test_its_tables_have_its_metric_its_measures_and_the_axes_of_its_world(
     plugin: Path, results: Path, monkeypatch: pytest.MonkeyPatch, width: int
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
-    lines = bench(plugin, "report", f"out={results}").splitlines()
+    lines = [line for name in ("run", "cells") for line in bench(plugin, "report", name, f"out={results}").splitlines()]
     text = "\n".join(lines)
     assert max(map(len, lines)) <= width
     assert "bends: 4 cells of 4 scenarios, 2 training seeds" in text
@@ -166,7 +166,7 @@ def test_another_world_of_a_known_track_brings_its_axes(tmp_path: Path, capsys: 
     """The baselines stand for every weather only where a world has weather."""
     from rich.console import Console
 
-    from leaderboard.terminal.run import run_report
+    from leaderboard.terminal.run import cells_report, run_report
 
     cells = [Cell(lanes=3, density=1.0, weather="clear")]
     made = pa.concat_tables([drive(cells=cells), drive(attack="zo", cells=cells), baseline_drivers(cells)])
@@ -175,6 +175,7 @@ def test_another_world_of_a_known_track_brings_its_axes(tmp_path: Path, capsys: 
         place = made.schema.get_field_index(name)
         made = made.set_column(place, made.schema.field(name), pa.array([value] * made.num_rows))
     run_report({"driving": made}, Console(width=120))
+    cells_report({"driving": made}, Console(width=120))
     said = capsys.readouterr().out
     assert "0.1 × 10" in said
     assert "of 50" in said

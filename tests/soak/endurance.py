@@ -7,6 +7,7 @@ from pathlib import Path
 
 import psutil
 
+from bench.records.packing import units_in
 from tests.framework.conftest import started
 from tests.soak.subjects import RUN
 
@@ -38,7 +39,7 @@ def endure(site: Path, out: Path, minutes: float) -> str:
     _, err = process.communicate()
     if ended is not None:
         return f"it ended too early, with exit code {ended}: {err.strip().splitlines()[-1:]}"
-    units = len(list(out.glob("episodes/*.parquet")))
+    units = len(set().union(*map(units_in, out.glob("episodes/*.parquet"))))
     parts = [[s for s in samples if low <= s[0] / (minutes * 60) < low + 0.2] for low in (0.2, 0.8)]
     (early, files), (late, later_files) = [
         (sum(s[1] for s in part) / max(len(part), 1), max((s[2] for s in part), default=0)) for part in parts

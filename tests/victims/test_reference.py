@@ -6,9 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.driving import DrivingFacts, Policy
+from bench.driving import DrivingFacts, ObservationThreat, Policy
+from bench.driving.meter import Columns
+from bench.driving.rollout import rollout
 from bench.errors import UserError
-from bench.victims.drivers.reference import Blind, IDMDriver, RandomDriver
+from bench.scenarios import SeedBlock
+from bench.victims.drivers.reference import Blind, IDMDriver, OracleDriver, RandomDriver
 from envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts
@@ -52,6 +55,27 @@ def test_the_blind_policies_are_those_of_the_worlds_own_actions() -> None:
     assert driven(Blind(policy="right").load(0, three), torch.zeros(1, dtype=torch.int64), 1).tolist() == [[2]]
     with pytest.raises(UserError, match="did you mean"):
         Blind(policy="lane_right").load(0, three)
+
+
+def test_perfect_information_drives_fast_and_safely_whoever_else_is_in_the_batch() -> None:
+    world = HighwayWorld(max_steps=90)
+    cells = [world.axes.cell(lanes=lanes, density=2.0, weather="clear") for lanes in (3, 4, 3)]
+    policy = OracleDriver().load(0, world.facts)
+
+    def scored(places: list[int]) -> Columns:
+        env = world.make([cells[place] for place in places], driver=policy.driver)
+        seeds = [SeedBlock.TRAIN + place for place in places]
+        return rollout(env, policy, None, ObservationThreat(budget=0.0), seeds, facts=world.facts, attack_seed=0)
+
+    together, alone = scored([0, 1, 2]), scored([1])
+    assert not together["crashed"].any()
+    assert together["safe_progress"].mean() > 0.6
+    assert together["return"][1] == alone["return"][0]
+
+
+def test_no_other_world_has_perfect_information() -> None:
+    with pytest.raises(UserError, match="perfect information"):
+        OracleDriver().load(0, HighwayWorld(backend="reference").facts)
 
 
 def test_random_actions_depend_on_the_episode_alone() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,13 +11,15 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.driving import DrivingWorld, Policy, TrainingHooks
+from bench.driving import DrivingWorld, Policy, State, TrainingHooks
 from bench.plugins import registry
 from bench.victims import zoo
+from bench.victims.drivers.attack_mix import AttackMix
+from bench.victims.drivers.behind import Guard, GuardedPractice, defense_of
 from bench.victims.drivers.ddpg import DDPG
 from bench.victims.drivers.dqn import DQN
 from bench.victims.drivers.networks import ActorPolicy, QPolicy
-from bench.victims.drivers.practice import Practice, roads
+from bench.victims.drivers.practice import ALLOWED, Practice, roads
 from bench.victims.drivers.training import LearningDriver
 from defenses.advtrain import AdversarialTraining, AttackInLoop
 
@@ -101,8 +104,8 @@ class Calm(TrainingHooks):
         torch.testing.assert_close(sample["observation"], 0.9 * sample["truth"])
         return own(sample) + 100 * policy.scores(sample["truth"]).square().mean()
 
-    def selection(self, policy: Policy) -> dict[str, Callable[[Tensor], Tensor]]:
-        return {"darker": lambda observation: 0.9 * observation}
+    def selection(self, policy: Policy) -> dict[str, Callable[[Tensor, State], Tensor]]:
+        return {"darker": lambda observation, state: 0.9 * observation}
 
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
@@ -195,3 +198,45 @@ def test_adversarial_training_trains_saves_and_loads(
     x = torch.rand(4, 10, 5)
     torch.testing.assert_close(loaded.scores(x), hardened.network.scores(x))
     assert not torch.equal(loaded.scores(x), victim.load(0, world.facts).scores(x))
+
+
+@pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
+def test_a_policy_behind_a_filter_learns_from_what_passes_it(victim: LearningDriver, world: DrivingWorld) -> None:
+    """Stored actions are allowed (or clipped when they are carried out), and a new episode begins with a fresh state."""
+    recipe = replace(victim, behind="tracker+shield")
+    policy = recipe.policy_type(**_shape(recipe))
+    hooks = AttackMix(policy, 40, world.facts, seed=0)
+    env = world.make(roads(world, 4), action_type=recipe.action_type)
+    env.set_seed(0)
+    learner = recipe.learner(env, hooks)
+    phase = recipe.phases(hooks)[0]
+    learner.enter(phase)
+    guard = Guard(defense_of(recipe.behind), recipe, world.facts)
+    practice = GuardedPractice(env, learner, phase, crash_penalty=40.0, memory=2000, batch=16, guard=guard)
+    executed = []
+    for _ in range(40):
+        before = practice.seen
+        with torch.no_grad():
+            step = practice.decide(0.0)
+        assert torch.equal(step["observation"], before["observation"])
+        action, allowed = step["action"], step[ALLOWED]
+        if recipe.action_type == "discrete":
+            assert bool(allowed.gather(1, action.unsqueeze(1)).all())
+        else:
+            executed.append((action.clamp(allowed[:, 0], allowed[:, 1]) - action).abs().max())
+        restarted = step["next", "done"].squeeze(-1)
+        assert practice.state is not None
+        assert torch.equal(practice.state["ego", "known"], ~restarted)
+    assert recipe.action_type == "discrete" or max(executed) > 0.1
+
+
+def test_another_defence_is_part_of_the_recipe() -> None:
+    plain, behind, other = DQN(), DQN(behind="shield"), DQN(behind="shield band=6")
+    keys = {zoo.Recipe.of(victim).key for victim in (plain, behind, other)}
+    assert len(keys) == 3
+    assert behind.zoo_name() == "dqn-behind-shield"
+
+
+def _shape(victim: LearningDriver) -> dict[str, object]:
+    shape: dict[str, object] = {"features": 5, "hidden": 8}
+    return shape | ({"actions": 5} if victim.action_type == "discrete" else {"steering_limit": 0.1})

@@ -135,10 +135,14 @@ class DeadReckoning:
         return ego._replace(target_lane=torch.minimum((ego.y / limits.lane_width).round().clamp(min=0), ego.edge))
 
     def _steering(self, ego: Ego) -> Tensor:
-        """ControlledVehicle.steering_control: the steering angle in rad towards the middle of the target lane."""
+        """The steering angle in rad towards the middle of the target lane."""
+        return self.steering(ego, self.kinematics.lane_width * ego.target_lane)
+
+    def steering(self, ego: Ego, place: Tensor) -> Tensor:
+        """ControlledVehicle.steering_control: the steering angle [...] in rad towards a place across the road, in m."""
         car = self.kinematics
         speed = ego.speed.clamp(min=0.01)
-        lateral = ego.y - car.lane_width * ego.target_lane
+        lateral = ego.y - place
         wanted = (-car.lateral_gain * lateral / speed).clamp(-1, 1).asin().clamp(-car.max_heading, car.max_heading)
         rate = car.heading_gain * (wanted - ego.heading)
         slip = (car.length / 2 / speed * rate).clamp(-1, 1).asin()
@@ -146,6 +150,9 @@ class DeadReckoning:
 
     def _moved(self, ego: Ego, acceleration: Tensor, steering: Tensor) -> Ego:
         """Vehicle.step: one frame of the kinematic bicycle model."""
+        # Vehicle.clip_actions
+        excess = ego.speed - self.kinematics.top_speed
+        acceleration = torch.where(excess > 0, torch.minimum(acceleration, -excess), acceleration)
         slip = (0.5 * steering.tan()).atan()
         y = ego.y + ego.speed * (ego.heading + slip).sin() * self.dt
         heading = ego.heading + ego.speed * slip.sin() / (self.kinematics.length / 2) * self.dt

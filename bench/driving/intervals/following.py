@@ -26,9 +26,18 @@ class FollowingDistance:
         period: seconds per decision.
         seconds: how long the leader brakes.
         within: seconds that count; None for all until the speeds are the same.
+        braking: the ego's own deceleration in m/s2, for continuous actions; None for repeated SLOWER.
     """
 
-    def __init__(self, kinematics: Kinematics, period: float, seconds: float, *, within: float | None = None) -> None:
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        period: float,
+        seconds: float,
+        *,
+        within: float | None = None,
+        braking: float | None = None,
+    ) -> None:
         speeds = torch.arange(0.0, FASTEST + STEP, STEP, dtype=torch.float64)
         rates = torch.arange(HARDEST + 1.0, dtype=torch.float64)
         dt = period / kinematics.frames
@@ -41,7 +50,7 @@ class FollowingDistance:
                 target = slower(own, kinematics.target_speeds)
             lost = lost + (own - other) * dt
             table = torch.maximum(table, lost)
-            change = kinematics.speed_gain * (target - own)
+            change = kinematics.speed_gain * (target - own) if braking is None else torch.full_like(own, -braking)
             own = (own + change * dt).clamp(min=0)
             if period + frame * dt < seconds - 1e-9:
                 other = (other - rate * dt).clamp(min=0)

@@ -11,6 +11,7 @@ from torch import Tensor
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import DeadReckoning, Ego
 from bench.driving.intervals.following import HARDEST, FollowingDistance
+from bench.driving.kinematics import Kinematics
 
 FREE = 200.0
 """The margin where there is no car, in m."""
@@ -78,7 +79,7 @@ class Margins(NamedTuple):
         return self.settled.unsqueeze(-1) | back
 
 
-class _Cars(NamedTuple):
+class Cars(NamedTuple):
     """The other cars, bounds in the road's frame, [..., V - 1] each: x relative to the ego, y, and the velocity."""
 
     present: Tensor
@@ -117,21 +118,19 @@ class Judge:
 
     def __call__(self, ego: Ego, boxes: Boxes) -> Margins:
         car, reckoning = self.reckoning.kinematics, self.reckoning
-        cars = _cars(ego, boxes)
-        in_lane = self._lanes(ego, cars)
+        cars = cars_of(ego, boxes)
+        in_lane = lanes_of(ego, cars, car)
         beside, ahead = in_lane[..., BESIDE], cars.ahead.unsqueeze(-1)
         options = torch.stack([reckoning.commanded(ego, change) for change in (1, 0, -1)], -1)
         own = reckoning.speed_after(ego.speed.unsqueeze(-1), options).unsqueeze(-2)
         along = (ego.speed * ego.heading.cos()).unsqueeze(-1)
-        leader, rate = cars.vx[0].clamp(min=0), self._braking(cars).unsqueeze(-1)
+        leader = cars.vx[0].clamp(min=0)
+        rate = braking_of(cars, car, self.caution.braking).unsqueeze(-1)
         gap = (cars.x[0] + (leader - along) * self.period - car.length - self.caution.distance).unsqueeze(-1)
-        front = _least(gap - self.following(own, leader.unsqueeze(-1), rate), beside & ahead)
-        cross = _least(gap - self.crossing(own, leader.unsqueeze(-1), rate), beside & ahead)
-        closing = (cars.vx[1] - own[..., 1]).clamp(min=0)
-        room = (
-            -cars.x[1] - car.length - self.caution.distance - REAR_S * closing - closing.square() / (2 * REAR_BRAKING)
-        )
-        rear = _least(room.unsqueeze(-1), beside & ~ahead)[..., 0]
+        front = least(gap - self.following(own, leader.unsqueeze(-1), rate), beside & ahead)
+        cross = least(gap - self.crossing(own, leader.unsqueeze(-1), rate), beside & ahead)
+        room = room_behind(cars, own[..., 1], car.length + self.caution.distance)
+        rear = least(room.unsqueeze(-1), beside & ~ahead)[..., 0]
 
         off = ego.y - car.lane_width * ego.target_lane
         straddled = torch.where(off.abs() > STRADDLING, off.sign(), 0.0)
@@ -148,38 +147,44 @@ class Judge:
             straddled=straddled,
         )
 
-    def _lanes(self, ego: Ego, cars: _Cars) -> Tensor:
-        """bool [..., V - 1, 9]: the lanes `SIDES` that each car may be in, or soon enter."""
-        left = cars.y[0] + (cars.vy[0] + DEAD_BAND).clamp(max=0) * DRIFT_S
-        right = cars.y[1] + (cars.vy[1] - DEAD_BAND).clamp(min=0) * DRIFT_S
-        car = self.reckoning.kinematics
-        middle = car.lane_width * (ego.target_lane.unsqueeze(-1) + torch.tensor(SIDES).to(ego.y)).unsqueeze(-2)
-        reach = car.width + CLEARANCE
-        inside = (right.unsqueeze(-1) > middle - reach) & (left.unsqueeze(-1) < middle + reach)
-        return inside & cars.present.unsqueeze(-1)
-
-    def _braking(self, cars: _Cars) -> Tensor:
-        """[..., V - 1] how hard every car brakes for the next one ahead of it, by its car-following model, in m/s2."""
-        model, place, speed = self.reckoning.kinematics.following, cars.place, cars.speed
-        reach = self.reckoning.kinematics.width + CLEARANCE
-        gap = place.unsqueeze(-2) - place.unsqueeze(-1)
-        same = (cars.y[0].unsqueeze(-2) < cars.y[1].unsqueeze(-1) + reach) & (
-            cars.y[1].unsqueeze(-2) > cars.y[0].unsqueeze(-1) - reach
-        )
-        closing = speed.unsqueeze(-1) - speed.unsqueeze(-2)
-        wanted = model.desired_gap(speed.unsqueeze(-1), closing)
-        rate = model.acceleration * ((wanted.clamp(min=0) / gap.clamp(min=1)).square() - model.free_share)
-        rate = torch.where(cars.present.unsqueeze(-2) & (gap > 0) & same, rate, 0.0).amax(-1)
-        return rate.clamp(self.caution.braking, HARDEST)
-
-    def _speeds(self, cars: _Cars, counts: Tensor) -> Tensor:
+    def _speeds(self, cars: Cars, counts: Tensor) -> Tensor:
         """[..., 9] the speed that the cars ahead allow for on each lane: theirs, and the free room over the horizon."""
         allowed = cars.speed + (cars.place - ROOM).clamp(min=0) / HORIZON_S
         top = self.reckoning.kinematics.target_speeds[-1]
         return torch.where(counts, allowed.unsqueeze(-1), FREE).amin(-2).clamp(max=top)
 
 
-def _cars(ego: Ego, boxes: Boxes) -> _Cars:
+def lanes_of(ego: Ego, cars: Cars, car: Kinematics) -> Tensor:
+    """bool [..., V - 1, 9]: the lanes `SIDES` that each car may be in, or soon enter."""
+    left = cars.y[0] + (cars.vy[0] + DEAD_BAND).clamp(max=0) * DRIFT_S
+    right = cars.y[1] + (cars.vy[1] - DEAD_BAND).clamp(min=0) * DRIFT_S
+    middle = car.lane_width * (ego.target_lane.unsqueeze(-1) + torch.tensor(SIDES).to(ego.y)).unsqueeze(-2)
+    reach = car.width + CLEARANCE
+    inside = (right.unsqueeze(-1) > middle - reach) & (left.unsqueeze(-1) < middle + reach)
+    return inside & cars.present.unsqueeze(-1)
+
+
+def braking_of(cars: Cars, car: Kinematics, lowest: float) -> Tensor:
+    """[..., V - 1] how hard every car brakes for the next one ahead of it, by its car-following model, in m/s2."""
+    model, place, speed, reach = car.following, cars.place, cars.speed, car.width + CLEARANCE
+    gap = place.unsqueeze(-2) - place.unsqueeze(-1)
+    same = (cars.y[0].unsqueeze(-2) < cars.y[1].unsqueeze(-1) + reach) & (
+        cars.y[1].unsqueeze(-2) > cars.y[0].unsqueeze(-1) - reach
+    )
+    closing = speed.unsqueeze(-1) - speed.unsqueeze(-2)
+    wanted = model.desired_gap(speed.unsqueeze(-1), closing)
+    rate = model.acceleration * ((wanted.clamp(min=0) / gap.clamp(min=1)).square() - model.free_share)
+    rate = torch.where(cars.present.unsqueeze(-2) & (gap > 0) & same, rate, 0.0).amax(-1)
+    return rate.clamp(lowest, HARDEST)
+
+
+def room_behind(cars: Cars, own: Tensor, length: float) -> Tensor:
+    """[..., V - 1] the room that a car behind needs no part of to brake, if the ego drives at `own` m/s, [..., 1]."""
+    closing = (cars.vx[1] - own).clamp(min=0)
+    return -cars.x[1] - length - REAR_S * closing - closing.square() / (2 * REAR_BRAKING)
+
+
+def cars_of(ego: Ego, boxes: Boxes) -> Cars:
     low, high = boxes.low[..., 1:, :], boxes.high[..., 1:, :]
     own = (None, ego.y, ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin())
     bounds = [
@@ -188,7 +193,7 @@ def _cars(ego: Ego, boxes: Boxes) -> _Cars:
         else (low[..., place] + value.unsqueeze(-1), high[..., place] + value.unsqueeze(-1))
         for place, value in enumerate(own)
     ]
-    return _Cars(boxes.present[..., 1:], *bounds)
+    return Cars(boxes.present[..., 1:], *bounds)
 
 
 def _middle(low: Tensor, high: Tensor) -> Tensor:
@@ -197,6 +202,6 @@ def _middle(low: Tensor, high: Tensor) -> Tensor:
     return (first + last) / (low.isfinite().to(low) + high.isfinite().to(low)).clamp(min=1)
 
 
-def _least(room: Tensor, counts: Tensor) -> Tensor:
+def least(room: Tensor, counts: Tensor) -> Tensor:
     """The least room [..., lanes, options] over the cars that count, bool [..., V - 1, lanes]."""
     return torch.where(counts.unsqueeze(-1), room.unsqueeze(-2), FREE).amin(-3)

@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.driving.features import ActionType, DrivingFacts
 from bench.driving.intervals.boxes import Assumed, Boxes
 from bench.driving.intervals.ego import DeadReckoning, Ego
-from bench.driving.policy import Policy, State
+from bench.driving.policy import Passed, Policy, State
 from bench.driving.threat import Norm
 from bench.errors import UserError
 
@@ -48,6 +48,13 @@ class IntervalPolicy(Policy):
     @abstractmethod
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         """Whether an action has a margin of at least 0, bool [...]."""
+
+    def filtered(self, observation: Tensor, boxes: Boxes, state: State) -> Passed:
+        """As `passed`, for given boxes."""
+        return Passed(observation)
+
+    def passed(self, observation: Tensor, state: State = None) -> Passed:
+        return self.filtered(observation, self.assumed.boxes(observation), state)
 
     def assured(self, observation: Tensor, state: State) -> Tensor | None:
         return self.safe(self.assumed.boxes(observation), state)

@@ -37,6 +37,7 @@ class DDPG(LearningDriver):
         actor_delay: critic updates per actor update.
     """
 
+    algorithm = "ddpg"
     policy_type = ActorPolicy
 
     # Smaller and shorter than for DQN, because training actor and critic in turns takes longer.
@@ -49,9 +50,6 @@ class DDPG(LearningDriver):
     @property
     def action_type(self) -> ActionType:
         return "continuous"
-
-    def zoo_name(self) -> str:
-        return "ddpg"
 
     def learner(self, env: EnvBase, hooks: TrainingHooks) -> Learner:
         return _ActorCriticLearner(self, env, hooks)

@@ -18,6 +18,7 @@ from bench.driving import ActionType, Policy, TrainingHooks
 from bench.plugins.ranges import Share
 from bench.victims.drivers.learner import CHUNK, Learner, Phase, copy_weights
 from bench.victims.drivers.networks import QPolicy
+from bench.victims.drivers.practice import ALLOWED
 from bench.victims.drivers.training import LearningDriver
 
 
@@ -32,6 +33,7 @@ class DQN(LearningDriver):
         final_epsilon: share of random actions after the first 30 % of the training; it falls linearly from 1 until then.
     """
 
+    algorithm = "dqn"
     policy_type = QPolicy
 
     final_epsilon: Share = 0.02
@@ -39,9 +41,6 @@ class DQN(LearningDriver):
     @property
     def action_type(self) -> ActionType:
         return "discrete"
-
-    def zoo_name(self) -> str:
-        return "dqn"
 
     def learner(self, env: EnvBase, hooks: TrainingHooks) -> Learner:
         return _QLearner(self, env, hooks)
@@ -57,12 +56,14 @@ class _QLearner(Learner):
         self.mean = QPolicy(features, actions, recipe.hidden)
         if hooks.start is not None:
             self.policy.load_state_dict(hooks.start.state_dict())
-        actor = _actor(self.policy)
+        self.mask = ALLOWED if recipe.behind else None
+        actor = self._actor(self.policy)
         self.greedy = EGreedyModule(
             Categorical(actions, shape=(batch,)),
             eps_init=1.0 if hooks.start is None else recipe.final_epsilon,
             eps_end=recipe.final_epsilon,
             annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
+            action_mask_key=self.mask,
         )
         self.explore = TensorDictSequential(actor, self.greedy)
         self.loss = DQNLoss(actor, loss_function="smooth_l1", double_dqn=True, delay_value=True)
@@ -93,16 +94,22 @@ class _QLearner(Learner):
     def _disadvantage(self, sample: TensorDictBase) -> Tensor:
         """V(s) - Q(s, a) [N, 1], which advantage learning subtracts from the reward (Bellemare et al. 2016, Eq. 6)."""
         values = self.policy.scores(sample["observation"])
+        if self.mask is not None:
+            values = values.masked_fill(~sample[self.mask], -torch.inf)
         return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
 
     def anneal(self) -> None:
         self.greedy.step()
 
     def averaged(self) -> Policy:
-        copy_weights(self.loss.target_value_network_params, _actor(self.mean))
+        copy_weights(self.loss.target_value_network_params, self._actor(self.mean))
         return self.mean
 
-
-def _actor(policy: QPolicy) -> QValueActor:
-    actions = Categorical(policy.shape["actions"])
-    return QValueActor(policy.network, in_keys=["observation"], spec=actions, action_space="categorical")
+    def _actor(self, policy: QPolicy) -> QValueActor:
+        return QValueActor(
+            policy.network,
+            in_keys=["observation"],
+            spec=Categorical(policy.shape["actions"]),
+            action_space="categorical",
+            action_mask_key=self.mask,
+        )

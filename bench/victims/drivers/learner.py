@@ -1,4 +1,4 @@
-"""The base class of a learning algorithm: networks, loss and optimiser. `dqn` and `ddpg` implement it, `training` runs it."""
+"""The base class of a learning algorithm: networks, loss and optimiser. The trained drivers implement it."""
 
 from __future__ import annotations
 

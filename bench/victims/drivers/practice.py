@@ -12,6 +12,9 @@ from bench.plugins import registry
 from bench.scenarios import Cell
 from bench.victims.drivers.learner import Learner, Phase
 
+ALLOWED = "allowed"
+"""The key of the actions that a defence leaves to the policy behind it."""
+
 
 def roads(world: DrivingWorld, copies: int) -> list[Cell]:
     """The training cells of a world: its default grid, `copies` of each cell.
@@ -60,20 +63,24 @@ class Practice:
     @torch.no_grad()
     def drive(self, decisions: int, share: float) -> None:
         """Make `decisions` decisions on every road; `share` of the training is finished."""
-        hooks, policy = self.learner.hooks, self.learner.policy
-        chunk = []
-        for _ in range(decisions):
-            truth = self.td["observation"]
-            shown = hooks.acting(truth, policy, share)
-            self.td.set("observation", shown)
-            with set_exploration_type(ExplorationType.RANDOM):
-                self.learner.explore(self.td)
-            self.td.set("observation", hooks.remembered(truth, shown))
-            step, self.td = self.env.step_and_maybe_reset(self.td)
-            chunk.append(self._transition(step))
-        transitions = self.multi_step.inv(torch.stack(chunk, -1))
+        transitions = self.multi_step.inv(torch.stack([self.decide(share) for _ in range(decisions)], -1))
         if transitions is not None and transitions.numel():
             self.buffer.extend(transitions.exclude("gamma", "nonterminal", ("next", "original_reward")).reshape(-1))
+
+    def decide(self, share: float) -> TensorDict:
+        """One decision on every road: the transitions [B]."""
+        hooks, truth = self.learner.hooks, self.td["observation"]
+        shown = hooks.acting(truth, self.learner.policy, share)
+        self.td.set("observation", shown)
+        self.explore()
+        self.td.set("observation", hooks.remembered(truth, shown))
+        step, self.td = self.env.step_and_maybe_reset(self.td)
+        return self.transition(step)
+
+    def explore(self) -> None:
+        """The learner's actions for the observations in `td`, with exploration."""
+        with set_exploration_type(ExplorationType.RANDOM):
+            self.learner.explore(self.td)
 
     def sample(self, share: float) -> TensorDictBase:
         """A batch of transitions: `truth` is the stored observation, `observation` is after `hooks.replayed`."""
@@ -82,12 +89,12 @@ class Practice:
         sample.set("truth", truth)
         return sample.set("observation", self.learner.hooks.replayed(truth, self.learner.policy, share))
 
-    def _transition(self, step: TensorDictBase) -> TensorDict:
+    def transition(self, step: TensorDictBase) -> TensorDict:
+        """The transitions [B] with their rewards, from a step of the environment."""
         after, phase = step["next"], self.phase
         failed = after["info", "crashed"] | after["info", "offroad"]
         reward = self.sign * (after["info", "progress"] - self.crash_penalty * failed.float())
-        after = after.select("observation", "terminated", "done")
+        after = after.select("observation", ALLOWED, "terminated", "done", strict=False)
         after.set("reward", reward * ((1 - phase.gamma) / phase.repeat))
-        return TensorDict(
-            {"observation": step["observation"], "action": step["action"], "next": after}, batch_size=step.batch_size
-        )
+        before = step.select("observation", ALLOWED, "action", strict=False)
+        return TensorDict({**before, "next": after}, batch_size=step.batch_size)

@@ -143,5 +143,31 @@ class IDMDriver(DrivingVictim):
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         if "idm" not in facts.drivers:
             raise UserError("the world has no IDM driver")
-        idle = facts.actions.index("IDLE") if "IDLE" in facts.actions else 0
-        return _Constant(torch.eye(len(facts.actions))[idle], "discrete", driver="idm").eval()
+        return _driven_by_the_world(facts, "idm")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OracleDriver(DrivingVictim):
+    """A planner with perfect information, the upper reference line (random-shooting model-predictive control).
+
+    Three times a second it tries 64 plans of 4 s in copies of the simulator, hidden state included, and follows the best one. It
+    reads no observation, so attacks and weather have no effect on it.
+    """
+
+    sees: ClassVar[bool] = False
+    driver: ClassVar[Driver] = "oracle"
+
+    @property
+    def action_type(self) -> ActionType:
+        return "discrete"
+
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        if "oracle" not in facts.drivers:
+            raise UserError("the world has no planner with perfect information")
+        return _driven_by_the_world(facts, "oracle")
+
+
+def _driven_by_the_world(facts: DrivingFacts, driver: Driver) -> Policy:
+    """A policy whose actions the world ignores."""
+    idle = facts.actions.index("IDLE") if "IDLE" in facts.actions else 0
+    return _Constant(torch.eye(len(facts.actions))[idle], "discrete", driver=driver).eval()

@@ -10,15 +10,16 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from bench.driving import DrivingWorld, Policy, TrainingHooks
+from bench.driving import DrivingWorld, Policy, State, TrainingHooks
 from bench.driving.metrics import safe_progress
+from bench.driving.policy import rows_of
 from bench.scenarios import SeedBlock
 from bench.victims.drivers.practice import roads
 
 
 @torch.no_grad()
 def selection_score(
-    policy: Policy, world: DrivingWorld, episodes: int, show: Callable[[Tensor], Tensor] | None = None
+    policy: Policy, world: DrivingWorld, episodes: int, show: Callable[[Tensor, State], Tensor] | None = None
 ) -> dict[str, float]:
     """Mean `safe_progress` for each road and over all, on the selection seeds, which are never reported.
 
@@ -26,21 +27,24 @@ def selection_score(
         policy: the policy.
         world: the world.
         episodes: number of episodes per road.
-        show: perturbs the observation [B, V, F] before the policy receives it; None for no perturbation.
+        show: perturbs the observation [B, V, F] before the policy receives it, and is given the policy's state; None for no
+            perturbation.
     """
     cells = roads(world, episodes)
     env = world.make(cells, action_type=policy.action_type)
     seeds = torch.arange(SeedBlock.SELECT, SeedBlock.SELECT + episodes).repeat(len(cells) // episodes)
     td = env.reset(TensorDict({"seed": seeds}, batch_size=env.batch_size))
+    state = policy.initial(torch.arange(len(cells)))
     progress, failed = torch.zeros(len(cells)), torch.zeros(len(cells), dtype=torch.bool)
     for _ in range(world.max_steps):
         running = ~td["done"].squeeze(-1)
         shown = td["observation"]
         if show is not None:
             shown = shown.clone()
-            shown[running] = show(shown[running])
-        td.set("action", policy.decide(shown))
-        td = env.step(td)["next"]
+            shown[running] = show(shown[running], rows_of(state, running))
+        action = policy.decide(shown, state)
+        td = env.step(td.set("action", action))["next"]
+        state = policy.advance(shown, action, state)
         progress += td["info", "progress"].squeeze(-1) * running
         failed |= (td["info", "crashed"] | td["info", "offroad"]).squeeze(-1) & running
         if bool(td["done"].all()):
@@ -52,7 +56,7 @@ def selection_score(
 
 @dataclass
 class Best:
-    """The best checkpoint so far, by the mean `selection_score` over true and perturbed (`hooks.selection`) observations.
+    """The best checkpoint so far, by its `selection_score` on true and perturbed (`hooks.selection`) observations.
 
     Args:
         world: the world for scoring.
@@ -60,12 +64,14 @@ class Best:
         episodes: number of episodes per road on true observations; a third of it on perturbed ones, which may cost ten times
             as much.
         sign: 1 keeps the highest score; -1 the lowest, for an adversary.
+        defended: puts a policy behind the defence that it is trained behind; by default there is none.
     """
 
     world: DrivingWorld
     hooks: TrainingHooks
     episodes: int
     sign: float = 1.0
+    defended: Callable[[Policy], Policy] = lambda policy: policy
     score: float | None = None
     scores: dict[str, dict[str, float]] = field(default_factory=dict)
     share: float = 0.0
@@ -74,10 +80,11 @@ class Best:
 
     def offer(self, policy: Policy, share: float) -> None:
         """Score `policy` and keep its weights if it is the best so far."""
-        scores = {"clean": selection_score(policy, self.world, self.episodes)}
-        for name, show in self.hooks.selection(policy).items():
-            scores[name] = selection_score(policy, self.world, self.episodes // 3, show)
-        score = sum(by_road["mean"] for by_road in scores.values()) / len(scores)
+        driver = self.defended(policy)
+        scores = {"clean": selection_score(driver, self.world, self.episodes)}
+        for name, show in self.hooks.selection(driver).items():
+            scores[name] = selection_score(driver, self.world, self.episodes // 3, show)
+        score = self.hooks.ranked({name: by_road["mean"] for name, by_road in scores.items()})
         self.history.append((round(share, 3), round(score, 4)))
         if self.score is None or self.sign * score > self.sign * self.score:
             self.score, self.scores, self.share = score, scores, share

@@ -6,6 +6,7 @@ import math
 import time
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -16,6 +17,8 @@ from bench.plugins.contracts import Progress, Trained
 from bench.plugins.ranges import Count, Share, Width
 from bench.scenarios import SeedBlock
 from bench.victims import zoo
+from bench.victims.drivers.attack_mix import AttackMix
+from bench.victims.drivers.behind import Guard, GuardedPractice, defense_of
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
 from bench.victims.drivers.practice import Practice, roads
 from bench.victims.drivers.selection import Best
@@ -48,9 +51,14 @@ class LearningDriver(DrivingVictim):
         tau: rate of the target networks' soft update.
         checkpoints: number of candidates for the final weights, spread over the last share `fine` of the training.
         trained_in: non-default parameters of the training world, for instance `vehicles=5`; set by `bench train`.
+        behind: the defence that it is trained behind, with its parameters, for instance `tracker+shield shield.band=6`; empty for
+            none. It only says which weights are meant; `defense` says what it drives behind.
+        behind_decisions: length of the training behind the defence, which continues from the weights without one.
     """
 
     learns: ClassVar[bool] = True
+    algorithm: ClassVar[str]
+    """The name of its entries in the zoo."""
     policy_type: ClassVar[type[Policy]]
     sign: ClassVar[float] = 1.0
     """-1 for an adversary: its reward is minus the driver's, and its best checkpoint has the lowest `safe_progress`."""
@@ -72,6 +80,11 @@ class LearningDriver(DrivingVictim):
     tau: Share = 0.005
     checkpoints: Count = 8
     trained_in: str = ""
+    behind: str = ""
+    behind_decisions: Count = 4_000
+
+    def zoo_name(self) -> str:
+        return f"{self.algorithm}-behind-{self.behind.split()[0]}" if self.behind.strip() else self.algorithm
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         return zoo.load(zoo.Recipe.of(self), seed, self.policy_type)
@@ -106,8 +119,14 @@ class LearningDriver(DrivingVictim):
         """Train on all roads of the world's default grid at once, and keep the best checkpoint."""
         torch.manual_seed(seed)
         started = time.process_time()
+        guard = Guard(defense_of(self.behind), self, world.facts) if self.behind else None
+        if guard is not None and hooks is None:
+            start = replace(self, behind="", behind_decisions=type(self).behind_decisions).load(seed, world.facts)
+            hooks = AttackMix(start, self.behind_decisions, world.facts, seed)
         hooks = hooks or TrainingHooks()
         best, learner, done = Best(world, hooks, self.selection_episodes, self.sign), None, 0
+        if guard is not None:
+            best.defended = guard.around
         phases = self.phases(hooks)
         total = sum(phase.decisions for phase in phases)
         for number, phase in enumerate(phases):
@@ -115,7 +134,8 @@ class LearningDriver(DrivingVictim):
             env.set_seed(SeedBlock.TRAIN * (seed + 1) + number * SeedBlock.REPORT)
             learner = learner or self.learner(env, hooks)
             learner.enter(phase)
-            practice = Practice(
+            practiced = Practice if guard is None else partial(GuardedPractice, guard=guard)
+            practice = practiced(
                 env,
                 learner,
                 phase,

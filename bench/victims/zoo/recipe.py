@@ -20,7 +20,7 @@ from bench.errors import UserError
 from bench.plugins import registry
 from bench.plugins.contracts import Attack, Component, Defense, Victim, World
 from bench.plugins.fingerprint import digest
-from bench.plugins.parameters import Parameter, parameters
+from bench.plugins.parameters import Parameter, differing, parameters
 from bench.plugins.registry import GROUPS, Kind
 
 DIGITS = 8
@@ -178,6 +178,11 @@ def trained_in(world: World, *, default: str) -> str:
     """
     part = Part.of("world", world)
     return _where(part.options, "" if part.name == default else part.name)
+
+
+def written(name: str, component: Component) -> str:
+    """A component in one text, with its non-default parameters: `tracker+shield shield.band=6`."""
+    return shlex.join([name, *(f"{key}={_text(value)}" for key, value in differing(component).items())])
 
 
 def check_world(recipe: Recipe, world: World) -> None:

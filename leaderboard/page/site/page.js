@@ -2,7 +2,7 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const at = (id) => document.getElementById(id);
 const pairs = new Map(data.pairs.map((pair) => [pair.key, pair]));
-const state = { track: null, board: 0, sort: {}, shown: null, axes: {} };
+const state = { track: null, board: 0, sort: {}, shown: null, axes: {}, defense: "", victim: "", attack: "", row: null, pair: null };
 
 /* ---- elements: text goes in as text, never as markup ---- */
 function el(tag, attributes = {}, ...children) {
@@ -79,7 +79,7 @@ function strip(score, baseline) {
   return made;
 }
 function cardLink(pair, text) {
-  return el("a", { href: `#pair-${pair.key}` }, text);
+  return el("a", { href: address({ row: rowOf(pair), pair }) }, text);
 }
 function draw(id, columns, rows, classes) {
   const table = at(id), sort = state.sort[id];
@@ -93,7 +93,7 @@ function draw(id, columns, rows, classes) {
     });
   }
   const focused = document.activeElement?.dataset?.column;
-  const shown = columns.filter((column) => !column.copied);
+  const shown = columns;
   const head = el("tr", {}, ...shown.map((column) => {
     const own = sort?.name === column.name ? (sort.down ? "descending" : "ascending") : "none";
     const cell = el("th", { scope: "col", class: column.number ? "number" : null });
@@ -110,26 +110,39 @@ function draw(id, columns, rows, classes) {
   const body = ordered.map((row, place) => {
     const grouped = classes?.(row, ordered[place - 1], !sort) ?? "";
     return el("tr", { class: grouped || null }, ...shown.map((column) =>
-      el("td", { class: [column.number && "number", column.class].filter(Boolean).join(" ") || null }, ...[column.show(row)].flat())));
+      el("td", { "data-label": column.name, class: [column.number && "number", column.class].filter(Boolean).join(" ") || null }, ...[column.show(row)].flat().filter((part) => part !== ""))));
   });
   table.replaceChildren(el("thead", {}, head), el("tbody", {}, ...body));
-  table.copied = () => [columns.filter((c) => c.value).map((c) => c.name), ...ordered.map((row) => columns.filter((c) => c.value).map((c) => (c.copy ?? c.value)(row)))];
+  const told = columns.filter((column) => column.value);
+  table.copied = () => ({
+    heads: told.map((column) => ({ name: column.name, interval: Boolean(column.interval) })),
+    rows: ordered.map((row) => told.map((column) => (column.interval ? { ...(column.interval(row) ?? { estimate: column.value(row) }), best: Boolean(column.best?.(row)) } : column.value(row)))),
+  });
   if (focused?.startsWith(`${id} `)) table.querySelector(`[data-column="${CSS.escape(focused)}"]`)?.focus();
 }
 const shortest = (value) => (typeof value === "number" ? Number(value.toFixed(4)).toString() : value == null ? "" : String(value));
-function csv(lines) {
+/* An interval takes three columns in CSV, and one in LaTeX. */
+function csv({ heads, rows }) {
+  const lines = [heads.flatMap((head) => (head.interval ? [head.name, `${head.name} low`, `${head.name} high`] : [head.name])),
+    ...rows.map((row) => row.flatMap((value, i) => (heads[i].interval ? [value.estimate, value.low, value.high] : [value])))];
   return lines.map((line) => line.map((value) => {
     // A spreadsheet takes these for formulas.
     const text = (typeof value === "string" && /^[=+\-@\t\r]/.test(value) ? "'" : "") + shortest(value);
     return /[",\n\r]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
   }).join(",")).join("\n") + "\n";
 }
-function latex(lines) {
-  const escape = (value) => (typeof value === "number" ? value.toFixed(Number.isInteger(value) ? 0 : 2) : shortest(value))
-    .replace(/[\\&%$#_{}~^]/g, (c) => ({ "\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}" })[c] ?? `\\${c}`).replaceAll("×", "$\\times$").replaceAll("−", "$-$");
-  const rows = lines.map((line) => line.map(escape).join(" & ") + " \\\\");
-  const align = lines[0].map((_, i) => (lines.slice(1).every((line) => typeof line[i] === "number" || line[i] == null) ? "r" : "l")).join("");
-  return ["\\begin{tabular}{" + align + "}", "\\toprule", rows[0], "\\midrule", ...rows.slice(1), "\\bottomrule", "\\end{tabular}"].join("\n") + "\n";
+function latex({ heads, rows }) {
+  const escape = (text) => String(text).replace(/[\\&%$#_{}~^]/g, (c) => ({ "\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}" })[c] ?? `\\${c}`).replaceAll("×", "$\\times$").replaceAll("−", "$-$").replaceAll("–", "--");
+  const digits = (value) => value.toFixed(Number.isInteger(value) ? 0 : 2);
+  const written = (value) => (typeof value === "number" ? escape(digits(value)) : escape(shortest(value)));
+  const estimated = ({ estimate, low, high, best }) => {
+    if (estimate == null) return "";
+    const text = escape(fixed(estimate));
+    return (best ? `\\textbf{${text}}` : text) + (low == null ? "" : ` {\\scriptsize [${escape(short(low))}, ${escape(short(high))}]}`);
+  };
+  const numeric = heads.map((head, i) => head.interval || rows.every((row) => typeof row[i] === "number" || row[i] == null));
+  const lines = rows.map((row) => row.map((value, i) => (heads[i].interval ? estimated(value) : written(value))).join(" & ") + " \\\\");
+  return ["\\begin{tabular}{" + numeric.map((one) => (one ? "r" : "l")).join("") + "}", "\\toprule", heads.map((head) => escape(head.name)).join(" & ") + " \\\\", "\\midrule", ...lines, "\\bottomrule", "\\end{tabular}"].join("\n") + "\n";
 }
 async function copy(text, what) {
   try {
@@ -165,32 +178,90 @@ const joined = (values) => values.join(" × ");
 function options(select, values, chosen) {
   select.replaceChildren(...values.map(([value, text]) => el("option", { value, selected: String(value) === String(chosen) }, text)));
 }
-function setTrack(track) {
-  state.track = track; state.board = 0; state.shown = null; state.sort = {};
-  for (const button of document.querySelectorAll("nav button")) button.setAttribute("aria-pressed", button.dataset.track === track);
-  at("thesis").hidden = track !== "thesis";
-  at("method").hidden = track !== "method";
-  at("board").hidden = !boards().length;
-  if (boards().length) setBoard(0);
+/* ---- addresses: #/TRACK/THREAT/DEFENCE+VICTIM/PAIR?weather=clear&sort=Clean holds all that the page shows ---- */
+const written = (text) => encodeURIComponent(text.replaceAll(" ", ",")).replaceAll("%2B", "+").replaceAll("%2C", ",").replaceAll("%3D", "=").replaceAll("%3A", ":");
+function boardNames() {
+  const taken = new Set();
+  return boards().map((board, i) => {
+    const t = board.threat;
+    let name = "";
+    for (const part of [`${t.norm}-${t.budget}`, board.grid, `${t.access}-${t.queries}`, t.share, board.world.name, i]) {
+      name = name ? `${name}-${part}` : part;
+      if (!taken.has(name)) break;
+    }
+    taken.add(name);
+    return name;
+  });
 }
-function setBoard(place) {
-  state.board = place; state.shown = null;
+const rowName = (row) => `${row.defense.label}+${row.victim.label}`.replaceAll(" ", ",");
+const rowOf = (pair) => current().rows.find((row) => sameDefended(row, pair)) ?? null;
+const sorted = (id) => (id === "ranks" ? "sort" : `sort-${id}`);
+function address({ row = state.row, pair = state.pair } = {}) {
+  const parts = [state.track], query = [];
+  const board = current();
+  if (board) {
+    parts.push(boardNames()[state.board], ...(row ? [rowName(row), ...(pair ? [pair.card.pair] : [])] : []));
+    for (const kind of ["defense", "victim", "attack"]) if (state[kind]) query.push([kind, state[kind]]);
+    for (const axis of board.axes) {
+      const left = axis.values.filter((value) => state.axes[axis.name].has(value));
+      if (left.length < axis.values.length) query.push([axis.name, left.join(",")]);
+    }
+    for (const [id, sort] of Object.entries(state.sort)) query.push([sorted(id), (sort.down ? "-" : "") + sort.name]);
+    if (state.shown) query.push(["grid", state.shown[0] === "r" ? rowName(board.rows[+state.shown.slice(1)]) : pairs.get(+state.shown.slice(1)).card.pair]);
+  }
+  return `#/${parts.map(written).join("/")}${query.length ? `?${query.map(([key, value]) => `${written(key)}=${written(String(value))}`).join("&")}` : ""}`;
+}
+/* Show what the address says; what it does not say has its default. */
+function go() {
+  if (location.hash && !location.hash.startsWith("#/")) return;
+  const [path, query = ""] = location.hash.slice(2).split("?");
+  const read = (text) => { try { return decodeURIComponent(text); } catch { return text; } };
+  const [track, boardName, row, pair] = path.split("/").map(read);
+  const given = new Map(query.split("&").filter(Boolean).map((part) => part.split(/=(.*)/s).slice(0, 2).map(read)));
+  const tracks = [...document.querySelectorAll("[data-track]")].map((button) => button.dataset.track);
+  state.track = tracks.includes(track) ? track : tracks[0];
+  for (const button of document.querySelectorAll("nav button")) button.setAttribute("aria-pressed", button.dataset.track === state.track);
+  at("thesis").hidden = state.track !== "thesis";
+  at("method").hidden = state.track !== "method";
+  at("board").hidden = !boards().length;
+  state.row = state.pair = state.shown = null; state.sort = {};
+  if (boards().length) setBoard(Math.max(0, boardNames().map(written).indexOf(written(boardName ?? ""))), given, row, pair);
+  showCard();
+}
+function visit(hash) {
+  history.pushState(null, "", hash);
+  go();
+}
+function setBoard(place, given, row, pair) {
+  state.board = place;
   const board = current();
   options(at("threat"), boards().map((one, i) => [i, `${one.world.name}, ${one.grid}: ${threatName(one.threat)}`]), place);
-  state.axes = Object.fromEntries(board.axes.map((axis) => [axis.name, new Set(axis.values)]));
+  state.axes = Object.fromEntries(board.axes.map((axis) => {
+    const wanted = given.has(axis.name) ? given.get(axis.name).split(",") : null;
+    return [axis.name, new Set(axis.values.filter((value) => !wanted || wanted.includes(String(value))))];
+  }));
   const ordered = [...board.axes].sort((a, b) => b.perceptual - a.perceptual);
   at("axes").replaceChildren(...ordered.map((axis) => el("fieldset", {}, el("legend", { title: axis.meaning }, capital(axis.name) + (axis.unit ? ` (${axis.unit})` : "")),
     ...axis.values.map((value) => el("label", {}, el("input", {
-      type: "checkbox", checked: true, name: axis.name, value, onchange: (event) => {
+      type: "checkbox", checked: state.axes[axis.name].has(value), name: axis.name, value, onchange: (event) => {
         if (event.target.checked) state.axes[axis.name].add(value); else state.axes[axis.name].delete(value);
         render();
       } }), String(value))))));
-  for (const kind of ["defense", "victim"]) {
-    state[kind] = "";
-    options(at(kind), [["", "all"], ...[...new Set(board.rows.map((row) => row[kind].name))].sort().map((name) => [name, name])], "");
+  const known = { defense: board.rows.map((one) => one.defense.name), victim: board.rows.map((one) => one.victim.name), attack: within(board).map((one) => one.attack.name) };
+  for (const [kind, names] of Object.entries(known)) {
+    state[kind] = names.includes(given.get(kind)) ? given.get(kind) : "";
+    options(at(kind), [["", "all"], ...[...new Set(names)].sort().map((name) => [name, name])], state[kind]);
   }
-  state.attack = "";
-  options(at("attack"), [["", "all"], ...[...new Set(within(board).map((pair) => pair.attack.name))].sort().map((name) => [name, name])], "");
+  for (const id of ["ranks", "pairs"]) {
+    const sort = given.get(sorted(id))?.replaceAll(",", " ");
+    if (sort) state.sort[id] = { name: sort.replace(/^-/, ""), down: sort.startsWith("-") };
+  }
+  const findRow = (name) => board.rows.find((one) => written(rowName(one)) === written(name ?? ""));
+  const findPair = (name) => within(board).find((one) => written(one.card.pair) === written(name ?? ""));
+  const shown = given.get("grid");
+  state.shown = findRow(shown) ? `r${board.rows.indexOf(findRow(shown))}` : findPair(shown) ? `p${findPair(shown).key}` : null;
+  state.row = findRow(row) ?? null;
+  state.pair = state.row ? findPair(pair) ?? null : null;
   render();
 }
 function within(board) {
@@ -215,34 +286,36 @@ function render() {
   const whole = left === total;
   const columns = [
     { name: "Rank", show: (one) => (one.row ? String(one.row.group) : ""), value: (one) => one.row?.group ?? null },
-    { name: "Defence", class: "name", show: (one) => (one.row ? el("a", { href: "#grid", onclick: () => { state.shown = `r${board.rows.indexOf(one.row)}`; render(); } }, one.row.defense.label) : one.baseline.name), value: (one) => one.row?.defense.label ?? one.baseline.name },
+    { name: "Defence", class: "name", show: (one) => (one.row ? el("a", { href: address({ row: one.row, pair: null }) }, one.row.defense.label) : one.baseline.name), value: (one) => one.row?.defense.label ?? one.baseline.name },
     { name: "Victim", show: (one) => one.row?.victim.label ?? "", value: (one) => one.row?.victim.label ?? "" },
-    { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, number: true },
-    { name: "95 %", copied: true, value: (one) => bounds(one.score) },
-    { name: "0 – 1", show: (one) => strip(one.score, baselineOf(one)) },
-    ...(said().failure ? [{ name: capital(said().failure_title), show: (one) => (one.row ? percent(failedOf(one)) : ""), value: (one) => (one.row ? failedOf(one) : null), number: true }] : []),
-    { name: "Worst cell", show: (one) => worstCell(one), value: (one) => lowest(one)?.estimate ?? null, number: true },
-    { name: "Clean", show: (one) => (whole ? fixed(one.row?.clean?.estimate) : fixed(cleanOf(one)?.estimate)), value: (one) => (whole ? one.row?.clean?.estimate : cleanOf(one)?.estimate) ?? null, number: true },
-    ...(said().baseline ? [{ name: `Against ${said().baseline.replace(/^the /, "")}`, show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, number: true }] : []),
+    { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, interval: (one) => one.score, best: (one) => one.row?.group === 1, number: true },
+    { name: "0 – 1", class: "drawn", show: (one) => strip(one.score, baselineOf(one)) },
+    ...(said().failure ? [{ name: capital(said().failure_title), show: (one) => (one.row ? percent(failedOf(one)) : ""), value: (one) => (one.row ? failedOf(one) : null), interval: (one) => (whole ? one.row?.failed : null), number: true }] : []),
+    { name: "Worst cell", show: (one) => worstCell(one), value: (one) => lowest(one)?.estimate ?? null, interval: lowest, number: true },
+    { name: "Clean", show: (one) => (whole ? fixed(one.row?.clean?.estimate) : fixed(cleanOf(one)?.estimate)), value: (one) => (whole ? one.row?.clean?.estimate : cleanOf(one)?.estimate) ?? null, interval: (one) => (whole ? one.row?.clean : cleanOf(one)), number: true },
+    ...(said().baseline ? [{ name: `Against ${said().baseline.replace(/^the /, "")}`, show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, interval: (one) => leadOf(one, whole), number: true }] : []),
     { name: "Strongest attack", class: "name", show: (one) => (one.row ? cardLink(pairs.get(one.row.strongest), pairs.get(one.row.strongest).attack.label) : ""), value: (one) => (one.row ? pairs.get(one.row.strongest).attack.label : "") },
+    ...(board.rows.some((row) => row.clip) ? [{ name: "Film", show: (one) => (one.row?.clip ? el("a", { href: address({ row: one.row, pair: null }), "aria-label": `Film of ${one.row.defense.label} · ${one.row.victim.label}` }, "▶ film") : "") }] : []),
     { name: "Flags", class: "doubts", show: (one) => (one.row ? doubts(one.row) : ""), value: (one) => (one.row ? one.row.flags.filter((flag) => flag.fired).map((flag) => flag.name).join(" ") : "") },
   ];
   draw("ranks", columns, [...rows, ...baselines], (one, before, unsorted) =>
-    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", unsorted && before && one.row?.group !== before.row?.group ? "group" : ""].filter(Boolean).join(" "));
+    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", one.row?.group === 1 ? "best" : "", unsorted && before && one.row?.group !== before.row?.group ? "group" : ""].filter(Boolean).join(" "));
 
   drawPairs(board, metric);
   drawMatrix(board);
   drawCurves(board);
   drawHeat(board);
+  history.replaceState(null, "", address());
 }
 function sameDefended(a, b) {
   return ["defense", "victim"].every((kind) => JSON.stringify([a[kind].name, a[kind].params]) === JSON.stringify([b[kind].name, b[kind].params]));
 }
+function controlOf(row) {
+  const strongest = pairs.get(row.strongest);
+  return data.pairs.find((pair) => pair.attack.name === "none" && pair.track === strongest.track && sameDefended(pair, strongest)) ?? null;
+}
 function cleanOf(one) {
-  if (!one.row) return null;
-  const strongest = pairs.get(one.row.strongest);
-  const control = data.pairs.find((pair) => pair.attack.name === "none" && pair.track === strongest.track &&
-    sameDefended(pair, strongest));
+  const control = one.row ? controlOf(one.row) : null;
   return control ? over(control, control.score) : null;
 }
 function besideBaseline(row) {
@@ -290,7 +363,6 @@ function adds(pair, row) {
 function drawPairs(board, metric) {
   const rows = within(board).filter(chosen).filter((pair) => !state.attack || pair.attack.name === state.attack)
     .map((pair) => ({ pair, score: over(pair, pair.score) })).filter((one) => one.score);
-  const rowOf = (pair) => board.rows.find((row) => sameDefended(row, pair));
   const failed = ({ pair }) => mean(pair, "failed", pair.measures[said().failure]?.estimate ?? null);
   const queries = ({ pair }) => mean(pair, "queries", pair.queries);
   draw("pairs", [
@@ -298,13 +370,12 @@ function drawPairs(board, metric) {
     { name: "Defence", class: "name", show: ({ pair }) => pair.defense.label, value: ({ pair }) => pair.defense.label },
     { name: "Victim", show: ({ pair }) => pair.victim.label, value: ({ pair }) => pair.victim.label },
     { name: "Threat model", show: ({ pair }) => threatShort(pair.threat), value: ({ pair }) => threatShort(pair.threat) },
-    { name: capital(metric), show: (one) => [estimate(one.score), el("small", {}, " ", part(one.pair, rowOf(one.pair)))].flat(), value: (one) => one.score.estimate, number: true },
-    { name: "95 %", copied: true, value: (one) => bounds(one.score) },
-    { name: "0 – 1", show: (one) => strip(one.score) },
+    { name: capital(metric), show: (one) => [estimate(one.score), el("small", {}, " ", part(one.pair, rowOf(one.pair)))].flat(), value: (one) => one.score.estimate, interval: (one) => one.score, number: true },
+    { name: "0 – 1", class: "drawn", show: (one) => strip(one.score) },
     ...(said().failure ? [{ name: capital(said().failure_title), show: (one) => percent(failed(one)), value: failed, number: true }] : []),
     { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
     { name: "Queries", show: (one) => fixed(queries(one), 0), value: queries, number: true },
-    { name: "Adds", show: ({ pair }) => adds(pair, rowOf(pair)), value: ({ pair }) => added(pair, rowOf(pair))?.estimate ?? null, number: true },
+    { name: "Adds", show: ({ pair }) => adds(pair, rowOf(pair)), value: ({ pair }) => added(pair, rowOf(pair))?.estimate ?? null, interval: ({ pair }) => added(pair, rowOf(pair)), number: true },
     { name: "Recording", show: ({ pair }) => (pair.card.recording ? el("a", { href: data.recordings + pair.card.recording }, "rrd") : "") },
   ], rows);
 }
@@ -315,8 +386,10 @@ function tint(value) {
   const place = Math.max(0, Math.min(1, value)) * (STOPS.length - 1);
   const low = Math.min(Math.floor(place), STOPS.length - 2);
   const rgb = STOPS[low].map((from, i) => Math.round(from + (STOPS[low + 1][i] - from) * (place - low)));
-  const light = (0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]) / 255;
-  return `background: rgb(${rgb.join(", ")}); color: ${light > 0.45 ? "#111" : "#fff"}`;
+  // Black or white, whichever can be read better (WCAG 2): at least 4.58 on any colour.
+  const [r, g, b] = rgb.map((c) => (c / 255 <= 0.04045 ? c / 255 / 12.92 : ((c / 255 + 0.055) / 1.055) ** 2.4));
+  const level = 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  return `background: rgb(${rgb.join(", ")}); color: ${(level + 0.05) ** 2 > 0.05 * 1.05 ? "#000" : "#fff"}`;
 }
 function drawHeat(board) {
   const choices = board.rows.map((row, i) => [`r${i}`, `${row.defense.label} · ${row.victim.label}: worst attack of each cell`])
@@ -350,11 +423,16 @@ function part(pair, row) {
   const own = kept(pair.cells).length, all = row ? kept(row.cells).length : own;
   return own < all ? `${own} of ${all} cells` : "";
 }
+/* An attack, with its threat model where it is not that of the board. */
+function attackName(pair) {
+  const t = current().threat, same = ["budget", "access", "queries"].every((name) => pair.threat[name] === t[name]);
+  return pair.attack.label + (same ? "" : ` (${threatShort(pair.threat)}, ${pair.threat.queries} queries)`);
+}
 function drawMatrix(board) {
   const rows = board.rows.filter(chosen);
   const all = within(board).filter(chosen);
   const controls = all.filter((pair) => pair.attack.name === "none");
-  const label = (pair) => (pair.attack.name === "none" ? "no attack" : pair.attack.label + (pair.threat.budget === board.threat.budget && pair.threat.access === board.threat.access && pair.threat.queries === board.threat.queries ? "" : ` (${threatShort(pair.threat)}, ${pair.threat.queries})`));
+  const label = (pair) => (pair.attack.name === "none" ? "no attack" : attackName(pair));
   const driven = (attack) => all.reduce((sum, pair) => sum + (label(pair) === attack ? pair.cells.length : 0), 0);
   const attacks = [...new Set([...controls, ...all.filter((pair) => pair.attack.name !== "none")].map(label))]
     .sort((a, b) => (b === "no attack") - (a === "no attack") || driven(b) - driven(a));
@@ -364,71 +442,152 @@ function drawMatrix(board) {
     el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Defence · victim"), ...attacks.map((attack) => el("th", { scope: "col" }, attack)))),
     el("tbody", {}, ...rows.map((row, i) => el("tr", {}, el("th", { scope: "row" }, `${row.defense.label} · ${row.victim.label}`),
       ...scored[i].map((one) => (one?.score ? el("td", { class: "value", style: tint(one.score.estimate) }, cardLink(one.pair, fixed(one.score.estimate)), el("small", {}, bounds(one.score)), el("small", {}, part(one.pair, rows[i]))) : el("td", { class: "value" }, "")))))));
-  at("matrix").copied = () => [["defence", "victim", ...attacks], ...rows.map((row, i) => [row.defense.label, row.victim.label, ...scored[i].map((one) => one?.score?.estimate ?? null)])];
+  at("matrix").copied = () => ({
+    heads: [{ name: "defence" }, { name: "victim" }, ...attacks.map((name) => ({ name, interval: true }))],
+    rows: rows.map((row, i) => [row.defense.label, row.victim.label, ...scored[i].map((one) => one?.score ?? { estimate: null })]),
+  });
 }
+/* ---- curves: every defended victim is a line of one plot ---- */
 function drawCurves(board) {
-  const shown = data.curves.map((curve) => ({ ...curve, first: pairs.get(curve.points[0].pair) }))
-    .filter((curve) => curve.first.track === board.track && chosen(curve.first) && curve.first.threat.norm === board.threat.norm &&
-      board.rows.some((row) => row.defense.label === curve.first.defense.label && row.victim.label === curve.first.victim.label));
-  at("curves-section").hidden = !shown.length;
-  at("curves").replaceChildren(...shown.slice(0, 60).map((curve) => figure(curve, board)));
+  const alike = (one) => one.track === board.track && ["grid", "world"].every((name) => JSON.stringify(one[name]) === JSON.stringify(board[name])) &&
+    ["norm", "access", "queries", "share"].every((name) => one.threat[name] === board.threat[name]);
+  const family = data.boards.filter(alike).sort((a, b) => a.threat.budget - b.threat.budget);
+  const found = board.rows.filter(chosen).map((row) => ({
+    row,
+    parts: family.flatMap((one) => one.rows.filter((other) => sameDefended(row, other)).map((other) => ({ x: one.threat.budget, of: other }))),
+  })).filter(({ parts }) => parts.length > 1);
+  // Only cells that every point of every line has: otherwise a line would compare different roads.
+  const sets = found.flatMap(({ row, parts }) => [...parts.map(({ of }) => of), controlOf(row)].filter(Boolean).map((one) => new Set(kept(one.cells).map(({ cell }) => place(cell)))));
+  const common = new Set([...(sets[0] ?? [])].filter((name) => sets.every((set) => set.has(name))));
+  const on = (one) => interval(one, one.cells.flatMap(({ cell }, n) => (common.has(place(cell)) ? [n] : [])));
+  const budget = !common.size ? [] : found.map(({ row, parts }) => ({
+    name: `${row.defense.label} · ${row.victim.label}`,
+    points: [...(controlOf(row) ? [{ x: 0, ...on(controlOf(row)) }] : []), ...parts.map(({ x, of }) => ({ x, ...on(of) }))],
+  }));
+  const effort = data.curves.filter((curve) => curve.kind === "queries").map((curve) => ({ curve, first: pairs.get(curve.points[0].pair) }))
+    .filter(({ first }) => first.track === board.track && chosen(first) && first.threat.norm === board.threat.norm && first.threat.budget === board.threat.budget && rowOf(first))
+    .map(({ curve, first }) => ({ name: `${first.attack.label} on ${first.defense.label} · ${first.victim.label} (${curve.cells.length} cells)`, points: curve.points }));
+  const plots = [
+    plot(budget, `Budget (${board.threat.norm}); 0 is no attack`, false, `Score under the strongest attack, on the ${common.size} cells that every point has`),
+    plot(effort, `${capital(said().queries_title)}, log scale`, true, "Score when an attack may spend more"),
+  ].filter(Boolean);
+  at("curves-section").hidden = !plots.length;
+  at("curves").replaceChildren(...plots);
 }
-function figure(curve, board) {
-  const W = 340, H = 190, L = 34, B = 34, T = 8, R = 12, ns = "http://www.w3.org/2000/svg";
-  const points = curve.kind === "budget" && curve.clean ? [{ x: 0, ...curve.clean }, ...curve.points] : curve.points;
-  const log = curve.kind === "queries" && points[0].x > 0;
-  const scale = (x) => (log ? Math.log10(x) : x);
-  const low = scale(points[0].x), high = scale(points[points.length - 1].x) || 1;
+/* Round numbers: 1, 2 or 5 times a power of ten. */
+function ticks(low, high, log) {
+  const found = [];
+  if (log) {
+    for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power++) for (const digit of [1, 2, 5]) found.push(digit * 10 ** power);
+    const within = found.filter((x) => x >= low && x <= high);
+    return within.length > 1 ? within : [found.filter((x) => x < low).pop() ?? low, found.find((x) => x > high) ?? high];
+  }
+  const rough = (high - low) / 4 || 1, power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].find((digit) => digit * power >= rough) * power;
+  for (let n = Math.ceil(low / step); n * step <= high * 1.0001; n++) found.push(+(n * step).toPrecision(6));
+  return found;
+}
+function plot(lines, unit, log, title) {
+  const xs = lines.flatMap(({ points }) => points.map(({ x }) => x)).filter((x) => !log || x > 0);
+  if (!xs.length) return null;
+  const W = 560, H = 280, L = 40, B = 46, T = 10, R = 16, ns = "http://www.w3.org/2000/svg";
+  const scale = (x) => (log ? Math.log10(Math.max(x, 1e-9)) : x);
+  const marks = ticks(Math.min(...xs), Math.max(...xs), log);
+  const low = scale(Math.min(...xs, ...(log ? marks : []))), high = scale(Math.max(...xs, ...(log ? marks : [])));
   const X = (x) => L + ((scale(x) - low) / (high - low || 1)) * (W - L - R), Y = (y) => H - B - Math.max(0, Math.min(1, y)) * (H - B - T);
   const make = (tag, attributes, text) => { const made = document.createElementNS(ns, tag); for (const [k, v] of Object.entries(attributes)) made.setAttribute(k, v); if (text != null) made.textContent = text; return made; };
-  const svg = make("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": points.map((p) => `${p.x}: ${fixed(p.estimate)}`).join("; ") });
-  for (const y of [0, 0.5, 1]) svg.append(make("path", { class: "axis", d: `M${L} ${Y(y)}H${W - R}` }), make("text", { x: L - 6, y: Y(y) + 4, "text-anchor": "end" }, String(y)));
-  svg.append(make("path", { class: "band", d: "M" + points.map((p) => `${X(p.x)} ${Y(p.high ?? p.estimate)}`).join("L") + "L" + [...points].reverse().map((p) => `${X(p.x)} ${Y(p.low ?? p.estimate)}`).join("L") + "Z" }));
-  svg.append(make("path", { class: "line", d: "M" + points.map((p) => `${X(p.x)} ${Y(p.estimate)}`).join("L") }));
-  for (const p of points) svg.append(make("circle", { cx: X(p.x), cy: Y(p.estimate), r: 3 }), make("text", { x: X(p.x), y: H - B + 15, "text-anchor": "middle" }, p.x >= 100 ? Math.round(p.x) : +p.x.toFixed(3)));
-  const unit = curve.kind === "budget" ? `budget (${board.threat.norm})` : said().queries_title;
-  svg.append(make("text", { x: (L + W - R) / 2, y: H - 4, "text-anchor": "middle" }, unit + (log ? ", log scale" : "")));
-  return el("figure", {}, svg, el("figcaption", { title: curve.cells.map((cell) => joined(Object.values(cell))).join("; ") }, `${curve.first.attack.label} on ${curve.first.defense.label} · ${curve.first.victim.label}, ${curve.cells.length} cell${curve.cells.length > 1 ? "s" : ""}${curve.left_out ? ` (${curve.left_out} at the floor or the ceiling left out)` : ""}`));
+  const svg = make("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": lines.map(({ name, points }) => `${name}: ${points.map((p) => `${+p.x.toPrecision(3)}: ${fixed(p.estimate)}`).join(", ")}`).join("; ") });
+  for (const y of [0, 0.25, 0.5, 0.75, 1]) svg.append(make("path", { class: "axis", d: `M${L} ${Y(y)}H${W - R}` }), make("text", { x: L - 6, y: Y(y) + 4, "text-anchor": "end" }, String(y)));
+  for (const x of marks) svg.append(make("path", { class: "axis", d: `M${X(x)} ${H - B}v5` }), make("text", { class: "tick", x: X(x), y: H - B + 18, "text-anchor": "middle" }, String(x)));
+  svg.append(make("text", { x: (L + W - R) / 2, y: H - 6, "text-anchor": "middle" }, unit));
+  lines.forEach(({ points }, n) => {
+    const colour = `c${n % 8}`, dash = n >= 8 ? "4 3" : null;
+    for (const p of points) if (p.low != null) svg.append(make("path", { class: `bar ${colour}`, d: `M${X(p.x)} ${Y(p.low)}V${Y(p.high)}` }));
+    svg.append(make("path", { class: `line ${colour}`, ...(dash ? { "stroke-dasharray": dash } : {}), d: "M" + points.map((p) => `${X(p.x)} ${Y(p.estimate)}`).join("L") }));
+    for (const p of points) svg.append(make("circle", { class: colour, cx: X(p.x), cy: Y(p.estimate), r: 4 }));
+  });
+  const key = (n) => { const swatch = make("svg", { viewBox: "0 0 28 10", class: "swatch", "aria-hidden": "true" }); swatch.append(make("path", { class: `line c${n % 8}`, ...(n >= 8 ? { "stroke-dasharray": "4 3" } : {}), d: "M0 5H28" }), make("circle", { class: `c${n % 8}`, cx: 14, cy: 5, r: 4 })); return swatch; };
+  return el("figure", {}, el("figcaption", {}, title), svg, el("ul", { class: "key" }, ...lines.map(({ name }, n) => el("li", {}, key(n), name))));
 }
 
-/* ---- the card of a pair: #pair-12 ---- */
+/* ---- cards: of a row, and of one attack on it ---- */
+const fact = (name, ...value) => [el("dt", {}, name), el("dd", {}, ...value)];
+const command = (text) => [el("code", {}, text), el("button", { type: "button", onclick: () => copy(text, "Text") }, "Copy")];
+const listed = (values) => values.join(", ") || "none";
+/* Where this card can be found again. */
+function here() {
+  return location.protocol === "file:" ? `cavbench leaderboard, ${address()}` : location.href.split("#")[0] + address();
+}
+function bibtex(title, key) {
+  return [`@misc{cavbench-${key.replace(/[^\w.-]+/g, "-")},`, `  title = {${title}},`, "  author = {{The cavbench authors}},", `  year = {${data.made.slice(0, 4)}},`,
+    `  note = {cavbench ${data.cavbench}, records of ${data.made.slice(0, 10)}},`, `  howpublished = {${here()}}`, "}"].join("\n");
+}
+/* What the components are, with the papers that their authors name. */
+function works(card, kinds) {
+  return kinds.flatMap((kind) => fact(kind === "defense" ? "defence" : kind,
+    el("b", {}, [card.components[kind].name, ...Object.entries(card.components[kind].params).map(([k, v]) => `${k}=${JSON.stringify(v)}`)].join(" ")),
+    card.about[kind] ? el("div", {}, card.about[kind]) : null, el("small", { class: "quiet" }, listed(card.shipped_by[kind]))));
+}
+function provenance(pair) {
+  const card = pair.card;
+  return [
+    ...fact("training seeds", listed(card.training_seeds)),
+    ...fact("scenario seeds", `${card.scenario_seeds[0]} to ${card.scenario_seeds[1]} (${listed(card.grid)}), ${pair.cells.length} cells, ${card.episodes} episodes` + (card.left_out ? `; ${card.left_out} left out` : "")),
+    ...fact("weights (sha256)", listed(card.weights_sha256)),
+    ...(card.artefact_sha256.length ? fact(`${data.tracks[pair.track].artefact} (sha256)`, listed(card.artefact_sha256)) : []),
+    ...fact("code (sha256)", listed(card.code_digest)),
+    ...fact("libraries", ...card.libraries.map((one) => el("div", {}, Object.entries(one).map(([k, v]) => `${k} ${v}`).join(", ")))),
+    ...fact("machine", listed(card.machine)),
+    ...fact("finished", `${card.finished}, ${card.wall_s} s of work`),
+    ...fact("run it again", ...command(card.run)),
+    ...fact("replay an episode", ...command(card.replay)),
+  ];
+}
+function rowCard(row) {
+  const name = `${row.defense.label} · ${row.victim.label}`, strongest = pairs.get(row.strongest);
+  const film = row.clip ? el("figure", { class: "film" }, el("img", { src: row.clip, alt: `The same scenario without an attack, and under ${strongest.attack.name}`, onerror: (event) => event.target.closest("figure").remove() }), el("figcaption", {}, "The same scenario without an attack (above), and attacked (below)")) : null;
+  return [name, el("p", { class: "quiet" }, threatText(current().threat)), film, el("dl", {},
+    ...fact("score", ...estimate(row.score), `, rank ${row.group}`),
+    ...(row.failed ? fact(said().failure_title, `${percent(row.failed.estimate)} (${bounds(row.failed)})`) : []),
+    ...fact("worst cell", ...worstCell({ row })),
+    ...(row.clean ? fact("without an attack", ...estimate(row.clean)) : []),
+    ...fact("attacks", ...row.pairs.map((key) => el("div", {}, cardLink(pairs.get(key), attackName(pairs.get(key))), " ", ...estimate(pairs.get(key).score), " ", el("small", { class: "quiet" }, part(pairs.get(key), row))))),
+    ...fact("flags", doubts(row)),
+    ...works(strongest.card, ["defense", "victim", "world"]),
+    ...fact("strongest attack", pairs.get(row.strongest).attack.label),
+    ...provenance(strongest),
+    ...fact("cite", ...command(bibtex(`${name} under ${threatName(current().threat)}, ${current().grid}: ${data.tracks[state.track].title} ${fixed(row.score.estimate)} [${bounds(row.score)}]`, rowName(row)))),
+    ...fact("address", ...command(here())))];
+}
+function pairCard(pair) {
+  const card = pair.card;
+  return [card.pair, null, null, el("dl", {},
+    ...fact("score", ...estimate(pair.score)),
+    ...works(card, ["attack", "defense", "victim", "world"]),
+    ...fact("threat model", pair.threat.budget ? threatName(pair.threat) : "nothing is attacked"),
+    ...provenance(pair),
+    ...fact("recording", card.recording ? el("a", { href: data.recordings + card.recording }, card.recording) : "none here; the command above makes one"),
+    ...fact("cite", ...command(bibtex(`${card.pair}: ${data.tracks[pair.track].title} ${fixed(pair.score.estimate)} [${bounds(pair.score)}]`, card.pair))),
+    ...fact("address", ...command(here())))];
+}
 function showCard() {
-  const key = /^#pair-(\d+)$/.exec(location.hash)?.[1];
-  const pair = key && pairs.get(+key), dialog = at("card");
-  if (!pair) { if (dialog.open) dialog.close(); return; }
-  const card = pair.card, words = (values) => values.join(", ") || "none";
-  const params = (component) => [component.name, ...Object.entries(component.params).map(([k, v]) => `${k}=${JSON.stringify(v)}`)].join(" ");
-  const fact = (name, ...value) => [el("dt", {}, name), el("dd", {}, ...value)];
-  const command = (text) => [el("code", {}, text), el("button", { type: "button", onclick: () => copy(text, "Command") }, "Copy")];
+  const dialog = at("card");
+  if (!state.row) { if (dialog.open) dialog.close(); return; }
+  const [title, ...parts] = state.pair ? pairCard(state.pair) : rowCard(state.row);
   dialog.replaceChildren(
-    el("div", { class: "bar" }, el("h2", { id: "card-title" }, card.pair), el("button", { type: "button", onclick: () => dialog.close() }, "Close")),
-    el("dl", {},
-      ...fact("score", ...estimate(pair.score)),
-      ...["attack", "defense", "victim", "world"].flatMap((kind) => fact(kind === "defense" ? "defence" : kind, params(card.components[kind]), el("br"), el("small", { class: "quiet" }, words(card.shipped_by[kind])))),
-      ...fact("threat model", pair.threat.budget ? threatName(pair.threat) : "nothing is attacked"),
-      ...fact("training seeds", words(card.training_seeds)),
-      ...fact("scenario seeds", `${card.scenario_seeds[0]} to ${card.scenario_seeds[1]} (${words(card.grid)}), ${pair.cells.length} cells, ${card.episodes} episodes` + (card.left_out ? `; ${card.left_out} left out` : "")),
-      ...fact("weights", words(card.weights_sha256)),
-      ...(card.artefact_sha256.length ? fact(data.tracks[pair.track].artefact, words(card.artefact_sha256)) : []),
-      ...fact("code", words(card.code_digest)),
-      ...fact("libraries", ...card.libraries.map((one) => el("div", {}, Object.entries(one).map(([k, v]) => `${k} ${v}`).join(", ")))),
-      ...fact("machine", words(card.machine)),
-      ...fact("finished", `${card.finished}, ${card.wall_s} s of work`),
-      ...fact("run it again", ...command(card.run)),
-      ...fact("replay an episode", ...command(card.replay)),
-      ...fact("recording", card.recording ? el("a", { href: data.recordings + card.recording }, card.recording) : "none here; the command above makes one"),
-    ));
+    el("div", { class: "bar" }, el("h2", { id: "card-title" }, title), el("button", { type: "button", onclick: () => dialog.close() }, "Close")),
+    ...parts.filter(Boolean));
+  dialog.scrollTop = 0;
   if (!dialog.open) dialog.showModal();
 }
-at("card").addEventListener("close", () => { if (location.hash.startsWith("#pair-")) history.replaceState(null, "", location.pathname + location.search); });
+at("card").addEventListener("close", () => { state.row = state.pair = null; history.replaceState(null, "", address()); });
 at("card").addEventListener("click", (event) => { if (event.target === at("card")) at("card").close(); });
-addEventListener("hashchange", showCard);
+addEventListener("hashchange", go);
 
-for (const button of document.querySelectorAll("nav button")) button.addEventListener("click", () => setTrack(button.dataset.track));
-at("threat").addEventListener("change", (event) => setBoard(+event.target.value));
+for (const button of document.querySelectorAll("[data-track]")) button.addEventListener("click", (event) => { event.preventDefault(); visit(`#/${button.dataset.track}`); });
+at("threat").addEventListener("change", (event) => visit(`#/${written(state.track)}/${written(boardNames()[+event.target.value])}`));
 for (const kind of ["defense", "victim", "attack"]) at(kind).addEventListener("change", (event) => { state[kind] = event.target.value; render(); });
 at("shown").addEventListener("change", (event) => { state.shown = event.target.value; render(); });
-at("filters").addEventListener("reset", (event) => { event.preventDefault(); setBoard(state.board); });
+at("filters").addEventListener("reset", (event) => { event.preventDefault(); visit(`#/${written(state.track)}/${written(boardNames()[state.board])}`); });
 at("filters").addEventListener("submit", (event) => event.preventDefault());
-setTrack(document.querySelector("nav button").dataset.track);
-showCard();
+go();

@@ -1,0 +1,67 @@
+"""The options of `bench run` and `bench train` that choose neither a component nor a cell. Importing them is quick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from bench.run.process import machine_bytes
+
+
+def half_of_memory() -> float:
+    """Half of the machine's memory in GB; 0 if it cannot be read."""
+    return machine_bytes() / 2e9
+
+
+def _meaning(meaning: str, default: str) -> dict[str, str]:
+    """Metadata of a field: its meaning, and its default as help shows it."""
+    return {"meaning": meaning, "default": default}
+
+
+@dataclass
+class RayOptions:
+    """The options of `executor=ray`."""
+
+    address: str = field(
+        default="local",
+        metadata=_meaning("Ray cluster: local starts one, auto finds the running one, or HOST:PORT.", "local"),
+    )
+
+
+@dataclass
+class RunOptions:
+    """The options of `bench run`, with types and defaults."""
+
+    grid: str | None = field(default=None, metadata=_meaning("Named list of scenarios.", "the world's"))
+    episodes: int | None = field(default=None, metadata=_meaning("Scenarios in each cell.", "the grid's"))
+    seeds: list[int] | None = field(
+        default=None, metadata=_meaning("Training seeds of the victims (detectors: patch seeds).", "the grid's")
+    )
+    executor: str = field(
+        default="processes", metadata=_meaning("What carries out the work: serial, processes or ray.", "processes")
+    )
+    workers: int | None = field(default=None, metadata=_meaning("Worker processes.", "one a core"))
+    ray: RayOptions = field(default_factory=RayOptions)
+    out: str = field(default="results", metadata=_meaning("Results folder.", "results"))
+    record: int | None = field(
+        default=None, metadata=_meaning("Episodes to record in each cell.", "one of the first cell")
+    )
+    reference: bool = field(default=True, metadata=_meaning("Whether the baselines are driven, too.", "true"))
+    shard: str = field(default="1/1", metadata=_meaning("PART/PARTS: 3/10 drives the third of ten parts.", "1/1"))
+    unit_timeout: float = field(
+        default=3600.0, metadata=_meaning("Seconds that a unit may take; 0 for no limit.", "3600.0")
+    )
+    unit_memory: float = field(
+        default_factory=half_of_memory,
+        metadata=_meaning("GB that a worker may use; 0 for no limit.", "half of the machine's"),
+    )
+    until: float | None = field(
+        default=None, metadata=_meaning("Drives scenarios until a row is known to +- this.", "the whole grid")
+    )
+
+
+@dataclass
+class TrainOptions:
+    """The options of `bench train`, with types and defaults."""
+
+    seeds: list[int] = field(default_factory=lambda: [0], metadata=_meaning("Training seeds.", "0"))
+    out: str | None = field(default=None, metadata=_meaning("Zoo to save to.", "your own zoo"))

@@ -1,0 +1,76 @@
+"""A planner with perfect information: it tries plans in copies of the simulator, hidden state included (random shooting)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.highway.ego import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
+from envs.highway.engine import HighwayEngine
+from envs.highway.forecast import roll_batch
+
+HORIZON_S, SEGMENT_S, HELD_S = 4.0, 0.8, 1 / 3
+"""Seconds of a plan, of its parts, and for which it is carried out before the next one is chosen."""
+PLANS, LIBRARY = 64, 1024
+"""Plans that are tried at a time, and that there are; each choice tries the next ones."""
+CHANCES = {LANE_LEFT: 0.15, IDLE: 0.15, LANE_RIGHT: 0.15, FASTER: 0.4, SLOWER: 0.15}
+"""How often a part of a plan is each action. A lane change is sent once."""
+FAILURE = 1e3
+"""Cost of a crash or of leaving the road within the plan; a later one costs less."""
+
+
+class OraclePlanner:
+    """Chooses the actions of every episode of an engine by model-predictive control.
+
+    The state is copied with all its hidden parts and the world is deterministic, so a plan that is chosen works out. The rest of
+    the plan before is always among those that are tried.
+
+    Args:
+        engine: the engine, with discrete actions.
+    """
+
+    def __init__(self, engine: HighwayEngine) -> None:
+        hz = engine.config.policy_frequency
+        self.engine = engine
+        self.length, self.held = round(HORIZON_S * hz), max(1, round(HELD_S * hz))
+        self.library = _library(self.length, max(1, round(SEGMENT_S * hz)))
+        self.plan = np.full((engine.config.batch, self.length), IDLE, dtype=np.int64)
+
+    def actions(self) -> NDArray[np.int64]:
+        """The actions [B] in the current states."""
+        steps = self.engine.episodes["steps"]
+        running = ~(self.engine.episodes["terminated"] | self.engine.episodes["truncated"])
+        due = np.flatnonzero((steps % self.held == 0) & running)
+        for lanes in np.unique(self.engine.episodes["lanes"][due]):
+            self._choose(due[self.engine.episodes["lanes"][due] == lanes], int(lanes))
+        return self.plan[np.arange(len(steps)), steps % self.held]
+
+    def _choose(self, rows: NDArray[np.int64], lanes: int) -> None:
+        """Choose the plans of the episodes `rows` on roads with these lanes."""
+        steps = self.engine.episodes["steps"][rows]
+        turn = (steps // self.held)[:, None] * PLANS + np.arange(PLANS)
+        tried = self.library[turn % LIBRARY]
+        begun = (steps > 0)[:, None]
+        rest = np.roll(self.plan[rows], -self.held, axis=1)
+        rest[:, -self.held :] = IDLE
+        tried[:, 0] = np.where(begun, rest, IDLE)
+        for place, action in enumerate((FASTER, IDLE, SLOWER), start=1):
+            tried[:, place] = action
+        cars = np.ascontiguousarray(self.engine.vehicles[rows])
+        failed = np.zeros(tried.shape[:2], np.int64)
+        crashed, progress = np.zeros(failed.shape, np.bool_), np.zeros(failed.shape, np.float32)
+        counts = np.full(len(rows), cars.shape[1], np.int64)
+        controls = np.zeros((*tried.shape, 2))
+        roll_batch(cars, counts, tried, controls, lanes, self.engine.parameters, failed, crashed, progress)
+        worth = progress - np.where(failed < self.length, FAILURE - failed, 0.0)
+        self.plan[rows] = tried[np.arange(len(rows)), worth.argmax(1)]
+
+
+def _library(length: int, segment: int) -> NDArray[np.int64]:
+    """[LIBRARY, length] random plans, always the same."""
+    generator = np.random.default_rng(0)
+    parts = generator.choice(list(CHANCES), size=(LIBRARY, -(-length // segment)), p=list(CHANCES.values()))
+    plans = np.repeat(parts, segment, axis=1)[:, :length]
+    sideways = np.isin(plans, (LANE_LEFT, LANE_RIGHT))
+    first = np.arange(length) % segment == 0
+    return np.ascontiguousarray(np.where(sideways & ~first, FASTER, plans), dtype=np.int64)
