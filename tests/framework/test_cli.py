@@ -93,7 +93,7 @@ def test_what_is_typed_wrong_is_said_in_our_own_words(bench: Bench, words: tuple
         (("attack=nudge", "attack.pause=long"), "attack.pause must be a number, got long"),
         (("threat.budget=-1",), "threat.budget must be between 0 and 2, got -1"),
         (("attack=steer", "victim=toy"), "attack 'steer' does not fit victim 'toy'"),
-        (("--fast",), "unknown option '--fast'; known: --help"),
+        (("--fast",), "unknown option '--fast'; known: "),
     ],
 )
 def test_bad_input_is_refused_before_any_work(bench: Bench, tmp_path: Path, words: tuple[str, ...], part: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from bench.records.schema import schema
 from bench.run import runner
 from bench.run.config import run_config
 from bench.run.plan import plan
+from bench.scenarios import Cell
 from tests.framework.conftest import import_path
 from tests.framework.test_runner import Silent, comparable
 
@@ -37,7 +39,15 @@ WORDS = (
 
 
 @dataclass(frozen=True)
+class Named:
+    id: str
+
+
+@dataclass(frozen=True)
 class Wanted:
+    pair: Named
+    cell: Cell
+    training_seed: int
     seeds: range
     track: Track = TRACK
 
@@ -64,7 +74,12 @@ def some(unit: pa.Table) -> list[pa.Table]:
 def wanted(some: Sequence[pa.Table]) -> dict[str, Wanted]:
     """What a run asks for."""
     seeds = sorted(some[0]["seed"].to_pylist())
-    return {records["unit"][0].as_py(): Wanted(range(seeds[0], seeds[-1] + 1)) for records in some}
+    found = {}
+    for records in some:
+        row = records.slice(0, 1).to_pylist()[0]
+        named, cell = Named(row["pair"]), Cell(**json.loads(row["cell"]))
+        found[row["unit"]] = Wanted(named, cell, row["training_seed"], range(seeds[0], seeds[-1] + 1))
+    return found
 
 
 @pytest.fixture
