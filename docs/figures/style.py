@@ -59,8 +59,8 @@ STYLE = {
     "savefig.facecolor": GROUND,
 }
 
-LONG_NUMBER = re.compile(r"(?<=[\s\"])-?\d+\.\d{3,}(?=[\s\"])")
-"""A coordinate in an SVG file. Two decimals are enough."""
+LONG_NUMBER = re.compile(r"(?<=[\s\"])-?\d+\.\d{2,}(?=[\s\"])")
+"""A coordinate in an SVG file. One decimal is enough: a tenth of a point."""
 
 
 def figure(height: float, title: str) -> Figure:
@@ -81,7 +81,8 @@ def save(made: Figure, path: Path) -> None:
     if path.suffix == ".svg":
         drawn = io.StringIO()
         made.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
-        path.write_text(LONG_NUMBER.sub(lambda number: f"{float(number[0]):.2f}", drawn.getvalue()))
+        text = LONG_NUMBER.sub(lambda number: f"{float(number[0]):.1f}", drawn.getvalue())
+        path.write_text(re.sub(r"\s*\n\s*", "\n", text))
         return
     drawn = io.BytesIO()
     made.savefig(drawn, format="png", dpi=PNG_DPI)

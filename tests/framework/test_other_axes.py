@@ -14,7 +14,7 @@ RUN = ("run", "attack=nudge", "victim=toy", "world=bend", "seeds=0,1", "executor
 
 def test_a_run_takes_its_axes_from_the_world(bench: Bench, tmp_path: Path) -> None:
     out = tmp_path / "results"
-    said = bench(*RUN, "curvature=0.1,0.2", f"out={out}")
+    said = bench(*RUN, "curvature=0.1,0.2", "--cells", f"out={out}")
     assert said.code == 0, said.err
     assert "curvature" in said.out
     assert "gap" in said.out

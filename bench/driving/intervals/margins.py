@@ -203,5 +203,5 @@ def _middle(low: Tensor, high: Tensor) -> Tensor:
 
 
 def least(room: Tensor, counts: Tensor) -> Tensor:
-    """The least room [..., lanes, options] over the cars that count, bool [..., V - 1, lanes]."""
-    return torch.where(counts.unsqueeze(-1), room.unsqueeze(-2), FREE).amin(-3)
+    """The least room [..., lanes, options], from -`FREE` to `FREE`, over the cars that count, bool [..., V - 1, lanes]."""
+    return torch.where(counts.unsqueeze(-1), room.unsqueeze(-2), FREE).amin(-3).clamp(min=-FREE)
