@@ -13,7 +13,7 @@ import pytest
 from bench.plugins.track import track
 from bench.records import reading
 from tests.framework.conftest import Said, ran
-from tests.framework.distributions import install
+from tests.framework.distributions import install, install_toy
 
 HERE = Path(__file__).parent
 CELL = ("world=toy", "lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0", "record=0", "reference=false")
@@ -48,15 +48,17 @@ HARMLESS = ("none", "reseed", "print", "print much", "fork", "fork and stay")
 
 
 @pytest.fixture(scope="module")
-def site(toy_folder: Path) -> Path:
-    """The toy distribution and the misbehaving one, on the import path of new processes."""
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy distribution and the misbehaving one, on the import path of new processes only."""
+    folder = tmp_path_factory.mktemp("site")
+    install_toy(folder)
     points = {
         "cavbench.attacks": {"rogue": "rogue:Rogue", **{name: f"{name}:Attack" for name in ON_IMPORT}},
         "cavbench.victims": {"bad_answers": "rogue:BadVictim"},
     }
     modules = {"rogue": (HERE / "misbehaving.py").read_text(), **ON_IMPORT}
-    install(toy_folder, "cavbench-rogue", points, modules, "3.1")
-    return toy_folder
+    install(folder, "cavbench-rogue", points, modules, "3.1")
+    return folder
 
 
 @pytest.fixture(scope="module")
