@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from operator import itemgetter
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -80,20 +82,18 @@ class EOT(PatchAttack):
     noise: NotNegative = 0.02
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
-        best, least = None, torch.inf
-        for start in range(self.restarts):
+        found = [
+            self._optimised(oracle, scenes, partial(self._report, progress, start)) for start in range(self.restarts)
+        ]
+        patch, _ = min(found, key=itemgetter(1))
+        return patch
 
-            def share(done: float, text: str, start: int = start) -> None:
-                progress((start + done) / self.restarts, text)
-
-            patch, loss = self._optimised(oracle, scenes, share)
-            if best is None or loss < least:
-                best, least = patch, loss
-        assert best is not None
-        return best
+    def _report(self, progress: Progress, start: int, share: float, text: str) -> None:
+        """Report the share of one start that is done."""
+        progress((start + share) / self.restarts, text)
 
     def _optimised(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> tuple[Tensor, float]:
-        """A patch [3, P, P] from a random start, and its mean loss in the last steps; infinite if no query was left for one."""
+        """A patch [3, P, P] from a random start, and its mean loss in the last steps; infinite if the queries ended before."""
         from attacks.transformations import Transformations
 
         seen = (scenes.visible >= SEEN).nonzero().squeeze(1)
@@ -121,7 +121,7 @@ class EOT(PatchAttack):
             scores = predictions.scores_of(oracle.label).amax(-1)
             found, variation = scores.mean(), total_variation(patch)
             oracle.report(patch[0], found=found, total_variation=variation)
-            loss = self._of(scores) + self.tv * variation
+            loss = self._loss(scores) + self.tv * variation
             adam.zero_grad()
             loss.backward()
             adam.step()
@@ -134,7 +134,7 @@ class EOT(PatchAttack):
         last = losses[-max(1, round(JUDGED * self.steps)) :]
         return patch.detach()[0], sum(last) / len(last) if len(losses) == self.steps else torch.inf
 
-    def _of(self, scores: Tensor) -> Tensor:
+    def _loss(self, scores: Tensor) -> Tensor:
         """The loss of scores [N] in [0, 1]."""
         if self.loss == "probability":
             return scores.mean()

@@ -36,7 +36,7 @@ MEMBERS_S = {
 SCENARIOS = 30
 """Of a unit of standard-v2; counted as three times ten, which is too much, because large batches are cheaper."""
 DENSITY_2 = 1.5
-"""A unit at density 2 takes so much longer: `python benchmarks/unit_cost.py`."""
+"""A unit at density 2 takes so much longer: an assumption, not a measurement."""
 VICTIMS, TRAINING_SEEDS, ROADS_AND_WEATHERS = 14, 10, 9
 ALONE = ("plan", "pessimist")
 """Members that are not driven in batches."""

@@ -386,13 +386,14 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
         raise UserError(f"{kind} {name!r} needs {', '.join(missing)}")
     if not given:
         return {}
+    schema = _schema(owned)
     try:
-        config = OmegaConf.create({kind: OmegaConf.structured(_schema(owned))})
+        config = OmegaConf.create({kind: OmegaConf.structured(schema)})
     except OmegaConfBaseException as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"the parameters of {kind} {name!r} cannot be set on the command line: {reason}") from error
     overrides = [f"{kind}.{key}={value}" for key, value in given.items()]
-    composed = _composed(config, overrides, _schema(owned))[kind]
+    composed = _composed(config, overrides, schema)[kind]
     arguments = OmegaConf.to_object(composed)
     return _read(kind, owned, arguments)
 

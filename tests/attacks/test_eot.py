@@ -66,7 +66,7 @@ def test_log_odds_lead_to_the_optimum_too() -> None:
 
 def test_log_odds_keep_the_gradient_where_the_detector_is_sure() -> None:
     scores = torch.tensor([0.9999, 0.5], requires_grad=True)
-    (gradient,) = torch.autograd.grad(EOT(loss="log_odds")._of(scores), scores)
+    (gradient,) = torch.autograd.grad(EOT(loss="log_odds")._loss(scores), scores)
     assert gradient[0] > 1000 * gradient[1]
 
 
