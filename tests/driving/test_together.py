@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -166,3 +167,13 @@ def test_a_task_of_several_units_has_the_outcome_of_each() -> None:
         assert other.records is not None
         same = [name for name in one.records.column_names if name not in PROBES | timed]
         assert one.records.select(same).to_pylist() == other.records.select(same).to_pylist()
+
+
+def test_an_outcome_survives_the_way_from_a_worker() -> None:
+    outcome = carried_out(Task(work=units("noise", 1, seeds=range(1_000_000, 1_000_002))[0]))
+    assert outcome.records is not None
+    sent = pickle.dumps(replace(outcome, others=[outcome, Outcome(wall_s=1.0, artefact=b"patch")]))
+    found = pickle.loads(sent)
+    assert found.records.equals(outcome.records, check_metadata=True)
+    assert found.others[0].records.equals(outcome.records)
+    assert (found.others[1].records, found.others[1].artefact) == (None, b"patch")
