@@ -193,9 +193,8 @@ def print_start(out: Path, count: int, episodes: int) -> None:
     for what, units, expected in (("all", wanted, count), ("none", others, 0)):
         start, used = time.perf_counter(), time.process_time()
         found = finished(out, units)
-        print(
-            f"finished: {what} of {count} units in {time.process_time() - used:.1f} s of CPU time, {time.perf_counter() - start:.1f} s"
-        )
+        wall, cpu = time.perf_counter() - start, time.process_time() - used
+        print(f"finished: {what} of {count} units in {cpu:.1f} s of CPU time, {wall:.1f} s", flush=True)
         assert len(found) == expected
 
 

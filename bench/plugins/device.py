@@ -35,7 +35,9 @@ def resolved(asked: str, executor: str) -> str:
     if asked == "cuda" and executor == "ray":
         raise ValueError("executor=ray gives its workers no GPU: leave out device=cuda, or use executor=processes")
     if asked == "cuda" and not _gpu():
-        raise ValueError("device=cuda needs a GPU that torch can use, and there is none: leave it out, or use device=auto")
+        raise ValueError(
+            "device=cuda needs a GPU that torch can use, and there is none: leave it out, or use device=auto"
+        )
     return "cuda" if asked != CPU and executor != "ray" and _gpu() else CPU
 
 

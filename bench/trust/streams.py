@@ -14,7 +14,7 @@ from bench.plugins.fingerprint import digest
 
 
 class Stream:
-    """States of the global random generators of torch (of its GPU, too), numpy and Python's `random` that are not in use at the moment.
+    """States of the global random generators of torch, numpy and Python's `random` that are not in use at the moment.
 
     Args:
         seed: any values; the same values give the same numbers.
@@ -25,6 +25,7 @@ class Stream:
         self._torch = torch.Generator().manual_seed(number).get_state()
         self._python = random.Random(number).getstate()
         self._numpy: np.random.BitGenerator = np.random.MT19937(number)
+        # None before the GPU is in use: its generator then goes on as it is.
         self._gpu = torch.Generator("cuda").manual_seed(number).get_state() if torch.cuda.is_initialized() else None
         self._fresh = _bytes(self._torch), self._python, _drawn(self._numpy), _bytes(self._gpu)
 

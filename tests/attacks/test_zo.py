@@ -153,8 +153,13 @@ def test_the_gradient_of_a_unit_does_not_depend_on_others_in_the_batch(sizes: li
     generator = torch.Generator().manual_seed(seed)
     ends = list(accumulate(sizes, initial=0))
     parts = [Part(slice(start, end), generator) for start, end in pairwise(ends)]
-    value, directions = torch.randn(count + 1, ends[-1]), _directions(count, torch.Size((5, 5)), [generator] * len(sizes))
+    value, directions = (
+        torch.randn(count + 1, ends[-1]),
+        _directions(count, torch.Size((5, 5)), [generator] * len(sizes)),
+    )
     together = _gradient(value, directions, parts)
     for part, own in zip(parts, directions, strict=True):
         alone = value[:, part.rows].contiguous()
-        assert torch.equal(together[part.rows], _gradient(alone, own[None], [Part(slice(0, alone.shape[1]), generator)]))
+        assert torch.equal(
+            together[part.rows], _gradient(alone, own[None], [Part(slice(0, alone.shape[1]), generator)])
+        )

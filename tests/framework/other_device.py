@@ -157,4 +157,4 @@ if __name__ == "__main__":
     install()
     for name in sys.argv[1:]:
         CASES[name]()
-        print(f"{name}: the same on {NAME}")
+        sys.stdout.write(f"{name}: the same on {NAME}\n")
