@@ -212,7 +212,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Measure `bench report html=PAGE` on a million records.")
     parser.add_argument("--units", type=int, default=10_000)
     parser.add_argument("--episodes", type=int, default=100, help="of a unit")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=3, help="reports; 0 for none")
     parser.add_argument("--packed", action="store_true", help="packed files only, and what a run needs to find them")
     arguments = parser.parse_args()
     count, episodes = arguments.units, arguments.episodes
@@ -221,6 +221,8 @@ def main() -> None:
         folders, page = made(Path(root), count, episodes), Path(root) / "leaderboard.html"
         if arguments.packed:
             print_start(folders["packed"], count, episodes)
+        if not arguments.rounds:
+            return
         rounds = [{name: measure(out, page) for name, out in folders.items()} for _ in range(arguments.rounds)]
         print(
             "| records | files | bytes a unit | wall, s | CPU, s | memory, GB | to one file |\n|---|---|---|---|---|---|---|"
