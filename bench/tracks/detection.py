@@ -101,7 +101,7 @@ class DetectionTrack(Track):
         side="attack", title="the best baseline patch", heading="beyond best\nbaseline"
     )
     place: ClassVar[str] = "location"
-    queries_title: ClassVar[str] = "images a patch"
+    queries_title: ClassVar[str] = "images per patch"
     gradients: ClassVar[str] = "gradients"
     excess: ClassVar[str] = "excess"
     enough_episodes: ClassVar[int] = 3
