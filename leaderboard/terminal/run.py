@@ -94,7 +94,7 @@ def marks(baseline: str) -> Text:
     text = Text(style="dim")
     for mark, style, meaning in (
         ("✓", "green", f"better than {baseline}"),
-        ("≈", "yellow", "no significant difference"),
+        ("≈", "yellow", "better, not significantly"),
         ("✗", "bold red", "not better"),
     ):
         text.append(f"{mark} ", style=f"not dim {style}").append(f"{meaning}  ")
