@@ -47,7 +47,7 @@ class RunOptions:
     reference: bool = field(default=True, metadata=_meaning("Drive the baselines, too.", "true"))
     shard: str = field(default="1/1", metadata=_meaning("PART/PARTS: 3/10 drives the third of ten parts.", "1/1"))
     unit_timeout: float = field(
-        default=3600.0, metadata=_meaning("Seconds that a unit may take; 0 for no limit.", "3600")
+        default=3600.0, metadata=_meaning("Seconds that a unit may take; 0 for no limit.", "3600.0")
     )
     unit_memory: float = field(
         default_factory=half_of_memory,
