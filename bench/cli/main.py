@@ -382,11 +382,11 @@ def main() -> None:
         except Exception as error:
             if debug:
                 raise
+            # What the system refuses is no error of a plug-in.
+            if isinstance(error, OSError) and error.filename and error.strerror:
+                sys.exit(_complain(f"{error.filename}: {error.strerror}"))
             full = "there is not enough memory for this: choose smaller numbers"
-            if isinstance(error, OSError) and error.strerror:
-                reason = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-            else:
-                reason = full if _is_full(error) else f"{type(error).__name__}: {error}"
+            reason = full if _is_full(error) else f"{type(error).__name__}: {error}"
             sys.exit(_complain(f"{reason} (--debug shows the traceback)"))
     sys.exit(status or 0)
 

@@ -27,8 +27,8 @@ def endure(site: Path, out: Path, minutes: float) -> str:
     samples: list[tuple[float, float, int]] = []
     begin = time.monotonic()
     while (now := time.monotonic() - begin) < minutes * 60 and process.poll() is None:
-        family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
         try:
+            family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
             memory = sum(member.memory_info().rss for member in family) / 1e6
             samples.append((now, memory, sum(member.num_fds() for member in family)))
         except psutil.NoSuchProcess:

@@ -332,6 +332,23 @@ def test_sizes_that_torch_does_not_check_are_checked(
         call(*(torch.ones(size) for size in sizes), *numbers)
 
 
+@pytest.mark.parametrize("network", [nn.GRU, nn.RNN])
+@pytest.mark.parametrize("bidirectional", [False, True])
+def test_a_recurrent_network_needs_the_weights_of_all_its_layers(
+    network: type[nn.GRU | nn.RNN], bidirectional: bool
+) -> None:
+    made = network(5, 7, 2, bidirectional=bidirectional)
+    name = {nn.GRU: "gru", nn.RNN: "rnn_tanh"}[network]
+    found, call = operation(f"torch.ops.aten.{name}.input")
+    weights, input, hidden = made._flat_weights, torch.rand(3, 4, 5), torch.zeros(4 if bidirectional else 2, 4, 7)
+    rest = [True, 2, 0.0, False, bidirectional, False]
+    torch.testing.assert_close(call(input, hidden, weights, *rest), found(input, hidden, weights, *rest))
+    short = [*weights[:-1], weights[-1][:1]]
+    for wrong in (weights[4:], [*weights[4:], *weights[:4]], short):
+        with pytest.raises(RefusedError, match="a recurrent network has weights or states"):
+            call(input, hidden, wrong, *rest)
+
+
 def test_sizes_that_fit_are_computed_as_by_torch() -> None:
     query, mask = torch.rand(2, 1, 9, 4), torch.rand(9, 9)
     for name, given in {

@@ -145,6 +145,29 @@ def _weight_norm(given: Given) -> str:
     return ""
 
 
+def _recurrent(gates: int) -> Callable[[Given], str]:
+    """The check of a recurrent network: each layer and direction has the weights [G, I], [G, H] and, with biases, [G] twice.
+
+    Args:
+        gates: G as a multiple of the hidden size H.
+    """
+
+    def check(given: Given) -> str:
+        input, hidden, params = given["input"], given["hx"], list(given["params"])
+        directions = 2 if given["bidirectional"] else 1
+        size = hidden.shape[-1]
+        wanted: list[tuple[int, ...]] = []
+        for layer in range(given["num_layers"]):
+            inputs = directions * size if layer else input.shape[-1]
+            own = [(gates * size, inputs), (gates * size, size), *[(gates * size,)] * 2 * given["has_biases"]]
+            wanted += own * directions
+        if [tuple(one.shape) for one in params] != wanted or len(hidden) != directions * given["num_layers"]:
+            return "a recurrent network has weights or states of another size than its layers"
+        return ""
+
+    return check
+
+
 CHECKS: Mapping[str, Callable[[Given], str]] = {
     "batch_norm": _batch_norm,
     "_native_batch_norm_legit_no_training": _batch_norm,
@@ -153,5 +176,8 @@ CHECKS: Mapping[str, Callable[[Given], str]] = {
     "scaled_dot_product_attention": _attention,
     "_scaled_dot_product_flash_attention_for_cpu": _attention,
     "_weight_norm": _weight_norm,
+    "gru": _recurrent(3),
+    "rnn_relu": _recurrent(1),
+    "rnn_tanh": _recurrent(1),
 }
 """What to check before an operation is called: why its arguments are refused, or nothing."""
