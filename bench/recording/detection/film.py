@@ -15,7 +15,7 @@ from bench.detection.approach import Sight, Sighting
 from bench.recording import about
 from bench.recording.detection.blueprint import FPS, outcome, sights
 from bench.recording.film.drawing import BLACK, BLUE, GREEN, GREY, PALE, VERMILLION, Colour, blank, box, line, write
-from bench.recording.film.film import Film, Picture
+from bench.recording.film.film import PAPER, Film, Picture
 
 WIDTH, VIEW = 720, 300
 """Width of the film, and height of a view of the street, in pixels."""
@@ -82,7 +82,9 @@ class ApproachFilm(Film):
         self._box(view, self.scenes.boxes[frame], GREEN)
         for found, score in zip(sight.found[frame].boxes, sight.found[frame].scores, strict=True):
             x, y = self._box(view, found, COLOURS[name])
-            write(view, f"{float(score):.2f}", x, max(y - 10, 10), size=15, colour=COLOURS[name], align="centre")
+            y = max(y - 10, 10)
+            box(view, x, y, (18, 9), COLOURS[name])
+            write(view, f"{float(score):.2f}", x, y, size=15, colour=PAPER, align="centre")
 
     def _box(self, view: Picture, corners: Tensor, colour: Colour) -> tuple[float, float]:
         """An outline; returns the middle of its upper edge, in pixels of the view."""
