@@ -16,7 +16,7 @@ from bench.recording.film.film import Film, Picture
 
 COLOURS, COLOURS_OF_PHOTOGRAPHS = 64, 256
 """Colours of a GIF."""
-QUALITY = 70
+QUALITY = 55
 """Of a WebP of photographs, from 0 to 100."""
 GIF_FPS = 10.0
 """A GIF shows at most so many pictures a second, in real time: its size grows with their number."""
