@@ -31,7 +31,7 @@ from bench.victims.drivers.networks import QPolicy
 
 @dataclass(frozen=True, kw_only=True)
 class PAAD(Directed):
-    """A learned director and a gradient actor (Sun et al. 2022, PA-AD, arXiv 2106.05087).
+    """A learned policy chooses the action that PGD makes the victim take (Sun et al. 2022, PA-AD, arXiv 2106.05087).
 
     The director is trained with the victim in the loop: it sees the true observation and chooses a target, PGD of a few steps
     tries to induce it, the victim drives, and the director's reward is minus the driver's. So it learns what can be induced in

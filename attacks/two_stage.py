@@ -16,7 +16,7 @@ from bench.victims.drivers.networks import QPolicy
 
 @dataclass(frozen=True, kw_only=True)
 class TwoStage(Directed):
-    """A driver that wants to crash says what to induce (Qu et al. 2021, arXiv 2106.15860).
+    """A policy trained to crash chooses the action that PGD makes the victim take (Qu et al. 2021, arXiv 2106.15860).
 
     Stage one trains a driver whose reward is minus the victim's, at the wheel itself: it knows the roads, but no victim. So it is
     trained once for a world and an action type. Stage two induces, at each step, the best of its actions that can be induced.

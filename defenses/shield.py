@@ -26,7 +26,7 @@ SOFTNESS = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Shield(DrivingDefense):
-    """Leaves only actions that are safe in the worst case and not needlessly slow: a mask, or a projection of continuous ones.
+    """Allows only actions that are safe in the worst case and not needlessly slow; clips continuous actions.
 
     The worst case is over the true values that an assumed perturbation set allows behind the shown ones. The ego's own motion
     is reckoned from its actions; the victim receives the reckoned row. An action is safe if the gap to every car ahead lasts

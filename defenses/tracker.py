@@ -19,7 +19,7 @@ from bench.driving.threat import Norm
 
 @dataclass(frozen=True, kw_only=True)
 class Tracker(DrivingDefense):
-    """Tracks every car as a set (set-membership estimation, Schweppe 1968).
+    """Intersects the intervals of every car over time (set-membership estimation, Schweppe 1968).
 
     The interval of true values behind each shown value is intersected with the one predicted from the observation before: a car
     accelerates by at most 6 m/s2. A policy that acts on intervals (`planner`, `shield`) receives the intersection; any other

@@ -9,6 +9,9 @@ sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 project = "cavbench"
 author = "the authors of cavbench"
 version = release = metadata.version("cavbench")
+# The address is set once, as "Documentation" in [project.urls] of pyproject.toml: a folder with one site for each version.
+_addresses = dict(entry.split(", ", 1) for entry in metadata.metadata("cavbench").get_all("Project-URL") or ())
+html_baseurl = f"{_addresses['Documentation'].rstrip('/')}/{release}/" if "Documentation" in _addresses else ""
 language = "en-GB"
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "cavbench_site"]

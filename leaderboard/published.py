@@ -52,7 +52,7 @@ def publish(folder: Path, file: Path) -> int:
     """
     found = reading.read_all(folder)
     if len(found) > 1:
-        raise UserError(f"{folder} has records of the tracks {' and '.join(found)}; what is published has one")
+        raise UserError(f"{folder} has records of the tracks {' and '.join(found)}; publish one track at a time")
     (records,) = found.values()
     with whole(file) as made:
         pq.write_table(records, made, compression="zstd", compression_level=19)

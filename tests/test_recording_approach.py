@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from PIL import Image
 from rerun.chunk import Chunk, RrdReader
 from torch import Tensor
 
@@ -16,6 +17,9 @@ from bench.detection import Approach, stopping
 from bench.detection.approach import Sighting, look
 from bench.detection.patch import Evolution, Patch
 from bench.recording.detection import save
+from bench.recording.detection.film import ApproachFilm
+from bench.recording.film import save as save_film
+from bench.recording.film.drawing import BLUE, VERMILLION
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.test_recording import META, read, values
 
@@ -135,3 +139,19 @@ def test_the_page_says_when_the_sign_is_confirmed_and_where_the_car_stops(path: 
 def test_a_recording_opens_with_a_layout_of_its_own(path: Path) -> None:
     save(sighting(), meta=META, path=path)
     assert len(list(RrdReader(path).blueprints())) == 1
+
+
+def test_a_film_shows_the_signs_that_are_found_with_and_without_the_patch(tmp_path: Path) -> None:
+    def share(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
+        return int((np.abs(picture.astype(int) - colour) <= 2).all(-1).sum())
+
+    attacked, clean = ApproachFilm(sighting(), META), ApproachFilm(sighting(None), META)
+    first, *_, last = attacked.pictures(10)
+    (alone,) = clean.pictures(1)
+    assert share(alone, BLUE) > 100
+    assert share(alone, VERMILLION) == 0
+    assert alone.shape[0] < first.shape[0], "without an attack there is one view of the street"
+    assert share(last, VERMILLION) > share(first, VERMILLION), "the chart grows with the distance"
+    save_film(attacked, tmp_path / "clip.webp")
+    film = Image.open(tmp_path / "clip.webp")
+    assert (film.n_frames, film.size) == (10, (first.shape[1], first.shape[0]))

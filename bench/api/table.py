@@ -23,10 +23,21 @@ STRONGEST = "strongest"
 """Name of the row in which the strongest attack of each cell counts."""
 
 
+NOT_PRINTED = ("worst_cell", "worst_score", "queries", "episodes", "pair")
+"""Columns that `print(scores)` leaves out, besides the intervals of the failure rate."""
+
+
 class Scores(pd.DataFrame):
     """A DataFrame of scores; a part of it, such as `scores[scores.role == "attacked"]`, is a plain DataFrame."""
 
     _metadata = ["_episodes"]  # noqa: RUF012 - pandas reads a list
+
+    def __repr__(self) -> str:
+        """The main columns as text, rounded; pandas would cut out the columns in the middle, which are the scores."""
+        told = [name for name in self.columns if name not in NOT_PRINTED and not name.endswith(("_low", "_high"))]
+        if "defense" in told and self["defense"].nunique() < 2:
+            told.remove("defense")
+        return str(pd.DataFrame(self)[told].to_string(index=False, float_format="%.2f", na_rep=""))
 
     @property
     def records(self) -> pd.DataFrame:

@@ -168,8 +168,18 @@ def audit(words: Words = None) -> None:
     raise typer.Exit(cli_audit.audit(words or [], Console()))
 
 
+TrainWords = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="KEY=VALUE...",
+        help="One victim, defence and attack, and a list of seeds: victim=dqn defense=advtrain defense.skip=0.3 seeds=0,1,2.",
+        autocompletion=completed,
+    ),
+]
+
+
 @app.command(cls=TrainHelp)
-def train(words: Words = None) -> None:
+def train(words: TrainWords = None) -> None:
     """Train a victim, with or without a defence, and save it to the zoo.
 
     For instance: bench train victim=dqn seeds=0,1,2, or bench train defense=advtrain defense.skip=0.3 victim=dqn
@@ -258,7 +268,7 @@ def view(
         cli_view.save_film(runs, where, folder, Console(), save, seconds)
         return
     if len(runs) > 1 or seconds is not None:
-        raise UserError("several runs, and --seconds, need --save FILE")
+        raise UserError("--seconds, and more than one run, need --save FILE")
     cli_view.open_recording(runs[0], [f"{key}={value}" for key, value in where.items()], folder, Console(), web=web)
 
 

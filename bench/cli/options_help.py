@@ -17,13 +17,13 @@ COMPONENTS = {
     "attack": ("none", "Attacks, or a suite such as standard: bench list attack."),
     "defense": ("none", "Defences; NAME+NAME is a chain: bench list defense."),
     "victim": ("dqn", "Policies or detectors: bench list victim."),
-    "world": ("the track's", "World that is driven in: bench list world."),
+    "world": ("the track's", "World to drive in: bench list world."),
 }
 THREAT = {
-    "norm": ("relative; patch", "Perturbation set; linf, too, for drivers."),
+    "norm": ("relative; patch", "Perturbation set: relative or linf (drivers), patch (detectors)."),
     "budget": ("0.1; 0.5", "Size of the perturbation set."),
     "access": ("gradients", "oblivious, decisions, scores, gradients or dynamics."),
-    "queries": ("1000; 20000", "Evaluations of the victim: a step; a patch."),
+    "queries": ("1000; 20000", "Most evaluations of the victim: per step; per patch."),
     "share": ("1", "Share of the frames that may be attacked (drivers)."),
 }
 """Defaults of drivers, then of detectors where they differ. Reading them from the tracks would import torch."""
@@ -82,12 +82,13 @@ class TrainHelp(TyperCommand):
         from bench.run.options import TrainOptions
 
         super().format_help(ctx, formatter)
-        rows = [("victim", "dqn", "What is trained, alone or with:")]
-        rows += [
-            ("defense", "none", "a defence, which is then trained with the victim."),
-            ("attack", "none", "an attack."),
+        rows = [
+            ("victim", "dqn", "Victim to train."),
+            ("defense", "none", "Defence to train with the victim: bench list defense."),
+            ("attack", "none", "Attack to train against the victim, if it learns: bench list attack."),
+            ("world", "the track's", "World to train in."),
+            ("KIND.PARAMETER", "", "A parameter of a component: bench list NAME."),
         ]
-        rows += [("world", "the track's", "World that is trained in."), ("KIND.PARAMETER", "", "As in bench run.")]
         _print(Console(), "Every KEY=VALUE, with its default", [*rows, *settings(TrainOptions)])
 
 

@@ -76,7 +76,7 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
         raise UserError("name the folder of the submission: bench verify FOLDER")
     salt, episodes = (_number(options, key) for key in ("salt", "episodes"))
     if episodes is not None and episodes < ENOUGH_SCENARIOS:
-        raise UserError(f"episodes must be at least {ENOUGH_SCENARIOS}, got {episodes}: fewer are no evidence")
+        raise UserError(f"episodes must be at least {ENOUGH_SCENARIOS}, got {episodes}: fewer are too few to compare")
     found = submission.read(Path(names[0]).expanduser())
     packages = submission.installed(found)
     console.print(

@@ -87,7 +87,7 @@ def chained(links: tuple[tuple[str, type[Defense]], ...]) -> type[Chain]:
     """
     names = [name for name, _ in links]
     if len(set(names)) < len(names) or not all(name.isidentifier() for name in names):
-        raise UserError(f"defense {MARK.join(names)!r}: a chain takes different defences without choices")
+        raise UserError(f"defense {MARK.join(names)!r}: a chain takes each defence once, and none as NAME:CHOICE")
     if late := [name for name, link in links[1:] if link.train is not Defense.train]:
         raise UserError(f"defense {MARK.join(names)!r}: {late[0]!r} trains its victim, so it must come first")
     parts: list[Any] = [(name, link, field(default_factory=link)) for name, link in links]

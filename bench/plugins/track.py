@@ -178,7 +178,7 @@ class Track(ABC):
     queries: ClassVar[str] = "queries"
     """The measurement that counts the queries of an attack."""
     queries_title: ClassVar[str] = "queries"
-    """Its name in reports, for instance "queries a step"."""
+    """Its name in reports, for instance "queries per step"."""
     gradients: ClassVar[str] = "gradient_queries"
     """The measurement or probe that counts the gradients of an attack."""
     excess: ClassVar[str] = ""

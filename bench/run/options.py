@@ -37,16 +37,15 @@ class RunOptions:
         default=None, metadata=_meaning("Training seeds of the victims (detectors: patch seeds).", "the grid's")
     )
     executor: str = field(
-        default="processes", metadata=_meaning("What carries out the work: serial, processes or ray.", "processes")
+        default="processes",
+        metadata=_meaning("Where units run: processes, ray, or serial (this process).", "processes"),
     )
-    workers: int | None = field(default=None, metadata=_meaning("Worker processes.", "one a core"))
+    workers: int | None = field(default=None, metadata=_meaning("Worker processes.", "one per core"))
     ray: RayOptions = field(default_factory=RayOptions)
     device: str = field(default="cpu", metadata=_meaning("Where victims compute: cpu, cuda (a GPU), or auto.", "cpu"))
     out: str = field(default="results", metadata=_meaning("Results folder.", "results"))
-    record: int | None = field(
-        default=None, metadata=_meaning("Episodes to record in each cell.", "one of the first cell")
-    )
-    reference: bool = field(default=True, metadata=_meaning("Whether the baselines are driven, too.", "true"))
+    record: int | None = field(default=None, metadata=_meaning("Episodes to record in each cell.", "1, in the first"))
+    reference: bool = field(default=True, metadata=_meaning("Drive the baselines, too.", "true"))
     shard: str = field(default="1/1", metadata=_meaning("PART/PARTS: 3/10 drives the third of ten parts.", "1/1"))
     unit_timeout: float = field(
         default=3600.0, metadata=_meaning("Seconds that a unit may take; 0 for no limit.", "3600.0")
@@ -56,7 +55,7 @@ class RunOptions:
         metadata=_meaning("GB that a worker may use; 0 for no limit.", "half of the machine's"),
     )
     until: float | None = field(
-        default=None, metadata=_meaning("Drives scenarios until a row is known to +- this.", "the whole grid")
+        default=None, metadata=_meaning("Drive in rounds until each score is known to +- this.", "off")
     )
 
 

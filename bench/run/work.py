@@ -213,7 +213,7 @@ def _driven(unit: Unit, task: Task) -> Outcome:
     try:
         records = table(constants, driven.columns, track=unit.track)
     except ValueError as error:
-        raise UserError(f"its measurements cannot be: {error}") from error
+        raise UserError(f"its measurements have impossible values: {error}") from error
     recordings, warnings = _recordings(unit, driven.traces, constants)
     return Outcome(wall_s=wall_s, records=records, recordings=recordings, warnings=warnings)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -16,6 +16,9 @@ from bench.plugins.contracts import Progress
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
 from bench.records.schema import FLOAT, PROBES, TEXT, field
+
+if TYPE_CHECKING:
+    from bench.recording.film import Film
 
 REFERENCE_PATCHES = ("noise_patch", "grey_patch")
 """Baseline patches, not optimised against the detector: they measure the effect of covering the sign."""
@@ -101,7 +104,7 @@ class DetectionTrack(Track):
         side="attack", title="the best baseline patch", heading="beyond best\nbaseline"
     )
     place: ClassVar[str] = "location"
-    queries_title: ClassVar[str] = "images a patch"
+    queries_title: ClassVar[str] = "images per patch"
     gradients: ClassVar[str] = "gradients"
     excess: ClassVar[str] = "excess"
     enough_episodes: ClassVar[int] = 3
@@ -161,3 +164,8 @@ class DetectionTrack(Track):
         from bench.recording.detection import save
 
         save(trace, meta=meta, path=path)
+
+    def film(self, job: Job, trace: Any, meta: Mapping[str, object]) -> Film:
+        from bench.recording.detection.film import ApproachFilm
+
+        return ApproachFilm(trace, meta)

@@ -122,7 +122,7 @@ class DrivingTrack(Track):
         heading="against\nbest blind",
         short="beats\nblind",
     )
-    queries_title: ClassVar[str] = "queries a step"
+    queries_title: ClassVar[str] = "queries per step"
     excess: ClassVar[str] = "excess_max"
     step_ms: ClassVar[str] = "attack_ms"
     other_input: ClassVar[str] = "another episode's observation"

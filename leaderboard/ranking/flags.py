@@ -82,10 +82,10 @@ Finding = tuple[bool | None, str]
 
 
 def unattacked(of: Subject) -> Finding:
-    """Fires where no attack that was run asked the victim anything: the score is only one under noise."""
+    """Fires where no attack queried the victim: the score is one under noise."""
     if of.strongest("answers", "gradients", "unknown"):
-        return False, f"{sum(attack.knowledge != 'nothing' for attack in of.attacks)} attacks asked the victim."
-    return True, "No attack that was run asks the victim anything: this is a score under noise."
+        return False, f"{sum(attack.knowledge != 'nothing' for attack in of.attacks)} attacks queried the victim."
+    return True, "No attack queried the victim, so this is a score under noise."
 
 
 def left_out(of: Subject) -> Finding:
@@ -99,7 +99,7 @@ def left_out(of: Subject) -> Finding:
         if change:
             found[alone.name] = change
     if not found:
-        return False, "No attack is left out of as many cells as are evidence."
+        return False, "No attack that is left out shares enough cells with the row."
     name, largest = max(found.items(), key=lambda item: item[1].low)
     return largest.low > 0, f"The score minus that under {name}, which is left out: {_signed(largest)}."
 
@@ -158,7 +158,7 @@ def unsafe(of: Subject) -> Finding:
     own, others = (float(rates.mean()) for rates in (of.worst.failed[:, known], safe[known]))
     return (
         own - others > TOO_MANY_CRASHES,
-        f"Under attack {100 * own:.0f} % of its episodes end so, {100 * others:.0f} % of those of {title}.",
+        f"Under attack it fails in {100 * own:.0f} % of its episodes, {title} in {100 * others:.0f} %.",
     )
 
 
@@ -190,7 +190,7 @@ def one_draw(of: Subject) -> Finding:
     if of.track.many_draws:
         return False, of.track.many_draws
     draws = max((value for attack in of.attacks if not math.isnan(value := attack.mean("draws"))), default=0.0)
-    asked = f"the most patient attack asked {draws:.1f} times about each observation"
+    asked = f"the attack with the most draws asked {draws:.1f} times about each observation"
     return (
         draws < ONE_DRAW,
         f"Asked the same twice, it gave another answer in {100 * redrawn:.0f} % of probes; {asked}.",
@@ -201,7 +201,7 @@ def no_fall(of: Subject) -> Finding:
     """Fires where the same attack lowers the score no more with the largest perturbation budget than with the smallest."""
     found = _curves(of, budgets(of.others))
     if not found:
-        return None, "Not measured: no attack was run with two budgets, in cells where a score can fall."
+        return None, "Not measured: no attack was run with two budgets in cells whose score can fall."
     curve = min(found, key=lambda one: one.scores[-1].estimate)
     small, large = curve.points[0], curve.points[-1]
     span = f"from budget {small.identity['threat_budget']:g} to {large.identity['threat_budget']:g} {large.identity['attack']}"
@@ -213,7 +213,7 @@ def not_flattened(of: Subject) -> Finding:
     """Fires where the last increase of an attack's steps, restarts or queries still lowered the score by more than 0.02."""
     found = _curves(of, efforts(of.attacks))
     if not found:
-        return None, "Not measured: no attack was run with two efforts, in cells where a score can fall."
+        return None, "Not measured: no attack was run with two efforts in cells whose score can fall."
     curve = min(found, key=lambda one: one.scores[-1].estimate)
     less, more = curve.points[-2:]
     change = curve.fall(-2, -1)
@@ -244,13 +244,13 @@ def too_little(of: Subject) -> Finding:
 
 
 def decoy(of: Subject) -> Finding:
-    """Fires where at least 1 % of probes, asked as an attack asks, were answered otherwise than the victim acts."""
+    """Fires where at least 1 % of the answers to probes, asked as an attack asks, differ from the victim's actions."""
     share = of.shares("inconsistent")
     if math.isnan(share):
         return None, "Not measured: the records have no probes of an attack's paths."
     return (
         share >= DRAWN,
-        f"Asked as an attack asks, it answered otherwise than it acts in {100 * share:.1f} % of probes.",
+        f"In {100 * share:.1f} % of probes its answer to an attack's query differs from its action.",
     )
 
 
@@ -288,7 +288,7 @@ FLAGS: dict[str, tuple[str, Callable[[Subject], Finding]]] = {
     "unsafe": ("crashes far more often than the traffic's own driver", unsafe),
     "ignores_input": ("the answer does not depend on the input", ignores_input),
     "public_only": ("higher on the public scenarios than on new ones", public_only),
-    "decoy": ("answers an attack otherwise than it acts", decoy),
+    "decoy": ("its answers to attacks differ from its actions", decoy),
     "left_out": ("an attack that is left out lowers the score more", left_out),
     "masked_gradients": ("a black-box attack beats the white-box one", masked_gradients),
     "zero_gradients": ("gradients are zero", zero_gradients),

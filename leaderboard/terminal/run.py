@@ -94,7 +94,7 @@ def marks(baseline: str) -> Text:
     text = Text(style="dim")
     for mark, style, meaning in (
         ("✓", "green", f"better than {baseline}"),
-        ("≈", "yellow", "no significant difference"),
+        ("≈", "yellow", "better, not significantly"),
         ("✗", "bold red", "not better"),
     ):
         text.append(f"{mark} ", style=f"not dim {style}").append(f"{meaning}  ")
@@ -147,7 +147,7 @@ def _of_the_attack(one: Comparison) -> Iterator[str]:
     if contrast is None or one.is_baseline or contrast.side == "victim":
         return
     if one.lead is None:
-        yield "compared with no baseline attack, which knows nothing of the victim: part of the drop may be its effect"
+        yield "no baseline attack was run beside it, so its part in the drop is unknown"
     elif one.lead.high >= 0:
         yield f"does not lower the score more than {track.baseline_kinds[one.rival].title}, which knows nothing of the victim"
 

@@ -83,6 +83,21 @@ def test_a_model_trained_in_it_is_scored(tmp_path: Path) -> None:
     assert list(found.role) == ["attacked", "clean"]
 
 
+def test_an_actor_critic_is_scored_after_its_training(tmp_path: Path) -> None:
+    """Its policy keeps the distribution of the last update, with a graph that torch does not copy."""
+    sb3 = pytest.importorskip("stable_baselines3")
+    env = cavbench.gym.make("highway", max_steps=20, **CELL)
+    model = sb3.PPO("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, seed=0, device="cpu").learn(32)
+    assert model.policy.action_dist.distribution.logits.requires_grad
+    world = cavbench.component("world", "highway", max_steps=20)
+    found = cavbench.score(
+        model, cavbench.component("attack", "pgd", steps=2, restarts=1), world=world, **CELL, episodes=2, baselines=False,
+        workers=2, out=tmp_path,
+    )  # fmt: skip
+    assert list(found.role) == ["attacked", "clean"]
+    assert model.policy.action_dist.distribution is not None, "the model itself is as it was"
+
+
 @pytest.fixture
 def cartpole(plugins: Path) -> Iterator[Any]:
     """The module of the page, installed as a package."""

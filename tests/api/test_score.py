@@ -85,6 +85,10 @@ def test_it_writes_the_records_of_the_command(tmp_path: Path, score: Callable[..
     rows = records.filter(records_are(records, "noise"))
     assert attacked.safe_progress == pytest.approx(sum(rows["safe_progress"].to_pylist()) / 2)
     assert attacked.low <= attacked.safe_progress <= attacked.high
+    heading, *rows = repr(found).splitlines()
+    assert heading.split() == ["role", "attack", "victim", "safe_progress", "low", "high", "crashed", "kept"]
+    assert len(rows) == len(found)
+    assert f"{found.safe_progress[0]:.2f}" in rows[0]
 
 
 def records_are(records: Any, attack: str) -> Any:

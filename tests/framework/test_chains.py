@@ -70,7 +70,7 @@ def test_each_link_has_its_own_parameters() -> None:
         ("tracker+shield", {"shield.bnd": "4"}, "did you mean 'shield.band'"),
         ("tracker+shield", {"shield.band": "-1"}, "band must be at least 0"),
         ("tracker+shield", {"shield.assumed_norm": "l2"}, "linf"),
-        ("shield+shield", {}, "different defences"),
+        ("shield+shield", {}, "each defence once"),
         ("shield+advtrain", {}, "must come first"),
         ("tracker+nosuch", {}, "nosuch"),
         ("tracker+jpeg", {}, "different tracks"),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 import tomllib
 from importlib import metadata
 from pathlib import Path
 
 import pytest
 
+from bench.cli.early import check_names
 from bench.cli.explain import GLOSSARY
 from bench.plugins.registry import GROUPS, KINDS, Kind, entries
 
@@ -36,6 +38,34 @@ def test_every_component_has_a_page(kind: Kind, name: str) -> None:
     assert re.search(rf"^{name} <{page}>$", (DOCS / "index.md").read_text(), re.MULTILINE), (
         "not in the table of contents"
     )
+
+
+WRITTEN_ELSEWHERE = {"plugins.md", "gymnasium.md", "changelog.md"}
+"""Pages whose commands need a plug-in that another test writes, or belong to earlier versions."""
+PLACEHOLDERS = ("…", "=N", "my_", "NAME", "$SLURM")
+
+
+def _commands(page: Path) -> list[list[str]]:
+    """Every `bench ...` of a page, in code blocks and in the text."""
+    text = page.read_text()
+    blocks = re.findall(r"^(?:    +|\$ )?(bench .+)$", text, re.M)
+    return [shlex.split(one, comments=True) for one in (*blocks, *re.findall(r"(?<!`)`(bench [^`]+)`", text))]
+
+
+def test_every_command_in_the_documentation_names_what_exists() -> None:
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
+    checked = 0
+    for page in (page for page in pages if page.name not in WRITTEN_ELSEWHERE and "_build" not in page.parts):
+        for _, name, *words in _commands(page):
+            if any(placeholder in word for word in words for placeholder in PLACEHOLDERS):
+                continue
+            if name in ("run", "audit", "train"):
+                given = [word for word in words if not word.startswith(("--", "salt="))]
+                check_names(given, "TrainOptions" if name == "train" else "RunOptions")
+            elif name in ("list", "check") and words and words[0].isidentifier():
+                assert any(words[0] in entries(GROUPS[kind]) for kind in KINDS) or words[0] in (*KINDS, "standard")
+            checked += 1
+    assert checked > 100
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])

@@ -107,6 +107,17 @@ def test_the_source_distribution_builds_the_same_wheel(wheel: set[str], copy: Pa
     assert set(zipfile.ZipFile(again).namelist()) == wheel
 
 
+def test_the_version_is_the_same_everywhere() -> None:
+    version = tomllib.loads((TREE / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    written = {
+        "CITATION.cff": rf"^version: {re.escape(version)}$",
+        "README.md": rf"version = {{{re.escape(version)}}}",
+        "docs/submit.md": rf"version = {{{re.escape(version)}}}",
+        "docs/quick_start.md": rf"cavbench-{re.escape(version)}-py3-none-any\.whl",
+    }
+    assert [name for name, text in written.items() if not re.search(text, (TREE / name).read_text(), re.M)] == []
+
+
 def test_the_base_dependencies_are_what_the_packages_import() -> None:
     project = tomllib.loads((TREE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     base = {_name(one) for one in project["dependencies"]}

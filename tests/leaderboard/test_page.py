@@ -88,6 +88,18 @@ def test_a_heading_sorts_up_and_down_by_mouse_and_by_keyboard(opened: Open) -> N
     assert column(page, "pairs", 5)[0].startswith(f"{min(falling):.2f}")
 
 
+def test_a_phone_sorts_its_cards(opened: Open) -> None:
+    page = opened(viewport={"width": 360, "height": 740})
+    page.locator("#sort-ranks").select_option("-Clean")
+    shown = [float(text) for text in texts(page, "#ranks td[data-label=Clean]") if text not in ("", "—")]
+    assert len(shown) > 2
+    assert shown == sorted(shown, reverse=True)
+    assert page.evaluate("location.hash").endswith("sort=-Clean")
+    page.locator("#sort-ranks").select_option("")
+    assert "sort" not in page.evaluate("location.hash")
+    assert not opened().locator("#sort-ranks").is_visible(), "headings sort where there is room for them"
+
+
 def test_filters_choose_rows_and_compute_scores_again_from_the_cells_that_are_left(opened: Open, site: Path) -> None:
     page = opened()
     (board, *_), _ = read_boards(reading.read_all(site / "results"))
@@ -145,7 +157,7 @@ def test_no_cell_left_is_said_and_breaks_nothing(opened: Open) -> None:
     page = opened()
     for value in ("clear", "rain", "fog"):
         page.locator(f"input[name=weather][value={value}]").uncheck()
-    assert "Nothing was driven" in page.locator("#scope").inner_text()
+    assert "No row was driven" in page.locator("#scope").inner_text()
 
 
 def test_the_heat_map_shows_the_pair_that_was_chosen(opened: Open) -> None:

@@ -81,7 +81,7 @@ def test_the_threat_model_and_the_attacks_parameters_are_stated() -> None:
     text = " ".join(cells(one_pair()).split())
     assert "zo objective=expected steps=50" in text
     assert "relative 0.1: each measured value may be off by 10 % of itself" in text
-    assert "at most 1000 queries a step" in text
+    assert "at most 1000 queries per step" in text
 
 
 def test_a_linf_threat_model_is_stated_on_the_normalised_scale() -> None:

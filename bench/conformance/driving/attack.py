@@ -140,7 +140,7 @@ class AttackSuite(Suite):
                         f"{one_line(error)}: check oracle.remaining before a query, and return the best answer so far"
                     ) from None
                 most = max(most, int(enforcer.counts[0].max()))
-        return f"{most} of 1000 queries a step"
+        return f"{most} of 1000 queries per step"
 
     def leaves_the_victim(self) -> None:
         """It changes neither the weights, mode or gradients of the victim nor the true observation."""

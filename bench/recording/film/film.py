@@ -20,9 +20,11 @@ class Film(ABC):
 
     Args:
         fps: pictures per second, in the time of the episode.
+        photographs: whether the pictures are photographs; WebP files of photographs are lossy, and GIFs have more colours.
     """
 
     fps: float
+    photographs: bool = False
 
     @abstractmethod
     def __len__(self) -> int:
@@ -36,6 +38,7 @@ class Film(ABC):
 class _Stacked(Film):
     def __init__(self, films: Sequence[Film]) -> None:
         self.films, self.fps = films, films[0].fps
+        self.photographs = any(film.photographs for film in films)
 
     def __len__(self) -> int:
         return max(map(len, self.films))

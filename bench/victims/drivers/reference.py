@@ -150,7 +150,7 @@ class IDMDriver(DrivingVictim):
 
 @dataclass(frozen=True, kw_only=True)
 class OracleDriver(DrivingVictim):
-    """A planner with perfect information, the upper reference line (random-shooting model-predictive control).
+    """A planner with perfect information, a reference above all other drivers (random-shooting model-predictive control).
 
     Three times a second it tries 64 plans of 4 s in copies of the simulator, hidden state included, and follows the best one. It
     reads no observation, so attacks and weather have no effect on it.

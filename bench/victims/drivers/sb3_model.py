@@ -55,7 +55,7 @@ class ModelNetwork(nn.Module):
         self.shape = tuple(space.shape)
         self.action_type: ActionType = "discrete" if type(actions).__name__ == "Discrete" else "continuous"
         self.width = int(actions.n) if self.action_type == "discrete" else int(actions.shape[0])
-        self.policy = copy.deepcopy(model.policy).cpu()
+        self.policy = _copied(model.policy).cpu()
         self.policy.set_training_mode(False)
         if self.action_type == "continuous":
             self.register_buffer("low", torch.as_tensor(actions.low))
@@ -80,6 +80,7 @@ class ModelNetwork(nn.Module):
             # Actors answer in [-1, 1]; `predict` scales that to the range of the actions.
             return self.policy.actor(observation)
         distribution = self.policy.get_distribution(observation).distribution
+        self.policy.action_dist.distribution = None  # Its graph could be neither copied nor pickled.
         return distribution.logits if self.action_type == "discrete" else self._scaled(distribution.mean)
 
     def normalised(self, observation: Tensor) -> Tensor:
@@ -91,6 +92,16 @@ class ModelNetwork(nn.Module):
     def _scaled(self, action: Tensor) -> Tensor:
         """An action of the space's range on the [-1, 1] scale."""
         return (2 * (action - self.low) / (self.high - self.low) - 1).clamp(-1, 1)
+
+
+def _copied(policy: Any) -> Any:
+    """A copy of a model's policy, without the distribution of its last forward pass: torch copies no tensor with a graph."""
+    kept = getattr(policy, "action_dist", None)
+    if kept is None:
+        return copy.deepcopy(policy)
+    empty = copy.copy(kept)
+    empty.distribution = None
+    return copy.deepcopy(policy, {id(kept): empty})
 
 
 class ModelCritic(nn.Module):

@@ -18,12 +18,13 @@ const fixed = (value, digits = 2) => (value == null ? "—" : (Math.abs(value) <
 const short = (value) => fixed(value).replace(/^(−?)0\./, "$1.");
 const bounds = (found) => (found && found.low != null ? `${short(found.low)}–${short(found.high)}` : "");
 const signed = (found) => (found == null ? "—" : (found.estimate > 0 ? "+" : "") + fixed(found.estimate));
+const counted = (cells) => `${cells} cell${cells === 1 ? "" : "s"}`;
 const percent = (share) => (share == null ? "—" : `${Math.round(100 * share)} %`);
 function estimate(found) {
   return found == null ? ["—"] : [el("b", {}, fixed(found.estimate)), " ", el("small", {}, bounds(found))];
 }
 
-/* ---- statistics: those of bench/statistics/estimates.py, for the cells that are left ---- */
+/* ---- statistics: those of bench/statistics/estimates.py, for the selected cells ---- */
 const average = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
 function tQuantile(freedom) {
   const after = data.t.findIndex(([df]) => df >= freedom);
@@ -118,6 +119,10 @@ function draw(id, columns, rows, classes) {
     heads: told.map((column) => ({ name: column.name, interval: Boolean(column.interval) })),
     rows: ordered.map((row) => told.map((column) => (column.interval ? { ...(column.interval(row) ?? { estimate: column.value(row) }), best: Boolean(column.best?.(row)) } : column.value(row)))),
   });
+  // A phone shows cards without headings to click on.
+  const orders = columns.filter((column) => column.value).flatMap(({ name, number }) =>
+    (number ? [[`-${name}`, `${name}, highest first`], [name, `${name}, lowest first`]] : [[name, name]]));
+  options(at(`sort-${id}`), [["", "default order"], ...orders], sort ? (sort.down ? "-" : "") + sort.name : "");
   if (focused?.startsWith(`${id} `)) table.querySelector(`[data-column="${CSS.escape(focused)}"]`)?.focus();
 }
 const shortest = (value) => (typeof value === "number" ? Number(value.toFixed(4)).toString() : value == null ? "" : String(value));
@@ -280,8 +285,8 @@ function render() {
   const metric = said().title;
   const total = new Set(board.rows.flatMap((row) => row.cells.map(({ cell }) => place(cell)))).size;
   const left = new Set(board.rows.flatMap((row) => kept(row.cells).map(({ cell }) => place(cell)))).size;
-  at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, mean with its 95 % interval.` + (left === total ? "" : " Ranks and flags are those of all cells.") +
-    (rows.length ? "" : " Nothing was driven in the cells that are left.");
+  at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, mean with its 95 % interval.` + (left === total ? "" : " Ranks and flags refer to all cells.") +
+    (rows.length ? "" : " No row was driven in the selected cells.");
 
   const whole = left === total;
   const columns = [
@@ -466,10 +471,10 @@ function drawCurves(board) {
   }));
   const effort = data.curves.filter((curve) => curve.kind === "queries").map((curve) => ({ curve, first: pairs.get(curve.points[0].pair) }))
     .filter(({ first }) => first.track === board.track && chosen(first) && first.threat.norm === board.threat.norm && first.threat.budget === board.threat.budget && rowOf(first))
-    .map(({ curve, first }) => ({ name: `${first.attack.label} on ${first.defense.label} · ${first.victim.label} (${curve.cells.length} cells)`, points: curve.points }));
+    .map(({ curve, first }) => ({ name: `${first.attack.label} on ${first.defense.label} · ${first.victim.label} (${counted(curve.cells.length)})`, points: curve.points }));
   const plots = [
-    plot(budget, `Budget (${board.threat.norm}); 0 is no attack`, false, `Score under the strongest attack, on the ${common.size} cells that every point has`),
-    plot(effort, `${capital(said().queries_title)}, log scale`, true, "Score when an attack may spend more"),
+    plot(budget, `Budget (${board.threat.norm}); 0 is no attack`, false, `Score under the strongest attack, on the ${counted(common.size)} that every point has`),
+    plot(effort, `${capital(said().queries_title)}, log scale`, true, "Score when an attack may ask more"),
   ].filter(Boolean);
   at("curves-section").hidden = !plots.length;
   at("curves").replaceChildren(...plots);
@@ -587,6 +592,11 @@ addEventListener("hashchange", go);
 for (const button of document.querySelectorAll("[data-track]")) button.addEventListener("click", (event) => { event.preventDefault(); visit(`#/${button.dataset.track}`); });
 at("threat").addEventListener("change", (event) => visit(`#/${written(state.track)}/${written(boardNames()[+event.target.value])}`));
 for (const kind of ["defense", "victim", "attack"]) at(kind).addEventListener("change", (event) => { state[kind] = event.target.value; render(); });
+for (const id of ["ranks", "pairs"]) at(`sort-${id}`).addEventListener("change", ({ target }) => {
+  if (target.value) state.sort[id] = { name: target.value.replace(/^-/, ""), down: target.value.startsWith("-") };
+  else delete state.sort[id];
+  render();
+});
 at("shown").addEventListener("change", (event) => { state.shown = event.target.value; render(); });
 at("filters").addEventListener("reset", (event) => { event.preventDefault(); visit(`#/${written(state.track)}/${written(boardNames()[state.board])}`); });
 at("filters").addEventListener("submit", (event) => event.preventDefault());
