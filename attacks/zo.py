@@ -108,15 +108,14 @@ class ZOSignSGD(DrivingAttack):
             count = min(self.directions, left - base) if len(run.rows) else 0
             if count < 1:
                 break
-            directions = [_directions(count, shape, part.generator).to(observation) for part in run.parts]
+            directions = _directions(count, shape, [part.generator for part in run.parts]).to(observation)
             left -= base + count
             points = oracle.project(run.around(directions, self.smoothing), run.rows)
             scores = oracle.scores(points[1 - base :], run.rows)
             scores, known = scores if known is None else torch.cat((known.unsqueeze(0), scores)), None
             value, key, met = self._judge(run.loss, scores, points, run.truth)
             run.keep_best(points, key)
-            slopes = [_gradient(value[:, part.rows], own) for part, own in zip(run.parts, directions, strict=True)]
-            sign = torch.cat(slopes).sign_()
+            sign = _gradient(value, directions, run.parts).sign_()
             run.x = oracle.project(torch.addcmul(run.x, self.step_size * run.radius, sign, value=-1), run.rows)
             if self.early_stop:
                 run = run.without(met.any(0), answer)
@@ -169,9 +168,9 @@ class _Run:
     loss: Loss
     parts: Sequence[Part]
 
-    def around(self, directions: Sequence[Tensor], smoothing: float) -> Tensor:
-        """[q + 1, R, V, F] the current points, and the points along the directions [q, V, F] of each part."""
-        reach, points = smoothing * self.radius, self.x.new_empty(len(directions[0]) + 1, *self.x.shape)
+    def around(self, directions: Tensor, smoothing: float) -> Tensor:
+        """[q + 1, R, V, F] the current points, and the points along the directions [P, q, V, F] of the parts."""
+        reach, points = smoothing * self.radius, self.x.new_empty(directions.shape[1] + 1, *self.x.shape)
         points[0] = self.x
         for part, own in zip(self.parts, directions, strict=True):
             torch.addcmul(self.x[part.rows], reach[part.rows], own.unsqueeze(1), out=points[1:, part.rows])
@@ -195,12 +194,22 @@ class _Run:
         return _Run(rows, truth, radius, x, self.best[on], self.lowest[on], loss, parts)
 
 
-def _gradient(value: Tensor, directions: Tensor) -> Tensor:
-    """Gradient estimate [B, V, F] up to a positive factor, from the losses [q + 1, B] at x and along `directions` [q, V, F].
+def _gradient(value: Tensor, directions: Tensor, parts: Sequence[Part]) -> Tensor:
+    """Gradient estimate [R, V, F] up to a positive factor, from the losses [q + 1, R] at x and along the directions of the parts.
 
     It uses differences to the mean loss instead of the loss at x, which have the same expectation and less variance.
+
+    Args:
+        value: the losses.
+        directions: [P, q, V, F].
+        parts: P units of episodes.
     """
-    return ((value[1:] - value.mean(0)).T @ directions.flatten(1)).view(-1, *directions.shape[1:])
+    slopes = []
+    for part, along in zip(parts, directions.flatten(2), strict=True):
+        # The last bit of a mean may depend on the layout in memory: it is that of a unit that is driven alone.
+        own = value[:, part.rows].contiguous()
+        slopes.append((own[1:] - own.mean(0)).T @ along)
+    return torch.cat(slopes).view(-1, *directions.shape[2:])
 
 
 def _generator(of_run: torch.Generator) -> torch.Generator:
@@ -218,17 +227,25 @@ def _hadamard(order: int) -> Tensor:
     return matrix
 
 
-def _directions(count: int, shape: torch.Size, generator: torch.Generator) -> Tensor:
-    """[q, V, F] nearly orthogonal random signs: random rows and columns of a Hadamard matrix.
+def _directions(count: int, shape: torch.Size, generators: Sequence[torch.Generator]) -> Tensor:
+    """[P, q, V, F] nearly orthogonal random signs for each generator: random rows and columns of a Hadamard matrix.
 
     Orthogonal directions estimate a gradient with less variance than independent ones (Choromanski et al. 2018, "Structured
     Evolution with Compact Architectures"). The entry of `presence` is 0, because it cannot be changed.
     """
     vehicles, features = shape[0], shape[1] - 1
-    order = 1 << (max(count, vehicles * features) - 1).bit_length()
-    rows = torch.randperm(order, generator=generator)[:count]
-    columns = torch.randperm(order, generator=generator)[: vehicles * features]
-    flips = torch.randint(0, 2, (vehicles * features,), generator=generator) * 2.0 - 1.0
-    directions = torch.zeros(count, *shape)
-    directions[..., 1:] = (_hadamard(order)[rows.unsqueeze(1), columns] * flips).view(count, vehicles, features)
+    size = vehicles * features
+    order = 1 << (max(count, size) - 1).bit_length()
+    drawn = [
+        (
+            torch.randperm(order, generator=generator)[:count],
+            torch.randperm(order, generator=generator)[:size],
+            torch.randint(0, 2, (size,), generator=generator),
+        )
+        for generator in generators
+    ]
+    rows, columns, flips = map(torch.stack, zip(*drawn, strict=True))
+    signs = _hadamard(order)[rows.unsqueeze(2), columns.unsqueeze(1)] * (flips * 2.0 - 1.0).unsqueeze(1)
+    directions = torch.zeros(len(drawn), count, *shape)
+    directions[..., 1:] = signs.view(len(drawn), count, vehicles, features)
     return directions

@@ -40,7 +40,7 @@ DENSITY_2 = 1.5
 VICTIMS, TRAINING_SEEDS, ROADS_AND_WEATHERS = 14, 10, 9
 ALONE = ("plan", "pessimist")
 """Members that are not driven in batches."""
-DRIVER_MS = 1.0 + 1.1 + 0.3
+DRIVER_MS = 1.0 + 0.1 + 0.3
 """What a unit costs the driver with Ray: the task, its outcome, its records (`benchmarks/executor_speed.py`)."""
 WORKER_MS = 5.0
 """What a task costs a worker besides its unit (the same)."""

@@ -4,13 +4,14 @@
     python benchmarks/executor_speed.py --tasks 500 --episodes 50 --rounds 1
 
 Prints the figures that docs/scale.md and `benchmarks/cluster_cost.py` use. Capacity is the number of tasks for which a second of
-the driver's CPU time is enough: on a busy machine wall time says little. Ray and processes drive the pair in turns; the ratio of
-wall time is the median over the rounds.
+the driver's CPU time is enough: on a busy machine wall time says little. Ray and processes drive the pair in turns; the ratios of
+wall time and of the CPU time of all processes are medians over the rounds.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.util
 import pickle
 import statistics
@@ -116,23 +117,30 @@ def _renamed(records: pa.Table, number: int) -> pa.Table:
     return records.set_column(place, records.schema.field("unit"), column)
 
 
-def pair_seconds(name: str, episodes: int) -> tuple[float, float]:
-    """Wall time of one pair, with the start of the workers, and the megabytes of this process and its largest child."""
+def pair_seconds(name: str, episodes: int) -> tuple[float, float, float]:
+    """Wall time and CPU time of one pair, with the start of the workers, and the megabytes of the largest child.
+
+    The CPU time is that of this process and all its descendants, Ray's own included, as far as they were seen alive.
+    """
     with tempfile.TemporaryDirectory() as folder:
         words: Sequence[str] = [*PAIR, *QUIET, f"episodes={episodes}", f"executor={name}", f"out={folder}"]
         largest = 0.0
+        used: dict[tuple[int, float], float] = {}
 
         class Watching(Silent):
             def working(self, works: object) -> None:
                 nonlocal largest
                 # Ray's own processes have a few hundred MB as well.
-                children = psutil.Process().children(recursive=True)
-                sizes = [child.memory_info().rss for child in children if child.is_running()]
-                largest = max(largest, max(sizes, default=0) / 1e6)
+                for child in psutil.Process().children(recursive=True):
+                    # It may end at any time.
+                    with contextlib.suppress(psutil.Error):
+                        times, size = child.cpu_times(), child.memory_info().rss
+                        largest = max(largest, size / 1e6)
+                        used[child.pid, child.create_time()] = times.user + times.system
 
-        start = time.perf_counter()
+        start, own = time.perf_counter(), time.process_time()
         runner.run(run_config(words), Watching())
-        return time.perf_counter() - start, largest
+        return time.perf_counter() - start, time.process_time() - own + sum(used.values()), largest
 
 
 def main() -> None:
@@ -155,12 +163,12 @@ def main() -> None:
     of_records()
     rounds = [{name: pair_seconds(name, arguments.episodes) for name in names} for _ in range(arguments.rounds)]
     for name in names if rounds else ():
-        seconds, memory = (statistics.median(one[name][at] for one in rounds) for at in (0, 1))
-        print(f"{name}: {seconds:.1f} s for the pair, {memory:.0f} MB the largest worker")
+        wall, cpu, memory = (statistics.median(one[name][at] for one in rounds) for at in range(3))
+        print(f"{name}: {wall:.1f} s for the pair, {cpu:.1f} s of CPU time, {memory:.0f} MB the largest worker")
     print(f"driver: {psutil.Process().memory_info().rss / 1e6:.0f} MB")
     if rounds and len(names) > 1:
-        ratio = statistics.median(one["ray"][0] / one["processes"][0] for one in rounds)
-        print(f"Ray takes {ratio:.2f} x of processes, with the start of the workers")
+        wall, cpu = (statistics.median(one["ray"][at] / one["processes"][at] for one in rounds) for at in (0, 1))
+        print(f"Ray takes {wall:.2f} x of processes, {cpu:.2f} x in CPU time, with the start of the workers")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ class _Compressed(Guarded):
         self.quality = quality
 
     def transform(self, pictures: Tensor) -> Tensor:
-        coded = (pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).numpy()
+        coded = (pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
         through = np.stack([self._through(picture) for picture in coded])
         return torch.from_numpy(through).permute(0, 3, 1, 2).to(pictures) / 255
 

@@ -67,7 +67,7 @@ class Filter(IntervalPolicy):
         self.caution = Caution(braking=settings.braking, seconds=settings.braking_s, distance=settings.distance)
 
     def initial(self, episodes: Tensor) -> State:
-        own = {"ego": self.reckoning.unknown(episodes), "edge": torch.zeros(len(episodes))}
+        own = {"ego": self.reckoning.unknown(episodes), "edge": torch.zeros(len(episodes), device=episodes.device)}
         return _with_inner(own, self.policy.initial(episodes), episodes.shape)
 
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
@@ -125,7 +125,7 @@ class Shielded(Filter):
         keeps = torch.cat((safe[..., :1], safe[..., 1:] & ~needless), -1)
         changes = (change >= 0) & margins.changeable
         none = ~keeps.any(-1, keepdim=True) & ~changes.any(-1, keepdim=True)
-        slower = torch.tensor([False, False, True])
+        slower = torch.tensor([False, False, True], device=safe.device)
         hard = torch.cat((keeps | (none & slower), changes), -1).to(stay)
         soft = torch.cat((stay, change), -1).div(SOFTNESS).sigmoid()
         ordered = hard + soft - soft.detach()

@@ -47,6 +47,7 @@ def score(
     record: int = 0,
     out: str | Path = "results",
     workers: int = 1,
+    device: Literal["auto", "cpu", "cuda"] = "cpu",
     progress: bool | None = None,
     name: str | None = None,
     actions: Literal["discrete", "continuous"] | None = None,
@@ -74,6 +75,7 @@ def score(
         out: results folder. What is there is not driven again.
         workers: worker processes. 1 drives in this process. More need a script with `if __name__ == "__main__":`, and objects
             that can be pickled. Results do not depend on it.
+        device: where victims compute: `cpu`, `cuda` (a GPU), or `auto` (a GPU if there is one).
         progress: whether to show a progress bar; by default on a terminal.
         name: how records call a victim that is an object; by default its class and the first digits of its weights' hash.
         actions: type of actions of a torch network whose output fits both.
@@ -101,6 +103,7 @@ def score(
             seeds=tuple(range(count) if seeds is None else seeds),
             executor="serial" if workers == 1 else "processes",
             workers=workers,
+            device=device,
             out=Path(out).expanduser(),
             record=record,
             reference=baselines,

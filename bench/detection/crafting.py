@@ -11,6 +11,7 @@ from bench.detection.contracts import CameraWorld, PatchAttack
 from bench.detection.detector import Detector
 from bench.detection.enforcer import PatchEnforcer
 from bench.detection.patch import Patch
+from bench.detection.placed import placed
 from bench.detection.scenes import Scenes
 from bench.detection.threat import PatchThreat
 from bench.errors import UserError
@@ -72,7 +73,7 @@ def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
     assert isinstance(world, CameraWorld)
     assert isinstance(threat, PatchThreat)
     with Stream("load", job.attack_seed).in_use():
-        detector = pair.load(job.training_seed)
+        detector = placed(pair.load(job.training_seed), job.device)
         scenes = world.training_scenes()
         patch = craft(attack, detector, scenes, threat, attack_seed=job.attack_seed, progress=progress)
     return patch.written(made_by)

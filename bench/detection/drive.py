@@ -10,6 +10,7 @@ from bench.detection import approach, boxes, crafting, enforcer, oracle, stoppin
 from bench.detection.approach import Trace, check_approaches, score
 from bench.detection.contracts import CameraWorld
 from bench.detection.patch import Patch
+from bench.detection.placed import placed
 from bench.errors import UserError
 from bench.plugins.track import Driven, Job
 from bench.trust.seal import Seal
@@ -32,7 +33,7 @@ def drive(job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
     patch = _patch(artefact, job.artefact) if artefact else None
     SEAL.check()
     with Stream("load", job.attack_seed).in_use():
-        detector = pair.load(job.training_seed)
+        detector = placed(pair.load(job.training_seed), job.device)
         approaches = world.approaches(job.cell, job.seeds)
         check_approaches(approaches, job.seeds, type(world).__name__)
         trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None

@@ -9,6 +9,7 @@ from bench.driving import attacker, enforcer, meter, oracle, probes, threat, vic
 from bench.driving import rollout as rollouts
 from bench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
 from bench.driving.meter import Columns
+from bench.driving.placed import placed
 from bench.driving.policy import Policy
 from bench.driving.rollout import Trace, rollout
 from bench.driving.threat import ObservationThreat
@@ -73,6 +74,7 @@ def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
     SEAL.check()
     with Stream("load", first.attack_seed).in_use():
         policy, attack = _checked(pair.load(first.training_seed), pair), pair.armed(first.training_seed)
+        policy = placed(policy, first.device)
         cells = [job.cell for job in jobs for _ in job.seeds]
         env = world.make(cells, action_type=policy.action_type, driver=policy.driver)
         try:

@@ -135,9 +135,7 @@ class Enforcer:
             self.asked.append((rows, observation.detach()))
         queries, spent = observation.shape[:-3].numel(), self.spent.numpy()
         # NumPy: a call costs a fraction of torch's, and this runs before every query.
-        wanted = spent + (queries if rows is None else 0)
-        if rows is not None:
-            np.add.at(wanted, rows.numpy(), queries)
+        wanted = spent + (queries if rows is None else queries * np.bincount(rows.numpy(), minlength=len(spent)))
         worst = int(wanted.max(initial=0))
         if worst > self.threat.queries:
             raise QueryBudgetError(

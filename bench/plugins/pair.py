@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 from bench.errors import PluginError, UserError, message, reason
@@ -144,8 +145,8 @@ class Pair:
         """Whether there is no attack."""
         return self.attack.name == "none"
 
-    @property
-    def identity(self) -> dict[str, str]:
+    @cached_property
+    def identity(self) -> Mapping[str, str]:
         """Names and parameters of everything in the pair."""
         named = {part.kind: part.name for part in self.parts}
         return named | {f"{part.kind}_params": part.params for part in self.parts} | {"threat": canonical(self.threat)}

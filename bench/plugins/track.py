@@ -39,6 +39,7 @@ class Job:
         seeds: the scenario seed of each episode.
         artefact: fingerprint of the artefact that was prepared for it; empty if there is none.
         entropy: seed of the moments at which the victim is probed, drawn when the work is done; no measurement depends on it.
+        device: where the victim computes: `cpu` or `cuda`.
     """
 
     pair: Pair
@@ -48,6 +49,7 @@ class Job:
     seeds: range
     artefact: str = ""
     entropy: int = 0
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from bench.errors import UserError, notice
 from bench.plugins.track import Track
@@ -24,6 +26,8 @@ from bench.records.store import path_of, write_packed
 from bench.scenarios import Cell
 
 SET_ASIDE = "set_aside"
+WHOSE = ("pair", "training_seed", "cell")
+"""Columns that say whose records they are."""
 
 
 class _Pair(Protocol):
@@ -82,8 +86,14 @@ def finished(out: Path, units: Mapping[str, Wanted]) -> set[str]:
             )
         else:
             done.add(key)
-    for path in packed_files(out) if done != units.keys() else ():
-        done |= _packed(out, path, {key: unit for key, unit in units.items() if key not in done})
+    left = {key: unit for key, unit in units.items() if key not in done}
+    for path in packed_files(out):
+        if not left:
+            break
+        # No copy of what is left: it may be a hundred thousand units, and there may be hundreds of files.
+        for key in _packed(out, path, left):
+            done.add(key)
+            del left[key]
     return done
 
 
@@ -105,18 +115,30 @@ def _incomplete(path: Path, key: str, unit: Wanted) -> str:
     if set(records["unit"].to_pylist()) != {key}:
         return "it has the rows of another unit"
     other = _other_rows(records["seed"].to_numpy(), unit)
-    return other or _invalid(records, unit.track) or _of_another(records, unit)
+    whose = [set(records[name].to_pylist()) for name in WHOSE]
+    return other or _invalid(records, unit.track) or _of_another(whose, unit)
 
 
-def _of_another(records: pa.Table, unit: Wanted) -> str:
-    """Which columns of a unit's valid records are not its own; empty if none."""
-    if set(records["pair"].to_pylist()) != {unit.pair.id}:
+def _of_another(whose: Sequence[Collection[Any]], unit: Wanted) -> str:
+    """Which columns of a unit's valid records are not its own; empty if none.
+
+    Args:
+        whose: the values in its rows of each column of `WHOSE`.
+        unit: the unit.
+    """
+    pairs, training_seeds, cells = whose
+    if any(pair != unit.pair.id for pair in pairs):
         return "it has the rows of another pair"
-    if set(records["training_seed"].to_pylist()) != {unit.training_seed}:
+    if any(seed != unit.training_seed for seed in training_seeds):
         return "it has the rows of another training seed"
-    if any(json.loads(cell) != dict(unit.cell) for cell in set(records["cell"].to_pylist())):
+    if any(_parsed(cell) != dict(unit.cell) for cell in cells):
         return "it has the rows of another cell"
     return ""
+
+
+@lru_cache(maxsize=1024)
+def _parsed(cell: str) -> Any:
+    return json.loads(cell)
 
 
 def _other_rows(seeds: np.ndarray, unit: Wanted) -> str:
@@ -135,7 +157,7 @@ def _packed(out: Path, path: Path, units: Mapping[str, Wanted]) -> set[str]:
     """The fingerprints among `units` that have records in a file of many units."""
     try:
         inside = pc.unique(pq.read_table(path, columns=["unit"])["unit"]).to_pylist()
-        wanted = units.keys() & set(inside)
+        wanted = {key for key in inside if key in units}
         if not wanted:
             return set()
         track, generation = check(path)
@@ -157,7 +179,7 @@ def _packed(out: Path, path: Path, units: Mapping[str, Wanted]) -> set[str]:
         notice(f"unit {key} in the record {path} does not count as finished: {why}; it is driven again")
     if wrong:
         _without(out, path, wrong.keys())
-    return set(wanted) - wrong.keys()
+    return wanted - wrong.keys()
 
 
 def _wrong(records: pa.Table, track: Track, units: Mapping[str, Wanted]) -> dict[str, str]:
@@ -171,7 +193,8 @@ def _wrong(records: pa.Table, track: Track, units: Mapping[str, Wanted]) -> dict
     encoded = records["unit"].combine_chunks()
     codes, names = encoded.indices.to_numpy(), encoded.dictionary.to_pylist()
     order = np.argsort(codes, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
+    starts = np.append(0, np.flatnonzero(np.diff(codes[order])) + 1)
+    parts = np.split(order, starts[1:])
     seeds = records["seed"].to_numpy()
     found = {}
     for rows in parts:
@@ -182,14 +205,29 @@ def _wrong(records: pa.Table, track: Track, units: Mapping[str, Wanted]) -> dict
             if why:
                 found[key] = why
     suspect = validity.complaint(records, track)
-    whose = records.select(["pair", "training_seed", "cell"])
-    for rows in parts:
-        key, place = names[codes[rows[0]]], pa.array(rows)
+    whose = zip(*(_ends(records[name], order, starts) for name in WHOSE), strict=True)
+    for rows, own in zip(parts, whose, strict=True):
+        key = names[codes[rows[0]]]
         if key in units and key not in found:
-            invalid = _invalid(records.take(place), track) if suspect else ""
-            if why := invalid or _of_another(whose.take(place), units[key]):
+            invalid = _invalid(records.take(pa.array(rows)), track) if suspect else ""
+            if why := invalid or _of_another(own, units[key]):
                 found[key] = why
     return found
+
+
+def _ends(column: pa.ChunkedArray, order: NDArray[np.int64], starts: NDArray[np.int64]) -> Iterator[tuple[Any, Any]]:
+    """Two values of a column in each part of its rows, which differ unless the part has one value only.
+
+    Args:
+        column: the column.
+        order: its rows, part after part.
+        starts: where each part begins in `order`.
+    """
+    whole = column.combine_chunks()
+    encoded = whole if pa.types.is_dictionary(whole.type) else whole.dictionary_encode()
+    codes, values = encoded.indices.to_numpy()[order], encoded.dictionary.to_pylist()
+    for low, high in zip(np.minimum.reduceat(codes, starts), np.maximum.reduceat(codes, starts), strict=True):
+        yield values[low], values[high]
 
 
 def _without(out: Path, path: Path, units: Collection[str]) -> None:

@@ -88,7 +88,7 @@ PROVENANCE: tuple[pa.Field, ...] = (
         TEXT,
         "JSON: versions of Python, torch, other computing libraries and the libraries of components",
     ),
-    field("machine", TEXT, "system, processor and number of cores"),
+    field("machine", TEXT, "system, processor and number of cores; if the victim computed on a GPU, which"),
     field("created_at", pa.timestamp("us", tz="UTC"), "time when the unit was finished"),
     field("wall_s", FLOAT, "wall time of the unit with all its episodes", "s", low=0),
 )

@@ -13,6 +13,7 @@ from typing import Any
 
 from bench.errors import UserError, short
 from bench.plugins import registry
+from bench.plugins.device import CPU, resolved
 from bench.plugins.options import Options, configured
 from bench.plugins.pair import Chosen, Pair, check_track
 from bench.plugins.registry import KINDS, Kind
@@ -42,6 +43,7 @@ class RunConfig:
         shard: (3, 10) drives the third of ten equal parts of the units.
         unit_timeout: seconds that a unit or preparation may take; 0 for no limit.
         unit_memory: GB of memory that a worker process may use; 0 for no limit.
+        device: where victims compute: `auto` is a GPU if there is one, and becomes `cpu` or `cuda` here.
         until: half the width of the interval at which a row has enough scenarios (`bench.run.rounds`); None drives them all.
 
     Raises:
@@ -63,11 +65,13 @@ class RunConfig:
     unit_timeout: float = 3600.0
     unit_memory: float = field(default_factory=half_of_memory)
     until: float | None = None
+    device: str = CPU
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
         if self.executor not in EXECUTORS:
             raise ValueError(registry.unknown(f"executor {self.executor!r}", self.executor, EXECUTORS))
+        object.__setattr__(self, "device", resolved(self.device, self.executor))
         if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers must be at least 1, got {self.workers}")
         for name in ("unit_timeout", "unit_memory"):
@@ -158,6 +162,7 @@ def run_config(words: Sequence[str]) -> RunConfig:
             unit_timeout=settings["unit_timeout"],
             unit_memory=settings["unit_memory"],
             until=settings["until"],
+            device=settings["device"],
         )
 
 

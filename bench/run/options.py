@@ -41,6 +41,7 @@ class RunOptions:
     )
     workers: int | None = field(default=None, metadata=_meaning("Worker processes.", "one a core"))
     ray: RayOptions = field(default_factory=RayOptions)
+    device: str = field(default="cpu", metadata=_meaning("Where victims compute: cpu, cuda (a GPU), or auto.", "cpu"))
     out: str = field(default="results", metadata=_meaning("Results folder.", "results"))
     record: int | None = field(
         default=None, metadata=_meaning("Episodes to record in each cell.", "one of the first cell")

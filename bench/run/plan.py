@@ -66,6 +66,7 @@ def units_of(config: RunConfig, weights: Weights) -> list[Unit]:
                 weights_sha256=loaded[0],
                 adversary_sha256=loaded[1],
                 sequential=config.grid.name == SEQUENTIAL,
+                device=config.device,
             )
             units += [replace(first, cell=cell) for cell in mine]
     return units

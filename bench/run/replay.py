@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 
 from bench.errors import UserError
 from bench.plugins import registry
+from bench.plugins.device import recorded as recorded_device
 from bench.plugins.framework import Snapshot
 from bench.plugins.pair import IN_PROCESS, Chosen, Pair, choose
 from bench.plugins.track import track
@@ -236,6 +237,7 @@ def _unit(out: Path, record: Mapping[str, Any]) -> tuple[Unit, pa.Table]:
         weights_sha256=pair.weights_sha256(record["training_seed"]),
         adversary_sha256=pair.adversary_sha256(record["training_seed"]),
         sequential=record["grid"] == SEQUENTIAL,
+        device=recorded_device(record["machine"]),
     )
     return unit, before
 

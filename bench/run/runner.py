@@ -224,6 +224,8 @@ def stem(cell: Cell, seed: int) -> str:
 
 def _recorded(config: RunConfig, units: Iterable[Unit]) -> dict[str, Sequence[int]]:
     """The scenario seeds to record, by fingerprint of the unit: of the requested pairs, with their first training seed."""
+    if config.record == 0:
+        return {}
     requested = {pair.id for pair in config.pairs}
     first_units: dict[str, Unit] = {}
     for unit in units:

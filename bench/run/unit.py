@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 from bench.plugins import registry
+from bench.plugins.device import CPU, said
 from bench.plugins.fingerprint import canonical, code_digest, digest, libraries, machine
 from bench.plugins.pair import Chosen, Pair
 from bench.plugins.track import Job, Track, track_of
@@ -50,6 +51,7 @@ class Work:
         training_seed: seed of the victim and of the preparation.
         weights_sha256: hash of the defended victim's weights.
         adversary_sha256: hash of the weights of an attack that learns; otherwise empty.
+        device: where the victim computes: `cpu` or `cuda`.
         cell: one value on each axis of the world.
         seeds: the scenario seed of each episode.
     """
@@ -60,6 +62,7 @@ class Work:
     cell: Cell
     seeds: range
     adversary_sha256: str = ""
+    device: str = CPU
 
     @property
     def track(self) -> Track:
@@ -103,6 +106,7 @@ class Work:
             cell=self.cell,
             seeds=self.seeds,
             artefact=self.artefact,
+            device=self.device,
         )
 
     @property
@@ -119,6 +123,7 @@ class Work:
             "attack_seed": self.attack_seed,
             "weights": self.weights_sha256,
             **({"adversary": self.adversary_sha256} if self.adversary_sha256 else {}),
+            **({"device": self.device} if self.device != CPU else {}),
             "code": self.code_digest,
             "shipped_by": [part.shipped_by for part in self.pair.parts],
             "libraries": self.libraries,
@@ -184,6 +189,7 @@ class Unit(Work):
             cell=self.cell,
             seeds=self.seeds,
             adversary_sha256=self.adversary_sha256,
+            device=self.device,
         )
 
     @property
@@ -233,7 +239,7 @@ class Unit(Work):
             "weights_sha256": self.weights_sha256,
             "code_digest": self.code_digest,
             "libraries": canonical(self.libraries),
-            "machine": machine(),
+            "machine": machine() + said(self.device),
             "created_at": datetime.now(UTC),
             "wall_s": wall_s,
         }

@@ -25,7 +25,9 @@ class Stream:
         self._torch = torch.Generator().manual_seed(number).get_state()
         self._python = random.Random(number).getstate()
         self._numpy: np.random.BitGenerator = np.random.MT19937(number)
-        self._fresh = self._torch.numpy().tobytes(), self._python, _drawn(self._numpy)
+        # None before the GPU is in use: its generator then goes on as it is.
+        self._gpu = torch.Generator("cuda").manual_seed(number).get_state() if torch.cuda.is_initialized() else None
+        self._fresh = _bytes(self._torch), self._python, _drawn(self._numpy), _bytes(self._gpu)
 
     def used(self) -> bool:
         """Whether anything was drawn from it, or it was seeded, since it was made; ask while it is not in use."""
@@ -39,6 +41,11 @@ class Stream:
         random.setstate(self._python)
         mtrand.set_bit_generator(self._numpy)
         self._torch, self._python, self._numpy = in_use
+        if torch.cuda.is_initialized():
+            gpu, own = torch.cuda.get_rng_state(), self._gpu
+            if own is not None:
+                torch.cuda.set_rng_state(own)
+            self._gpu = gpu
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
@@ -49,9 +56,14 @@ class Stream:
         finally:
             self.swap()
 
-    def marks(self) -> tuple[bytes, object, bytes]:
+    def marks(self) -> tuple[bytes, object, bytes, bytes]:
         """What tells whether anything was drawn from the global generators."""
-        return torch.get_rng_state().numpy().tobytes(), random.getstate(), _drawn(mtrand.get_bit_generator())
+        gpu = torch.cuda.get_rng_state() if torch.cuda.is_initialized() else None
+        return _bytes(torch.get_rng_state()), random.getstate(), _drawn(mtrand.get_bit_generator()), _bytes(gpu)
+
+
+def _bytes(state: torch.Tensor | None) -> bytes:
+    return b"" if state is None else state.numpy().tobytes()
 
 
 def _drawn(generator: np.random.BitGenerator) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import accumulate, pairwise
 
 import pytest
 import torch
@@ -12,8 +13,8 @@ from torch import Tensor
 
 from attacks.noise import Noise
 from attacks.objectives import Objective, distortion
-from attacks.zo import ZOObjective, ZOSignSGD, _directions
-from bench.driving import ActionType, ObservationThreat, Policy
+from attacks.zo import ZOObjective, ZOSignSGD, _directions, _gradient
+from bench.driving import ActionType, ObservationThreat, Part, Policy
 from tests.attacks.victims import Linear, left, loss_of, observations, perturb, victim
 
 
@@ -108,14 +109,14 @@ def test_as_many_directions_as_entries_find_the_optimum_of_a_linear_victim(seed:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 70), st.integers(1, 12), st.integers(0, 99))
 def test_directions_are_distinct_signs_that_leave_presence_alone(count: int, vehicles: int, seed: int) -> None:
-    directions = _directions(count, torch.Size((vehicles, 5)), torch.Generator().manual_seed(seed))
+    directions = _directions(count, torch.Size((vehicles, 5)), [torch.Generator().manual_seed(seed)])[0]
     assert directions.shape == (count, vehicles, 5)
     assert bool((directions[..., 0] == 0).all())
     assert bool((directions[..., 1:].abs() == 1).all())
 
 
 def test_as_many_directions_as_a_full_hadamard_matrix_are_orthogonal() -> None:
-    directions = _directions(16, torch.Size((4, 5)), torch.Generator().manual_seed(0)).flatten(1)
+    directions = _directions(16, torch.Size((4, 5)), [torch.Generator().manual_seed(0)])[0].flatten(1)
     torch.testing.assert_close(directions @ directions.T, 16 * torch.eye(16))
 
 
@@ -144,3 +145,21 @@ def test_a_continuous_victim_moves_towards_the_objective(objective: ZOObjective)
     else:
         target = torch.tensor([1.0, 0.5])
         assert float((after - target).norm(dim=-1).mean()) < float((before - target).norm(dim=-1).mean())
+
+
+@settings(deadline=None)
+@given(sizes=st.lists(st.integers(1, 4), min_size=2, max_size=5), count=st.integers(1, 20), seed=st.integers(0, 2**31))
+def test_the_gradient_of_a_unit_does_not_depend_on_others_in_the_batch(sizes: list[int], count: int, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    ends = list(accumulate(sizes, initial=0))
+    parts = [Part(slice(start, end), generator) for start, end in pairwise(ends)]
+    value, directions = (
+        torch.randn(count + 1, ends[-1]),
+        _directions(count, torch.Size((5, 5)), [generator] * len(sizes)),
+    )
+    together = _gradient(value, directions, parts)
+    for part, own in zip(parts, directions, strict=True):
+        alone = value[:, part.rows].contiguous()
+        assert torch.equal(
+            together[part.rows], _gradient(alone, own[None], [Part(slice(0, alone.shape[1]), generator)])
+        )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,6 +23,9 @@ from bench.plugins.framework import Snapshot
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Columns
 from bench.run.batches import EPISODES, batches
+from bench.run.config import run_config
+from bench.run.plan import key_of, loadings, units_of
+from bench.run.runner import _recorded
 from bench.run.unit import Unit
 from bench.run.work import Outcome, Task, attempt
 from bench.scenarios import Cell
@@ -166,3 +170,23 @@ def test_a_task_of_several_units_has_the_outcome_of_each() -> None:
         assert other.records is not None
         same = [name for name in one.records.column_names if name not in PROBES | timed]
         assert one.records.select(same).to_pylist() == other.records.select(same).to_pylist()
+
+
+def test_an_outcome_survives_the_way_from_a_worker() -> None:
+    outcome = carried_out(Task(work=units("noise", 1, seeds=range(1_000_000, 1_000_002))[0]))
+    assert outcome.records is not None
+    sent = pickle.dumps(replace(outcome, others=[outcome, Outcome(wall_s=1.0, artefact=b"patch")]))
+    found = pickle.loads(sent)
+    assert found.records.equals(outcome.records, check_metadata=True)
+    assert found.others[0].records.equals(outcome.records)
+    assert (found.others[1].records, found.others[1].artefact) == (None, b"patch")
+
+
+def test_a_run_without_recordings_drives_its_units_in_batches() -> None:
+    words = ("attack=noise", "lanes=3,4,5", "density=1,2", "weather=clear", "seeds=0", "reference=false")
+    sizes = []
+    for record in ("record=0", "record=1"):
+        config = run_config([*words, record])
+        works = units_of(config, {key_of(loading): ("", "") for loading in loadings(config)})
+        sizes.append({len(batch) for batch in batches(works, _recorded(config, works), workers=1)})
+    assert sizes == [{3}, {1, 3}]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.errors import UserError
+from bench.errors import UnfinishedError, UserError
 from bench.plugins.track import track
 from bench.records import reading
 from bench.run import rounds, runner
@@ -129,3 +129,18 @@ def test_fixed_scenarios_and_audits_are_refused(tmp_path: Path) -> None:
         run_config(["victim=yolov3_tiny", "attack=grey_patch", "until=0.1", f"out={tmp_path}"])
     with pytest.raises(UserError, match="leave out until"):
         audit_config([*WORDS, f"out={tmp_path}"])
+
+
+def test_a_pair_that_fails_has_stopped_and_the_others_go_on_as_without_it(tmp_path: Path) -> None:
+    runner.run(config(tmp_path / "alone"), Silent())
+    asked = config(tmp_path / "both", "attack.mood=calm,raise")
+    alone = rounds.read(tmp_path / "alone", [asked.pairs[0].id])
+    for resumed in (False, True):
+        watcher = Silent()
+        with pytest.raises(UnfinishedError):
+            runner.run(asked, watcher)
+        calm, failed = rounds.read(tmp_path / "both", [pair.id for pair in asked.pairs])
+        assert [calm] == alone
+        assert (failed.why, failed.scenarios) == ("failed", 0)
+        assert bool(watcher.done) is not resumed
+        assert watcher.failures

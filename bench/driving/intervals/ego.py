@@ -63,7 +63,7 @@ class DeadReckoning:
 
     def unknown(self, episodes: Tensor) -> TensorDict:
         """The state before the first observation."""
-        zero = torch.zeros(len(episodes))
+        zero = torch.zeros(len(episodes), device=episodes.device)
         fields = dict.fromkeys(Ego._fields, zero)
         return TensorDict({**fields, "known": zero.bool()}, batch_size=episodes.shape)
 

@@ -67,7 +67,7 @@ class FollowingDistance:
         down, right = first - row, second - column
         level = rate.detach().clamp(0, HARDEST).ceil()
         place = ((level * self.side + row) * self.side + column).long()
-        table = self.table
+        self.table = table = self.table.to(place.device)
         upper = table[place] * (1 - right) + table[place + 1] * right
         lower = table[place + self.side] * (1 - right) + table[place + self.side + 1] * right
         return upper * (1 - down) + lower * down

@@ -54,11 +54,11 @@ class ONNX(FileDriver):
 
         def network(observation: Tensor) -> Tensor:
             try:
-                (answer,) = session.run([output], {name: observation.detach().contiguous().numpy()})
+                (answer,) = session.run([output], {name: observation.detach().cpu().contiguous().numpy()})
             # ONNX Runtime has many exceptions; their text names the operation.
             except Exception as error:
                 node = re.search(r"running (\w+) node", str(error))
                 raise OperationError(node[1]) if node else error from error
-            return torch.from_numpy(answer)
+            return torch.from_numpy(answer).to(observation.device)
 
         return FilePolicy(network, shape, self.action_type, width, sha256)

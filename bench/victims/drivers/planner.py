@@ -105,6 +105,6 @@ class IntervalPlanner(IntervalPolicy):
         worth = SPEED * (speed - SLOWEST) / (top - SLOWEST) + per_lane * sides
         lane = ego.target_lane.unsqueeze(-1) + sides
         worth = torch.where((lane >= 0) & (lane <= ego.edge.unsqueeze(-1)), worth, FORBIDDEN)
-        beyond = self.rules.detour * torch.arange(4.0)
+        beyond = self.rules.detour * torch.arange(4.0).to(speed)
         left, right = worth[..., :4].flip(-1) - beyond, worth[..., 5:] - beyond
         return torch.stack([left.amax(-1), worth[..., 4], right.amax(-1)], -1)

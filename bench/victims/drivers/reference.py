@@ -94,7 +94,9 @@ class _RandomPolicy(Policy):
     def initial(self, episodes: Tensor) -> State:
         generators = [torch.Generator().manual_seed(int(episode)) for episode in episodes]
         draws = torch.stack([torch.rand(DRAWS, self.actions, generator=generator) for generator in generators])
-        return TensorDict({"step": torch.zeros_like(episodes), "draws": draws}, batch_size=episodes.shape)
+        return TensorDict(
+            {"step": torch.zeros_like(episodes), "draws": draws.to(episodes.device)}, batch_size=episodes.shape
+        )
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         assert state is not None

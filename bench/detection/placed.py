@@ -1,0 +1,37 @@
+"""A detector on another device than the run."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.detection.detector import Detector, Predictions
+from bench.plugins.device import CPU, move
+
+
+class Placed(Detector):
+    """A detector on another device: images are copied there, and predictions and gradients come back to the processor.
+
+    Args:
+        detector: the (defended) victim.
+        device: where it computes, for instance `cuda`.
+    """
+
+    def __init__(self, detector: Detector, device: str) -> None:
+        super().__init__()
+        self.inner = detector
+        self.names, self.stride, self.weights_sha256 = detector.names, detector.stride, detector.weights_sha256
+        self._there = torch.device(device)
+        move(detector, self._there)
+
+    def forward(self, pictures: Tensor) -> Predictions:
+        return self.predict(pictures)
+
+    def predict(self, pictures: Tensor) -> Predictions:
+        found = self.inner(pictures.to(self._there))
+        return Predictions(found.boxes.to(CPU), found.objectness.to(CPU), found.classes.to(CPU))
+
+
+def placed(detector: Detector, device: str) -> Detector:
+    """The detector on a device; itself on the processor."""
+    return detector if device == CPU else Placed(detector, device)
