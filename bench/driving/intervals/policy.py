@@ -46,8 +46,8 @@ class IntervalPolicy(Policy):
         """The state after a step, as in `advance`, for given boxes."""
 
     @abstractmethod
-    def safe(self, boxes: Boxes, state: State) -> Tensor:
-        """Whether an action has a margin of at least 0, bool [...]."""
+    def safe(self, boxes: Boxes, state: State) -> Tensor | None:
+        """Whether an action has a margin of at least 0, bool [...]; None if it promises nothing."""
 
     def filtered(self, observation: Tensor, boxes: Boxes, state: State) -> Passed:
         """As `passed`, for given boxes."""
