@@ -229,6 +229,8 @@ def _records(out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track) -
     ]
     try:
         with duckdb.connect() as connection:
+            # On a slow machine it would stand among the tables.
+            connection.execute("set enable_progress_bar = false")
             connection.sql("create view records as " + " union all by name ".join(parts))
             connection.execute("set variable latest = ?", [_latest()])
             future = "select file from records where created_at > getvariable('latest') limit 1"
