@@ -25,7 +25,7 @@ from tests.soak.endurance import endure
 from tests.soak.subjects import SUBJECTS, Subject
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-GONE_S = 20
+GONE_S = 60
 """Seconds that the processes of a killed command may take to end."""
 
 
