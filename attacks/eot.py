@@ -11,7 +11,8 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from bench.detection import PatchAttack, PatchOracle, Scenes
+from bench.detection import PatchAttack, PatchOracle, Predictions, Scenes
+from bench.detection.printing import non_printability
 from bench.detection.threat import Texels
 from bench.plugins.contracts import Access, Progress
 from bench.plugins.ranges import Count, NotNegative, Positive
@@ -37,7 +38,11 @@ class EOT(PatchAttack):
     Where a detector is sure, the gradient of a probability vanishes; the log-odds log(p / (1 - p)) keep it (as the margin loss of
     Carlini and Wagner 2017 does). Of several restarts, the patch with the lowest loss in the last steps is kept.
 
+    With norm `print` each step ends with printable texels, so the patch that is optimised is the one that is scored.
+
     Args:
+        target: class that the detector shall see instead, such as "traffic sign": the loss of its highest score on the sign is
+            subtracted. Empty: the sign shall only vanish (default).
         texels: side of the patch in texels, from 8 to 512 (default 100, as in the thesis, which also uses 32 and 64).
         steps: optimiser steps of each start, at least 1 (default 150).
         restarts: number of random starts, at least 1 (default 1).
@@ -45,6 +50,7 @@ class EOT(PatchAttack):
         batch: views per step, at least 1 (default 8).
         learning_rate: learning rate of Adam, above 0 (default 0.05).
         tv: weight of the total variation: mean absolute difference of neighbouring texels, in both directions (default 0.1).
+        nps: weight of the non-printability score: mean distance to the nearest of thirty printable colours (default 0).
         window: side in pixels of the square window around the sign; a multiple of the detector's stride (default 320).
         rotation: largest rotation, in degrees (default 8).
         scale: largest change of size, as a share (default 0.3).
@@ -63,6 +69,7 @@ class EOT(PatchAttack):
 
     access: ClassVar[Access] = "gradients"
 
+    target: str = ""
     texels: Texels = 100
     steps: Count = 150
     restarts: Count = 1
@@ -70,6 +77,7 @@ class EOT(PatchAttack):
     batch: Count = 8
     learning_rate: Positive = 0.05
     tv: NotNegative = 0.1
+    nps: NotNegative = 0.0
     window: Count = 320
     rotation: Annotated[float, Interval(ge=0, le=180)] = 8.0
     scale: Annotated[float, Interval(ge=0, lt=1)] = 0.3
@@ -122,13 +130,18 @@ class EOT(PatchAttack):
             found, variation = scores.mean(), total_variation(patch)
             oracle.report(patch[0], found=found, total_variation=variation)
             loss = self._loss(scores) + self.tv * variation
+            if self.target:
+                places = transform.carried(scenes.boxes[frames] - corners.repeat(1, 2))
+                loss = loss - self._loss(seen_at(places, predictions, oracle.index(self.target)))
+            if self.nps:
+                loss = loss + self.nps * non_printability(patch)
             adam.zero_grad()
             loss.backward()
             adam.step()
             schedule.step()
             losses.append(loss.item())
             with torch.no_grad():
-                patch.clamp_(0, 1)
+                patch.copy_(oracle.threat.confine(patch))
             if step % REPORT_EVERY == 0:
                 progress(step / self.steps, f"stop sign {found.item():.2f}")
         last = losses[-max(1, round(JUDGED * self.steps)) :]
@@ -147,6 +160,13 @@ class EOT(PatchAttack):
         shift = (torch.rand(len(boxes), 2, generator=generator) * 2 - 1) * self.translation * self.window
         middle = (boxes[:, :2] + boxes[:, 2:]) / 2 + shift
         return torch.minimum((middle - side / 2).round().long().clamp(min=0), limit - side)
+
+
+def seen_at(boxes: Tensor, predictions: Predictions, label: int) -> Tensor:
+    """[N] the highest score of a class among the predictions whose middle is in the box [N, 4] of their image; 0 without one."""
+    middle = (predictions.boxes[..., :2] + predictions.boxes[..., 2:]) / 2
+    inside = ((middle >= boxes[:, None, :2]) & (middle <= boxes[:, None, 2:])).all(-1)
+    return (predictions.scores_of(label) * inside).amax(-1)
 
 
 def total_variation(patch: Tensor) -> Tensor:

@@ -48,12 +48,22 @@ class Transformations:
         coloured = brightness or contrast or saturation or hue
         self.jiggle = ColorJiggle(brightness, contrast, saturation, hue, p=1.0) if coloured else None
         self.noise = noise
+        self._matrices: list[Tensor] = []
+
+    def carried(self, boxes: Tensor) -> Tensor:
+        """Boxes [N, 4] of the images of the last call, around where its warps have moved them."""
+        corners = boxes[:, [0, 1, 2, 1, 2, 3, 0, 3]].unflatten(1, (4, 2))
+        for matrices in self._matrices:
+            corners = transform_points(matrices, corners)
+        return torch.cat((corners.amin(1), corners.amax(1)), 1)
 
     def __call__(self, pictures: Tensor, boxes: Tensor) -> Tensor:
         """Transform images [N, 3, H, W] in [0, 1]; differentiable in the pixels inside `boxes` [N, 4]."""
         shape = pictures.shape
+        self._matrices = []
         for warp, beyond in self.warps:
             matrices = warp.compute_transformation(pictures, warp.forward_parameters(shape), warp.flags)
+            self._matrices.append(matrices)
             grid = sources(matrices, shape)
             boxes = moved(mirrored(boxes, grid) if beyond == "reflection" else boxes[:, None], matrices, shape)
             places = around(boxes, shape)

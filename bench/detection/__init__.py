@@ -3,13 +3,14 @@
 from bench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
 from bench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions
 from bench.detection.oracle import PatchOracle
-from bench.detection.scenes import Approach, Scenes
+from bench.detection.scenes import Approach, Decoy, Scenes
 from bench.detection.threat import PatchThreat
 
 __all__ = [
     "STOP_SIGN",
     "Approach",
     "CameraWorld",
+    "Decoy",
     "Detections",
     "Detector",
     "DetectorDefense",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -12,34 +12,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.detection import stopping
-from bench.detection.boxes import confidence, detections, overlap
-from bench.detection.detector import STOP_SIGN, Detections, Detector, Predictions
+from bench.detection.boxes import confidence, overlap
+from bench.detection.detector import STOP_SIGN, Detections, Detector
+from bench.detection.discrimination import discrimination, if_visible
 from bench.detection.patch import Patch
+from bench.detection.printing import non_printability
 from bench.detection.scenes import Approach, Scenes
-from bench.errors import UserError
+from bench.detection.sight import SAME_IOU, Sight, look, look_at_decoys
 from bench.trust.streams import Stream
 
 Columns = dict[str, NDArray[np.generic]]
 
-BATCH = 16
-"""Frames per forward pass."""
 SAME_CONFIDENCE = 0.01
 """Two confidences count as the same answer if they differ by at most this."""
-NMS_IOU, SAME_IOU = 0.45, 0.3
-"""IoU of non-maximum suppression (YOLOv5's default), and smallest IoU at which a detection is the sign (`boxes.confidence`)."""
-
-
-@dataclass(frozen=True)
-class Sight:
-    """The output of a detector on the F frames of an approach.
-
-    Args:
-        confidence: float32 [F], confidence in the sign at its true place, in [0, 1]; 0 without a box there.
-        found: the stop signs detected in each frame.
-    """
-
-    confidence: NDArray[np.float32]
-    found: Sequence[Detections]
 
 
 @dataclass(frozen=True)
@@ -96,6 +81,7 @@ def score(
     texels = patch.texels if patch else None
     with torch.no_grad():
         seen = [look(detector, approach.scenes, texels, share) for approach in approaches]
+        others = [look_at_decoys(detector, approach.scenes) for approach in approaches]
         if trace:
             for place in trace.episodes:
                 clean = look(detector, approaches[place].scenes, None, share) if texels is not None else None
@@ -110,41 +96,18 @@ def score(
         "gradient_queries": float(crafted.gradients),
         "zero_gradients": crafted.zero_gradients / crafted.gradients if crafted.gradients else np.nan,
         "draws": np.nan,
+        "non_printability": np.nan if texels is None else float(non_printability(texels)),
         **probed(detector, approaches, seen, texels, share, entropy),
     }
+    scenes = [approach.scenes for approach in approaches]
     return {
         "seed": np.array([approach.seed for approach in approaches], np.int64),
         "location": np.array([approach.location for approach in approaches]),
         **{name: np.array([value] * len(approaches)) for name, value in constant.items()},
-        **measured(seen, [approach.scenes for approach in approaches]),
+        **measured(seen, scenes),
+        **discrimination(seen, others, scenes),
+        **if_visible(seen, scenes),
     }
-
-
-def look(detector: Detector, scenes: Scenes, texels: Tensor | None, share: float) -> Sight:
-    """Run the detector on each frame.
-
-    Args:
-        detector: the (defended) victim.
-        scenes: F frames.
-        texels: the patch [3, P, P]; None for no patch.
-        share: side of the patch as a share of the sign's side.
-
-    Raises:
-        UserError: if a prediction is NaN or infinite.
-    """
-    label = detector.index(STOP_SIGN)
-    patches = texels.unsqueeze(0) if texels is not None else None
-    confidences, found = [], []
-    for frames in torch.arange(len(scenes)).split(BATCH):
-        predictions = detector(scenes.render(frames, patches, share))
-        if not all(
-            bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)
-        ):
-            raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
-        boxes = scenes.boxes[frames].to(predictions.boxes)
-        confidences.append(confidence(predictions, label, boxes, iou=SAME_IOU))
-        found += found_of(predictions, label)
-    return Sight(torch.cat(confidences).numpy(), found)
 
 
 def probed(
@@ -192,12 +155,6 @@ def probed(
         "inconsistent": float(abs(answer - scored) > SAME_CONFIDENCE + 4 * spread),
         "entropy": entropy,
     }
-
-
-def found_of(predictions: Predictions, label: int) -> list[Detections]:
-    """The objects of one class detected in each image."""
-    only = replace(predictions, classes=predictions.classes[..., label : label + 1])
-    return detections(only, threshold=stopping.THRESHOLD, iou=NMS_IOU)
 
 
 def false_alarms(found: Sequence[Detections], boxes: Tensor) -> NDArray[np.int64]:

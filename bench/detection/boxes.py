@@ -69,3 +69,24 @@ def confidence(predictions: Predictions, label: int, boxes: Tensor, *, iou: floa
     matches = overlap(predictions.boxes, boxes.unsqueeze(1)) >= iou
     scores = predictions.scores_of(label) * matches
     return nn.functional.pad(scores, (0, 1)).amax(-1)
+
+
+@torch.no_grad()
+def best_other(predictions: Predictions, label: int, boxes: Tensor, *, iou: float = 0.3) -> list[tuple[float, int]]:
+    """The best score of any other class at the object's true place in each image, and that class; 0 and `label` if there is none.
+
+    Args:
+        predictions: predictions on N images.
+        label: label of the object's class.
+        boxes: [N, 4], the true box in each image.
+        iou: smallest IoU with the true box at which a prediction counts.
+    """
+    found = []
+    for number, box in enumerate(boxes):
+        here = overlap(predictions.boxes[number], box) >= iou
+        scores = predictions.objectness[number, here, None] * predictions.classes[number, here]
+        best = nn.functional.pad(scores, (0, 0, 0, 1)).amax(0)
+        best[label] = 0
+        score, other = best.max(0)
+        found.append((float(score), int(other) if score > 0 else label))
+    return found

@@ -6,7 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.detection import approach, boxes, crafting, enforcer, oracle, stopping, threat
+from bench.detection import (
+    approach,
+    boxes,
+    crafting,
+    discrimination,
+    enforcer,
+    oracle,
+    precision,
+    printing,
+    sight,
+    stopping,
+    threat,
+)
 from bench.detection.approach import Trace, check_approaches, score
 from bench.detection.contracts import CameraWorld
 from bench.detection.patch import Patch
@@ -17,7 +29,7 @@ from bench.trust.seal import Seal
 from bench.trust.streams import Stream
 from bench.trust.watch import Watch
 
-SEAL = Seal(approach, boxes, crafting, enforcer, oracle, stopping, threat)
+SEAL = Seal(approach, boxes, crafting, discrimination, enforcer, oracle, precision, printing, sight, stopping, threat)
 
 
 def drive(job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:

@@ -44,7 +44,9 @@ class PatchEnforcer:
         self.threat = deepcopy(threat)
         self.watch, self.stream = watch, stream
         self.spent = self.backwards = self.zeros = self._evaluated = 0
-        self.oracle = PatchOracle(self, threat, generator, label=detector.index(STOP_SIGN), stride=detector.stride)
+        self.oracle = PatchOracle(
+            self, threat, generator, label=detector.index(STOP_SIGN), stride=detector.stride, names=detector.names
+        )
 
     @contextmanager
     def turn(self) -> Iterator[None]:

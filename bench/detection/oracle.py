@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import torch
@@ -12,6 +13,7 @@ from bench.detection.patch import MOMENTS, Evolution
 from bench.detection.threat import PatchThreat
 from bench.errors import UserError
 from bench.plugins.contracts import Access
+from bench.plugins.registry import unknown
 
 
 class Door(Protocol):
@@ -37,13 +39,33 @@ class PatchOracle:
         generator: the attack's random generator.
         label: the class to hide.
         stride: height and width of an image must be multiples of it.
+        names: names of the detector's classes, by label.
     """
 
-    def __init__(self, door: Door, threat: PatchThreat, generator: torch.Generator, *, label: int, stride: int) -> None:
-        self._door = door
+    def __init__(
+        self,
+        door: Door,
+        threat: PatchThreat,
+        generator: torch.Generator,
+        *,
+        label: int,
+        stride: int,
+        names: Sequence[str],
+    ) -> None:
+        self._door, self.names = door, tuple(names)
         self.threat, self.generator, self.label, self.stride = threat, generator, label, stride
         self._reports, self._every = 0, 1
         self._moments: list[tuple[int, Tensor, dict[str, float]]] = []
+
+    def index(self, name: str) -> int:
+        """The label of a class.
+
+        Raises:
+            UserError: if the detector does not have this class.
+        """
+        if name not in self.names:
+            raise UserError(unknown(f"class {name!r}", name, self.names))
+        return self.names.index(name)
 
     @property
     def spent(self) -> int:

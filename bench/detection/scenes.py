@@ -11,6 +11,19 @@ from torch import Tensor
 from bench.detection.detector import STOP_SIGN, Objects
 
 
+@dataclass(frozen=True)
+class Decoy:
+    """What stands in the place of the stop sign to see whether a detector knows the sign: another face, or none.
+
+    Args:
+        name: of the face.
+        octagonal: whether it has the outline of the stop sign.
+    """
+
+    name: str
+    octagonal: bool
+
+
 class Scenes(ABC):
     """M frames of a camera world, each with a stop sign that can carry a patch.
 
@@ -26,6 +39,8 @@ class Scenes(ABC):
     """[M] share of the sign that is in the image and not hidden, in [0, 1]."""
     distance: Tensor
     """[M] distance from the camera to the sign along the road, in m."""
+    decoys: tuple[Decoy, ...] = ()
+    """[M] the decoy of each frame (`render_decoys`); empty if the world has none."""
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -43,6 +58,14 @@ class Scenes(ABC):
             patches: [N, 3, P, P], or [1, 3, P, P] for the same patch in all frames; None for no patch.
             share: side of the patch as a share of the sign's side, in (0, 1].
         """
+
+    def render_decoys(self, frames: Tensor) -> Tensor:
+        """Images [N, 3, H, W] as those of `render`, but with the frame's decoy in the place of the stop sign.
+
+        Args:
+            frames: int64 [N], indices of the frames.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no decoys")
 
     def windows(
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]

@@ -9,6 +9,7 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from bench.detection.printing import printed
 from bench.errors import UserError
 from bench.plugins.contracts import ThreatModel
 from bench.plugins.ranges import Natural
@@ -28,12 +29,13 @@ class PatchThreat(ThreatModel):
     """The threat model of the detection track.
 
     Args:
-        norm: `patch`: any texels on a square in the middle of the sign, no change elsewhere.
+        norm: `patch`: any texels on a square in the middle of the sign, no change elsewhere. `print`: only colours that a printer
+            can put there (`bench.detection.printing`).
         budget: side of the square as a share of the sign's side, in (0, 1]; 0 only with 0 queries, for runs without attack.
         queries: largest number of queries (images) for crafting one patch.
     """
 
-    norm: Literal["patch"] = "patch"
+    norm: Literal["patch", "print"] = "patch"
     budget: float = 0.5
     queries: Natural = 20_000
 
@@ -42,11 +44,16 @@ class PatchThreat(ThreatModel):
         if not 0 < self.budget <= 1 and (self.budget, self.queries) != (0, 0):
             raise ValueError(f"threat.budget must be in (0, 1], a share of the sign's side, got {self.budget}")
 
+    def confine(self, texels: Tensor) -> Tensor:
+        """The allowed texels for texels [..., 3, P, P] without NaN: clipped to [0, 1], and printable with norm `print`."""
+        clipped = texels.clamp(0, 1)
+        return printed(clipped) if self.norm == "print" else clipped
+
     def project(self, texels: Tensor) -> tuple[Tensor, float]:
-        """The patch to render, float32, and the largest distance from `texels` to [0, 1].
+        """The patch to render, float32, and the largest distance from `texels` to it.
 
         Args:
-            texels: [3, P, P]; values outside [0, 1] are clipped, NaN and infinite values become grey.
+            texels: [3, P, P]; they are confined to the perturbation set, NaN and infinite values become grey.
 
         Raises:
             UserError: if the shape is wrong.
@@ -61,5 +68,5 @@ class PatchThreat(ThreatModel):
             raise UserError(f"a patch must be {wanted}, the attack made one of {list(texels.shape)}")
         given = texels.detach().to("cpu", torch.float32)
         given = torch.where(given.isnan(), GREY, given)
-        patch = torch.where(given.isinf(), GREY, given.clamp(0, 1))
+        patch = self.confine(torch.where(given.isinf(), GREY, given))
         return patch, float((given - patch).abs().where(given.isfinite(), 0).max())

@@ -80,6 +80,7 @@ class Measure:
         with_interval: whether the overview shows its interval.
         tables: tables that show it: `overview` (one row per attack), `cells` (one row per cell), or `both`.
         spare: a narrow terminal drops the columns with the highest numbers first; 0 is never dropped.
+        ranked: whether leaderboards show it beside the score, of the attack that is the strongest in most cells.
     """
 
     column: str
@@ -91,6 +92,7 @@ class Measure:
     with_interval: bool = False
     tables: Literal["overview", "cells", "both"] = "both"
     spare: int = 0
+    ranked: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +155,8 @@ class Track(ABC):
     """The columns of its records, in addition to those of all tracks (`bench.records.schema`)."""
     probes: ClassVar[tuple[pa.Field, ...]] = ()
     """Further columns, which may be null, for the flags of a leaderboard."""
+    of_older: ClassVar[Mapping[str, str]] = {}
+    """For probes that may not be null: the measurement that stands for them in records from before they were measured."""
     norms: ClassVar[tuple[str, ...]] = ()
     """The norms of its threat models; records with another one are refused. Empty: any name."""
     facts_of_v1: ClassVar[Mapping[str, object]] = {}

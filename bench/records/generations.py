@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from bench.errors import UserError
 from bench.plugins.track import Track, tracks
-from bench.records.schema import FLOAT, IDENTITY, PROVENANCE, TEXT, field, schema
+from bench.records.schema import FLOAT, IDENTITY, INT, PROVENANCE, TEXT, field, schema
 
 AXES_OF_V1 = (
     field("lanes", pa.int32(), "of the cell"),
@@ -25,6 +25,8 @@ AXES_OF_V1 = (
 )
 CELL_OF_V1 = "to_json({'lanes': lanes, 'density': density, 'weather': weather})::varchar"
 
+SQL = {FLOAT: "double", INT: "bigint", TEXT: "varchar"}
+"""The types of probes in SQL."""
 ADDED = {"threat_share": "1.0::double"}
 """Identity columns that records of version 2 got later, with the value of records without them."""
 
@@ -48,8 +50,8 @@ def selection(track: Track, columns: pa.Schema) -> str:
     present = set(columns.names)
     facts = json.dumps(track.facts_of_v1, separators=(",", ":")).replace("'", "''")
     older = {"cell": f'{CELL_OF_V1} as "cell"', "world_facts": f"'{facts}' as \"world_facts\""}
-    kinds = {field.name: "double" if pa.types.is_floating(field.type) else "bigint" for field in track.probes}
-    missing = {name: f'null::{kind} as "{name}"' for name, kind in kinds.items()} | older
+    missing = {field.name: f'null::{SQL[field.type]} as "{field.name}"' for field in track.probes} | older
+    missing |= {name: f'"{stand_in}" as "{name}"' for name, stand_in in track.of_older.items()}
     missing |= {name: f'{value} as "{name}"' for name, value in ADDED.items()}
     return ", ".join(f'"{name}"' if name in present else missing[name] for name in schema(track).names)
 

@@ -241,9 +241,11 @@ def difference(treated: Episodes, control: Episodes, name: str) -> Interval:
 
 
 def measured(episodes: Episodes, measure: Measure) -> Interval:
-    """Aggregate some episodes by a measure; the bounds are NaN if it has no interval."""
+    """Aggregate some episodes by a measure; the bounds are NaN if it has no interval, or was not measured in all episodes."""
     if measure.how == "mean":
         scores = episodes.column(measure.column)
+        if (missing := np.isnan(scores)).any():
+            return Interval(float(scores[~missing].mean()) if not missing.all() else np.nan, np.nan, np.nan)
         return share_interval(scores) if measure.unit == "share" else interval(scores)
     if measure.how == "step mean":
         return Interval(step_mean(episodes, measure.column), np.nan, np.nan)

@@ -54,7 +54,11 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
     field("gradients", FLOAT, "images whose gradient was taken to craft the patch", "images", low=0),
     field("crafting_s", FLOAT, "wall time of crafting the patch", "s", low=0),
     field(
-        "excess", FLOAT, "largest distance of the attack's texels outside [0, 1], before clipping", "texel value", low=0
+        "excess",
+        FLOAT,
+        "largest distance of the attack's texels to the perturbation set",
+        "texel value",
+        low=0,
     ),
     field("patch", TEXT, "fingerprint of the patch, patches/<fingerprint>.safetensors; empty if there is none"),
     field("patch_sha256", TEXT, "of its texels; empty if the attack makes no patch"),
@@ -64,8 +68,75 @@ MEASUREMENTS: tuple[pa.Field, ...] = (
 )
 
 
+DECOYS: tuple[pa.Field, ...] = (
+    field(
+        "stop_score",
+        FLOAT,
+        "confidence_mean minus decoy_confidence, not below 0; confidence_mean where no decoys were shown",
+        "0 to 1",
+    ),
+    field(
+        "average_precision",
+        FLOAT,
+        "of the stop signs detected in the frames with the sign and with decoys, at an IoU of 0.5; without frames that show less "
+        "than half of the sign",
+        "0 to 1",
+        nullable=True,
+    ),
+    field(
+        "decoy_confidence",
+        FLOAT,
+        "confidence in a stop sign where another face or nothing is on the post, mean over the frames",
+        "0 to 1",
+        nullable=True,
+    ),
+    field(
+        "false_stops",
+        FLOAT,
+        "stop signs detected in frames with decoys, mean per frame",
+        "detections",
+        nullable=True,
+        low=0,
+    ),
+    field(
+        "octagons",
+        FLOAT,
+        "frames with another face on the octagon in which it is detected as a stop sign",
+        "share, 0 to 1",
+        nullable=True,
+    ),
+)
+"""How the detector tells the sign from decoys; null in records that are older than decoys, and in worlds without them."""
+PRINTED: tuple[pa.Field, ...] = (
+    field(
+        "non_printability",
+        FLOAT,
+        "mean distance of the patch's texels to the nearest of thirty printable colours; null without a patch",
+        "sRGB",
+        nullable=True,
+        low=0,
+    ),
+    field(
+        "confidence_visible",
+        FLOAT,
+        "confidence_mean of the frames that show at least half of the sign",
+        "0 to 1",
+        nullable=True,
+    ),
+    field(
+        "misread",
+        FLOAT,
+        "frames that show at least half of the sign in which another class is detected there, with a higher score",
+        "share, 0 to 1",
+        nullable=True,
+    ),
+    field("seen_instead", TEXT, "the class of most of these frames; empty if there is none", nullable=True),
+)
+"""What was printed, and what is seen of the sign where it can be seen; null in older records."""
+
+
 class DetectionTrack(Track):
-    """Detectors of a stop sign, attacked by a patch on it, ranked by their mean confidence in the sign."""
+    """Detectors of a stop sign, attacked by a patch on it, ranked by how far they tell the sign from decoys."""
 
     name: ClassVar[str] = "detection"
     world: ClassVar[str] = "camera"
@@ -76,12 +147,15 @@ class DetectionTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("patch",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = PROBES
-    norms: ClassVar[tuple[str, ...]] = ("patch",)
-    metric: ClassVar[str] = "confidence_mean"
-    metric_title: ClassVar[str] = "confidence"
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED)
+    of_older: ClassVar[Mapping[str, str]] = {"stop_score": "confidence_mean"}
+    norms: ClassVar[tuple[str, ...]] = ("patch", "print")
+    metric: ClassVar[str] = "stop_score"
+    metric_title: ClassVar[str] = "stop score"
     failure: ClassVar[str] = "ran"
     measures: ClassVar[tuple[Measure, ...]] = (
+        Measure(column="average_precision", heading="AP of\nstop", digits=2, spare=1, ranked=True),
+        Measure(column="false_stops", heading="false\nstops", digits=2, spare=1, ranked=True),
         Measure(column="detection_rate", heading="frames\nseen", unit="share"),
         Measure(column="first_seen_m", heading="first\nseen m", digits=1, spare=2),
         Measure(column="ran", heading="runs the\nsign", unit="share", with_interval=True),
@@ -92,9 +166,10 @@ class DetectionTrack(Track):
         Measure(column="crafting_s", heading="craft\ns", of_attack=True, tables="overview", spare=4),
     )
     legend: ClassVar[str] = (
-        "confidence: in the stop sign at its true position, mean over an approach, 0 in a frame that misses it. frames seen: "
-        "share with confidence above 0.25. runs the sign: the car, at 10 m/s, never brakes, or stops more than 1 m beyond the "
-        "line. false alarms: per frame."
+        "stop score: confidence in the stop sign at its true position minus confidence in decoys (other faces on the same post), "
+        "mean over an approach. AP of stop: average precision over frames with the sign and with decoys. false stops: per frame "
+        "with a decoy. frames seen: share with confidence above 0.25. runs the sign: the car, at 10 m/s, never brakes, or stops "
+        "more than 1 m beyond the line. false alarms: per frame with the sign."
     )
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
         "noise_patch": Baseline(title="noise patch", heading="\nnoise", spare=1),
@@ -139,12 +214,21 @@ class DetectionTrack(Track):
                 yield replace(pair, attack=choose("attack", name))
 
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
-        same = ("defense", "defense_params", "victim", "victim_params", "world", "world_params", "threat_budget")
+        same = (
+            "defense",
+            "defense_params",
+            "victim",
+            "victim_params",
+            "world",
+            "world_params",
+            "threat_norm",
+            "threat_budget",
+        )
         is_one = other["attack"] in REFERENCE_PATCHES and all(other[name] == own[name] for name in same)
         return str(other["attack"]) if is_one else ""
 
     def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
-        return f"a patch {100 * budget:g} % as wide as the sign"
+        return f"a {'printable ' * (norm == 'print')}patch {100 * budget:g} % as wide as the sign"
 
     def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
         images, seconds = (float(column(name).mean()) for name in ("queries", "crafting_s"))

@@ -45,6 +45,7 @@ FIGURES = {
     "victim_yolov5.png": "detectors:yolov5",
     "world_highway.svg": "highway:world",
     "world_camera.png": "camera:world",
+    "decoys.png": "camera:decoys",
     "leaderboard.svg": "leaderboard:standard",
 }
 """The module and the function that makes each file."""

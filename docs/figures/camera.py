@@ -1,11 +1,15 @@
-"""The camera world: every place in every weather."""
+"""The camera world: every place in every weather, and the decoys."""
 
 from __future__ import annotations
 
+from copy import copy
+
+import torch
 from matplotlib.figure import Figure
 
 from docs.figures import style
 from docs.figures.sightings import FRAME, approaches, picture, show
+from envs.camera.faces import DECOYS
 from envs.weather import WEATHERS
 
 WINDOW = 400, 230
@@ -27,4 +31,24 @@ def world() -> Figure:
         row[0].set_ylabel(weather)
     for axes, place in zip(panels[0], places, strict=True):
         axes.set_title(place.replace("-", " "), fontsize=10.5)
+    return made
+
+
+def decoys() -> Figure:
+    """One frame with the stop sign and with each decoy, clear and in rain."""
+    made = style.figure(2.1, "The stop sign and the decoys")
+    panels = made.subplots(2, 1 + len(DECOYS))
+    for row, weather, place in zip(panels, ("clear", "rain"), (0, 1), strict=True):
+        approach = approaches(weather)[place]
+        scenes = copy(approach.scenes)
+        left, top, right, bottom = scenes.boxes[FRAME].tolist()
+        x, y, half = round((left + right) / 2), round((top + bottom) / 2), round(0.8 * (right - left))
+        window = slice(None), slice(max(y - half, 0), y + half), slice(x - half, x + half)
+        show(row[0], picture(approach, FRAME)[window])
+        for axes, decoy in zip(row[1:], DECOYS, strict=True):
+            scenes.decoys = (decoy,) * len(scenes)
+            show(axes, scenes.render_decoys(torch.tensor([FRAME]))[0][window])
+        row[0].set_ylabel(weather)
+    for axes, name in zip(panels[0], ("stop sign", *(decoy.name for decoy in DECOYS)), strict=True):
+        axes.set_title(name, fontsize=10)
     return made

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.detection import STOP_SIGN, Approach, Detector
-from bench.detection.approach import Sight, look
 from bench.detection.boxes import confidence
+from bench.detection.sight import Sight, look
 from bench.detection.stopping import THRESHOLD
 from bench.plugins.pair import choose
 from bench.plugins.track import track

@@ -19,7 +19,7 @@ from torch import Tensor
 from bench.detection import Objects, Scenes
 from bench.errors import UserError
 from bench.files import whole
-from envs.camera import sign
+from envs.camera import faces, sign
 from envs.camera.frame import Frame, noise_level
 from envs.camera.objects import objects
 from envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
@@ -118,6 +118,9 @@ class BankScenes(Scenes):
         self.boxes = torch.from_numpy(np.array(boxes)).float()
         self.visible = torch.tensor([frame.visible for frame in self.frames])
         self.distance = torch.tensor([pose.distance for pose in self.poses])
+        # So that over the places and roads each decoy is seen at every distance.
+        first = self.poses[0].seed
+        self.decoys = tuple(faces.DECOYS[(first + n) % len(faces.DECOYS)] for n in range(len(self.poses)))
         self._plates: dict[int, Plate] = {}
 
     def objects(self, frame: int) -> Objects:
@@ -127,6 +130,15 @@ class BankScenes(Scenes):
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
         return self.windows(frames, patches, share, torch.zeros(len(frames), 2, dtype=torch.int64), self.size)
+
+    def render_decoys(self, frames: Tensor) -> Tensor:
+        whole = (0, 0, self.size[1], self.size[0])
+        return torch.stack(
+            [
+                self._add_noise(self._plate(number).carrying(faces.face(self.decoys[number].name)), number, whole)
+                for number in frames.tolist()
+            ]
+        )
 
     def windows(
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]

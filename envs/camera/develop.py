@@ -7,6 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bench.detection.colour import linear, srgb
+
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Luminance weights of linear sRGB (ITU-R BT.709)."""
 MIDDLE_GREY = 0.18
@@ -33,11 +35,9 @@ def tone(light: Tensor) -> Tensor:
     return srgb(curved)
 
 
-def srgb(linear: Tensor) -> Tensor:
-    """IEC 61966-2-1, from linear to coded values in [0, 1]."""
-    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
-
-
-def linear(coded: Tensor) -> Tensor:
-    """IEC 61966-2-1, from coded to linear values in [0, 1]."""
-    return torch.where(coded <= 0.04045, coded / 12.92, ((coded.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4)
+def light_of(picture: Tensor) -> Tensor:
+    """Exposed light of an sRGB picture in [0, 1], the inverse of `tone`; white is the least light that is shown white."""
+    y = linear(picture)
+    # The positive root of 2.51 x^2 + 0.03 x = y (2.43 x^2 + 0.59 x + 0.14).
+    a, b, c = 2.51 - 2.43 * y, 0.03 - 0.59 * y, -0.14 * y
+    return (torch.sqrt(b * b - 4 * a * c) - b) / (2 * a) / 0.8

@@ -8,14 +8,19 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.camera import develop, sign
+from envs.camera.bare import Post, post_of, without_sign
 from envs.camera.camera import Array, Camera
+from envs.camera.faces import Face
 from envs.camera.frame import GAMMA, Frame
 
 SUPERSAMPLING = 4
 """Texture samples along the side of a pixel."""
+LEAST_GAIN = 0.03
+"""Pixels that gain a smaller share of the largest gain do not show the sign: it is hidden there, or lights them indirectly."""
 
 Box = tuple[int, int, int, int]
 """x0, y0, x1, y1 in pixels of the image."""
@@ -30,6 +35,7 @@ class Plate:
         crop: box around the sign; empty if the sign is outside.
         black, gain: float32 [3, h, w] on the crop; the exposed light is black + gain * texture.
         face_from_pixel: homography [3, 3] (`sign.pixel_to_face`).
+        post: where the post is in the image.
     """
 
     picture: Tensor
@@ -37,6 +43,7 @@ class Plate:
     black: Tensor
     gain: Tensor
     face_from_pixel: Array
+    post: Post
 
     @cached_property
     def plain(self) -> Tensor:
@@ -52,6 +59,34 @@ class Plate:
         """
         here = within(part, self.crop)
         return develop.tone(self.black[here] + self.gain[here] * texture_mean(part, face, self.face_from_pixel))
+
+    def carrying(self, face: Face) -> Tensor:
+        """The whole image with a decoy on the post, float32 [3, H, W]; where its plate is not, the background is filled in."""
+        picture = self.picture / 255
+        if common(self.crop):
+            side = detail(self.crop)
+            light, cover = (
+                texture_mean(self.crop, filtered(part[None], side)[0], self.face_from_pixel)
+                for part in (face.reflectance, face.cover)
+            )
+            shown = self.black + self.gain * light
+            mixed = cover * shown + (1 - cover) * self.bare
+            picture[within(self.crop, (0, 0, 0, 0))] = develop.tone(torch.where(self.lit, mixed, shown))
+        return picture
+
+    @cached_property
+    def lit(self) -> Tensor:
+        """The pixels of the crop that show the sign, bool [h, w]."""
+        gain = self.gain.amax(0)
+        return (gain > LEAST_GAIN * gain.max()) & torch.from_numpy(
+            _inside(self.crop, self.face_from_pixel)[1].any((1, 3))
+        )
+
+    @cached_property
+    def bare(self) -> Tensor:
+        """The exposed light of the crop without a sign, [3, h, w]: guessed from its surroundings."""
+        filled = without_sign(self.picture.permute(1, 2, 0).numpy(), self.crop, self.lit.numpy(), self.post)
+        return develop.light_of(torch.from_numpy(filled).permute(2, 0, 1) / 255)
 
     def cut(self, part: Box) -> Tensor:
         """A part of the image with the plain sign, float32 [3, h, w]."""
@@ -70,7 +105,7 @@ def opened(kept: Frame, camera: Camera, x: float) -> Plate:
         for code, most in zip((kept.black, kept.gain), kept.scale, strict=True)
     )
     planes = torch.from_numpy(picture).permute(2, 0, 1).contiguous()
-    return Plate(planes, kept.crop, black, gain, sign.pixel_to_face(x, camera))
+    return Plate(planes, kept.crop, black, gain, sign.pixel_to_face(x, camera), post_of(camera, x))
 
 
 def common(*boxes: Box) -> Box | None:
@@ -88,15 +123,10 @@ def within(part: Box, whole: Box) -> tuple[slice, slice, slice]:
 
 def texture_mean(part: Box, face: Tensor, face_from_pixel: Array) -> Tensor:
     """Mean of the texture over the part of each pixel that the sign covers, [3, h, w]."""
-    x0, y0, x1, y1 = part
-    step = 1 / SUPERSAMPLING
-    u, v = (np.arange(low + step / 2, high, step, dtype=np.float32) for low, high in ((x0, x1), (y0, y1)))
-    across, down, scale = (a * u + (b * v + c)[:, None] for a, b, c in face_from_pixel.tolist())
-    place = np.stack((across / scale, down / scale), -1)
-    inside = sign.inside(place).reshape(y1 - y0, SUPERSAMPLING, x1 - x0, SUPERSAMPLING)
+    place, inside = _inside(part, face_from_pixel)
     cover = inside.mean((1, 3), np.float32, keepdims=True)
     # Where the tracer saw a corner of the sign but no sample hits it, the border texel is used.
-    weight = np.where(cover > 0, inside / np.maximum(cover, 1e-6), np.float32(1)).reshape(len(v), len(u))
+    weight = np.where(cover > 0, inside / np.maximum(cover, 1e-6), np.float32(1)).reshape(place.shape[:2])
     found = torch.nn.functional.grid_sample(
         face.unsqueeze(0),
         torch.from_numpy(2 * place - 1).unsqueeze(0),
@@ -105,6 +135,16 @@ def texture_mean(part: Box, face: Tensor, face_from_pixel: Array) -> Tensor:
         align_corners=False,
     )
     return torch.nn.functional.avg_pool2d(found * torch.from_numpy(weight), SUPERSAMPLING)[0]
+
+
+def _inside(part: Box, face_from_pixel: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Where the samples of the pixels are on the face [h * S, w * S, 2], and whether on the octagon [h, S, w, S]."""
+    x0, y0, x1, y1 = part
+    step = 1 / SUPERSAMPLING
+    u, v = (np.arange(low + step / 2, high, step, dtype=np.float32) for low, high in ((x0, x1), (y0, y1)))
+    across, down, scale = (a * u + (b * v + c)[:, None] for a, b, c in face_from_pixel.tolist())
+    place = np.stack((across / scale, down / scale), -1)
+    return place, sign.inside(place).reshape(y1 - y0, SUPERSAMPLING, x1 - x0, SUPERSAMPLING)
 
 
 def detail(crop: Box) -> int:

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bench.detection.colour import linear
 from envs.camera.camera import Array, Camera
-from envs.camera.develop import linear
 
 SIZE_M = 1.2
 """Width across flats: 48 inches, the oversized R1-1 of the MUTCD (2009, table 2B-1)."""

@@ -26,12 +26,14 @@ def measurements(of: Track) -> set[str]:
     """The measurements of a track that leaderboards read, of columns that hold no lists."""
     needed = {of.metric, of.failure, of.place, of.queries, of.gradients} | {one.column for one in headline(of)}
     needed |= {f"{of.artefact[0]}_sha256"} if of.artefact else set()
+    # The thesis' tables compare what older records have.
+    needed |= set(of.of_older.values())
     return needed & {field.name for field in of.measurements if not pa.types.is_list(field.type)}
 
 
 def headline(of: Track) -> tuple[Measure, ...]:
-    """The measures of a victim that every table has, however narrow: what a leaderboard says beside the metric."""
-    return tuple(measure for measure in of.measures if measure.spare == 0 and not measure.of_attack)
+    """The measures of a victim that a leaderboard says beside the metric: those that every table has, and the ranked ones."""
+    return tuple(one for one in of.measures if (one.spare == 0 or one.ranked) and not one.of_attack)
 
 
 def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:

@@ -87,6 +87,11 @@ def _track(track: Track) -> dict[str, Any]:
         "baseline": contrast.title if contrast and contrast.side == "victim" else "",
         "queries_title": track.queries_title,
         "artefact": track.artefact[0] if track.artefact else "",
+        "columns": [
+            {"name": one.column, "title": " ".join(one.heading.split()), "digits": one.digits}
+            for one in track.measures
+            if one.ranked
+        ],
     }
 
 

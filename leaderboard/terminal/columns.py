@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
@@ -9,7 +10,7 @@ from rich.text import Text
 
 from bench.plugins.track import Measure
 from bench.statistics.estimates import Interval
-from leaderboard.comparisons.comparison import Comparison
+from leaderboard.comparisons.comparison import Comparison, mean
 from leaderboard.terminal.layout import Column
 from leaderboard.terminal.text import estimate, number, share
 
@@ -40,8 +41,13 @@ def measure_columns(
             spare=measure.spare or int(crowded and measure.column != first.track.failure),
         )
         for measure in sorted(first.track.measures, key=lambda one: crowded and one.column != first.track.failure)
-        if measure.tables in (table, "both") and (attacked or not measure.of_attack)
+        if measure.tables in (table, "both") and (attacked or not measure.of_attack) and _known(measure, comparisons)
     ]
+
+
+def _known(measure: Measure, comparisons: Sequence[Comparison]) -> bool:
+    """Whether any record has the measure; older ones may lack it."""
+    return any(not math.isnan(mean(one.own.table, measure.column)) for one in comparisons)
 
 
 def _heading(measure: Measure, table: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import pyarrow as pa
@@ -15,6 +16,7 @@ from leaderboard.comparisons.naming import component, varying
 from leaderboard.published import every_track
 from leaderboard.ranking.boards import Board, Row, read_boards
 from leaderboard.ranking.flags import FLAGS
+from leaderboard.terminal.columns import written
 from leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
 from leaderboard.terminal.text import (
     ATTACKED,
@@ -92,6 +94,7 @@ def _columns(board: Board) -> list[Column[Row]]:
         Column("victim", lambda row: component(row.attacks[0], "victim", shown["victim"]), "left", folds=True),
         Column(f"{measure}\nworst [95 %]", lambda row: estimate(row.worst.score, style=ATTACKED), "left"),
         *_failures(board.track),
+        *_measures(board),
         Column("worst\ncell", lambda row: number(row.worst.worst_cell[1].estimate, 2)),
         Column("\n ", lambda row: Text(cell_name(row.worst.worst_cell[0]), style="dim"), "left", spare=2),
         Column("\nclean", lambda row: estimate(row.worst.clean, style=CLEAN), "left", spare=3),
@@ -117,6 +120,16 @@ def _failures(track: Track) -> list[Column[Row]]:
     if measure is None:
         return []
     return [Column(measure.heading, lambda row: share(row.worst.failure.estimate if row.worst.failure else None))]
+
+
+def _measures(board: Board) -> list[Column[Row]]:
+    """The ranked measures that some record has, under the attack that is the strongest in most cells."""
+    measures = [one for one in board.track.measures if one.ranked]
+    return [
+        Column(one.heading, lambda row, one=one: str(written(one, row.attacks[0].measured(one))), spare=one.spare)  # type: ignore[misc]
+        for one in measures
+        if any(not math.isnan(row.attacks[0].measured(one).estimate) for row in board.rows)
+    ]
 
 
 def _fired(row: Row) -> Text:

@@ -42,6 +42,13 @@ COLUMNS = (*IDENTITY, *SCENARIO, "world_facts", "weights_sha256", "created_at", 
 """Of a record that are read here."""
 
 
+class ByConfidence(DetectionTrack):
+    """Ranked by the confidence in the sign alone, as in the thesis, which shows no decoys."""
+
+    metric = "confidence_mean"
+    metric_title = "confidence"
+
+
 @dataclass(frozen=True)
 class Configuration:
     """How a patch is crafted.
@@ -130,8 +137,8 @@ class Source:
 
     def __init__(self, records: pa.Table, shipped: pa.Table | None = None) -> None:
         ours = (pc.field("world") == WORLD) & (pc.field("defense") == "none")
-        self.track = track(DetectionTrack.name)
-        tables = (records, published(self.track) if shipped is None else shipped)
+        self.track = ByConfidence()
+        tables = (records, published(track(DetectionTrack.name)) if shipped is None else shipped)
         self.tables = [table.select(COLUMNS).filter(ours) for table in tables]
         self.detectors = _detectors(self.tables)
         self.missing: dict[Detector, set[str]] = {}

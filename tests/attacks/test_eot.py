@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -13,9 +13,10 @@ from torch import Tensor
 from attacks.eot import EOT, total_variation
 from attacks.grey_patch import GreyPatch
 from attacks.noise_patch import NoisePatch
-from bench.detection import Detector, PatchOracle, PatchThreat, Scenes
+from bench.detection import Detector, PatchOracle, PatchThreat, Predictions, Scenes
 from bench.detection.boxes import confidence
 from bench.detection.enforcer import PatchEnforcer
+from bench.errors import UserError
 from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.vision.drawn_street import DrawnStreet
@@ -24,12 +25,16 @@ SCENES = RedScenes(torch.linspace(30, 8, 5))
 
 
 def crafted(
-    attack: EOT | NoisePatch | GreyPatch, seed: int = 0, queries: int = 20_000, detector: Detector | None = None
+    attack: EOT | NoisePatch | GreyPatch,
+    seed: int = 0,
+    queries: int = 20_000,
+    detector: Detector | None = None,
+    scenes: Scenes | None = None,
 ) -> tuple[Tensor, PatchOracle]:
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     oracle = PatchEnforcer(detector or RedDetector(), PatchThreat(queries=queries), attack.access, generator).oracle
-    scenes: Scenes = SCENES if detector is None else DrawnStreet().training_scenes()
+    scenes = scenes or (SCENES if detector is None else DrawnStreet().training_scenes())
     return attack.craft(oracle, scenes, lambda share, text: None), oracle
 
 
@@ -95,6 +100,34 @@ def test_it_reports_its_losses_without_changing_the_patch(monkeypatch: pytest.Mo
     assert torch.allclose(reported.losses["total_variation"], variation, atol=0.01)
     monkeypatch.setattr(PatchOracle, "report", lambda *_, **__: None)
     assert torch.equal(crafted(attack)[0], patch)
+
+
+class TwoColours(RedDetector):
+    """Red boxes are stop signs, blue ones are cars."""
+
+    def predict(self, pictures: Tensor) -> Predictions:
+        found = super().predict(pictures)
+        blue = super().predict(pictures.flip(1))
+        return Predictions(
+            found.boxes, torch.ones_like(found.objectness), torch.stack((blue.objectness, found.objectness), -1)
+        )
+
+
+def test_a_target_is_seen_instead() -> None:
+    def seen(attack: EOT) -> tuple[Tensor, float]:
+        patch = crafted(attack, detector=TwoColours(), scenes=SCENES)[0]
+        shown = SCENES.render(torch.arange(len(SCENES)), patch.unsqueeze(0), 0.5)
+        return patch, float(confidence(TwoColours()(shown), 0, SCENES.boxes).mean())
+
+    common = EOT(texels=8, steps=40, batch=4, window=32, tv=0, loss="log_odds")
+    hidden, aimed = (seen(replace(common, target=target)) for target in ("", "car"))
+    assert aimed[1] > 1.2 * hidden[1]
+    # Green hides the sign, but makes no car of it.
+    assert aimed[0][2].mean() > 0.8
+    assert aimed[0][0].mean() < 0.2
+    assert aimed[0][1].mean() < hidden[0][1].mean() - 0.2
+    with pytest.raises(UserError, match="unknown class 'bus'; known: car, stop sign"):
+        crafted(EOT(texels=8, steps=1, batch=1, window=32, target="bus"))
 
 
 def test_it_stops_at_the_query_budget() -> None:

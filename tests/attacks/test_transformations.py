@@ -85,3 +85,16 @@ def test_noise_has_the_given_standard_deviation() -> None:
     grey = torch.full((4, 3, 64, 64), 0.5)
     noisy = Transformations(**OFF | {"noise": 0.05})(grey, torch.tensor([[10.0, 10.0, 20.0, 20.0]]).expand(4, 4))
     assert (noisy - grey).std().item() == pytest.approx(0.05, rel=0.02)
+
+
+def test_boxes_are_carried_to_where_the_warps_move_their_content() -> None:
+    shown = torch.zeros(4, 3, 64, 64)
+    shown[:, :, 24:34, 20:32] = 1
+    boxes = torch.tensor([[20.0, 24.0, 32.0, 34.0]]).expand(4, 4)
+    torch.manual_seed(0)
+    transform = Transformations(**OFF | {"rotation": 20.0, "scale": 0.3, "perspective": 0.3})
+    moved = transform(shown, boxes)
+    for picture, box in zip(moved, transform.carried(boxes), strict=True):
+        rows, columns = (picture[0] > 0.5).nonzero().T
+        found = torch.stack([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).float()
+        assert (found - box).abs().max() < 2.5

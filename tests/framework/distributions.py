@@ -17,7 +17,11 @@ TOY_POINTS = {
         "blank": "toy_camera_plugin:Blank",
     },
     "cavbench.defenses": {"guard": "toy_plugin:Guard", "harden": "toy_camera_plugin:Harden"},
-    "cavbench.victims": {"toy": "toy_plugin:ToyVictim", "red": "toy_camera_plugin:RedVictim"},
+    "cavbench.victims": {
+        "toy": "toy_plugin:ToyVictim",
+        "red": "toy_camera_plugin:RedVictim",
+        "stop_everywhere": "toy_camera_plugin:CheatingVictim",
+    },
     "cavbench.worlds": {
         "toy": "toy_plugin:ToyWorld",
         "bend": "toy_plugin:BendWorld",

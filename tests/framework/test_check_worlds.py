@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import torch
+from torch import Tensor
 
 from bench.conformance import examine
+from bench.conformance.check import BrokenRuleError, NotApplicableError, Subject
+from bench.conformance.detection.camera import CameraSuite
+from bench.detection import Decoy, Scenes
 from bench.plugins.track import track
 from tests.framework.conftest import Bench
 from tests.framework.distributions import install
 from tests.framework.test_third_track import POINTS as LISTENING
+from tests.framework.toy_camera import GREEN, RedScenes, RedStreet
 
 BAD = (
     *(
@@ -101,3 +108,31 @@ def test_a_track_without_checks_of_its_own_has_those_of_every_component(plugins:
         assert "the track 'listening' has no checks for this kind of component" in outcomes["behaviour"].text
     assert outcomes["grids"].text == "melodies-v1; melodies-v1 has 2 cells"
     track.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("decoys", "shown", "complaint"),
+    [
+        ((GREEN,), None, "there are 1 decoys for 12 frames"),
+        ((GREEN,) * 12, "sign", "a decoy's image is that of the stop sign"),
+        ((GREEN,) * 12, "noise", "the decoys of a frame change from call to call"),
+        ((), None, "it has no decoys"),
+    ],
+)
+def test_decoys_are_checked(decoys: tuple[Decoy, ...], shown: str | None, complaint: str) -> None:
+    class Odd(RedScenes):
+        def render_decoys(self, frames: Tensor) -> Tensor:
+            if shown == "noise":
+                return torch.rand(len(frames), 3, *self.size)
+            return self.render(frames, None, 0.5) if shown else super().render_decoys(frames)
+
+    @dataclass(frozen=True, kw_only=True)
+    class OddStreet(RedStreet):
+        def training_scenes(self) -> Scenes:
+            scenes = Odd(torch.linspace(8, 30, 12))
+            scenes.decoys = decoys
+            return scenes
+
+    suite = CameraSuite(Subject(kind="world", name="odd", component=OddStreet()))
+    with pytest.raises((BrokenRuleError, NotApplicableError), match=complaint):
+        suite.decoys()

@@ -12,6 +12,8 @@ from safetensors import safe_open
 
 from bench.cli.show import recordings
 from bench.detection.patch import Patch
+from bench.detection.printing import non_printability
+from bench.detection.threat import PatchThreat
 from bench.errors import UserError
 from bench.plugins import fingerprint
 from bench.plugins.sources import names, tracks_of
@@ -23,6 +25,7 @@ from bench.run.plan import plan
 from bench.run.replay import find, replay
 from bench.run.unit import Preparation
 from bench.victims import zoo
+from leaderboard.ranking.boards import read_boards
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.framework.test_cli import TOY, assert_one_line
@@ -74,7 +77,7 @@ BAD = {
     "attack=paint victim=toy world=toy": "attack 'paint' does not fit victim 'toy' of the driving track; fitting: art, bias",
     "victim=red world=highway": "world 'highway' does not fit victim 'red' of the detection track; fitting: ",
     "victim=toy,red": "victims 'toy' (driving) and 'red' (detection) belong to different tracks",
-    "victim=red world=red_street threat.norm=linf": "unknown threat.norm 'linf'; known: patch",
+    "victim=red world=red_street threat.norm=linf": "unknown threat.norm 'linf'; known: patch, print",
     "victim=red world=red_street threat.budget=1.5": "threat.budget must be in (0, 1]",
     "attack=paint victim=red world=red_street threat.budget=0": "threat.budget must be in (0, 1]",
     "attack=paint victim=red world=red_street threat.access=scores": "needs access 'gradients'",
@@ -202,6 +205,20 @@ def test_texels_are_clipped_and_their_excess_is_recorded(tmp_path: Path) -> None
     assert 0 <= float(texels.min()) < float(texels.max()) <= 1
 
 
+def test_a_patch_that_must_be_printable_is_projected_and_what_is_seen_instead_is_recorded(tmp_path: Path) -> None:
+    records, _ = run(tmp_path, "threat.norm=print", "weather=clear", "seeds=0")
+    (attacked, clean) = (records.filter(pc.field("attack") == name) for name in ("paint", "none"))
+    with safe_open(patch_path(tmp_path, attacked["patch"][0].as_py()), "pt") as file:
+        texels = file.get_tensor("patch")
+    assert PatchThreat(norm="print").project(texels)[1] < 1e-4
+    assert min(attacked["excess"].to_pylist()) > 0.01
+    assert set(attacked["threat_norm"].to_pylist()) == {"print"}
+    assert attacked["non_printability"][0].as_py() == pytest.approx(float(non_printability(texels)))
+    assert clean["non_printability"].null_count == clean.num_rows
+    assert clean["confidence_visible"].equals(clean["confidence_mean"])
+    assert (set(clean["misread"].to_pylist()), set(clean["seen_instead"].to_pylist())) == ({0.0}, {""})
+
+
 def test_a_trained_detector_has_one_zoo_entry_per_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench
 ) -> None:
@@ -248,6 +265,25 @@ def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path,
     assert "patch 0.5, access gradients, 20000 queries" in one.out
     rows = {track: table.num_rows for track, table in reading.read_all(tmp_path).items()}
     assert bench("report", "count", f"out={tmp_path}").out == f"{rows}\n"
+
+
+def test_a_detector_that_always_says_stop_ranks_at_the_bottom(tmp_path: Path, bench: Bench) -> None:
+    words = ("executor=serial", "record=0", f"out={tmp_path}", "weather=clear", "seeds=0", "victim=red,stop_everywhere")
+    said = bench(
+        "run", *[word for word in SMALL.split() if word.split("=")[0] not in ("victim", "weather", "seeds")], *words
+    )
+    assert said.code == 0, said.err
+    assert "false" in said.out
+    found, _ = read_boards(reading.read_all(tmp_path))
+    honest, cheat = found[0].rows
+    assert (honest.identity["victim"], cheat.identity["victim"]) == ("red", "stop_everywhere")
+    assert honest.worst.score.estimate > cheat.worst.score.estimate == 0
+    assert {flag.name for flag in cheat.flags if flag.fired} - {flag.name for flag in honest.flags if flag.fired} >= {
+        "octagon",
+        "ignores_input",
+    }
+    records = reading.read(tmp_path, track=track("detection")).filter(pc.field("victim") == "stop_everywhere")
+    assert set(records["confidence_mean"].to_pylist()) == {1.0}
 
 
 def test_the_file_of_a_patch_contains_its_provenance(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from bench.detection import (
     Approach,
     CameraWorld,
+    Decoy,
     Detector,
     DetectorDefense,
     DetectorVictim,
@@ -53,6 +54,9 @@ RED_V1 = Grid(
 )
 
 
+GREEN, NOTHING = Decoy("green", octagonal=True), Decoy("nothing", octagonal=False)
+
+
 class RedScenes(Scenes):
     """A red square that fades with the distance and the extinction of the air."""
 
@@ -63,6 +67,12 @@ class RedScenes(Scenes):
         self.boxes = torch.tensor([[8.0, 8.0, 24.0, 24.0]]).expand(len(distance), 4)
         self.visible = torch.ones(len(distance))
         self.red = torch.exp(-(extinction_per_m + 0.01) * distance)
+        self.decoys = tuple((GREEN, NOTHING)[number % 2] for number in range(len(distance)))
+
+    def render_decoys(self, frames: Tensor) -> Tensor:
+        green = torch.tensor([self.decoys[number] is GREEN for number in frames.tolist()]).float()[:, None]
+        faces = green * torch.tensor([0.0, 1.0, 0.0]) + (1 - green) * 0.5
+        return self._shown(frames, faces[:, :, None, None].expand(len(frames), 3, 16, 16))
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
         face = torch.tensor([1.0, 0.0, 0.0])[:, None, None].expand(len(frames), 3, 16, 16)
@@ -73,6 +83,9 @@ class RedScenes(Scenes):
             padding = (edge, 16 - side - edge) * 2
             hole = nn.functional.pad(torch.ones(side, side), padding)
             face = face * (1 - hole) + nn.functional.pad(pasted, padding)
+        return self._shown(frames, face)
+
+    def _shown(self, frames: Tensor, face: Tensor) -> Tensor:
         pale = self.red[frames][:, None, None, None]
         return nn.functional.pad(face * pale + 0.5 * (1 - pale), (8, 8, 8, 8), value=0.5)
 
@@ -132,6 +145,22 @@ class RedVictim(DetectorVictim):
 
     def load(self, seed: int, facts: Facts) -> Detector:
         return RedDetector().requires_grad_(False).eval()
+
+
+class StopEverywhere(RedDetector):
+    """Says "stop sign" with full confidence, wherever it has a box, whatever it sees."""
+
+    def predict(self, pictures: Tensor) -> Predictions:
+        found = super().predict(pictures)
+        return Predictions(found.boxes, found.objectness * 0 + 1, torch.ones_like(found.classes))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheatingVictim(DetectorVictim):
+    """The victim of `StopEverywhere`."""
+
+    def load(self, seed: int, facts: Facts) -> Detector:
+        return StopEverywhere().requires_grad_(False).eval()
 
 
 @dataclass(frozen=True, kw_only=True)

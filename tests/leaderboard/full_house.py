@@ -53,7 +53,7 @@ def detection() -> pa.Table:
         tables.append(approach(0.9, defense=defense))
         tables += [approach(left, attack="eot", defense=defense), approach(0.75, attack="noise_patch", defense=defense)]
         tables.append(approach(0.8, attack="grey_patch", defense=defense))
-    return pa.concat_tables(tables)
+    return probed(pa.concat_tables(tables), average_precision=0.83, false_stops=0.27)
 
 
 def write(out: Path) -> Path:

@@ -205,6 +205,7 @@ def approach(
         "frame_visible": [[1.0] * 10 for _ in run],
         "created_at": datetime(2026, 1, 1, tzinfo=UTC),
         "wall_s": 1.0,
+        "stop_score": confidence,
     }
     return table(schema(track("detection")), columns, len(run))
 

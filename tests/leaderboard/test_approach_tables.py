@@ -8,6 +8,7 @@ import re
 import pyarrow.compute as pc
 import pytest
 from rich.console import Console
+from synthetic import probed
 
 from bench.plugins.pair import choose
 from bench.plugins.track import track
@@ -25,6 +26,19 @@ def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut_off(width: int)
     text = out.getvalue()
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in re.sub(r"[−+]\S*…[−+]\S*", "", text)  # an interval of numbers below 0 is written −.54…−.53
+
+
+def test_records_from_before_decoys_are_scored_by_their_confidence_and_shown_without_columns_of_decoys() -> None:
+    records = published(track("detection"))
+    assert records["decoy_confidence"].null_count == records.num_rows
+    assert records["stop_score"].equals(records["confidence_mean"])
+    texts = []
+    for tables in (records, probed(records, false_stops=0.25, average_precision=0.5)):
+        out = io.StringIO()
+        run_report({"detection": tables.filter(pc.field("defense") == "none")}, Console(file=out, width=160))
+        texts.append(out.getvalue())
+    assert "stops" not in texts[0]
+    assert "stops" in texts[1]
 
 
 def test_most_published_patches_were_crafted_with_the_default_parameters() -> None:

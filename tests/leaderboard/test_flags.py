@@ -20,8 +20,9 @@ def board(*tables: pa.Table, track: str = "driving") -> Board:
     return boards(read_tracks({track: pa.concat_tables(tables)}))[0]
 
 
-def flag(name: str, *tables: pa.Table, track: str = "driving") -> Flag:
+def flag(name: str, *tables: pa.Table) -> Flag:
     """The flag of the only row."""
+    track = "driving" if "safe_progress" in tables[0].column_names else "detection"
     (row,) = board(*tables, track=track).rows
     return next(each for each in row.flags if each.name == name)
 
@@ -60,6 +61,7 @@ FIRES: dict[str, tuple[pa.Table, ...]] = {
         zo(0.5, attack_params={"steps": 4}, queries=40.0),
     ),
     "public_only": (clean(), zo(0.6), zo(0.2, grid="audit")),
+    "octagon": (probed(approach(0.9), octagons=0.8), probed(approach(0.1, attack="eot"), octagons=0.8)),
     "decoy": (clean(inconsistent=0.2), probed(zo(), inconsistent=0.2)),
     "left_out": (
         probed(drive(skill=0.8, weights="ab", runs=range(9)), **SEEN),
@@ -84,6 +86,7 @@ FIRES_NOT: dict[str, tuple[pa.Table, ...]] = {
         zo(0.3, attack_params={"steps": 4}, queries=40.0),
     ),
     "public_only": (clean(), zo(0.4), zo(0.4, grid="audit")),
+    "octagon": (probed(approach(0.9), octagons=0.2), probed(approach(0.1, attack="eot"), octagons=0.2)),
     "decoy": (clean(inconsistent=0.0), probed(zo(), inconsistent=0.0)),
     "left_out": (
         probed(drive(skill=0.8, weights="ab", runs=range(9)), **SEEN),
@@ -103,6 +106,7 @@ NOT_MEASURED: dict[str, tuple[pa.Table, ...]] = {
     "no_fall": (clean(), zo()),
     "not_flattened": (clean(), zo()),
     "public_only": (clean(), zo()),
+    "octagon": (approach(0.9), approach(0.1, attack="eot")),
     "decoy": (drive(), drive(attack="zo", queries=44.0)),
 }
 
@@ -132,7 +136,7 @@ def test_a_reason_is_one_sentence(name: str) -> None:
 def test_a_detector_that_sees_signs_in_grey_images_is_flagged() -> None:
     def seen(share: float) -> Flag:
         tables = [approach(0.9), approach(0.8, attack="eot")]
-        return flag("ignores_input", *(probed(one, same_answer=share) for one in tables), track="detection")
+        return flag("ignores_input", *(probed(one, same_answer=share) for one in tables))
 
     assert seen(1.0).fired is True
     assert seen(0.0).fired is False
@@ -141,7 +145,7 @@ def test_a_detector_that_sees_signs_in_grey_images_is_flagged() -> None:
 def test_a_patch_that_lowers_the_score_no_more_than_noise_is_flagged() -> None:
     def beside(left: float) -> Flag:
         tables = approach(0.9), approach(left, attack="eot"), approach(0.6, attack="noise_patch")
-        return flag("noise", *tables, track="detection")
+        return flag("noise", *tables)
 
     assert beside(0.65).fired is True
     assert beside(0.2).fired is False

@@ -75,6 +75,14 @@ def test_rows_are_in_rank_groups_with_their_flags_and_the_baselines_below(opened
     assert "(white box)" in row.locator("li", has_text="masked gradients").inner_text()
 
 
+def test_measures_of_decoys_stand_beside_the_scores_of_detectors_only(opened: Open) -> None:
+    headings = {track: texts(opened(f"#/{track}"), "#ranks th") for track in ("driving", "detection")}
+    for name, value in (("AP of stop", "0.83"), ("False stops", "0.27")):
+        assert not any(text.startswith(name) for text in headings["driving"])
+        place = next(n for n, text in enumerate(headings["detection"]) if text.startswith(name))
+        assert set(column(opened("#/detection"), "ranks", place + 1)) == {value}
+
+
 def test_a_heading_sorts_up_and_down_by_mouse_and_by_keyboard(opened: Open) -> None:
     page = opened()
     heading = page.locator("#pairs th", has_text="Safe progress")

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from bench.detection import Predictions, stopping
-from bench.detection.approach import false_alarms, found_of, look, measure
+from bench.detection.approach import false_alarms, measure
+from bench.detection.sight import candidates_of, look
 from tests.framework.toy_camera import RedDetector, RedScenes
 
 DISTANCE = np.linspace(30, 8, 10)
@@ -74,7 +75,7 @@ def test_only_a_detection_away_from_the_sign_is_a_false_alarm() -> None:
     boxes = torch.tensor([[[0.0, 0, 10, 10], [1, 1, 11, 11], [40, 40, 60, 60], [80, 80, 90, 90]]])
     classes = torch.tensor([[[1.0, 0], [1, 0], [1, 0], [0, 1]]])
     predictions = Predictions(boxes, torch.full((1, 4), 0.9), classes)
-    found = found_of(predictions, 0)
+    found = candidates_of(predictions, 0)
     assert false_alarms(found, torch.tensor([[0.0, 0, 10, 10]])).tolist() == [1]
     assert false_alarms(found, torch.tensor([[200.0, 200, 210, 210]])).tolist() == [2]
 

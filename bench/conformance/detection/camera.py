@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from bench.conformance.check import Check, Suite, require
+from bench.conformance.check import Check, NotApplicableError, Suite, require
 from bench.conformance.scenarios import first_cell
 from bench.detection import STOP_SIGN, CameraWorld, Scenes
 from bench.plugins import registry
@@ -33,6 +33,7 @@ class CameraSuite(Suite):
             "patches": self.patches,
             "windows": self.windows,
             "reach": self.reach,
+            "decoys": self.decoys,
             "cells": self.every_cell,
             "approaches": self.approaches,
             "determinism": self.same_seed_same_approach,
@@ -95,6 +96,22 @@ class CameraSuite(Suite):
             outside = picture.clone()
             outside[top:bottom, left:right] = 0
             require(float(outside.max()) < 1e-4, "a patch changes pixels outside of reach: make the boxes larger")
+
+    def decoys(self) -> str:
+        """Each frame has a decoy; its image is a frame without the stop sign, and the same every time."""
+        scenes, frames = self._some()
+        known = {one.name for one in scenes.decoys}
+        if not known:
+            raise NotApplicableError("it has no decoys: nothing shows whether a detector knows the sign's face")
+        require(len(scenes.decoys) == len(scenes), f"there are {len(scenes.decoys)} decoys for {len(scenes)} frames")
+        shown = scenes.render_decoys(frames)
+        shape = (FRAMES, 3, *scenes.size)
+        require(tuple(shown.shape) == shape, f"render_decoys returns shape {list(shown.shape)}, not {list(shape)}")
+        require(bool(((shown >= 0) & (shown <= 1)).all()), "render_decoys returns colours outside [0, 1]")
+        require(torch.equal(shown, scenes.render_decoys(frames)), "the decoys of a frame change from call to call")
+        signs = scenes.render(frames, None, SHARE)
+        require(bool((shown != signs).flatten(1).any(1).all()), "a decoy's image is that of the stop sign")
+        return ", ".join(sorted(known))
 
     def every_cell(self) -> str:
         """Every cell of the default grid has approaches."""

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.detection import Scenes, stopping
-from bench.detection.approach import Sight, Sighting
+from bench.detection.approach import Sighting
 from bench.detection.patch import Evolution
+from bench.detection.sight import Sight
 from bench.recording.columns import Colour, Columns
 from bench.recording.detection import blueprint as approach_blueprint
 from bench.recording.detection.blueprint import GAP, sights

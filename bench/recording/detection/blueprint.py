@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import rerun.blueprint as rrb
 
 from bench.detection import Scenes
-from bench.detection.approach import Sight, Sighting, measured
+from bench.detection.approach import Sighting, measured
+from bench.detection.sight import Sight
 from bench.recording import about
 from bench.recording.driving.blueprint import bare
 

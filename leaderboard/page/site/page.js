@@ -296,6 +296,8 @@ function render() {
     { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, interval: (one) => one.score, best: (one) => one.row?.group === 1, number: true },
     { name: "0 – 1", class: "drawn", show: (one) => strip(one.score, baselineOf(one)) },
     ...(said().failure ? [{ name: capital(said().failure_title), show: (one) => (one.row ? percent(failedOf(one)) : ""), value: (one) => (one.row ? failedOf(one) : null), interval: (one) => (whole ? one.row?.failed : null), number: true }] : []),
+    ...said().columns.filter(({ name }) => rows.some((one) => measureOf(one, name)?.estimate != null)).map(({ name, title, digits }) =>
+      ({ name: capital(title), show: (one) => fixed(measureOf(one, name)?.estimate, digits), value: (one) => measureOf(one, name)?.estimate ?? null, interval: (one) => measureOf(one, name), number: true })),
     { name: "Worst cell", show: (one) => worstCell(one), value: (one) => lowest(one)?.estimate ?? null, interval: lowest, number: true },
     { name: "Clean", show: (one) => (whole ? fixed(one.row?.clean?.estimate) : fixed(cleanOf(one)?.estimate)), value: (one) => (whole ? one.row?.clean?.estimate : cleanOf(one)?.estimate) ?? null, interval: (one) => (whole ? one.row?.clean : cleanOf(one)), number: true },
     ...(said().baseline ? [{ name: `Against ${said().baseline.replace(/^the /, "")}`, show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, interval: (one) => leadOf(one, whole), number: true }] : []),
@@ -340,6 +342,8 @@ function lead(one, whole) {
   const found = leadOf(one, whole);
   return found ? [el("b", {}, signed(found)), " ", el("small", {}, found.low == null ? "" : `${fixed(found.low)} … ${fixed(found.high)}`)] : "—";
 }
+/* A measure of all cells, under the strongest attack of a row. */
+const measureOf = ({ row }, name) => (row ? pairs.get(row.strongest).measures[name] : null);
 const failedOf = ({ row }) => mean(row, "failed", row.failed?.estimate ?? null);
 function lowest(one) {
   const cells = one.row ? kept(one.row.cells) : [];

@@ -1,0 +1,75 @@
+"""Whether a detector knows the stop sign: what it says of the sign, beside what it says of decoys in the sign's place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.detection import stopping
+from bench.detection.precision import VISIBLE, precision_of_approach
+from bench.detection.scenes import Scenes
+from bench.detection.sight import Sight
+
+
+def discrimination(
+    seen: Sequence[Sight], decoys: Sequence[Sight | None], scenes: Sequence[Scenes]
+) -> dict[str, NDArray[np.generic]]:
+    """The measurements of A approaches with decoys, [A] each; all but `stop_score` are NaN where the world has no decoys.
+
+    `stop_score` is the discrimination slope of Yates (1982, "External correspondence"), the mean confidence in the sign minus the
+    mean confidence in the decoys, not below 0. A detector that says "stop" more often raises both.
+
+    Args:
+        seen: the output with the sign, which may have a patch.
+        decoys: the output with decoys; None where the world has none.
+        scenes: the frames.
+    """
+    rows = [_of_approach(*each) for each in zip(seen, decoys, scenes, strict=True)]
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def _of_approach(seen: Sight, decoys: Sight | None, scenes: Scenes) -> dict[str, float]:
+    confidence = float(seen.confidence.mean(dtype=np.float64))
+    if decoys is None:
+        missing = dict.fromkeys(("average_precision", "decoy_confidence", "false_stops", "octagons"), np.nan)
+        return {"stop_score": confidence, **missing}
+    of_decoys = float(decoys.confidence.mean(dtype=np.float64))
+    octagonal = np.array([decoy.octagonal for decoy in scenes.decoys]) & (scenes.visible >= VISIBLE).numpy()
+    taken = decoys.confidence[octagonal] > stopping.THRESHOLD
+    return {
+        "stop_score": max(0.0, confidence - of_decoys),
+        "average_precision": precision_of_approach(seen.candidates, decoys.candidates, scenes.boxes, scenes.visible),
+        "decoy_confidence": of_decoys,
+        "false_stops": float(np.mean([len(one.scores) for one in decoys.found])),
+        "octagons": float(taken.mean()) if len(taken) else np.nan,
+    }
+
+
+def if_visible(seen: Sequence[Sight], scenes: Sequence[Scenes]) -> dict[str, NDArray[np.generic]]:
+    """What is seen of the sign in the frames that show at least half of it, [A] each; NaN and "" where no frame does.
+
+    Args:
+        seen: the output with the sign.
+        scenes: the frames.
+    """
+    rows = []
+    for sight, one in zip(seen, scenes, strict=True):
+        shown = (one.visible >= VISIBLE).numpy()
+        names = [name for name, there in zip(sight.others, shown, strict=True) if name and there]
+        rows.append((_mean(sight.confidence[shown]), _mean(np.array(sight.others)[shown] != ""), _commonest(names)))
+    confidence, misread, instead = zip(*rows, strict=True)
+    return {
+        "confidence_visible": np.array(confidence),
+        "misread": np.array(misread),
+        "seen_instead": np.array(instead),
+    }
+
+
+def _commonest(names: Sequence[str]) -> str:
+    return max(sorted(set(names)), key=names.count, default="")
+
+
+def _mean(values: NDArray[np.generic]) -> float:
+    return float(values.mean(dtype=np.float64)) if len(values) else np.nan

@@ -1,0 +1,102 @@
+"""The output of a detector on the frames of an approach, with the stop sign or with decoys in its place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bench.detection import stopping
+from bench.detection.boxes import best_other, confidence, detections
+from bench.detection.detector import STOP_SIGN, Detections, Detector, Predictions
+from bench.detection.scenes import Scenes
+from bench.errors import UserError
+
+BATCH = 16
+"""Frames per forward pass."""
+NMS_IOU, SAME_IOU = 0.45, 0.3
+"""IoU of non-maximum suppression (YOLOv5's default), and smallest IoU at which a detection is the sign (`boxes.confidence`)."""
+LEAST_SCORE = 0.01
+"""Detections with a lower score are not kept; average precision does not see them."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The output of a detector on the F frames of an approach.
+
+    Args:
+        confidence: float32 [F], confidence in a stop sign at the place of the sign, in [0, 1]; 0 without a box there.
+        candidates: the stop signs with a score above `LEAST_SCORE` in each frame, after non-maximum suppression.
+        others: the class other than a stop sign with the highest score at the place of the sign in each frame; empty if that
+            is no higher than the confidence, or no detection.
+    """
+
+    confidence: NDArray[np.float32]
+    candidates: Sequence[Detections]
+    others: Sequence[str]
+
+    @property
+    def found(self) -> Sequence[Detections]:
+        """The stop signs detected in each frame: the candidates above the threshold of detection."""
+        return [surer(one, stopping.THRESHOLD) for one in self.candidates]
+
+
+def surer(found: Detections, threshold: float) -> Detections:
+    """The detections with a score above a threshold."""
+    kept = found.scores > threshold
+    return Detections(found.boxes[kept], found.scores[kept], found.labels[kept])
+
+
+def look(detector: Detector, scenes: Scenes, texels: Tensor | None, share: float) -> Sight:
+    """Run the detector on each frame.
+
+    Args:
+        detector: the (defended) victim.
+        scenes: F frames.
+        texels: the patch [3, P, P]; None for no patch.
+        share: side of the patch as a share of the sign's side.
+
+    Raises:
+        UserError: if a prediction is NaN or infinite.
+    """
+    patches = texels.unsqueeze(0) if texels is not None else None
+    return _sight(detector, scenes, lambda frames: scenes.render(frames, patches, share))
+
+
+def look_at_decoys(detector: Detector, scenes: Scenes) -> Sight | None:
+    """Run the detector on each frame with the frame's decoy in the place of the stop sign; None if the world has none.
+
+    Raises:
+        UserError: if a prediction is NaN or infinite.
+    """
+    return _sight(detector, scenes, scenes.render_decoys) if scenes.decoys else None
+
+
+def _sight(detector: Detector, scenes: Scenes, render: Callable[[Tensor], Tensor]) -> Sight:
+    label = detector.index(STOP_SIGN)
+    confidences, candidates, others = [], [], []
+    for frames in torch.arange(len(scenes)).split(BATCH):
+        predictions = detector(render(frames))
+        if not all(
+            bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)
+        ):
+            raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
+        boxes = scenes.boxes[frames].to(predictions.boxes)
+        sure = confidence(predictions, label, boxes, iou=SAME_IOU)
+        confidences.append(sure)
+        candidates += candidates_of(predictions, label)
+        others += [
+            detector.names[found] if score > max(float(of_sign), stopping.THRESHOLD) else ""
+            for (score, found), of_sign in zip(best_other(predictions, label, boxes, iou=SAME_IOU), sure, strict=True)
+        ]
+    return Sight(torch.cat(confidences).numpy(), candidates, others)
+
+
+def candidates_of(predictions: Predictions, label: int) -> list[Detections]:
+    """The objects of one class in each image with a score above `LEAST_SCORE`, after non-maximum suppression."""
+    only = replace(predictions, classes=predictions.classes[..., label : label + 1])
+    return detections(only, threshold=LEAST_SCORE, iou=NMS_IOU)

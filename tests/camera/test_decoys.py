@@ -1,0 +1,62 @@
+"""The decoys of the camera world: other faces in the light of the sign, and a post without one."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from envs.camera import faces
+from envs.camera.develop import light_of, tone
+from envs.camera.world import StopSignApproach
+from tests.camera.scenes import scenes
+
+NEAREST = torch.tensor([9])
+
+
+def with_decoy(name: str) -> torch.Tensor:
+    """The nearest frame of a grey street, with this decoy on its post."""
+    made = scenes()
+    made.decoys = tuple(one for one in faces.DECOYS if one.name == name) * len(made)
+    return made.render_decoys(NEAREST)[0]
+
+
+def test_light_is_the_inverse_of_the_tone_curve() -> None:
+    light = torch.linspace(0, 3, 50)
+    torch.testing.assert_close(light_of(tone(light)), light, rtol=1e-3, atol=1e-4)
+
+
+def test_a_decoy_changes_the_sign_and_nothing_else() -> None:
+    made = scenes()
+    x0, y0, x1, y1 = made.frames[9].crop
+    signed = made.render(NEAREST, None, 0.5)[0]
+    for decoy in faces.DECOYS:
+        changed = (with_decoy(decoy.name) - signed).abs().amax(0) > 0.02
+        assert changed[y0:y1, x0:x1].float().mean() > 0.2, decoy.name
+        changed[y0:y1, x0:x1] = False
+        assert not changed.any(), decoy.name
+
+
+def test_without_a_sign_the_background_is_seen_and_around_a_triangle_too() -> None:
+    made = scenes()
+    x0, y0, x1, y1 = made.frames[9].crop
+    background = made.render(NEAREST, None, 0.5)[0][:, y0:y1, x0 - 8 : x0 - 4].mean(2, keepdim=True)
+    bare, triangle = (with_decoy(name)[:, y0:y1, x0:x1] for name in ("nothing", "yield"))
+    # The horizon behind the sign is guessed as a gradient.
+    assert ((bare - background).abs().amax(0) < 0.06).float().mean() > 0.75
+    height, width = bare.shape[1:]
+    corner = triangle[:, -height // 4 :, width // 6 : width // 4]
+    assert ((corner - background[:, -height // 4 :]).abs().amax(0) < 0.06).all()
+    assert ((triangle - background).abs().amax(0) > 0.1).float().mean() > 0.3
+
+
+def test_every_decoy_is_on_the_post_of_some_scored_frame_and_octagons_are_as_many_as_others() -> None:
+    world = StopSignApproach()
+    shown = [
+        decoy.name
+        for lanes in (3, 4, 5)
+        for approach in world.approaches(world.axes.cell(lanes=lanes, density=1.0, weather="fog"), range(3))
+        for decoy in approach.scenes.decoys
+    ]
+    assert set(shown) == {decoy.name for decoy in faces.DECOYS}
+    octagonal = {decoy.name for decoy in faces.DECOYS if decoy.octagonal}
+    assert 0.4 < np.mean([name in octagonal for name in shown]) < 0.7
