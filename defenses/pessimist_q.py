@@ -24,13 +24,13 @@ SEED = 0
 
 @dataclass(frozen=True, kw_only=True)
 class PessimistQ(DrivingDefense):
-    """Pessimistic action values over a belief (after Sun and Zheng 2024, "Belief-Enriched Pessimistic Q-Learning against
-    Adversarial State Perturbations", Algorithm 1).
+    """Takes the action whose lowest value over a belief is highest (after Sun and Zheng 2024, arXiv 2403.04050, Algorithm 1).
 
-    The belief is the box of true values that an assumed perturbation set allows behind the shown ones; with `tracker` in front,
-    behind all shown so far. Of each action the lowest value over points of the belief counts: its middle, the corner where every
-    car is nearer and closing faster, the opposite one, and random corners, the same at every step. The paper also trains with
-    this rule; here the victim is not trained again. The ego's row is reckoned from its actions. For discrete actions.
+    The paper is "Belief-Enriched Pessimistic Q-Learning against Adversarial State Perturbations". The belief is the box of true
+    values that an assumed perturbation set allows behind the shown ones; with `tracker` in front, behind all shown so far. Of
+    each action the lowest value over points of the belief counts: its middle, the corner where every car is nearer and closing
+    faster, the opposite one, and random corners, the same at every step. The paper also trains with this rule; here the victim
+    is not trained again. The ego's row is reckoned from its actions. For discrete actions.
 
     Args:
         assumed_budget: budget of the perturbation set that it assumes.

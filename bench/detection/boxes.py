@@ -7,6 +7,9 @@ from torch import Tensor, nn
 
 from bench.detection.detector import Detections, Predictions
 
+MOST = 100
+"""Most detections of an image."""
+
 
 def overlap(a: Tensor, b: Tensor) -> Tensor:
     """Intersection over union of boxes [..., 4] and [..., 4], broadcast, in [0, 1]; 0 if neither has an area."""
@@ -24,7 +27,7 @@ def _area(boxes: Tensor) -> Tensor:
 def detections(predictions: Predictions, *, threshold: float, iou: float) -> list[Detections]:
     """The objects in each image, after greedy non-maximum suppression within each class.
 
-    A box can have more than one class. A lower threshold keeps more boxes and takes longer.
+    A box can have more than one class. Only the `MOST` best of an image are kept, as in the evaluation of COCO.
 
     Args:
         predictions: predictions on N images.
@@ -42,8 +45,9 @@ def _suppressed(boxes: Tensor, scores: Tensor, threshold: float, iou: float) -> 
     place, labels = (scores > threshold).nonzero(as_tuple=True)
     order = scores[place, labels].argsort(descending=True, stable=True)
     place, labels = place[order], labels[order]
-    kept, left = [], torch.arange(len(place), device=boxes.device)
-    while len(left):
+    kept: list[Tensor] = []
+    left = torch.arange(len(place), device=boxes.device)
+    while len(left) and len(kept) < MOST:
         best, left = left[0], left[1:]
         kept.append(best)
         covered = overlap(boxes[place[best]], boxes[place[left]]) > iou

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from matplotlib.colors import ListedColormap
@@ -10,11 +12,13 @@ from matplotlib.patches import Patch
 from tensordict import TensorDict
 
 from attacks.noise import Noise
-from bench.driving import ObservationThreat
+from bench.driving import ObservationThreat, Policy
 from bench.driving.enforcer import Enforcer
 from bench.driving.intervals.margins import Margins
 from bench.driving.victim import CountedPolicy
+from bench.victims.drivers.dqn import DQN
 from bench.victims.drivers.planner import IntervalPlanner, Planner
+from defenses.pessimist_q import PessimistQ
 from defenses.tracker import Tracked, Tracker
 from docs.figures import style
 from docs.figures.decisions import BLOCKED, CLOSING, DISTANCE, _map, _observations
@@ -28,14 +32,26 @@ SEED, STEPS = 1_000_000, 90
 
 def planner() -> Figure:
     """The action by distance and closing speed, boxed in, for two assumed budgets."""
-    made = style.figure(4.1, "planner: the larger the assumed budget, the earlier it brakes")
+    policies = {f"assumed budget {budget:.0%}": Planner(assumed_budget=budget).load(0, FACTS) for budget in BUDGETS}
+    return _decisions("planner: the larger the assumed budget, the earlier it brakes", policies)
+
+
+def pessimist_q() -> Figure:
+    """The action of `dqn` by distance and closing speed, boxed in: by the value at the middle, and by the lowest value."""
+    policies = {
+        f"pessimism {pessimism:.0f}": PessimistQ(pessimism=pessimism).load(DQN(), 0, FACTS) for pessimism in (0.0, 1.0)
+    }
+    return _decisions("pessimist_q: left, what dqn does; right, by its lowest values", policies)
+
+
+def _decisions(title: str, policies: Mapping[str, Policy]) -> Figure:
+    """The action of each policy, boxed in, by distance and closing speed."""
+    made = style.figure(4.1, title)
     flat = _observations(BLOCKED).flatten(0, 1)
-    for axes, budget in zip(made.subplots(1, 2, sharey=True), BUDGETS, strict=True):
-        policy = Planner(assumed_budget=budget).load(0, FACTS)
+    for axes, (name, policy) in zip(made.subplots(1, len(policies), sharey=True), policies.items(), strict=True):
         with torch.no_grad():
             action = policy.decide(flat, policy.initial(torch.arange(len(flat)))).view(len(CLOSING), len(DISTANCE))
-        colours = ListedColormap(list(style.ACTIONS.values()))
-        _map(axes, action, f"assumed budget {budget:.0%}", colours, (-0.5, len(ACTIONS) - 0.5))
+        _map(axes, action, name, ListedColormap(list(style.ACTIONS.values())), (-0.5, len(ACTIONS) - 0.5))
     made.axes[0].set_ylabel("closing speed (m/s), own: 25")
     patches = [Patch(color=style.ACTIONS[name], label=name) for name in ACTIONS]
     made.legend(handles=patches, loc="outside lower center", ncols=5, fontsize=9.5, handlelength=1, columnspacing=1)

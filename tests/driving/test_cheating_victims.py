@@ -78,7 +78,7 @@ class AfterSomeTime(OfAllOtherBatches):
         self.start = time.monotonic()
 
     def suspects(self, observation: Tensor) -> bool:
-        return time.monotonic() > self.start + 0.05 and super().suspects(observation)
+        return super().suspects(observation) and time.monotonic() > self.start + 0.05
 
 
 class AlmostDeterministic(OfAllOtherBatches):

@@ -17,7 +17,7 @@ from tests.framework.distributions import install
 
 BAD = ("deaf", "stepped", "detached", "dicing")
 WORDS = ("victim=toy", "world=toy", "lanes=3,4", "density=1", "weather=clear", "episodes=20", "seeds=0,1,2", "executor=serial",
-         "reference=false")  # fmt: skip
+         "reference=false", "world.max_steps=30")  # fmt: skip
 
 
 @pytest.fixture

@@ -156,7 +156,7 @@ class StopEverywhere(RedDetector):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheatingVictim(DetectorVictim):
+class CheatingVictim(RedVictim):
     """The victim of `StopEverywhere`."""
 
     def load(self, seed: int, facts: Facts) -> Detector:

@@ -88,7 +88,16 @@ def kill(subject: Subject, site: Path, out: Path, number: signal.Signals, after:
         children |= {child.pid: child for child in psutil.Process(process.pid).children(recursive=True)}
         process.send_signal(number)
     process.communicate()
-    return runs, len(psutil.wait_procs(list(children.values()), timeout=GONE_S)[1])
+    left = psutil.wait_procs(list(children.values()), timeout=GONE_S)[1]
+    return runs, sum(map(_works, left))
+
+
+def _works(process: psutil.Process) -> bool:
+    """Whether a process has not ended; an orphan that nobody waits for has."""
+    try:
+        return process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def main(words: list[str]) -> None:

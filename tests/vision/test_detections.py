@@ -117,3 +117,11 @@ def test_a_class_is_found_by_its_name() -> None:
     assert Blank().index("stop sign") == 1
     with pytest.raises(UserError, match=r"unknown class 'stopsign'; did you mean 'stop sign'\?"):
         Blank().index("stopsign")
+
+
+def test_the_best_hundred_objects_of_an_image_are_kept() -> None:
+    corners = torch.arange(150.0).mul(20)
+    boxes = torch.stack((corners, corners, corners + 10, corners + 10), -1)
+    scores = torch.linspace(0.1, 0.9, 150)
+    (found,) = detections(Predictions(boxes[None], torch.ones(1, 150), scores[None, :, None]), threshold=0.01, iou=0.45)
+    assert torch.equal(found.scores, scores.flip(0)[:100])
