@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDict
 from torch import Tensor
 
 from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, State
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import Ego
-from bench.driving.intervals.policy import IntervalPolicy, corrected
+from bench.driving.intervals.policy import IntervalPolicy, corrected, with_inner
 from bench.driving.threat import Norm
 from bench.errors import UserError
 from bench.plugins.ranges import Count, Share
@@ -59,7 +59,8 @@ class Believing(IntervalPolicy):
         self.driver, self.weights_sha256 = policy.driver, policy.weights_sha256
 
     def initial(self, episodes: Tensor) -> State:
-        return self._state(self.reckoning.unknown(episodes), self.policy.initial(episodes), episodes.shape)
+        own = {"ego": self.reckoning.unknown(episodes)}
+        return with_inner(own, self.policy.initial(episodes), episodes.shape)
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
@@ -74,27 +75,35 @@ class Believing(IntervalPolicy):
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None
         ego = self.reckoning.now(boxes, state["ego"])
-        middle = corrected(self.belief(observation, boxes)[0], ego, self.assumed)
+        middle = corrected(self.belief(observation, boxes, corners=False)[0], ego, self.assumed)
         inner = self.policy.advance(middle, action, state.get("inner", None))
-        return self._state(self.reckoning.after(ego, action), inner, state.batch_size)
+        return with_inner({"ego": self.reckoning.after(ego, action)}, inner, state.batch_size)
 
     def safe(self, boxes: Boxes, state: State) -> None:
         """It promises nothing."""
 
-    def belief(self, observation: Tensor, boxes: Boxes) -> Tensor:
-        """Points of the belief about the other cars, [P, ..., V, F]: the middle first."""
+    def belief(self, observation: Tensor, boxes: Boxes, *, corners: bool = True) -> Tensor:
+        """Points of the belief about the other cars, [P, ..., V, F]: the middle, and after it the corners, if wanted."""
         low, high = self.assumed.normalised(boxes.low), self.assumed.normalised(boxes.high)
         middle, half = (low + high) / 2, (high - low) / 2
-        ahead = (boxes.low[..., 0] + boxes.high[..., 0] >= 0).to(half)
-        nearer = torch.zeros_like(half)
-        nearer[..., 0] = nearer[..., 2] = 1 - 2 * ahead
-        draw = torch.Generator().manual_seed(SEED)
-        drawn = torch.randint(2, (self.settings.corners, *half.shape[-2:]), generator=draw).to(half) * 2 - 1
-        drawn = drawn.reshape(-1, *[1] * (half.dim() - 2), *half.shape[-2:]).expand(-1, *half.shape)
-        sides = torch.cat((torch.stack((torch.zeros_like(half), nearer, -nearer)), drawn))
+        sides = torch.zeros_like(half).unsqueeze(0)
+        if corners:
+            sides = torch.cat((sides, self._corners(half, boxes)))
         measured = torch.where(boxes.present.unsqueeze(-1), middle + sides * half, observation[..., 1:])
         return torch.cat((observation[..., :1].expand(len(measured), *observation[..., :1].shape), measured), -1)
 
-    @staticmethod
-    def _state(ego: TensorDict, inner: State, shape: torch.Size) -> State:
-        return TensorDict({"ego": ego, **({} if inner is None else {"inner": inner})}, batch_size=shape)
+    def _corners(self, half: Tensor, boxes: Boxes) -> Tensor:
+        """Sides of the boxes [K, ..., V, F - 1], -1 to 1: nearer and closing faster, the opposite, and random corners."""
+        ahead = (boxes.low[..., 0] + boxes.high[..., 0] >= 0).to(half)
+        nearer = torch.zeros_like(half)
+        nearer[..., 0] = nearer[..., 2] = 1 - 2 * ahead
+        drawn = _signs(self.settings.corners, *half.shape[-2:]).to(half)
+        drawn = drawn.reshape(-1, *[1] * (half.dim() - 2), *half.shape[-2:]).expand(-1, *half.shape)
+        return torch.cat((torch.stack((nearer, -nearer)), drawn))
+
+
+@cache
+def _signs(count: int, rows: int, features: int) -> Tensor:
+    """[K, V, F - 1] random signs."""
+    drawn = torch.randint(2, (count, rows, features), generator=torch.Generator().manual_seed(SEED))
+    return drawn * 2.0 - 1

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, State
@@ -15,7 +15,7 @@ from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.corridor import Corridor, CorridorJudge
 from bench.driving.intervals.ego import Ego
 from bench.driving.intervals.margins import Caution, Judge, Margins
-from bench.driving.intervals.policy import IntervalPolicy, corrected
+from bench.driving.intervals.policy import IntervalPolicy, corrected, with_inner
 from bench.driving.threat import Norm
 from bench.errors import UserError
 from bench.plugins.ranges import NotNegative
@@ -68,14 +68,14 @@ class Filter(IntervalPolicy):
 
     def initial(self, episodes: Tensor) -> State:
         own = {"ego": self.reckoning.unknown(episodes), "edge": torch.zeros(len(episodes), device=episodes.device)}
-        return _with_inner(own, self.policy.initial(episodes), episodes.shape)
+        return with_inner(own, self.policy.initial(episodes), episodes.shape)
 
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None
         ego = self.ego(boxes, state)
         inner = self.policy.advance(corrected(observation, ego, self.assumed), action, state.get("inner", None))
         own = {"ego": self.reckoning.after(ego, action), "edge": self.edge(ego, boxes, state)}
-        return _with_inner(own, inner, state.batch_size)
+        return with_inner(own, inner, state.batch_size)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         assert state is not None
@@ -159,7 +159,3 @@ class ShieldedControls(Filter):
 
     def corridor(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Corridor:
         return self.judge(ego, boxes, self.edge(ego, boxes, state))
-
-
-def _with_inner(own: dict[str, Tensor | TensorDictBase], inner: State, shape: torch.Size) -> State:
-    return TensorDict({**own, **({} if inner is None else {"inner": inner})}, batch_size=shape)

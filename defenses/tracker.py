@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, PolicyWrapper, State
 from bench.driving.intervals.boxes import Assumed, Boxes
-from bench.driving.intervals.policy import IntervalPolicy, corrected, reckoning
+from bench.driving.intervals.policy import IntervalPolicy, corrected, reckoning, with_inner
 from bench.driving.intervals.tracks import narrowed, predicted
 from bench.driving.threat import Norm
 
@@ -48,9 +48,8 @@ class Tracked(PolicyWrapper):
         self.reckoning = reckoning(facts, policy.action_type)
 
     def initial(self, episodes: Tensor) -> State:
-        inner = self.policy.initial(episodes)
-        own = {"ego": self.reckoning.unknown(episodes), **({} if inner is None else {"inner": inner})}
-        return TensorDict(own, batch_size=episodes.shape)
+        own = {"ego": self.reckoning.unknown(episodes)}
+        return with_inner(own, self.policy.initial(episodes), episodes.shape)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         assert state is not None
@@ -76,8 +75,7 @@ class Tracked(PolicyWrapper):
         tracks = TensorDict(
             predicted(boxes, ego, after, self.reckoning.kinematics, self.period), batch_size=state.batch_size
         )
-        own = {"ego": after, "tracks": tracks, **({} if inner is None else {"inner": inner})}
-        return TensorDict(own, batch_size=state.batch_size)
+        return with_inner({"ego": after, "tracks": tracks}, inner, state.batch_size)
 
     def passed(self, observation: Tensor, state: State = None) -> Passed:
         assert state is not None

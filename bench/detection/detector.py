@@ -6,6 +6,7 @@ A box is [x1, y1, x2, y2] in pixels of the image: x to the right, y down, from t
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -96,6 +97,15 @@ class Detector(nn.Module, ABC):
         Raises:
             UserError: if the detector does not have this class.
         """
-        if name not in self.names:
-            raise UserError(unknown(f"class {name!r}", name, self.names))
-        return self.names.index(name)
+        return label_of(name, self.names)
+
+
+def label_of(name: str, names: Sequence[str]) -> int:
+    """The label of a class of a detector.
+
+    Raises:
+        UserError: if there is no such class.
+    """
+    if name not in names:
+        raise UserError(unknown(f"class {name!r}", name, names))
+    return names.index(name)

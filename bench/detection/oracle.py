@@ -8,12 +8,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from bench.detection.detector import Predictions
+from bench.detection.detector import Predictions, label_of
 from bench.detection.patch import MOMENTS, Evolution
 from bench.detection.threat import PatchThreat
 from bench.errors import UserError
 from bench.plugins.contracts import Access
-from bench.plugins.registry import unknown
 
 
 class Door(Protocol):
@@ -63,9 +62,7 @@ class PatchOracle:
         Raises:
             UserError: if the detector does not have this class.
         """
-        if name not in self.names:
-            raise UserError(unknown(f"class {name!r}", name, self.names))
-        return self.names.index(name)
+        return label_of(name, self.names)
 
     @property
     def spent(self) -> int:

@@ -347,6 +347,8 @@ def test_a_recurrent_network_needs_the_weights_of_all_its_layers(
     for wrong in (weights[4:], [*weights[4:], *weights[:4]], short):
         with pytest.raises(RefusedError, match="a recurrent network has weights or states"):
             call(input, hidden, wrong, *rest)
+    with pytest.raises(RefusedError, match="a recurrent network has weights or states"):
+        call(input, hidden, weights, True, 2**60, *rest[2:])
 
 
 def test_sizes_that_fit_are_computed_as_by_torch() -> None:

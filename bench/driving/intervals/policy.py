@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from bench.driving.features import ActionType, DrivingFacts
@@ -89,3 +91,8 @@ def corrected(observation: Tensor, ego: Ego, assumed: Assumed) -> Tensor:
     own = assumed.normalised(torch.stack([torch.zeros_like(along), ego.y, along, across], -1))[..., 1:]
     row = torch.cat((observation[..., :1, :2], own.unsqueeze(-2)), -1)
     return torch.cat((row, observation[..., 1:, :]), -2)
+
+
+def with_inner(own: Mapping[str, Tensor | TensorDictBase], inner: State, shape: torch.Size) -> TensorDict:
+    """The state of a defence: its own entries, and the state of the policy behind it as `inner`, if that has one."""
+    return TensorDict({**own, **({} if inner is None else {"inner": inner})}, batch_size=shape)

@@ -156,14 +156,17 @@ def _recurrent(gates: int) -> Callable[[Given], str]:
         input, hidden, params = given["input"], given["hx"], list(given["params"])
         directions = 2 if given["bidirectional"] else 1
         size = hidden.shape[-1]
+        wrong = "a recurrent network has weights or states of another size than its layers"
+        # A file may name any number of layers.
+        if len(params) != (4 if given["has_biases"] else 2) * directions * given["num_layers"]:
+            return wrong
         wanted: list[tuple[int, ...]] = []
         for layer in range(given["num_layers"]):
             inputs = directions * size if layer else input.shape[-1]
             own = [(gates * size, inputs), (gates * size, size), *[(gates * size,)] * 2 * given["has_biases"]]
             wanted += own * directions
-        if [tuple(one.shape) for one in params] != wanted or len(hidden) != directions * given["num_layers"]:
-            return "a recurrent network has weights or states of another size than its layers"
-        return ""
+        fits = [tuple(one.shape) for one in params] == wanted and len(hidden) == directions * given["num_layers"]
+        return "" if fits else wrong
 
     return check
 
