@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bench.detection import stopping
 from bench.detection.boxes import confidence, overlap
+from bench.detection.closed_loop import Drives
 from bench.detection.detector import STOP_SIGN, Detections, Detector
 from bench.detection.discrimination import discrimination, if_visible
 from bench.detection.patch import Patch
@@ -37,6 +38,7 @@ class Sighting:
         share: side of the patch as a share of the sign's side.
         shown: the output that was scored.
         clean: the output without the patch; None if there is no patch.
+        drives: the closed loop; None if the world has none.
     """
 
     approach: Approach
@@ -44,6 +46,7 @@ class Sighting:
     share: float
     shown: Sight
     clean: Sight | None
+    drives: Drives | None = None
 
     @property
     def texels(self) -> Tensor | None:
@@ -79,9 +82,12 @@ def score(
         trace: collects the detector's output on its episodes.
     """
     texels = patch.texels if patch else None
+    # Approaches may share their scenes; each frame is looked at once.
+    scenes, of_approach = _distinct([approach.scenes for approach in approaches])
     with torch.no_grad():
-        seen = [look(detector, approach.scenes, texels, share) for approach in approaches]
-        others = [look_at_decoys(detector, approach.scenes) for approach in approaches]
+        looks = [look(detector, one, texels, share) for one in scenes]
+        others = [look_at_decoys(detector, one) for one in scenes]
+        seen = [looks[number] for number in of_approach]
         if trace:
             for place in trace.episodes:
                 clean = look(detector, approaches[place].scenes, None, share) if texels is not None else None
@@ -99,15 +105,20 @@ def score(
         "non_printability": np.nan if texels is None else float(non_printability(texels)),
         **probed(detector, approaches, seen, texels, share, entropy),
     }
-    scenes = [approach.scenes for approach in approaches]
+    of_scenes = {**measured(looks, scenes), **discrimination(looks, others, scenes), **if_visible(looks, scenes)}
     return {
         "seed": np.array([approach.seed for approach in approaches], np.int64),
         "location": np.array([approach.location for approach in approaches]),
         **{name: np.array([value] * len(approaches)) for name, value in constant.items()},
-        **measured(seen, scenes),
-        **discrimination(seen, others, scenes),
-        **if_visible(seen, scenes),
+        **{name: values[of_approach] for name, values in of_scenes.items()},
     }
+
+
+def _distinct(scenes: Sequence[Scenes]) -> tuple[list[Scenes], NDArray[np.int64]]:
+    """The distinct objects, in order, and the number of each one's."""
+    known = {id(one): one for one in scenes}
+    numbers = {key: number for number, key in enumerate(known)}
+    return list(known.values()), np.array([numbers[id(one)] for one in scenes])
 
 
 def probed(

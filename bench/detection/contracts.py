@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor
 
@@ -14,6 +15,9 @@ from bench.detection.scenes import Approach, Scenes
 from bench.detection.threat import PatchThreat
 from bench.plugins.contracts import Attack, Defense, Facts, Progress, ThreatModel, Trained, Victim, World
 from bench.scenarios import Cell
+
+if TYPE_CHECKING:
+    from bench.detection.closed_loop import DrivingEnv
 
 
 class CameraWorld(World):
@@ -38,6 +42,17 @@ class CameraWorld(World):
             cell: lanes (lateral distance to the sign), traffic density (cars may hide the sign), weather.
             seeds: scenario seeds.
         """
+
+    def environment(self, cell: Cell, seeds: Sequence[int], patch: Tensor | None, share: float) -> DrivingEnv | None:
+        """One car that drives up to a sign, for the closed loop (`bench.detection.closed_loop`); None if the world has none.
+
+        Args:
+            cell: the cell.
+            seeds: scenario seeds; each is a draw of the cross traffic.
+            patch: [3, P, P] on the sign; None for no patch.
+            share: side of the patch as a share of the sign's side.
+        """
+        return None
 
     def render(self, out: Path | None, progress: Progress) -> list[Path]:
         """Render the frames of this world and return the files; an interrupted rendering is resumed.

@@ -77,23 +77,35 @@ def look_at_decoys(detector: Detector, scenes: Scenes) -> Sight | None:
 
 
 def _sight(detector: Detector, scenes: Scenes, render: Callable[[Tensor], Tensor]) -> Sight:
+    parts = [
+        glance(detector, render(frames), scenes.boxes[frames]) for frames in torch.arange(len(scenes)).split(BATCH)
+    ]
+    return Sight(
+        np.concatenate([part.confidence for part in parts]),
+        [one for part in parts for one in part.candidates],
+        [one for part in parts for one in part.others],
+    )
+
+
+def glance(detector: Detector, pictures: Tensor, boxes: Tensor) -> Sight:
+    """Run the detector on images [N, 3, H, W] with the true boxes [N, 4] of the sign.
+
+    Raises:
+        UserError: if a prediction is NaN or infinite.
+    """
     label = detector.index(STOP_SIGN)
-    confidences, candidates, others = [], [], []
-    for frames in torch.arange(len(scenes)).split(BATCH):
-        predictions = detector(render(frames))
-        if not all(
-            bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)
-        ):
-            raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
-        boxes = scenes.boxes[frames].to(predictions.boxes)
-        sure = confidence(predictions, label, boxes, iou=SAME_IOU)
-        confidences.append(sure)
-        candidates += candidates_of(predictions, label)
-        others += [
-            detector.names[found] if score > max(float(of_sign), stopping.THRESHOLD) else ""
-            for (score, found), of_sign in zip(best_other(predictions, label, boxes, iou=SAME_IOU), sure, strict=True)
-        ]
-    return Sight(torch.cat(confidences).numpy(), candidates, others)
+    predictions = detector(pictures)
+    if not all(
+        bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)
+    ):
+        raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
+    boxes = boxes.to(predictions.boxes)
+    sure = confidence(predictions, label, boxes, iou=SAME_IOU)
+    others = [
+        detector.names[found] if score > max(float(of_sign), stopping.THRESHOLD) else ""
+        for (score, found), of_sign in zip(best_other(predictions, label, boxes, iou=SAME_IOU), sure, strict=True)
+    ]
+    return Sight(sure.numpy(), candidates_of(predictions, label), others)
 
 
 def candidates_of(predictions: Predictions, label: int) -> list[Detections]:

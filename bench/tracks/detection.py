@@ -134,6 +134,38 @@ PRINTED: tuple[pa.Field, ...] = (
 )
 """What was printed, and what is seen of the sign where it can be seen; null in older records."""
 
+CLOSED_LOOP: tuple[pa.Field, ...] = (
+    field(
+        "stopped",
+        pa.bool_(),
+        "closed loop: whether the car stopped before the line or at most 1 m beyond it",
+        nullable=True,
+    ),
+    field(
+        "drive_confirmed_m",
+        FLOAT,
+        "closed loop: distance at which the driver confirmed the sign; 0 if never",
+        "m",
+        nullable=True,
+        low=0,
+    ),
+    field(
+        "drive_overrun_m",
+        FLOAT,
+        "closed loop: how far beyond the line the car came until it stood still or had left the crossing; 0 if before the line",
+        "m",
+        nullable=True,
+        low=0,
+    ),
+    field(
+        "collided",
+        pa.bool_(),
+        "closed loop: whether the car hit a vehicle of the cross traffic before it stood still or had left the crossing",
+        nullable=True,
+    ),
+)
+"""What the car does that the detector drives; null in older records, and in worlds without a closed loop."""
+
 
 class DetectionTrack(Track):
     """Detectors of a stop sign, attacked by a patch on it, ranked by how far they tell the sign from decoys."""
@@ -147,7 +179,7 @@ class DetectionTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("patch",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP)
     of_older: ClassVar[Mapping[str, str]] = {"stop_score": "confidence_mean"}
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")
     metric: ClassVar[str] = "stop_score"
@@ -160,6 +192,9 @@ class DetectionTrack(Track):
         Measure(column="first_seen_m", heading="first\nseen m", digits=1, spare=2),
         Measure(column="ran", heading="runs the\nsign", unit="share", with_interval=True),
         Measure(column="overrun_m", heading="over-\nrun m", digits=1, spare=3),
+        Measure(column="stopped", heading="stops\nin loop", unit="share", spare=1),
+        Measure(column="drive_overrun_m", heading="loop over-\nrun m", digits=1, spare=3),
+        Measure(column="collided", heading="\ncollides", unit="share", spare=1),
         Measure(column="visible_share", heading="\nvisible", unit="share", tables="cells", spare=5),
         Measure(column="false_alarms", heading="false\nalarms", digits=2, spare=7),
         Measure(column="queries", heading="\nimages", of_attack=True, tables="overview", spare=4),
@@ -169,7 +204,8 @@ class DetectionTrack(Track):
         "stop score: confidence in the stop sign at its true position minus confidence in decoys (other faces on the same post), "
         "mean over an approach. AP of stop: average precision over frames with the sign and with decoys. false stops: per frame "
         "with a decoy. frames seen: share with confidence above 0.25. runs the sign: the car, at 10 m/s, never brakes, or stops "
-        "more than 1 m beyond the line. false alarms: per frame with the sign."
+        "more than 1 m beyond the line. false alarms: per frame with the sign. stops in loop, loop "
+        "overrun, collides: of the car that the detector drives frame by frame."
     )
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
         "noise_patch": Baseline(title="noise patch", heading="\nnoise", spare=1),
@@ -250,6 +286,7 @@ class DetectionTrack(Track):
         save(trace, meta=meta, path=path)
 
     def film(self, job: Job, trace: Any, meta: Mapping[str, object]) -> Film:
+        from bench.recording.detection.drive_film import DriveFilm
         from bench.recording.detection.film import ApproachFilm
 
-        return ApproachFilm(trace, meta)
+        return DriveFilm(trace, trace.drives, meta) if trace.drives else ApproachFilm(trace, meta)

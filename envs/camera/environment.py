@@ -1,4 +1,4 @@
-"""The camera world as a TorchRL environment: the driver can brake during an approach."""
+"""The approach to a stop sign as a TorchRL environment, in closed loop: where the car is depends on how it brakes."""
 
 from __future__ import annotations
 
@@ -7,91 +7,141 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from bench.detection import Scenes
+from bench.detection.closed_loop import STANDS_MPS, DrivingEnv, Plan
 from bench.detection.stopping import SPEED_MPS
+from envs.camera.braking import Brakes, Motion
+from envs.camera.cross_traffic import CrossTraffic, overlap
+from envs.camera.street.layout import CROSSING
 
-HARDEST_MPS2 = 8.0
-"""Full braking on a dry road."""
+TICK_S = 0.01
+"""Longest time between two positions that are tested for a collision."""
+CAR_M = (4.6, 1.84)
+"""Length and width of the car; its front is at the camera."""
+CLEARED_M = -(CROSSING[1] + CAR_M[0])
+"""Distance to the line at which the car has left the crossing."""
 
 
-class ApproachEnv(EnvBase):
-    """B cars that approach a stop sign at 10 m/s.
+class ApproachEnv(DrivingEnv):
+    """B cars that approach a stop sign, and brake or cross the road behind it.
 
-    The action is the deceleration in m/s2, float32 [B, 1] in [0, 8]. A step is the time in which a car that does not brake
-    drives from one frame to the next. `observation` is the image of the nearest frame by distance, [B, 3, H, W]; after the
-    last frame it stays the same. `info` has the `distance` to the sign in m, the `speed` in m/s, the `box` of the sign in
-    pixels [B, 4] and its `visible` share. An episode ends when the car stands still or passes the sign; the stop line is level
-    with it (`bench.detection.stopping`). The reward is 1 for stopping before the line, else 0.
+    The action is the deceleration that the driver asks for in m/s2, float32 [B, 1]. The brakes build it up
+    (`envs.camera.braking`). A step is the time in which a car at 10 m/s drives from one frame to the next. `observation` is the
+    image of the nearest frame by distance, [B, 3, H, W]; after the last frame it stays the same. The stop line is level with
+    the sign (`bench.detection.stopping`). An episode ends when the car stands still or has left the crossing road; a collision
+    does not end it, because each car meets K draws of the cross traffic at once. The reward is 1 for stopping before the line,
+    else 0.
+
+    `info` has `distance` (from the front of the car to the line in m, negative beyond it), `speed` in m/s, `frame` (number of the
+    frame), the `box` of the sign in pixels [B, 4], its `visible` share, `others`, the rectangles of the cross traffic in m
+    [B, K, N, 4], and `hit`, whether the car has collided with one of them while it moved [B, K].
 
     Args:
         scenes: frames of each approach, farthest first, all of one size and at the same distances.
         patches: sRGB in [0, 1], [B or 1, 3, P, P]; None for no patch.
         share: side of the patch as a share of the sign's side.
+        speed: speed at the first frame in m/s.
+        brakes: the brakes of the cars.
+        seeds: seeds of K draws of the cross traffic; without any, the crossing road is empty.
+        plan: the road from above, for films.
     """
 
     batch_locked = True
 
-    def __init__(self, scenes: Sequence[Scenes], patches: Tensor | None = None, share: float = 0.5) -> None:
+    def __init__(
+        self,
+        scenes: Sequence[Scenes],
+        patches: Tensor | None = None,
+        share: float = 0.5,
+        *,
+        speed: float = SPEED_MPS,
+        brakes: Brakes = Brakes(),  # noqa: B008
+        seeds: Sequence[int] = (),
+        plan: Plan = Plan(),  # noqa: B008
+    ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([len(scenes)]))
-        self.scenes, self.share = tuple(scenes), share
+        self.scenes, self.share, self.approach_speed, self.brakes = tuple(scenes), share, speed, brakes
         self.patches = None if patches is None else patches.expand(len(scenes), -1, -1, -1)
+        self.plan = plan
+        self.traffic = CrossTraffic.drawn(seeds)
         self.distances = self.scenes[0].distance
         self.step_s = float(self.distances[0] - self.distances[1]) / SPEED_MPS
-        self.distance = self.speed = torch.zeros(len(scenes), 1)
         batch = len(scenes)
+        self.motion = Motion(*(torch.zeros(batch) for _ in range(3)))
+        self.seconds = torch.zeros(batch)
+        self.hit = torch.zeros(batch, len(seeds), dtype=torch.bool)
         number = Unbounded(shape=(batch, 1), dtype=torch.float32)
         info = Composite(
             distance=number,
             speed=number.clone(),
+            frame=Categorical(len(self.distances), shape=(batch, 1), dtype=torch.int64),
             box=Unbounded(shape=(batch, 4), dtype=torch.float32),
             visible=Bounded(0, 1, shape=(batch, 1), dtype=torch.float32),
+            others=Unbounded(shape=(batch, *self.traffic.half.shape[:2], 4), dtype=torch.float32),
+            hit=Binary(shape=(batch, len(seeds)), dtype=torch.bool),
             shape=(batch,),
         )
         picture = Bounded(0, 1, shape=(batch, 3, *self.scenes[0].size), dtype=torch.float32)
         self.observation_spec = Composite(observation=picture, info=info, shape=(batch,))
-        self.action_spec = Bounded(0, HARDEST_MPS2, shape=(batch, 1), dtype=torch.float32)
+        self.action_spec = Bounded(0, brakes.greatest, shape=(batch, 1), dtype=torch.float32)
         self.reward_spec = number.clone()
         flag = Binary(1, shape=(batch, 1), dtype=torch.bool)
         self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=(batch,))
 
     def _set_seed(self, seed: int | None) -> None:
-        """Nothing is random: an approach is given by its frames."""
+        """Nothing is random: an approach is given by its frames, and the cross traffic by its seeds."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        chosen = torch.ones(*self.batch_size, 1, dtype=torch.bool) if mask is None else mask.view(-1, 1)
-        self.distance = torch.where(chosen, self.distances[0], self.distance)
-        self.speed = torch.where(chosen, SPEED_MPS, self.speed)
+        chosen = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
+        still = torch.zeros(self.batch_size)
+        begin = Motion(still + self.distances[0], still + self.approach_speed, still)
+        self.motion = begin.where(chosen, self.motion)
+        self.seconds = torch.where(chosen, 0.0, self.seconds)
+        self.hit = self.hit & ~chosen[:, None]
         return self._shown()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         running = ~self._ended()
-        braking = tensordict["action"].clamp(0, HARDEST_MPS2)
-        # A car that stops within the step does not move backwards.
-        seconds = torch.where(braking > 0, (self.speed / braking.clamp(min=1e-6)).clamp(max=self.step_s), self.step_s)
-        driven = self.speed * seconds - braking * seconds.square() / 2
-        self.distance = torch.where(running, self.distance - driven, self.distance)
-        self.speed = torch.where(running, (self.speed - braking * seconds).clamp(min=0), self.speed)
-        stopped = running & (self.speed <= 1e-4) & (self.distance >= 0)
-        return self._shown().set("reward", stopped.float())
+        asked = tensordict["action"][:, 0]
+        ticks = max(1, round(self.step_s / TICK_S))
+        for _ in range(ticks):
+            moves = ~self._ended()
+            self.motion = self.brakes.moved(self.motion, asked, self.step_s / ticks).where(moves, self.motion)
+            self.seconds = torch.where(moves, self.seconds + self.step_s / ticks, self.seconds)
+            self.hit = self.hit | (self._collided() & moves[:, None])
+        stopped = running & (self.motion.speed <= STANDS_MPS) & (self.motion.distance >= 0)
+        return self._shown().set("reward", stopped[:, None].float())
 
     def _ended(self) -> Tensor:
-        return (self.speed <= 1e-4) | (self.distance < 0)
+        return (self.motion.speed <= STANDS_MPS) | (self.motion.distance < CLEARED_M)
+
+    def _collided(self) -> Tensor:
+        """Whether each car overlaps a vehicle in each draw, [B, K]."""
+        front, half = -self.motion.distance, torch.full_like(self.motion.distance, CAR_M[1] / 2)
+        car = torch.stack([-half, front - CAR_M[0], half, front], -1)
+        return overlap(car[:, None, None], self.traffic.at(self.seconds)).any(-1)
 
     def _shown(self) -> TensorDict:
-        frames = (self.distance - self.distances).abs().argmin(-1)
+        frames = (self.motion.distance[:, None] - self.distances).abs().argmin(-1)
         pictures, boxes, visible = [], [], []
         for number, (scenes, frame) in enumerate(zip(self.scenes, frames, strict=True)):
             patch = None if self.patches is None else self.patches[number : number + 1]
             pictures.append(scenes.render(frame.view(1), patch, self.share)[0])
             boxes.append(scenes.boxes[frame])
             visible.append(scenes.visible[frame].view(1))
-        ended = self._ended()
-        info = {"distance": self.distance.clone(), "speed": self.speed.clone()}
-        info |= {"box": torch.stack(boxes), "visible": torch.stack(visible)}
+        ended = self._ended()[:, None]
+        info = {
+            "distance": self.motion.distance[:, None].clone(),
+            "speed": self.motion.speed[:, None].clone(),
+            "frame": frames[:, None],
+            "box": torch.stack(boxes),
+            "visible": torch.stack(visible),
+            "others": self.traffic.at(self.seconds),
+            "hit": self.hit.clone(),
+        }
         content = {
             "observation": torch.stack(pictures).detach(),
             "info": TensorDict(info, batch_size=self.batch_size),

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from bench.detection.stopping import SPEED_MPS
 from envs.camera import develop, sign
 from envs.camera.poses import Pose
-from envs.camera.street.layout import sign_x
+from envs.camera.street.layout import LOCATIONS, sign_x
 from envs.camera.street.light import lighting
 from envs.camera.street.render import Traced
 from envs.camera.weather import air
 from envs.weather import Weather
 
-QUALITY = 85
-"""WebP quality of the image; the sign's crop is stored separately."""
+QUALITY, CLOSED_LOOP_QUALITY = 85, 60
+"""WebP quality of the image, lower on the road that has many frames; the sign's crop is stored separately."""
 GAMMA = 2.2
 """The light of the crop is stored in 8 bits as (value / largest) ** (1 / GAMMA)."""
 
@@ -54,8 +54,9 @@ def frame(traced: Traced, pose: Pose, weather: Weather) -> Frame:
     light = traced.black * between.transmitted + between.added
     factor = develop.exposure(light)
     picture = develop.tone(torch.from_numpy(light * factor)).numpy()
+    quality = CLOSED_LOOP_QUALITY if LOCATIONS[pose.location].closed_loop else QUALITY
     done, webp = cv2.imencode(
-        ".webp", np.rint(255 * picture[..., ::-1]).astype(np.uint8), [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
+        ".webp", np.rint(255 * picture[..., ::-1]).astype(np.uint8), [cv2.IMWRITE_WEBP_QUALITY, quality]
     )
     assert done
     black, most_black = _coded(light[y0:y1, x0:x1] * factor)

@@ -23,6 +23,10 @@ TRAINING_LIGHTINGS: tuple[Lighting, ...] = ("sun", "overcast")
 """The lightings of the weathers in the standard grid."""
 LEAST_VISIBLE = 0.6
 """Approximate share of the sign that a training view shows at least."""
+CLOSED_LOOP_LANES, CLOSED_LOOP_DENSITY = 3, 1.0
+CLOSED_LOOP_DISTANCES = tuple(float(distance) for distance in np.arange(30.0, 7.9, -0.5))
+"""Distances of the frames of the closed loop to the sign, in m."""
+CLOSED_LOOP_LIGHTINGS: tuple[Lighting, ...] = ("sun", "overcast")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +87,26 @@ def scored() -> tuple[Pose, ...]:
         for lanes in LANES
         for density in DENSITIES
         for location in LOCATIONS.values()
-        if not location.training
+        if location.scored
         for pose in approach(location.name, lanes, density, lighting)
+    )
+
+
+@cache
+def closed_loop() -> tuple[Pose, ...]:
+    """Every pose of the road that is driven in closed loop, farthest first under each lighting."""
+    return tuple(
+        Pose(
+            location=location.name,
+            lanes=CLOSED_LOOP_LANES,
+            density=CLOSED_LOOP_DENSITY,
+            lighting=lighting,
+            distance=distance,
+        )
+        for location in LOCATIONS.values()
+        if location.closed_loop
+        for lighting in CLOSED_LOOP_LIGHTINGS
+        for distance in CLOSED_LOOP_DISTANCES
     )
 
 

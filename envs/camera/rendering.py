@@ -6,8 +6,11 @@ Each traced pose is a file, so rendering is resumable.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,8 +20,8 @@ from envs.camera import bank
 from envs.camera.frame import frame
 from envs.camera.poses import Pose
 from envs.camera.street import layout, render
-from envs.camera.street.light import light, lighting
-from envs.camera.street.render import Traced, trace, variant, works
+from envs.camera.street.light import Light, light, lighting
+from envs.camera.street.render import Traced, load, trace, variant, works
 from envs.weather import WEATHERS
 
 VERSION = 2
@@ -35,16 +38,10 @@ def traced(folder: Path, pose: Pose) -> Traced:
     path = path_of(folder, pose)
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        location = layout.LOCATIONS[pose.location]
-        parts = layout.street(
-            location,
-            lanes=pose.lanes,
-            density=pose.density,
-            distance=pose.distance,
-            lights=pose.lighting == "night",
-        )
-        lit = light(pose.lighting, location.sun_azimuth_deg)
-        found = trace(parts, lit, pose.camera, layout.sign_x(pose.lanes), pose.seed)
+        # Where the traffic waits, all poses of a lighting share a scene.
+        shared = layout.LOCATIONS[pose.location].closed_loop and pose.lighting != "night"
+        world, lit = _loaded(replace(pose, distance=layout.DISTANCES[0]) if shared else pose)
+        found = trace(world, lit, pose.camera, layout.sign_x(pose.lanes), pose.seed)
         half = {name: value.astype(np.float16) for name, value in vars(found).items() if name != "crop"}
         with whole(path) as file:
             np.savez(file, crop=np.array(found.crop), **half)
@@ -52,6 +49,21 @@ def traced(folder: Path, pose: Pose) -> Traced:
         single = {name: kept[name].astype(np.float32) for name in kept.files if name != "crop"}
         x0, y0, x1, y1 = (int(edge) for edge in kept["crop"])
     return Traced(crop=(x0, y0, x1, y1), **single)
+
+
+@lru_cache(maxsize=1)
+def _loaded(pose: Pose) -> tuple[Any, Light]:
+    """The scene of a pose and its light."""
+    location = layout.LOCATIONS[pose.location]
+    parts = layout.street(
+        location,
+        lanes=pose.lanes,
+        density=pose.density,
+        distance=pose.distance,
+        lights=pose.lighting == "night",
+    )
+    lit = light(pose.lighting, location.sun_azimuth_deg)
+    return load(parts, lit, pose.camera, layout.sign_x(pose.lanes)), lit
 
 
 def make(poses: Sequence[Pose], *, kept: Path, out: Path, progress: Callable[[float, str], None]) -> list[Path]:

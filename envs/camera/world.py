@@ -32,7 +32,7 @@ class StopSignApproach(CameraWorld):
 
     axes: ClassVar[Axes] = AXES
     grid: ClassVar[str] = APPROACH_V1.name
-    locations: ClassVar[tuple[str, ...]] = tuple(place.name for place in LOCATIONS.values() if not place.training)
+    locations: ClassVar[tuple[str, ...]] = tuple(place.name for place in LOCATIONS.values() if place.scored)
 
     classes: ClassVar[tuple[str, ...]] = NAMES
 

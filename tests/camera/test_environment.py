@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
+from envs.camera.braking import Brakes
 from envs.camera.environment import ApproachEnv
 from tests.camera.scenes import scenes
 
 
 @pytest.fixture(scope="module")
 def env() -> ApproachEnv:
-    return ApproachEnv([scenes(), scenes(lanes=4)])
+    return ApproachEnv([scenes(), scenes(lanes=4)], brakes=Brakes(greatest=8.0, jerk=math.inf))
 
 
 def _driven(env: ApproachEnv, braking: float, after: int = 0) -> list[TensorDict]:

@@ -36,7 +36,7 @@ def test_a_composite_is_equal_to_a_direct_render(lighting: str) -> None:
     parts = layout.street(place, lanes=LANES, density=1.0, distance=9.0, lights=False)
     lit = light("sun" if lighting == "sun" else "overcast", place.sun_azimuth_deg)
     x = layout.sign_x(LANES)
-    traced = render.trace(parts, lit, CAMERA, x, seed=0)
+    traced = render.trace(render.load(parts, lit, CAMERA, x), lit, CAMERA, x, seed=0)
     board = ((torch.arange(8)[:, None] + torch.arange(8)) % 2).float().expand(1, 3, 8, 8)
     faces = sign.painted(board, 0.5)
     x0, y0, x1, y1 = traced.crop
@@ -58,14 +58,13 @@ def test_a_composite_is_equal_to_a_direct_render(lighting: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_render_is_the_same_twice() -> None:
+def test_a_scene_that_was_traced_gives_the_same_picture_again() -> None:
     place = layout.LOCATIONS["sun-beside"]
     small = Camera(y=-20.0, width=96, height=32, focal=55.0)
     parts = layout.street(place, lanes=LANES, density=1.0, distance=20.0, lights=True)
-    first, again = (
-        render.trace(parts, light("night", place.sun_azimuth_deg), small, layout.sign_x(LANES), seed=3)
-        for _ in range(2)
-    )
+    lit, x = light("night", place.sun_azimuth_deg), layout.sign_x(LANES)
+    world = render.load(parts, lit, small, x)
+    first, again = (render.trace(world, lit, small, x, seed=3) for _ in range(2))
     assert np.array_equal(first.black, again.black)
     assert np.array_equal(first.gain, again.gain)
     assert first.gain.max() > 0

@@ -19,7 +19,7 @@ from envs.camera.street import material as m
 from envs.camera.street import occlusion, textures
 from envs.camera.street.material import Material
 from envs.camera.street.mesh import Mesh, Rng, block, foliage, ground, join, quad, rod
-from envs.camera.street.vehicles import LENGTH, PAINTS, Model, Part, vehicle
+from envs.camera.street.vehicles import LENGTH, PAINTS, SHARES, Model, Part, footprint, vehicle
 
 LANE_M = 2.75
 LANES_TO_THE_LEFT = 2
@@ -50,6 +50,8 @@ class Location:
         sun_azimuth_deg: clockwise from the driving direction; at 180 the sun is behind the ego and shines on the sign.
         seed: seed of everything at this place.
         training: whether attacks and defences may use it; scores come from the other places.
+        closed_loop: whether a car drives there in closed loop. Then the traffic obeys the sign: it waits at the line, so a frame
+            depends on the place of the car only.
     """
 
     name: str
@@ -57,6 +59,12 @@ class Location:
     sun_azimuth_deg: float
     seed: int
     training: bool = False
+    closed_loop: bool = False
+
+    @property
+    def scored(self) -> bool:
+        """Whether it is a place of the world `camera` that scores come from."""
+        return not (self.training or self.closed_loop)
 
 
 LOCATIONS: dict[str, Location] = {
@@ -68,6 +76,7 @@ LOCATIONS: dict[str, Location] = {
         Location(name="training-1", surrounding="town", sun_azimuth_deg=150.0, seed=11, training=True),
         Location(name="training-2", surrounding="avenue", sun_azimuth_deg=285.0, seed=12, training=True),
         Location(name="training-3", surrounding="outskirts", sun_azimuth_deg=40.0, seed=13, training=True),
+        Location(name="crossing", surrounding="outskirts", sun_azimuth_deg=215.0, seed=21, closed_loop=True),
     )
 }
 
@@ -128,6 +137,8 @@ def traffic(location: Location, lanes: int, density: float) -> tuple[Placed, ...
 
     In dense traffic with lanes between the ego and the sign, it hides the sign in at least one frame.
     """
+    if location.closed_loop:
+        return _waiting(np.random.default_rng([location.seed, lanes, round(100 * density)]), density)
     least = 1 if lanes > LANES_TO_THE_LEFT + 1 and density > 1 else 0
     for attempt in itertools.count():
         placed = _drawn(np.random.default_rng([location.seed, lanes, round(100 * density), attempt]), lanes, density)
@@ -146,10 +157,25 @@ def _drawn(rng: Rng, lanes: int, density: float) -> tuple[Placed, ...]:
         y = -DISTANCES[0] + (14.0 if side == 0 else 5.0) + rng.uniform(0, 18 / density)
         speed = SPEED_MPS * (rng.uniform(0.0, 0.5) if side > 0 else rng.uniform(0.95, 1.15))
         while y < 90:
-            model = models[int(rng.choice(4, p=(0.35, 0.3, 0.2, 0.15)))]
+            model = models[int(rng.choice(4, p=SHARES))]
             half = LENGTH[model] / 2
             placed.append(Placed(model, x + rng.normal(0, 0.1), y + half, speed, int(rng.integers(len(PAINTS)))))
             y += 2 * half + 6.0 + rng.exponential(30 / density)
+    return tuple(placed)
+
+
+def _waiting(rng: Rng, density: float) -> tuple[Placed, ...]:
+    """Vehicles that stand at the line in the lanes to the left of the ego; its own lane is free."""
+    models = get_args(Model)
+    placed = []
+    for lane in range(LANES_TO_THE_LEFT):
+        front = -rng.uniform(0.5, 1.5)
+        for _ in range(1 + rng.poisson(density)):
+            model = models[int(rng.choice(4, p=SHARES))]
+            rear, ahead, _ = footprint(model)
+            x = LANE_M * (lane - LANES_TO_THE_LEFT) + rng.normal(0, 0.1)
+            placed.append(Placed(model, x, front - ahead, 0.0, int(rng.integers(len(PAINTS)))))
+            front -= ahead - rear + rng.uniform(1.5, 3.0)
     return tuple(placed)
 
 

@@ -87,20 +87,31 @@ def works(name: str) -> bool:
     return subprocess.run([sys.executable, "-c", PROBE, name], capture_output=True, check=False).returncode == 0
 
 
-def trace(parts: list[Part], light: Light, camera: Camera, sign_x: float, seed: int) -> Traced:
-    """Trace a pose.
+def load(parts: list[Part], light: Light, camera: Camera, sign_x: float) -> Any:
+    """Load a scene with a black sign; it depends on the camera only if the headlights are on.
 
     Args:
         parts: everything except the face of the sign.
         light: light of the weather.
         camera: camera of the view.
         sign_x: x of the sign in m.
+    """
+    scene = _scene(parts, light, camera, sign_x)
+    scene["sign"] = _shape("sign", _face(sign_x), {"type": "diffuse", "reflectance": _rgb((0, 0, 0))})
+    return _mitsuba().load_dict(scene)
+
+
+def trace(world: Any, light: Light, camera: Camera, sign_x: float, seed: int) -> Traced:
+    """Trace a pose.
+
+    Args:
+        world: the scene that `load` returns; the same one can be traced from several places.
+        light: light of the weather.
+        camera: camera of the view.
+        sign_x: x of the sign in m.
         seed: seed of the sampler.
     """
     mi = _mitsuba()
-    scene = _scene(parts, light, camera, sign_x)
-    scene["sign"] = _shape("sign", _face(sign_x), {"type": "diffuse", "reflectance": _rgb((0, 0, 0))})
-    world = mi.load_dict(scene)
     path = mi.load_dict({"type": "path", "max_depth": BOUNCES})
     guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal,depth:depth"})
     crop = _crop(camera, sign_x)
@@ -122,6 +133,8 @@ def trace(parts: list[Part], light: Light, camera: Camera, sign_x: float, seed: 
             return seen(path, SIGN_SAMPLES, crop)[..., :3], seen(guides, SIGN_SAMPLES, crop)[..., 0]
 
         (dark, no_albedo), (bright, albedo) = with_sign(0.0), with_sign(1.0)
+        painted["sign.bsdf.reflectance.value"] = 0.0
+        painted.update()
         coverage = np.clip(albedo - no_albedo, 0, 1)
         gain = np.where(coverage[..., None] > 0, np.clip(bright - dark, 0, None), 0).astype(np.float32)
         if light.headlights:

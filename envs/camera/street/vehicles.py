@@ -86,6 +86,14 @@ SHAPES: dict[Model, Shape] = {
     ),
 }
 LENGTH = {model: shape.body[-1][0] - shape.body[0][0] for model, shape in SHAPES.items()}
+SHARES = (0.35, 0.3, 0.2, 0.15)
+"""Shares of the models in traffic, in the order of `Model`."""
+
+
+def footprint(model: Model) -> tuple[float, float, float]:
+    """Rear end, front end and half the width of a vehicle at the origin, in m."""
+    stations = SHAPES[model].body + SHAPES[model].cabin
+    return min(s[0] for s in stations), max(s[0] for s in stations), max(s[3] for s in stations)
 
 
 def vehicle(model: Model, paint: tuple[float, float, float], *, lights: bool = False) -> list[Part]:

@@ -1,0 +1,195 @@
+"""The closed loop: a detector drives a car up to the sign frame by frame, and the car stops or does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from bench.detection import stopping
+from bench.detection.detector import Detections, Detector
+from bench.detection.driver import Memory
+from bench.detection.sight import glance
+
+STANDS_MPS = 1e-3
+"""A slower car stands still."""
+ROUNDING_M = 1e-3
+"""Smaller overruns are rounding errors."""
+MOST_STEPS = 2_000
+"""A drive is cut after this many steps; a car that drives on has left the crossing long before."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The road from above, for films; rectangles are x0, y0, x1, y1 in m, with the line at y = 0 and the car driving towards +y.
+
+    Args:
+        roads: [R, 4].
+        lines: [L, 4], painted lines.
+        sign: x and y of the stop sign.
+        waiting: [W, 4], vehicles that stand at the line.
+        car: length and width of the car, whose front is at its distance to the line.
+    """
+
+    roads: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    lines: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    sign: tuple[float, float] = (0.0, 0.0)
+    waiting: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    car: tuple[float, float] = (4.6, 1.84)
+
+
+class DrivingEnv(EnvBase):
+    """An environment of cars that a detector can drive; `envs.camera.environment.ApproachEnv` says what it shows.
+
+    Args:
+        step_s: time of a step in s.
+        plan: the road from above.
+    """
+
+    step_s: float
+    plan: Plan
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A step of a drive.
+
+    Args:
+        distance_m: from the front of the car to the line; negative beyond it.
+        speed_mps: of the car.
+        frame: number of the frame that was shown.
+        confidence: in the sign at its true place.
+        found: the stop signs that were detected.
+        confirmed: whether the driver has confirmed the sign.
+        asked: deceleration that the driver asks for, in m/s2.
+        others: rectangles [K, N, 4] of the cross traffic in m, in each of its K draws.
+        hit: [K], whether the car has collided.
+    """
+
+    distance_m: float
+    speed_mps: float
+    frame: int
+    confidence: float
+    found: Detections
+    confirmed: bool
+    asked: float
+    others: Array
+    hit: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive of one car, with K draws of the cross traffic.
+
+    Args:
+        moments: its steps.
+        step_s: time between two steps.
+        confirmed_m: distance at which the sign was confirmed; 0 if it never was.
+    """
+
+    moments: tuple[Moment, ...]
+    step_s: float
+    confirmed_m: float
+
+    @property
+    def stands(self) -> bool:
+        """Whether it stood still at the end."""
+        return self.moments[-1].speed_mps <= STANDS_MPS
+
+    @property
+    def overrun_m(self) -> float:
+        """How far beyond the line the car came until it stood still or had left the crossing; 0 if it stopped before the line."""
+        beyond = -self.moments[-1].distance_m
+        return beyond if beyond > ROUNDING_M else 0.0
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it stopped, at most `stopping.RAN_M` beyond the line."""
+        return self.stands and self.overrun_m <= stopping.RAN_M
+
+    @property
+    def collided(self) -> NDArray[np.bool_]:
+        """[K] whether it collided in each draw."""
+        return self.moments[-1].hit
+
+
+@dataclass(frozen=True)
+class Drives:
+    """The drives of one approach, for films.
+
+    Args:
+        shown: the drive that was scored.
+        clean: the same without the patch; None if there is no patch.
+        draw: number of the approach's draw of the cross traffic.
+        plan: the road from above.
+    """
+
+    shown: Drive
+    clean: Drive | None
+    draw: int
+    plan: Plan
+
+
+@torch.no_grad()
+def drive(detector: Detector, env: DrivingEnv) -> Drive:
+    """Let a detector drive the car of an environment of one car (`CameraWorld.environment`) until its episode ends.
+
+    Each new frame is shown to the detector. Its confidence in the sign goes to the driver (`bench.detection.driver`), and the
+    deceleration that the driver asks for goes to the car.
+
+    Raises:
+        UserError: if a prediction is NaN or infinite.
+        ValueError: if the environment has several cars.
+    """
+    (batch,) = env.batch_size
+    if batch != 1:
+        raise ValueError(f"a drive is that of one car, got {batch}")
+    memory, sight, moments = Memory.initial(1), None, []
+    now = env.reset()
+    while len(moments) < MOST_STEPS:
+        info = now["info"]
+        distance, speed, frame = (info[name][:, 0] for name in ("distance", "speed", "frame"))
+        if sight is None or int(frame) != int(memory.frame):
+            sight = glance(detector, now["observation"], info["box"])
+        memory = memory.seeing(torch.from_numpy(sight.confidence), frame, distance)
+        asked, memory = memory.deciding(distance, speed)
+        moments.append(
+            Moment(
+                distance_m=float(distance),
+                speed_mps=float(speed),
+                frame=int(frame),
+                confidence=float(sight.confidence[0]),
+                found=sight.found[0],
+                confirmed=bool(memory.confirmed_m > 0),
+                asked=float(asked),
+                others=_numbers(info["others"]),
+                hit=info["hit"][0].numpy(),
+            )
+        )
+        if bool(now["done"].all()):
+            break
+        now = env.step(now.set("action", env.action_spec.project(asked[:, None])))["next"]
+        memory = memory.after(env.step_s)
+    return Drive(tuple(moments), env.step_s, float(memory.confirmed_m))
+
+
+def _numbers(of_one: Tensor) -> Array:
+    return of_one[0].double().numpy()
+
+
+MEASURED = ("stopped", "drive_confirmed_m", "drive_overrun_m", "collided")
+"""The columns of a drive."""
+
+
+def measured(driven: Drive | None, approaches: int) -> dict[str, NDArray[np.generic]]:
+    """The columns of a drive [A], one row for each approach and its draw of the cross traffic; NaN without a closed loop."""
+    if driven is None:
+        return {name: np.full(approaches, np.nan) for name in MEASURED}
+    values = (driven.stopped, driven.confirmed_m, driven.overrun_m, driven.collided)
+    return {name: np.array(np.broadcast_to(value, approaches)) for name, value in zip(MEASURED, values, strict=True)}

@@ -1,0 +1,142 @@
+"""The crossing as a component: one road with a frame every half metre, on which a detector drives a car in closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from platformdirs import user_cache_path
+from torch import Tensor
+
+from bench.detection import Approach, CameraWorld
+from bench.detection.closed_loop import Plan
+from bench.errors import UserError
+from bench.plugins.contracts import Progress
+from bench.scenarios import Axes, Axis, Cell, Grid
+from envs.camera import bank, poses
+from envs.camera.bank import BankScenes
+from envs.camera.braking import brakes_in
+from envs.camera.environment import CAR_M, ApproachEnv
+from envs.camera.objects import NAMES
+from envs.camera.street import layout
+from envs.camera.street.vehicles import footprint
+from envs.camera.world import StopSignApproach
+from envs.weather import WEATHERS
+
+AXES = Axes(
+    (
+        Axis(
+            name="weather",
+            kind="str",
+            meaning="air, light and the friction of the road",
+            choices=("clear", "rain", "fog"),
+            default="clear",
+        ),
+        Axis(
+            name="speed",
+            kind="float",
+            meaning="speed of the car until it brakes",
+            unit="m/s",
+            low=4.0,
+            high=14.0,
+            default=10.0,
+        ),
+    )
+)
+CROSSING_V1 = Grid(
+    name="crossing-v1",
+    world="crossing",
+    axes=AXES,
+    values={"weather": ("clear", "rain", "fog"), "speed": (8.0, 10.0, 12.0)},
+    episodes=50,
+)
+PLACE = layout.LOCATIONS["crossing"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopSignCrossing(CameraWorld):
+    """A car driven by the detector up to a stop sign, in closed loop: it stops at the line, or crosses a road with traffic.
+
+    Args:
+        bank: folder of the rendered frames; empty for the shipped frames.
+    """
+
+    axes: ClassVar[Axes] = AXES
+    grid: ClassVar[str] = CROSSING_V1.name
+    locations: ClassVar[tuple[str, ...]] = (PLACE.name,)
+    classes: ClassVar[tuple[str, ...]] = NAMES
+
+    bank: str = ""
+
+    def __post_init__(self) -> None:
+        if self.bank and not Path(self.bank).expanduser().is_dir():
+            raise ValueError(f"crossing.bank must be a folder of rendered frames, got {self.bank}")
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the frames."""
+        return Path(self.bank).expanduser() if self.bank else bank.SHIPPED
+
+    def training_scenes(self) -> BankScenes:
+        """Those of the world `camera`."""
+        return StopSignApproach().training_scenes()
+
+    def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
+        """All seeds of a weather have the same frames; they differ in the cross traffic."""
+        scenes = _scenes(self.folder, str(cell.weather))
+        return [Approach(seed=seed, location=PLACE.name, scenes=scenes) for seed in seeds]
+
+    def environment(self, cell: Cell, seeds: Sequence[int], patch: Tensor | None, share: float) -> ApproachEnv:
+        return ApproachEnv(
+            [_scenes(self.folder, str(cell.weather))],
+            None if patch is None else patch.unsqueeze(0),
+            share,
+            speed=float(cell.speed),
+            brakes=brakes_in(WEATHERS[str(cell.weather)]),
+            seeds=seeds,
+            plan=_plan(),
+        )
+
+    def render(self, out: Path | None, progress: Progress) -> list[Path]:
+        """Trace the missing poses, and write the bank.
+
+        Args:
+            out: folder of the bank; None for the shipped bank.
+            progress: called with the share done.
+
+        Raises:
+            UserError: if the renderer is not installed.
+        """
+        from envs.camera import rendering
+
+        kept = user_cache_path("cavbench") / "street"
+        return rendering.make(poses.closed_loop(), kept=kept, out=out or self.folder, progress=progress)
+
+
+@lru_cache(maxsize=4)
+def _scenes(folder: Path, weather: str) -> BankScenes:
+    frames = bank.read(folder, PLACE.name, weather)
+    if not frames:
+        raise UserError(f"no frames of {PLACE.name} in {weather} in {folder}; `bench render` makes them")
+    return BankScenes(frames, [weather] * len(frames))
+
+
+def _plan() -> Plan:
+    """The roads, the line and the waiting vehicles from above."""
+    left, right = layout.LEFT_EDGE, layout.right_edge(poses.CLOSED_LOOP_LANES)
+    (near, far), away = layout.CROSSING, 200.0
+    waiting = []
+    for placed in layout.traffic(PLACE, poses.CLOSED_LOOP_LANES, poses.CLOSED_LOOP_DENSITY):
+        rear, front, half = footprint(placed.model)
+        waiting.append((placed.x - half, placed.y + rear, placed.x + half, placed.y + front))
+    return Plan(
+        roads=np.array([(left, -away, right, away), (-away, near, away, far)]),
+        lines=np.array([(left + 0.3, 0.4, right - 0.3, 0.9)]),
+        sign=(layout.sign_x(poses.CLOSED_LOOP_LANES), 0.0),
+        waiting=np.array(waiting),
+        car=CAR_M,
+    )
