@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from torchrl.envs import EnvBase
 
 from bench.detection import stopping
@@ -68,7 +68,7 @@ class Moment:
         found: the stop signs that were detected.
         confirmed: whether the driver has confirmed the sign.
         asked: deceleration that the driver asks for, in m/s2.
-        others: rectangles [K, N, 4] of the cross traffic in m, in each of its K draws.
+        others: rectangles [N, 4] of the cross traffic in m, in the draws that are kept.
         hit: [K], whether the car has collided.
     """
 
@@ -79,7 +79,7 @@ class Moment:
     found: Detections
     confirmed: bool
     asked: float
-    others: Array
+    others: Mapping[int, Array]
     hit: NDArray[np.bool_]
 
 
@@ -137,11 +137,16 @@ class Drives:
 
 
 @torch.no_grad()
-def drive(detector: Detector, env: DrivingEnv) -> Drive:
+def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Drive:
     """Let a detector drive the car of an environment of one car (`CameraWorld.environment`) until its episode ends.
 
     Each new frame is shown to the detector. Its confidence in the sign goes to the driver (`bench.detection.driver`), and the
     deceleration that the driver asks for goes to the car.
+
+    Args:
+        detector: the (defended) victim.
+        env: the environment.
+        draws: numbers of the draws of the cross traffic whose positions are kept.
 
     Raises:
         UserError: if a prediction is NaN or infinite.
@@ -150,8 +155,8 @@ def drive(detector: Detector, env: DrivingEnv) -> Drive:
     (batch,) = env.batch_size
     if batch != 1:
         raise ValueError(f"a drive is that of one car, got {batch}")
-    memory, sight, moments = Memory.initial(1), None, []
-    now = env.reset()
+    memory, sight, now = Memory.initial(1), None, env.reset()
+    moments: list[Moment] = []
     while len(moments) < MOST_STEPS:
         info = now["info"]
         distance, speed, frame = (info[name][:, 0] for name in ("distance", "speed", "frame"))
@@ -168,7 +173,7 @@ def drive(detector: Detector, env: DrivingEnv) -> Drive:
                 found=sight.found[0],
                 confirmed=bool(memory.confirmed_m > 0),
                 asked=float(asked),
-                others=_numbers(info["others"]),
+                others={draw: info["others"][0, draw].double().numpy() for draw in draws},
                 hit=info["hit"][0].numpy(),
             )
         )
@@ -179,10 +184,6 @@ def drive(detector: Detector, env: DrivingEnv) -> Drive:
     return Drive(tuple(moments), env.step_s, float(memory.confirmed_m))
 
 
-def _numbers(of_one: Tensor) -> Array:
-    return of_one[0].double().numpy()
-
-
 MEASURED = ("stopped", "drive_confirmed_m", "drive_overrun_m", "collided")
 """The columns of a drive."""
 
@@ -191,5 +192,9 @@ def measured(driven: Drive | None, approaches: int) -> dict[str, NDArray[np.gene
     """The columns of a drive [A], one row for each approach and its draw of the cross traffic; NaN without a closed loop."""
     if driven is None:
         return {name: np.full(approaches, np.nan) for name in MEASURED}
-    values = (driven.stopped, driven.confirmed_m, driven.overrun_m, driven.collided)
-    return {name: np.array(np.broadcast_to(value, approaches)) for name, value in zip(MEASURED, values, strict=True)}
+    return {
+        "stopped": np.array([driven.stopped] * approaches),
+        "drive_confirmed_m": np.array([driven.confirmed_m] * approaches),
+        "drive_overrun_m": np.array([driven.overrun_m] * approaches),
+        "collided": driven.collided,
+    }

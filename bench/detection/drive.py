@@ -84,13 +84,14 @@ def _driven(
 ) -> tuple[Drive | None, list[Sighting]]:
     """The drive in closed loop, None if the world has none, and the sightings with it and with the drive without the patch."""
     world, share = job.pair.world.component, job.pair.threat.budget
+    assert isinstance(world, CameraWorld)
     env = world.environment(job.cell, job.seeds, texels, share)
     if env is None:
         return None, sightings
-    shown, clean = closed_loop.drive(detector, env), None
-    if sightings and texels is not None and (bare := world.environment(job.cell, job.seeds, None, share)):
-        clean = closed_loop.drive(detector, bare)
     draws = [job.seeds.index(one.approach.seed) for one in sightings]
+    shown, clean = closed_loop.drive(detector, env, draws), None
+    if sightings and texels is not None and (bare := world.environment(job.cell, job.seeds, None, share)):
+        clean = closed_loop.drive(detector, bare, draws)
     return shown, [
         replace(one, drives=Drives(shown, clean, draw, env.plan)) for one, draw in zip(sightings, draws, strict=True)
     ]

@@ -46,6 +46,7 @@ FIGURES = {
     "victim_yolov5.png": "detectors:yolov5",
     "world_highway.svg": "highway:world",
     "world_camera.png": "camera:world",
+    "world_crossing.png": "crossing:world",
     "decoys.png": "camera:decoys",
     "leaderboard.svg": "leaderboard:standard",
 }

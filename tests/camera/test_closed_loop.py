@@ -26,11 +26,11 @@ AT_ONCE = Brakes(jerk=math.inf)
 SEEN = st.lists(st.booleans(), min_size=len(DISTANCES), max_size=len(DISTANCES))
 
 
-def driven(seen: list[bool], **options: object) -> Drive:
+def driven(seen: list[bool], speed: float = stopping.SPEED_MPS, brakes: Brakes = Brakes()) -> Drive:  # noqa: B008
     """The drive of a car whose detector sees the sign in these frames only."""
     scenes = RedScenes(DISTANCES)
     scenes.red = torch.tensor(seen).float()
-    return drive(RedDetector(), ApproachEnv([scenes], **options))
+    return drive(RedDetector(), ApproachEnv([scenes], speed=speed, brakes=brakes))
 
 
 @settings(deadline=None, max_examples=10)

@@ -167,7 +167,8 @@ def _enlarged(pixels: Picture, true: Tensor) -> Picture:
     side = max(x1 - x0, y1 - y0, 1.0) * (1 + MARGIN)
     scale = INSET / side
     matrix = np.array([[scale, 0, INSET / 2 - scale * (x0 + x1) / 2], [0, scale, INSET / 2 - scale * (y0 + y1) / 2]])
-    return cv2.warpAffine(pixels, matrix, (INSET, INSET), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    near = cv2.warpAffine(pixels, matrix, (INSET, INSET), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return near.astype(np.uint8)
 
 
 def _said(moment: Moment) -> str:

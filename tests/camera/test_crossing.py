@@ -1,0 +1,145 @@
+"""The world `crossing` with its shipped frames: from the patch to the collision, as records and as a film."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from bench.detection import Detector, DetectorVictim, PatchThreat, Predictions
+from bench.detection.closed_loop import measured
+from bench.detection.drive import drive
+from bench.detection.patch import Patch
+from bench.plugins.contracts import Facts
+from bench.plugins.pair import Chosen, Pair, choose
+from bench.plugins.track import Driven, Job, track
+from bench.recording.film import save
+from bench.recording.film.drawing import BLUE, VERMILLION
+from envs.camera.crossing import AXES, CROSSING_V1, StopSignCrossing
+from envs.camera.street import layout
+
+WORLD = StopSignCrossing()
+GREY = torch.full((3, 8, 8), 0.3)
+SEEDS = range(1_000_000, 1_000_040)
+
+
+class RedPlate(Detector):
+    """Finds what is red to the right of the lane: the vehicles with their red lamps wait on its left."""
+
+    names = ("stop sign",)
+    stride = 1
+
+    def predict(self, pictures: Tensor) -> Predictions:
+        boxes, found = [], []
+        for picture in pictures:
+            red, others = picture[0], picture[1:].amax(0)
+            rows, columns = torch.where((red > 0.3) & (red > 1.8 * others))
+            inside = columns > picture.shape[2] / 2
+            rows, columns = rows[inside].float(), columns[inside].float()
+            found.append(float(len(rows) > 50))
+            ends = torch.tensor([0.02, 0.98])
+            corners = [columns.quantile(ends), rows.quantile(ends)] if len(rows) else [ends, ends]
+            boxes.append(torch.stack(corners, 1).flatten())
+        shape = (len(pictures), 1)
+        return Predictions(torch.stack(boxes)[:, None], torch.tensor(found).view(shape), torch.ones(*shape, 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RedPlateVictim(DetectorVictim):
+    """The victim of `RedPlate`."""
+
+    def load(self, seed: int, facts: Facts) -> Detector:
+        return RedPlate().eval()
+
+
+def job(speed: float = 10.0) -> Job:
+    pair = Pair(
+        attack=choose("attack", "grey_patch"),
+        defense=choose("defense", "none"),
+        victim=Chosen(kind="victim", name="red_plate", component=RedPlateVictim(), code="test"),
+        world=choose("world", "crossing"),
+        threat=PatchThreat(budget=1.0),
+    )
+    return Job(pair=pair, training_seed=0, attack_seed=0, cell=AXES.cell(weather="clear", speed=speed), seeds=SEEDS)
+
+
+@pytest.fixture(scope="module")
+def attacked() -> Driven:
+    """A grey patch as large as the sign."""
+    return drive(job(), Patch(texels=GREY).written(""), SEEDS[:1])
+
+
+@pytest.fixture(scope="module")
+def clean() -> Driven:
+    return drive(job(), None, ())
+
+
+def test_every_frame_of_the_road_ships_and_neighbours_are_half_a_metre_apart() -> None:
+    for weather in CROSSING_V1.values["weather"]:
+        first, second = WORLD.approaches(AXES.cell(weather=weather, speed=10.0), range(2))
+        assert first.scenes is second.scenes
+        assert float(first.scenes.distance.diff().abs().max()) <= 0.5
+        assert float(first.scenes.distance.max()) == 30.0
+        assert float(first.scenes.visible.min()) > 0.9
+
+
+def test_the_traffic_obeys_the_sign_and_leaves_the_lane_of_the_car_free() -> None:
+    for placed in layout.traffic(layout.LOCATIONS["crossing"], 3, 1.0):
+        assert placed.speed == 0
+        assert placed.x < -layout.LANE_M / 2 - 0.5
+        assert placed.later(10.0) == placed.y < 0
+
+
+def test_frames_of_a_standing_street_grow_smoothly() -> None:
+    """From one frame to the next the sign grows as the projection says, and the picture changes little."""
+    scenes = WORLD.approaches(AXES.cell(weather="clear", speed=10.0), range(1))[0].scenes
+    width = (scenes.boxes[:, 2] - scenes.boxes[:, 0]) * scenes.distance
+    torch.testing.assert_close(width, torch.full_like(width, float(width[0])), rtol=0.01, atol=0)
+    pictures = scenes.render(torch.arange(0, 4), None, 0.5)
+    assert float((pictures[1:] - pictures[:-1]).abs().mean()) < 0.05
+
+
+def test_a_patch_sends_the_car_into_the_cross_traffic_and_without_it_the_car_stops(
+    attacked: Driven, clean: Driven
+) -> None:
+    assert clean.columns["stopped"].all()
+    assert not clean.columns["collided"].any()
+    assert (clean.columns["drive_confirmed_m"] > 25).all()
+    assert not attacked.columns["stopped"].any()
+    assert 0 < attacked.columns["collided"].mean() < 1
+    assert (attacked.columns["drive_overrun_m"] > layout.CROSSING[1]).all()
+    assert (attacked.columns["confidence_mean"] < clean.columns["confidence_mean"]).all()
+
+
+def test_the_closed_loop_confirms_where_the_open_loop_does(attacked: Driven, clean: Driven) -> None:
+    for driven in (attacked, clean):
+        np.testing.assert_allclose(driven.columns["drive_confirmed_m"], driven.columns["confirmed_m"], atol=1e-3)
+
+
+def test_a_world_without_a_closed_loop_has_empty_columns() -> None:
+    assert choose("world", "camera").component.environment(job().cell, SEEDS, None, 0.5) is None
+    assert all(np.isnan(values).all() for values in measured(None, 2).values())
+
+
+def test_the_film_shows_camera_and_road_side_by_side(attacked: Driven, tmp_path: Path) -> None:
+    film = track("detection").film(job(), attacked.traces[SEEDS[0]], {"victim": "red_plate", "seed": SEEDS[0]})
+    assert film.fps == pytest.approx(20.0)
+    assert len(film) > 60
+    first, second = film.pictures(2)
+    assert first.shape[1] > 1100
+    road = first[:, 770:]
+    assert (road == np.array(VERMILLION)).all(-1).sum() > 300, "the car under the attack"
+    assert (road == np.array(BLUE)).all(-1).sum() > 300, "the car without it"
+    assert not np.array_equal(road, second[:, 770:])
+    save(film, tmp_path / "drive.webp", seconds=(0, 0.5))
+    assert Image.open(tmp_path / "drive.webp").n_frames == 5
+
+
+def test_speeds_outside_of_the_axis_are_refused_in_one_line() -> None:
+    with pytest.raises(ValueError, match="speed must be a number between 4 and 14, got 30"):
+        AXES.cell(weather="clear", speed=30.0)
