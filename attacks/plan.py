@@ -64,6 +64,7 @@ class Plan(DrivingAttack):
     """
 
     access: ClassVar[Access] = "dynamics"
+    joint: ClassVar[bool] = True
 
     horizon: Positive = 3.0
     replan: Count = 2
@@ -77,7 +78,7 @@ class Plan(DrivingAttack):
     draw: Natural = 0
 
     def initial(self, observation: Tensor, oracle: Oracle) -> State:
-        state = oracle.dynamics.unknown(len(observation))
+        state = oracle.dynamics.unknown()
         state["age"] = torch.zeros(len(observation), dtype=torch.int64)
         if oracle.action_type == "discrete":
             state["worth"] = torch.ones(len(observation), oracle.dynamics.actions)
