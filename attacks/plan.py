@@ -79,10 +79,10 @@ class Plan(DrivingAttack):
 
     def initial(self, observation: Tensor, oracle: Oracle) -> State:
         state = oracle.dynamics.unknown()
-        state["age"] = torch.zeros(len(observation), dtype=torch.int64)
+        state["age"] = torch.zeros(len(state), dtype=torch.int64)
         if oracle.action_type == "discrete":
-            state["worth"] = torch.ones(len(observation), oracle.dynamics.actions)
-            state["danger"] = torch.zeros(len(observation), dtype=torch.bool)
+            state["worth"] = torch.ones(len(state), oracle.dynamics.actions)
+            state["danger"] = torch.zeros(len(state), dtype=torch.bool)
         return state
 
     def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor, State]:
