@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
+import pkgutil
 import subprocess
 import sys
 import traceback
@@ -17,6 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+import bench
 from bench.cli import main as cli
 from tests.framework.conftest import Said, ran, started
 from tests.soak.bad_inputs import bad_inputs
@@ -82,6 +85,9 @@ def bad_input(site: Path, place: Path) -> str:
 
     They run in copies of one process that has imported everything; every twentieth also in a new one, which must say the same.
     """
+    for module in pkgutil.walk_packages(bench.__path__, "bench."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
     wrong, other = [], 0
     for number, argv in enumerate(bad_inputs(BAD_INPUTS, seed=0, folder=place)):
         said = _in_a_copy(argv)
