@@ -37,6 +37,7 @@ class CameraSuite(Suite):
             "cells": self.every_cell,
             "approaches": self.approaches,
             "determinism": self.same_seed_same_approach,
+            "closed loop": self.closed_loop,
         }
 
     def places(self) -> None:
@@ -150,6 +151,23 @@ class CameraSuite(Suite):
             for _ in range(2)
         )
         require(torch.equal(first, second), "the same seed gives two different images")
+
+    def closed_loop(self) -> None:
+        """Its environment has one car, shows the frame that it names, and draws cross traffic for each seed."""
+        cell, seeds = first_cell(self.component), range(SeedBlock.REPORT, SeedBlock.REPORT + 2)
+        env = self.component.environment(cell, seeds, None, SHARE)
+        if env is None:
+            raise NotApplicableError("it has no environment: detectors do not drive in it")
+        require(tuple(env.batch_size) == (1,), f"its environment has {list(env.batch_size)} cars, not one")
+        now = env.reset()
+        missing = {"distance", "speed", "frame", "box", "others", "hit"} - set(now["info"].keys())
+        require(not missing, f"the info of its environment lacks {', '.join(sorted(missing))}")
+        require(tuple(now["info", "hit"].shape) == (1, len(seeds)), "info.hit must have one value for each seed")
+        scenes, frame = self.component.approaches(cell, seeds[:1])[0].scenes, now["info", "frame"][0]
+        require(
+            torch.allclose(now["observation"], scenes.render(frame, None, SHARE), atol=1e-5),
+            "the first image of its environment is not the frame that it names",
+        )
 
     def _check_scenes(self, scenes: Scenes) -> None:
         count = len(scenes)
