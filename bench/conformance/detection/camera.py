@@ -152,12 +152,12 @@ class CameraSuite(Suite):
         )
         require(torch.equal(first, second), "the same seed gives two different images")
 
-    def closed_loop(self) -> None:
+    def closed_loop(self) -> str:
         """Its environment has one car, shows the frame that it names, and draws cross traffic for each seed."""
         cell, seeds = first_cell(self.component), range(SeedBlock.REPORT, SeedBlock.REPORT + 2)
         env = self.component.environment(cell, seeds, None, SHARE)
         if env is None:
-            raise NotApplicableError("it has no environment: detectors do not drive in it")
+            return "none"
         require(tuple(env.batch_size) == (1,), f"its environment has {list(env.batch_size)} cars, not one")
         now = env.reset()
         missing = {"distance", "speed", "frame", "box", "others", "hit"} - set(now["info"].keys())
@@ -168,6 +168,7 @@ class CameraSuite(Suite):
             torch.allclose(now["observation"], scenes.render(frame, None, SHARE), atol=1e-5),
             "the first image of its environment is not the frame that it names",
         )
+        return "one car"
 
     def _check_scenes(self, scenes: Scenes) -> None:
         count = len(scenes)
