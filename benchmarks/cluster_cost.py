@@ -38,8 +38,8 @@ SCENARIOS, BLOCKS = 10, 3
 DENSITY_2 = 1.5
 """A unit at density 2 takes so much longer: an assumption, not a measurement."""
 VICTIMS, TRAINING_SEEDS, ROADS_AND_WEATHERS = 14, 10, 9
-ALONE = ("plan", "pessimist")
-"""Members that are not driven in batches."""
+ALONE = ("pessimist",)
+"""The members that are not driven in batches."""
 DRIVER_MS = 1.0 + 0.1 + 0.3
 """What a unit costs the driver with Ray: the task, its outcome, its records (`benchmarks/executor_speed.py`)."""
 WORKER_MS = 5.0
