@@ -25,7 +25,7 @@ AXES_OF_V1 = (
 )
 CELL_OF_V1 = "to_json({'lanes': lanes, 'density': density, 'weather': weather})::varchar"
 
-SQL = {FLOAT: "double", INT: "bigint", TEXT: "varchar"}
+SQL = {FLOAT: "double", INT: "bigint", TEXT: "varchar", pa.bool_(): "boolean"}
 """The types of probes in SQL."""
 ADDED = {"threat_share": "1.0::double"}
 """Identity columns that records of version 2 got later, with the value of records without them."""
