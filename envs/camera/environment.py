@@ -17,7 +17,7 @@ from envs.camera.cross_traffic import CrossTraffic, overlap
 from envs.camera.street.layout import CROSSING
 
 TICK_S = 0.01
-"""Longest time between two positions that are tested for a collision."""
+"""Time between two positions that are tested for a collision, rounded so that a step has a whole number of them."""
 CAR_M = (4.6, 1.84)
 """Length and width of the car; its front is at the camera."""
 CLEARED_M = -(CROSSING[1] + CAR_M[0])
