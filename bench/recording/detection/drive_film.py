@@ -104,7 +104,8 @@ class DriveFilm(Film):
         box(view, INSET / 2, INSET / 2, (INSET / 2, INSET / 2), COLOURS[name], 2)
         nearest = float(self.scenes.distance.min())
         if moment.distance_m < nearest - 0.5:
-            write(view, f"the last image, {nearest:.0f} m before the sign", width - 10, 14, colour=BLACK, align="right")
+            said = f"the last image, {nearest:.0f} m before the sign"
+            write(view, said, width - 10, height - 14, colour=BLACK, align="right")
 
     def _rendered(self, name: str, frame: int) -> Picture:
         texels = self.sighting.texels if name == "with_patch" else None
@@ -178,4 +179,6 @@ def _said(moment: Moment) -> str:
 
 
 def _at(moment: Moment) -> str:
+    if abs(moment.distance_m) < 0.05:
+        return "at the line"
     return f"{abs(moment.distance_m):.1f} m {'before' if moment.distance_m >= 0 else 'beyond'} the line"
