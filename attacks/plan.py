@@ -64,6 +64,7 @@ class Plan(DrivingAttack):
     """
 
     access: ClassVar[Access] = "dynamics"
+    joint: ClassVar[bool] = True
 
     horizon: Positive = 3.0
     replan: Count = 2
@@ -77,11 +78,11 @@ class Plan(DrivingAttack):
     draw: Natural = 0
 
     def initial(self, observation: Tensor, oracle: Oracle) -> State:
-        state = oracle.dynamics.unknown(len(observation))
-        state["age"] = torch.zeros(len(observation), dtype=torch.int64)
+        state = oracle.dynamics.unknown()
+        state["age"] = torch.zeros(len(state), dtype=torch.int64)
         if oracle.action_type == "discrete":
-            state["worth"] = torch.ones(len(observation), oracle.dynamics.actions)
-            state["danger"] = torch.zeros(len(observation), dtype=torch.bool)
+            state["worth"] = torch.ones(len(state), oracle.dynamics.actions)
+            state["danger"] = torch.zeros(len(state), dtype=torch.bool)
         return state
 
     def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor, State]:

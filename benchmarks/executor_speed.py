@@ -18,7 +18,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
@@ -39,7 +39,7 @@ from bench.run.work import Outcome, Task, attempt
 from bench.run.worker import Limits
 from bench.victims.drivers.reference import Blind
 
-PAIR = ("attack=noise", "defense=none", "victim=dqn", "lanes=3,4", "density=1", "weather=clear,fog", "seeds=0,1")
+PAIR = ("defense=none", "victim=dqn", "lanes=3,4", "density=1", "weather=clear,fog", "seeds=0,1")
 QUIET = ("record=0", "reference=false")
 
 
@@ -96,7 +96,7 @@ def of_records() -> None:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         words = [word for word in PAIR if not word.startswith(("lanes", "weather", "seeds"))]
-        more = ("lanes=3", "weather=clear", "seeds=0", "episodes=100", "executor=serial", *QUIET)
+        more = ("attack=noise", "lanes=3", "weather=clear", "seeds=0", "episodes=100", "executor=serial", *QUIET)
         units = runner.run(run_config([*words, *more, f"out={out}"]), Silent())
         records = reading.read(out, units[:1], track=track("driving"))
         sent = pickle.dumps(Outcome(wall_s=1.0, records=records), pickle.HIGHEST_PROTOCOL)
@@ -117,13 +117,13 @@ def _renamed(records: pa.Table, number: int) -> pa.Table:
     return records.set_column(place, records.schema.field("unit"), column)
 
 
-def pair_seconds(name: str, episodes: int) -> tuple[float, float, float]:
+def pair_seconds(name: str, attack: str, episodes: int) -> tuple[float, float, float]:
     """Wall time and CPU time of one pair, with the start of the workers, and the megabytes of the largest child.
 
     The CPU time is that of this process and all its descendants, Ray's own included, as far as they were seen alive.
     """
     with tempfile.TemporaryDirectory() as folder:
-        words: Sequence[str] = [*PAIR, *QUIET, f"episodes={episodes}", f"executor={name}", f"out={folder}"]
+        words = [f"attack={attack}", *PAIR, *QUIET, f"episodes={episodes}", f"executor={name}", f"out={folder}"]
         largest = 0.0
         used: dict[tuple[int, float], float] = {}
 
@@ -147,6 +147,7 @@ def main() -> None:
     """Measure, and print."""
     parser = argparse.ArgumentParser(description="Measure the back ends of `bench run`.")
     parser.add_argument("--tasks", type=int, default=2000, help="tasks that do nothing")
+    parser.add_argument("--attack", default="noise", help="attack of the pair; a longer pair hides the start of Ray")
     parser.add_argument("--episodes", type=int, default=100, help="episodes of a unit of the pair")
     parser.add_argument(
         "--rounds", type=int, default=3, help="runs of the pair with each back end, in turns; 0 for none"
@@ -161,7 +162,10 @@ def main() -> None:
     framework, task = Snapshot(), nothing()
     print(f"a worker takes {milliseconds(lambda: attempt(task, lambda *news: None, framework), 100):.1f} ms a task")
     of_records()
-    rounds = [{name: pair_seconds(name, arguments.episodes) for name in names} for _ in range(arguments.rounds)]
+    rounds = [
+        {name: pair_seconds(name, arguments.attack, arguments.episodes) for name in names}
+        for _ in range(arguments.rounds)
+    ]
     for name in names if rounds else ():
         wall, cpu, memory = (statistics.median(one[name][at] for one in rounds) for at in range(3))
         print(f"{name}: {wall:.1f} s for the pair, {cpu:.1f} s of CPU time, {memory:.0f} MB the largest worker")

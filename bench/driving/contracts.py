@@ -84,10 +84,14 @@ class DrivingWorld(World):
                 actions are repeated. Reward and progress are summed over the frames; an episode may end between them.
         """
 
-    def dynamics(self, cell: Cell, action_type: ActionType) -> Dynamics | None:
-        """The rules of motion on a cell's roads, for attacks with access `dynamics`; None if the world does not offer them.
+    def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics | None:
+        """The rules of motion, for attacks with access `dynamics`; None if the world does not offer them.
 
-        They must not depend on an episode.
+        They must not depend on the hidden state of an episode.
+
+        Args:
+            cells: the cell of each episode of the batch.
+            action_type: kind of the actions in a plan.
         """
         return None
 

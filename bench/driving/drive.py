@@ -35,14 +35,7 @@ def drive(job: Job, traced: Sequence[int]) -> Driven:
 
 def joint(pair: Pair) -> bool:
     """Whether `drive_jointly` can drive several jobs of a pair in one batch."""
-    attack = pair.attack.component
-    if pair.is_clean:
-        return True
-    victim = pair.victim.component
-    assert isinstance(victim, DrivingVictim)
-    # A critic has one output: the last bit of such a product of a matrix and a vector depends on the rest of the batch.
-    critic = victim.action_type == "continuous" and attack.access in ("gradients", "dynamics")
-    return bool(vars(type(attack)).get("joint")) and not critic
+    return pair.is_clean or bool(vars(type(pair.attack.component)).get("joint"))
 
 
 def drive_jointly(jobs: Sequence[Job]) -> Sequence[Driven] | None:
@@ -86,8 +79,7 @@ def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
                 [seed for job in jobs for seed in job.seeds],
                 facts=world.facts,
                 attack_seed=[job.attack_seed for job in jobs for _ in job.seeds],
-                # A joint attack has no access to them, because they differ between cells.
-                dynamics=world.dynamics(first.cell, policy.action_type) if len(jobs) == 1 else None,
+                dynamics=world.dynamics(cells, policy.action_type),
                 entropy=first.entropy,
                 trace=trace,
             )

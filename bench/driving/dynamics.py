@@ -27,10 +27,11 @@ class Forecast:
 
 
 class Dynamics(ABC):
-    """A world's rules of motion, for attackers. It is bound to a road and a kind of control, but to no episode.
+    """A world's rules of motion, for attackers. It is bound to the roads of B episodes and a kind of control.
 
-    An attacker keeps a `belief` for each of its episodes, a TensorDict of batch size [B] whose content belongs to the world. It
-    is computed from true observations alone. A belief may be edited: it is the attacker's own.
+    An attacker keeps a `belief` for each of its episodes, a TensorDict of batch size [B] whose content belongs to the world; the
+    road is part of it, so the methods also take the beliefs of some of the episodes. It is computed from true observations alone.
+    A belief may be edited: it is the attacker's own.
 
     Attributes:
         action_type: kind of the actions in a plan.
@@ -43,8 +44,8 @@ class Dynamics(ABC):
     period: float
 
     @abstractmethod
-    def unknown(self, batch: int) -> TensorDict:
-        """The belief about `batch` episodes of which nothing was seen."""
+    def unknown(self) -> TensorDict:
+        """The belief about each episode before anything was seen, batch size [B]."""
 
     @abstractmethod
     def believe(self, observation: Tensor, before: TensorDictBase) -> TensorDict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -145,11 +146,22 @@ def _check_actions(subject: CountedPolicy, observation: Tensor, state: State, fa
 
 
 def _check_rows(subject: CountedPolicy, observation: Tensor, state: State, gradients: bool) -> None:
-    """Raise NotJointError if an answer, or its gradient, depends to the last bit on the size of the batch or the place in it."""
+    """Raise NotJointError if an answer, or its gradient, depends to the last bit on the size of the batch or the place in it.
+
+    So must the value of a continuous victim's critic, if it has one.
+    """
 
     def answers(rows: Tensor) -> list[Tensor]:
         shown, own = observation[rows], rows_of(state, rows)
-        return [subject.aside(shown, own), *([_slope(subject, shown, own)] if gradients else [])]
+        scores = subject.aside(shown, own)
+        if not gradients:
+            return [scores]
+        found = [scores, _slope(subject, shown, own)]
+        if subject.action_type == "continuous":
+            with suppress(NotImplementedError), Stream("aside").in_use():
+                value, slope = subject.valued(shown, scores, own)
+                found += [value] if slope is None else [value, slope]
+        return found
 
     order = torch.arange(len(observation))
     whole = answers(order)

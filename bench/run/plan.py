@@ -1,7 +1,8 @@
-"""Splits a run into units of work: each pair, its clean control and its baselines, on every cell of the grid."""
+"""Splits a run into units of work: each pair, its clean control and its baselines, on every cell and block of seeds."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -52,9 +53,9 @@ def units_of(config: RunConfig, weights: Weights) -> list[Unit]:
     own, shards = config.shard
     for pair in _pairs(config):
         for training_seed in _training_seeds(pair, config):
-            cells = cells_of(pair, config)
-            mine = [cell for number, cell in enumerate(cells, place) if number % shards == own - 1]
-            place += len(cells)
+            parts = list(itertools.product(config.grid.blocks(), cells_of(pair, config)))
+            mine = [part for number, part in enumerate(parts, place) if number % shards == own - 1]
+            place += len(parts)
             loaded = weights.get(key_of(Loading(pair=pair, training_seed=training_seed)))
             if loaded is None:
                 continue
@@ -68,7 +69,7 @@ def units_of(config: RunConfig, weights: Weights) -> list[Unit]:
                 sequential=config.grid.name == SEQUENTIAL,
                 device=config.device,
             )
-            units += [replace(first, cell=cell) for cell in mine]
+            units += [replace(first, cell=cell, seeds=seeds) for seeds, cell in mine]
     return units
 
 

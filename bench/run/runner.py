@@ -242,6 +242,9 @@ def _recorded(config: RunConfig, units: Iterable[Unit]) -> dict[str, Sequence[in
 
 
 def _longest_first(unit: Unit) -> tuple[object, ...]:
-    """Sort key: attacked units first, then those with the highest values on their axes, so that no long unit comes last."""
+    """Sort key: block after block; in each, attacked units first, then those with the highest values on their axes.
+
+    So no long unit comes last, and a run that ends early has complete blocks.
+    """
     numbers = [-value for value in unit.cell.values() if not isinstance(value, str)]
-    return (unit.pair.is_clean, *reversed(numbers))
+    return (unit.seeds.start, unit.pair.is_clean, *reversed(numbers))

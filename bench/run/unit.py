@@ -206,7 +206,7 @@ class Unit(Work):
 
     @property
     def grid(self) -> str:
-        """Name of the grid of its world with this cell and these seeds; `audit` for drawn seeds, `custom` for others.
+        """Name of the grid of its world with this cell and this block of seeds; `audit` for drawn seeds, `custom` for others.
 
         `sequential` for those of a round.
         """
@@ -215,7 +215,9 @@ class Unit(Work):
         if self.seeds.start >= SeedBlock.AUDIT:
             return AUDIT
         grids = registry.grids(self.pair.world.name)
-        return next((grid.name for grid in grids if self.cell in grid.cells() and self.seeds == grid.seeds()), "custom")
+        return next(
+            (grid.name for grid in grids if self.cell in grid.cells() and self.seeds in grid.blocks()), "custom"
+        )
 
     def constants(self, wall_s: float) -> dict[str, object]:
         """The columns that all records of the unit share: IDENTITY (without `seed`) and PROVENANCE of `bench.records.schema`.

@@ -36,6 +36,8 @@ class Grid:
         episodes: scenario seeds per cell.
         training_seeds: number of training (or patch) seeds that a run drives if it is not told which.
         first_seed: first scenario seed.
+        block: scenario seeds in a unit of work; 0 for all. A run drives the first block of every cell before the second of any:
+            one that ends early has complete blocks.
 
     Raises:
         ValueError: in one line, if a value is missing or not allowed.
@@ -48,12 +50,15 @@ class Grid:
     episodes: int
     training_seeds: int = 3
     first_seed: int = SeedBlock.REPORT
+    block: int = 0
 
     def __post_init__(self) -> None:
         if not 1 <= self.episodes <= MOST_EPISODES:
             raise ValueError(f"episodes must be between 1 and {MOST_EPISODES}, got {self.episodes}")
         if self.training_seeds < 1:
             raise ValueError(f"training_seeds must be at least 1, got {self.training_seeds}")
+        if self.block < 0:
+            raise ValueError(f"block must be at least 0 (0: all episodes), got {self.block}")
         for name in self.axes:
             if not self.values.get(name):
                 raise ValueError(f"a grid needs at least one value for {name}")
@@ -69,9 +74,20 @@ class Grid:
         """The scenario seeds of every cell."""
         return range(self.first_seed, self.first_seed + self.episodes)
 
+    def blocks(self) -> tuple[range, ...]:
+        """The scenario seeds of every cell, in parts of `block`."""
+        seeds, size = self.seeds(), self.block or self.episodes
+        return tuple(seeds[start : start + size] for start in range(0, len(seeds), size))
+
     def with_(self, *, episodes: int | None = None, **values: Sequence[Value]) -> Grid:
-        """The grid with other values or another number of episodes; if anything changes, its name becomes `custom`."""
+        """The grid with other values or another number of episodes.
+
+        It keeps its name if it has the same cells and whole blocks of the same episodes; otherwise its name becomes `custom`. Any
+        other number of episodes is one block.
+        """
         wanted = self.episodes if episodes is None else episodes
         changed = replace(self, values={**self.values, **values}, episodes=wanted)
-        same = changed.episodes == self.episodes and changed.cells() == self.cells()
-        return self if same else replace(changed, name="custom")
+        own, others = self.blocks(), changed.blocks()
+        if others != own[: len(others)]:
+            return replace(changed, name="custom", block=0)
+        return changed if changed.cells() == self.cells() else replace(changed, name="custom")

@@ -73,7 +73,8 @@ class Moment:
 
 def attacked(attack: DrivingAttack, observation: Tensor, trials: int = 1) -> Moment:
     """Attack the undefended `dqn` at one moment [V, F], under the default threat model."""
-    threat, moves = ObservationThreat(access="dynamics"), WORLD.dynamics(AXES.cell(lanes=3, density=1.0), "discrete")
+    threat = ObservationThreat(access="dynamics")
+    moves = WORLD.dynamics([AXES.cell(lanes=3, density=1.0)] * trials, "discrete")
     attacker = Attacker(attack, CountedPolicy(policy()), threat, FEATURES, seed=0, dynamics=moves)
     asked: list[tuple[Tensor | None, Tensor]] = []
     attacker.enforcer.asked = asked

@@ -222,11 +222,14 @@ def track_batch(
     counts: Integers,
     rows: NDArray[np.float64],
     clipped: NDArray[np.bool_],
-    lanes: int,
-    sensor_range: float,
+    lanes: Integers,
+    sensor_range: Floats,
     parameters: Parameters,
 ) -> None:
-    """Update the beliefs `cars` [B, N] and `counts` [B] from measurements [B, V, 5] in physical units."""
+    """Update the beliefs `cars` [B, N] and `counts` [B] from measurements [B, V, 5] in physical units.
+
+    `lanes` and `sensor_range` [m] are those of each episode [B].
+    """
     size = cars.shape[1]
     before, trial = np.empty_like(cars[0]), np.empty_like(cars[0])
     taken = np.zeros(size, np.bool_)
@@ -238,8 +241,8 @@ def track_batch(
             counts[episode],
             rows[episode],
             clipped[episode],
-            lanes,
-            sensor_range,
+            lanes[episode],
+            sensor_range[episode],
             parameters,
             before,
             trial,

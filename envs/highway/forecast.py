@@ -34,7 +34,7 @@ def roll_batch(
     counts: Integers,
     actions: Integers,
     controls: Floats,
-    lanes: int,
+    lanes: Integers,
     parameters: Parameters,
     failed: Integers,
     crashed: NDArray[np.bool_],
@@ -45,6 +45,7 @@ def roll_batch(
     Args:
         cars: beliefs [B, N], of which the first `counts` [B] are known.
         actions: [B, P, T]; controls: [B, P, T, 2].
+        lanes: of each episode [B].
         failed, crashed, progress: outputs [B, P].
     """
     size = cars.shape[1]
@@ -64,18 +65,18 @@ def roll_batch(
             copy[:count] = near[:count]
             order[:count] = ordered[:count]
             vehicles, sequence, ego = copy[:count], order[:count], copy[0]
-            total, step = 0.0, 0
+            total, step, road = 0.0, 0, lanes[episode]
             while step < actions.shape[2]:
-                apply_action(ego, actions[episode, plan, step], controls[episode, plan, step], True, lanes, parameters)
+                apply_action(ego, actions[episode, plan, step], controls[episode, plan, step], True, road, parameters)
                 for _ in range(parameters.substeps):
-                    act(vehicles, sequence, places[:count], lanes, parameters.ego)
+                    act(vehicles, sequence, places[:count], road, parameters.ego)
                     for number in range(count):
-                        move(vehicles[number], lanes, parameters.dt)
+                        move(vehicles[number], road, parameters.dt)
                     sort_by_position(vehicles, sequence)
                     find_collisions(vehicles, sequence, parameters.dt, corners)
                 if ego.crashed or not is_on_lane(ego, ego.lane, 0.0):
                     break
-                share = PROGRESS_LANE * lane_share(ego, lanes, parameters) + PROGRESS_SPEED * speed_share(
+                share = PROGRESS_LANE * lane_share(ego, road, parameters) + PROGRESS_SPEED * speed_share(
                     ego, parameters
                 )
                 total += share / (PROGRESS_LANE + PROGRESS_SPEED)
@@ -86,27 +87,31 @@ def roll_batch(
 
 
 class HighwayDynamics(Dynamics):
-    """The highway's rules of motion on the roads of one cell.
+    """The highway's rules of motion on the roads of some cells.
 
     Args:
-        config: configuration with the cell; its other values are parameters of the world, which are no secret.
+        config: configuration with the cell of each episode; its other values are parameters of the world, which are no secret.
     """
 
     def __init__(self, config: HighwayConfig) -> None:
         self.config, self.parameters = config, parameters(config)
         self.action_type, self.period = config.action_type, 1 / config.policy_frequency
         self.actions = len(ACTIONS) if config.action_type == "discrete" else 0
-        cell = config.cells[0]
-        self.lanes: int = cell.lanes
-        self.sensor_range = sensor_range_m(WEATHERS[cell.weather])
         features = config.features
         self._half = (np.array(features.high) - np.array(features.low)) / 2
         self._centre = (np.array(features.high) + np.array(features.low)) / 2
 
-    def unknown(self, batch: int) -> TensorDict:
-        size = self.config.vehicles + 1
-        fields = {name: torch.zeros(batch, size, dtype=torch.float64) for name in FIELDS}
-        return TensorDict({**fields, "count": torch.zeros(batch, dtype=torch.int64)}, batch_size=[batch])
+    def unknown(self) -> TensorDict:
+        cells = self.config.cells
+        ranges = [sensor_range_m(WEATHERS[cell.weather]) for cell in cells]
+        road = {
+            "lanes": torch.tensor([cell.lanes for cell in cells]),
+            "sensor_range": torch.tensor(ranges, dtype=torch.float64),
+        }
+        size = (len(cells), self.config.vehicles + 1)
+        fields = {name: torch.zeros(size, dtype=torch.float64) for name in FIELDS}
+        count = torch.zeros(len(cells), dtype=torch.int64)
+        return TensorDict({**fields, **road, "count": count}, batch_size=[len(cells)])
 
     def believe(self, observation: Tensor, before: TensorDictBase) -> TensorDict:
         cars, counts = self._records(before)
@@ -114,8 +119,11 @@ class HighwayDynamics(Dynamics):
         rows = normalised.copy()
         rows[..., 1:] = normalised[..., 1:] * self._half + self._centre
         clipped = (np.abs(normalised[..., 1:]) >= 1).any(-1)
-        track_batch(cars, counts, rows, clipped, self.lanes, self.sensor_range, self.parameters)
-        return self._belief(cars, counts)
+        lanes, sensor_range = before["lanes"], before["sensor_range"]
+        track_batch(cars, counts, rows, clipped, lanes.numpy(), sensor_range.numpy(), self.parameters)
+        fields = {name: torch.from_numpy(cars[name].astype(np.float64)) for name in FIELDS}
+        road = {"lanes": lanes, "sensor_range": sensor_range}
+        return TensorDict({**fields, **road, "count": torch.from_numpy(counts)}, batch_size=[len(counts)])
 
     def roll(self, belief: TensorDictBase, plans: Tensor) -> Forecast:
         cars, counts = self._records(belief)
@@ -131,12 +139,8 @@ class HighwayDynamics(Dynamics):
             controls = np.ascontiguousarray(physical_controls(given.reshape(-1, 2)).reshape(*shape, 2))
         failed, progress = np.zeros(shape[:2], np.int64), np.zeros(shape[:2], np.float32)
         crashed = np.zeros(shape[:2], np.bool_)
-        roll_batch(cars, counts, actions, controls, self.lanes, self.parameters, failed, crashed, progress)
+        roll_batch(cars, counts, actions, controls, belief["lanes"].numpy(), self.parameters, failed, crashed, progress)
         return Forecast(torch.from_numpy(failed), torch.from_numpy(crashed), torch.from_numpy(progress))
-
-    def _belief(self, cars: NDArray[np.void], counts: Integers) -> TensorDict:
-        fields = {name: torch.from_numpy(cars[name].astype(np.float64)) for name in FIELDS}
-        return TensorDict({**fields, "count": torch.from_numpy(counts)}, batch_size=[len(counts)])
 
     def _records(self, belief: TensorDictBase) -> tuple[NDArray[np.void], Integers]:
         """A belief as records of the engine [B, N], and the number of known cars [B]."""

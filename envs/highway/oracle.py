@@ -41,12 +41,12 @@ class OraclePlanner:
         steps = self.engine.episodes["steps"]
         running = ~(self.engine.episodes["terminated"] | self.engine.episodes["truncated"])
         due = np.flatnonzero((steps % self.held == 0) & running)
-        for lanes in np.unique(self.engine.episodes["lanes"][due]):
-            self._choose(due[self.engine.episodes["lanes"][due] == lanes], int(lanes))
+        if len(due):
+            self._choose(due)
         return self.plan[np.arange(len(steps)), steps % self.held]
 
-    def _choose(self, rows: NDArray[np.int64], lanes: int) -> None:
-        """Choose the plans of the episodes `rows` on roads with these lanes."""
+    def _choose(self, rows: NDArray[np.int64]) -> None:
+        """Choose the plans of the episodes `rows`."""
         steps = self.engine.episodes["steps"][rows]
         turn = (steps // self.held)[:, None] * PLANS + np.arange(PLANS)
         tried = self.library[turn % LIBRARY]
@@ -61,6 +61,7 @@ class OraclePlanner:
         crashed, progress = np.zeros(failed.shape, np.bool_), np.zeros(failed.shape, np.float32)
         counts = np.full(len(rows), cars.shape[1], np.int64)
         controls = np.zeros((*tried.shape, 2))
+        lanes = self.engine.episodes["lanes"][rows].astype(np.int64)
         roll_batch(cars, counts, tried, controls, lanes, self.engine.parameters, failed, crashed, progress)
         worth = progress - np.where(failed < self.length, FAILURE - failed, 0.0)
         self.plan[rows] = tried[np.arange(len(rows)), worth.argmax(1)]

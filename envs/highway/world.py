@@ -120,11 +120,11 @@ class HighwayWorld(DrivingWorld):
             offroad_terminal=self.offroad_terminal,
         )
 
-    def dynamics(self, cell: Cell, action_type: ActionType) -> Dynamics:
+    def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics:
         """See `bench.driving.DrivingWorld.dynamics`; on the compiled engine for both backends."""
         from envs.highway.forecast import HighwayDynamics
 
-        return HighwayDynamics(self.config((cell,), action_type=action_type))
+        return HighwayDynamics(self.config(tuple(cells), action_type=action_type))
 
     def make(
         self,

@@ -33,8 +33,10 @@ def started(batch: int, action_type: ActionType = "discrete") -> tuple[BatchedHi
     return env, env.reset(TensorDict({"seed": torch.arange(3_000_000, 3_000_000 + batch)}, [batch]))["observation"]
 
 
-def attacker(policy: Policy, attack: Plan | None = None, threat: ObservationThreat = THREAT) -> Attacker:
-    dynamics = WORLD.dynamics(CELL, policy.action_type)
+def attacker(
+    policy: Policy, attack: Plan | None = None, threat: ObservationThreat = THREAT, episodes: int = 3
+) -> Attacker:
+    dynamics = WORLD.dynamics([CELL] * episodes, policy.action_type)
     return Attacker(
         attack or Plan(horizon=1.0), CountedPolicy(policy), threat, WORLD.features, seed=0, dynamics=dynamics
     )
@@ -65,7 +67,7 @@ def test_hidden_state_cannot_reach_it(action_type: ActionType) -> None:
 
 
 def test_it_is_given_nothing_that_belongs_to_an_episode() -> None:
-    dynamics = WORLD.dynamics(CELL, "discrete")
+    dynamics = WORLD.dynamics([CELL] * 2, "discrete")
     env, _ = started(2)
     held = [value for value in vars(dynamics).values() if isinstance(value, np.ndarray)]
     assert not any(np.shares_memory(array, env.engine.vehicles) for array in held)
@@ -85,7 +87,7 @@ def test_access_to_the_dynamics_must_be_declared_and_allowed() -> None:
         THREAT,
         WORLD.features,
         seed=0,
-        dynamics=WORLD.dynamics(CELL, "discrete"),
+        dynamics=WORLD.dynamics([CELL], "discrete"),
     )
     with pytest.raises(UserError, match="used access 'dynamics', but declares only 'gradients'"):
         _ = weaker.enforcer.begin(started(1)[1]).dynamics
@@ -94,8 +96,8 @@ def test_access_to_the_dynamics_must_be_declared_and_allowed() -> None:
 def test_the_belief_follows_the_traffic() -> None:
     """After 60 frames of driving every tracked car in view has its true target lane, and the ego its target speed, too."""
     env, observation = started(6)
-    dynamics = WORLD.dynamics(CELL, "discrete")
-    belief = dynamics.unknown(6)
+    dynamics = WORLD.dynamics([CELL] * 6, "discrete")
+    belief = dynamics.unknown()
     generator = torch.Generator().manual_seed(0)
     for _ in range(60):
         belief = dynamics.believe(observation, belief)
@@ -127,8 +129,8 @@ def test_the_belief_follows_the_traffic() -> None:
 def test_a_forecast_from_the_true_state_is_what_happens() -> None:
     """With nothing hidden a plan ends where the environment ends it: both are the same engine, but for far cars."""
     env, observation = started(40)
-    dynamics = WORLD.dynamics(CELL, "discrete")
-    belief = dynamics.believe(observation, dynamics.unknown(40))
+    dynamics = WORLD.dynamics([CELL] * 40, "discrete")
+    belief = dynamics.believe(observation, dynamics.unknown())
     told = {name: torch.from_numpy(env.engine.vehicles[name].astype(np.float64)) for name in FIELDS}
     belief.update({**told, "count": torch.full((40,), env.engine.vehicles.shape[1])})
     found = dynamics.roll(belief, torch.full((1, 75), FASTER)).failed[:, 0].numpy()
@@ -160,7 +162,7 @@ def test_it_leads_the_victim_into_the_action_that_crashes() -> None:
     observation[0, 0] = torch.tensor([1.0, 1.0, 0.0, 25 / 40, 0.0])
     observation[0, 1] = torch.tensor([1.0, 0.16, 0.0, -10 / 40, 0.0])
     assert int(policy.decide(observation)) == 1
-    at_work = attacker(policy, Plan())
+    at_work = attacker(policy, Plan(), episodes=1)
     shown = at_work.show(observation, torch.ones(1, dtype=torch.bool), None)
     worth = at_work.state["worth"][0]
     assert int(worth.argmin()) != SLOWER
@@ -172,7 +174,7 @@ def test_it_leads_the_victim_into_the_action_that_crashes() -> None:
 def test_it_keeps_to_the_query_budget(queries: int, action_type: ActionType) -> None:
     policy, threat = victim(action_type), ObservationThreat(access="dynamics", queries=queries)
     _, observation = started(2, action_type)
-    shown = attacker(policy, threat=threat).show(observation, torch.ones(2, dtype=torch.bool), None)
+    shown = attacker(policy, threat=threat, episodes=2).show(observation, torch.ones(2, dtype=torch.bool), None)
     assert int(shown.queries.max()) <= queries
 
 
@@ -180,7 +182,7 @@ def test_with_a_gap_it_attacks_only_frames_that_matter() -> None:
     policy = victim("discrete")
     env, observation = started(8)
     everyone = torch.ones(8, dtype=torch.bool)
-    always, choosy, never = (attacker(policy, Plan(horizon=2.0, gap=gap)) for gap in (0.0, 0.1, 1.0))
+    always, choosy, never = (attacker(policy, Plan(horizon=2.0, gap=gap), episodes=8) for gap in (0.0, 0.1, 1.0))
     touched = torch.zeros(3)
     for _ in range(6):
         for number, one in enumerate((always, choosy, never)):

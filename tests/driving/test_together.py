@@ -14,6 +14,7 @@ from torch import Tensor
 
 from attacks.noise import Noise
 from attacks.pgd import PGD
+from attacks.plan import Plan
 from attacks.zo import ZOSignSGD
 from bench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
 from bench.driving.drive import joint
@@ -46,14 +47,16 @@ SEEDS = range(1_000_000, 1_000_007)
 
 def driven(attack: DrivingAttack | None, policy: Policy, units: Sequence[int], share: float = 1.0) -> Columns:
     """The measurements of some of three units."""
+    cells = [CELLS[unit] for unit in units for _ in SEEDS]
     return rollout(
-        HIGHWAY.make([CELLS[unit] for unit in units for _ in SEEDS], action_type=policy.action_type),
+        HIGHWAY.make(cells, action_type=policy.action_type),
         policy,
         attack,
-        ObservationThreat(norm="linf", budget=0.1, share=share),
+        ObservationThreat(norm="linf", budget=0.1, access="dynamics", share=share),
         list(SEEDS) * len(units),
         facts=HIGHWAY.facts,
         attack_seed=[unit for unit in units for _ in SEEDS],
+        dynamics=HIGHWAY.dynamics(cells, policy.action_type),
     )
 
 
@@ -74,6 +77,7 @@ ATTACKS: dict[str, DrivingAttack | None] = {
     "gaussian": Noise(distribution="gaussian"),
     "pgd": PGD(),
     "pgd at a preference gap": PGD(gap=0.3, restarts=2, steps=3),
+    "plan": Plan(steps=4),
     "zo": ZOSignSGD(),
     "zo from a random start": ZOSignSGD(random_start=True, early_stop=False),
     "zo of the thesis": ZOSignSGD(objective="thesis", directions=20),
@@ -87,8 +91,6 @@ def test_units_in_one_batch_have_the_records_that_each_has_alone(name: str, kind
     policy: Policy = QPolicy(5, 5, 128) if kind == "discrete" else ActorPolicy(5, 64, 0.1)
     policy.eval().requires_grad_(False)
     attack = ATTACKS[name]
-    if kind == "continuous" and isinstance(attack, PGD):
-        pytest.skip("asks the critic")
     together = driven(attack, policy, (0, 1, 2), share=0.7)
     alone = [driven(attack, policy, (unit,), share=0.7) for unit in range(3)]
     for column in set(together) - PROBES - {"attack_ms"}:
@@ -134,10 +136,9 @@ def units(attack: str, count: int, victim: str = "dqn", **seeds: Any) -> list[Un
 
 
 def test_alike_units_come_together_and_all_workers_have_enough_to_do() -> None:
-    zo, noise, plan = (units(attack, 6) for attack in ("zo", "noise", "plan"))
-    assert [joint(one[0].pair) for one in (zo, noise, plan)] == [True, True, False]
-    assert [joint(units("pgd", 1, victim)[0].pair) for victim in ("dqn", "ddpg")] == [True, False]
-    works = [unit for three in zip(zo, noise, plan, strict=True) for unit in three]
+    zo, noise, pessimist = (units(attack, 6) for attack in ("zo", "noise", "pessimist"))
+    assert [joint(one[0].pair) for one in (zo, noise, pessimist)] == [True, True, False]
+    works = [unit for three in zip(zo, noise, pessimist, strict=True) for unit in three]
     found = batches(works, (), workers=2)
     assert sorted(map(len, found)) == [1] * 6 + [2] * 6
     assert sorted(map(str, works)) == sorted(str(unit) for batch in found for unit in batch)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 
 from bench.errors import UnfinishedError, UserError
@@ -162,6 +164,26 @@ def test_an_interrupted_run_keeps_finished_units_and_continues(tmp_path: Path) -
     assert comparable(went_on).equals(comparable(whole))
 
 
+def test_a_grid_in_blocks_drives_the_same_episodes_and_the_first_block_of_every_cell_first(tmp_path: Path) -> None:
+    whole = run_config([*SMALL.split(), "executor=serial", f"out={tmp_path / 'whole'}", "record=0"])
+    blocks = replace(whole, grid=replace(whole.grid, block=2), out=tmp_path / "blocks")
+    watcher = Silent()
+    runner.run(blocks, watcher)
+    runner.run(whole, Silent())
+    order = [(name, "ascending") for name in ("pair", "training_seed", "cell", "seed")]
+
+    def clean(out: Path) -> pa.Table:
+        records = reading.read(out, track=track("driving"))
+        return comparable(records).filter(pc.equal(records["attack"], "none")).drop("unit").sort_by(order)
+
+    assert clean(blocks.out).equals(clean(whole.out))
+    starts = [work.seeds.start for work in watcher.done if isinstance(work, Unit)]
+    assert starts == sorted(starts)
+    assert len(set(starts)) == 2
+    shards = [plan(replace(blocks, shard=(part, 3))) for part in (1, 2, 3)]
+    assert sum(map(len, shards)) == len({unit.fingerprint for units in shards for unit in units}) == len(starts)
+
+
 def test_a_failing_attack_is_reported_with_its_cell_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError) as raised:
         run(tmp_path, "attack.mood=raise")
@@ -197,6 +219,12 @@ def test_a_record_names_its_grid_only_if_cell_and_seeds_match() -> None:
     as_few_as_approaches = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=3"]))
     assert {unit.grid for unit in whole} == {"toy-v1"}
     assert {unit.grid for unit in (*short, *other, *as_few_as_approaches)} == {"custom"}
+
+
+def test_a_block_of_a_grid_has_its_name() -> None:
+    words = ["attack=noise", "victim=dqn", "grid=standard-v2", "reference=false", "seeds=0"]
+    assert {unit.grid for unit in plan(run_config([*words, "lanes=3", "episodes=20"]))} == {"standard-v2"}
+    assert {unit.grid for unit in plan(run_config([*words, "lanes=3", "episodes=15"]))} == {"custom"}
 
 
 def test_a_unit_in_which_an_attack_changed_the_victim_is_refused_with_its_package(

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import importlib
+import math
 import os
+import pkgutil
 import subprocess
-from collections.abc import Iterator, Mapping
+import sys
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from tests.framework.conftest import ran, started
+import bench
+from bench.cli import main as cli
+from tests.framework.conftest import Said, ran, started
 from tests.soak.bad_inputs import bad_inputs
 from tests.soak.subjects import RUN, SUBJECTS, Condition
 
 BAD_INPUTS = 1000
+NEW_PROCESS = 20
+"""One in so many bad inputs also runs in a new process."""
 
 
 def full_disk(site: Path, place: Path) -> str:
@@ -71,15 +81,49 @@ def clock_skew(site: Path, place: Path) -> str:
 
 
 def bad_input(site: Path, place: Path) -> str:
-    """Every bad command line ends with one line and a code other than 0."""
-    wrong = []
-    for argv in bad_inputs(BAD_INPUTS, seed=0, folder=place):
-        said = ran(site, *argv)
+    """Every bad command line ends with one line and a code other than 0.
+
+    They run in copies of one process that has imported everything; every twentieth also in a new one, which must say the same.
+    """
+    for module in pkgutil.walk_packages(bench.__path__, "bench."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    wrong, other = [], 0
+    for number, argv in enumerate(bad_inputs(BAD_INPUTS, seed=0, folder=place)):
+        said = _in_a_copy(argv)
         if said.code == 0 or len(said.err.strip().splitlines()) != 1 or "Traceback" in said.err:
             wrong.append(argv)
+        if number % NEW_PROCESS == 0:
+            other += said != ran(site, *argv)
     return (
-        f"{BAD_INPUTS} bad inputs, {len(wrong)} not refused in one line{f', for instance {wrong[0]}' if wrong else ''}"
+        f"{BAD_INPUTS} bad inputs, {len(wrong)} not refused in one line{f', for instance {wrong[0]}' if wrong else ''}; "
+        f"{other} of {math.ceil(BAD_INPUTS / NEW_PROCESS)} that also ran in a new process said something else there"
     )
+
+
+def _in_a_copy(argv: Sequence[str]) -> Said:
+    """Run the command line in a fork of this process."""
+    with TemporaryFile("w+") as out, TemporaryFile("w+") as err:
+        child = os.fork()
+        if not child:
+            code = 1
+            try:
+                os.environ |= {"OMP_NUM_THREADS": "1", "COLUMNS": "160"}
+                os.dup2(out.fileno(), 1)
+                os.dup2(err.fileno(), 2)
+                sys.argv = ["bench", *argv]
+                cli.main()
+            except SystemExit as end:
+                code = int(end.code or 0)
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(code)
+        _, status = os.waitpid(child, 0)
+        texts = [(file.seek(0), file.read())[1] for file in (out, err)]
+        return Said(os.waitstatus_to_exitcode(status), *texts)
 
 
 @contextmanager

@@ -181,7 +181,7 @@ class AttackSuite(Suite):
             self.component.access,
             self.subject.world.features,
             generator,
-            dynamics(self.component, self.subject.world, policy.action_type),
+            dynamics(self.component, self.subject.world, policy.action_type, len(observation)),
         )
         oracle = enforcer.begin(observation)
         try:
@@ -200,9 +200,10 @@ def allowing(attack: DrivingAttack, **values: Any) -> ObservationThreat:
     return threat if threat.allows(attack.access) else replace(threat, access=attack.access)
 
 
-def dynamics(attack: DrivingAttack, world: DrivingWorld, action_type: ActionType) -> Dynamics | None:
-    """The dynamics of the world's first cell, if the attack has access to them."""
-    return world.dynamics(registry.grid(world.grid).cells()[0], action_type) if attack.access == "dynamics" else None
+def dynamics(attack: DrivingAttack, world: DrivingWorld, action_type: ActionType, episodes: int) -> Dynamics | None:
+    """The dynamics of some episodes in the world's first cell, if the attack has access to them."""
+    cells = [registry.grid(world.grid).cells()[0]] * max(1, episodes)
+    return world.dynamics(cells, action_type) if attack.access == "dynamics" else None
 
 
 def _marks(policy: Policy) -> object:

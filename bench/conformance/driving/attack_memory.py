@@ -97,7 +97,7 @@ class AttackMemorySuite(Suite):
         facts = self.subject.world.facts
         policy = victim(action_type, facts).double()
         threat = allowing(self.component)
-        moves = dynamics(self.component, self.subject.world, action_type)
+        moves = dynamics(self.component, self.subject.world, action_type, EPISODES)
         return Attacker(self.component, CountedPolicy(policy), threat, facts.features, seed=seed, dynamics=moves)
 
     def _observations(self, seed: int = 0) -> Tensor:

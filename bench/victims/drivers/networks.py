@@ -52,22 +52,27 @@ FEW = 16
 """A matrix product of fewer rows than this may differ in the last bit from the same rows in a product of many."""
 
 
-def whatever_the_batch(network: nn.Module, observation: Tensor) -> Tensor:
+def whatever_the_batch(network: nn.Module, observation: Tensor, *more: Tensor) -> Tensor:
     """The output [..., A] of a network for observations [..., V, F], to the last bit the same in every batch.
 
     Fewer than `FEW` observations are filled up. Units that are driven together thus have the results that each has alone.
+
+    Args:
+        network: called with all inputs.
+        observation: [..., V, F].
+        more: further inputs, [..., n] each.
     """
     if torch.compiler.is_exporting():
         # An exported program has one graph for every size of the batch.
-        return network(observation)
+        return network(observation, *more)
     leading = observation.shape[:-2]
     missing = FEW - leading.numel()
-    if 0 < missing < FEW:
-        rows = observation.reshape(-1, *observation.shape[-2:])
-        full = torch.cat((rows, rows[:1].expand(missing, *rows.shape[1:])))
-        return whatever_the_batch(network, full)[: len(rows)].reshape(*leading, -1)
-    answer: Tensor = network(observation)
-    return answer
+    if not 0 < missing < FEW:
+        answer: Tensor = network(observation, *more)
+        return answer
+    rows = [one.reshape(leading.numel(), *one.shape[len(leading) :]) for one in (observation, *more)]
+    full = [torch.cat((one, one[:1].expand(missing, *one.shape[1:]))) for one in rows]
+    return whatever_the_batch(network, *full)[: leading.numel()].reshape(*leading, -1)
 
 
 class QPolicy(Policy):
@@ -118,7 +123,12 @@ class Critic(nn.Module):
         self.register_buffer("limit", limit, persistent=False)
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        return self.head(torch.cat((self.encoder(observation), action / self.limit), -1))
+        *hidden, last = self.head
+        found = torch.cat((self.encoder(observation), action / self.limit), -1)
+        for layer in hidden:
+            found = layer(found)
+        # The last bit of a product of a matrix and a vector depends on the number of rows; that of these sums does not.
+        return (found * last.weight[0]).sum(-1, keepdim=True) + last.bias
 
 
 def _head(inputs: int, outputs: int, hidden: int) -> MLP:
@@ -148,4 +158,4 @@ class ActorPolicy(Policy):
         return whatever_the_batch(self.actor, observation)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
-        return self.critic(observation, action).squeeze(-1)
+        return whatever_the_batch(self.critic, observation, action).squeeze(-1)
