@@ -34,7 +34,8 @@ def drawn(name: str) -> tuple[Image, Image]:
     inner = _polygon(outline, chance.uniform(0.75, 0.97)) if outline != "nothing" else cover
     picture[inner > 0] = _ground(chance)
     for _ in range(int(chance.integers(1, 4))):
-        chance.choice([_word, _word, _shape, _bars, _blocks])(picture, chance)
+        painting = (_word, _word, _shape, _bars, _blocks)
+        painting[int(chance.integers(len(painting)))](picture, chance)
     return picture, cover
 
 
