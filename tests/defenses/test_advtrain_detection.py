@@ -176,3 +176,15 @@ def test_the_shipped_detector_withstands_patches_that_hide_the_sign_from_the_und
         left[name] = seen(detector, attack.craft(oracle, scenes, lambda share, text: None))
     assert left["hardened"] > 0.8 > 0.5 > left["undefended"]
     assert seen(hardened, None) > seen(published, None) - 0.05
+
+
+@pytest.mark.slow
+def test_the_shipped_detector_knows_the_sign_from_faces_that_it_never_saw(published: YOLOv3TinyNetwork) -> None:
+    world = StopSignApproach()
+    (approach,) = world.approaches(world.axes.cell(lanes=3, density=1.0, weather="clear"), range(1))
+    hardened = DetectorAdversarialTraining().load(YOLOv3Tiny(), 0, FACTS)
+    with torch.no_grad():
+        of_sign = look(hardened, approach.scenes, None, 0.5).confidence.mean()
+        of_decoys, fooled = (look_at_decoys(one, approach.scenes).confidence for one in (hardened, published))
+    assert of_sign > 0.8
+    assert of_decoys.mean() < min(0.15, fooled.mean())
