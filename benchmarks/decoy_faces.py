@@ -1,6 +1,6 @@
 """Measures what detectors say of decoys: faces that no training sees, which are scored, and the faces of the training scenes.
 
-    python benchmarks/decoy_faces.py [--victims yolov3_tiny] [--skips 0.3 1] [--weathers clear rain] [--lanes 3]
+    python benchmarks/decoy_faces.py [--victims yolov3_tiny] [--skips 0.3] [--weathers clear rain] [--lanes 3]
 
 The places are those that are scored, so both kinds of faces are seen at places that no detector was trained at. The means are
 over the frames of all approaches; the training faces take turns in them as the others do.
@@ -31,7 +31,7 @@ MEASURES = ("decoy_confidence", "octagons", "false_stops", "average_precision")
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--victims", nargs="+", default=["yolov3_tiny"])
-    parser.add_argument("--skips", nargs="*", type=float, default=[0.3, 1.0], help="of `advtrain_detection`")
+    parser.add_argument("--skips", nargs="*", type=float, default=[0.3], help="of `advtrain_detection`")
     parser.add_argument("--weathers", nargs="+", default=["clear", "rain"])
     parser.add_argument("--lanes", nargs="+", type=int, default=[3])
     asked = parser.parse_args()
