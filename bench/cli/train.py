@@ -47,7 +47,15 @@ def train(words: Sequence[str], console: Console) -> None:
         start = time.perf_counter()
         with TrainingProgress(Console(stderr=True), f"{recipe.name}, seed {seed}") as progress:
             made = _trained(config, component, seed, progress)
-        path = zoo.save(made.network, recipe, seed=seed, world=config.world.component, card=made.card, root=config.out)
+        path = zoo.save(
+            made.network,
+            recipe,
+            seed=seed,
+            world=config.world.component,
+            card=made.card,
+            start=made.start,
+            root=config.out,
+        )
         seconds = time.perf_counter() - start
         line = f"{recipe.name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"
         console.print(Text(line), soft_wrap=True)

@@ -67,6 +67,10 @@ class Scenes(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} has no decoys")
 
+    def redrawn(self, number: int) -> Scenes:
+        """The same frames for training with other decoys, those of a number; the same decoys unless a world overrides it."""
+        return self
+
     def windows(
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
     ) -> Tensor:

@@ -248,10 +248,17 @@ class Defense(Component):
 
 @dataclass(frozen=True)
 class Trained(Generic[Network]):
-    """The result of a training: the network, and what its card says about the training."""
+    """The result of a training.
+
+    Args:
+        network: the trained network.
+        card: what its card says about the training.
+        start: the network that the training started from, if `load` has it anyway: the zoo stores only what differs.
+    """
 
     network: Network
     card: Mapping[str, object]
+    start: Network | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

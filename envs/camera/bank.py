@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import asdict
 from functools import cache
 from math import ceil, floor
@@ -16,10 +17,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
 
-from bench.detection import Objects, Scenes
+from bench.detection import Decoy, Objects, Scenes
 from bench.errors import UserError
 from bench.files import whole
-from envs.camera import faces, sign
+from envs.camera import faces, sign, training_faces
 from envs.camera.frame import Frame, noise_level
 from envs.camera.objects import objects
 from envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
@@ -107,6 +108,8 @@ class BankScenes(Scenes):
         weathers: name of the weather of each frame.
     """
 
+    decoys: tuple[Decoy, ...]
+
     def __init__(self, frames: Sequence[tuple[Pose, Frame]], weathers: Sequence[str]) -> None:
         self.poses = tuple(pose for pose, _ in frames)
         self.frames = tuple(frame for _, frame in frames)
@@ -176,6 +179,19 @@ class BankScenes(Scenes):
         down, right = seed % GRAIN_SHIFT, seed // GRAIN_SHIFT % GRAIN_SHIFT
         grain = _grain(height + GRAIN_SHIFT, width + GRAIN_SHIFT)[within(part, (-right, -down, width, height))]
         return picture.add_(grain, alpha=noise_level(WEATHERS[self.weathers[number]])).clamp_(0, 1)
+
+
+class TrainingScenes(BankScenes):
+    """Frames for training, with decoys that are never scored."""
+
+    def __init__(self, frames: Sequence[tuple[Pose, Frame]], weathers: Sequence[str]) -> None:
+        super().__init__(frames, weathers)
+        self.decoys = training_faces.decoys(0, len(self))
+
+    def redrawn(self, number: int) -> TrainingScenes:
+        other = copy(self)
+        other.decoys = training_faces.decoys(number * len(self), len(self))
+        return other
 
 
 @cache

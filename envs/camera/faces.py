@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bench.detection import Decoy
 from bench.detection.colour import linear
-from envs.camera import sign
+from envs.camera import sign, training_faces
 
 DECOYS = (
     Decoy("fifty", octagonal=True),
@@ -51,10 +51,10 @@ class Face:
     cover: Tensor
 
 
-@cache
+@lru_cache(maxsize=16)
 def face(name: str) -> Face:
-    """The face of a decoy of `DECOYS`. Cached: do not modify it."""
-    picture, cover = _DRAWN[name]()
+    """The face of a decoy, of `DECOYS` or for training. Cached: do not modify it."""
+    picture, cover = _DRAWN[name]() if name in _DRAWN else training_faces.drawn(name)
     colour, shape = (
         torch.from_numpy(cv2.resize(part, (sign.TEXELS, sign.TEXELS), interpolation=cv2.INTER_AREA)) / 255
         for part in (picture, cover)

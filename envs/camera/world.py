@@ -15,7 +15,7 @@ from bench.plugins.contracts import Progress
 from bench.scenarios import Axes, Cell
 from envs.camera import bank, poses
 from envs.camera.axes import APPROACH_V1, AXES
-from envs.camera.bank import BankScenes
+from envs.camera.bank import BankScenes, TrainingScenes
 from envs.camera.objects import NAMES
 from envs.camera.street.layout import LOCATIONS
 
@@ -47,7 +47,7 @@ class StopSignApproach(CameraWorld):
         """Folder of the frames."""
         return Path(self.bank).expanduser() if self.bank else bank.SHIPPED
 
-    def training_scenes(self) -> BankScenes:
+    def training_scenes(self) -> TrainingScenes:
         return _training(self.folder)
 
     def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
@@ -88,7 +88,7 @@ def _read(folder: Path, location: str, weather: str) -> list[tuple[poses.Pose, b
 
 
 @lru_cache(maxsize=1)
-def _training(folder: Path) -> BankScenes:
+def _training(folder: Path) -> TrainingScenes:
     """Every view of the training places in the weathers of the standard grid."""
     found, weathers = [], []
     for place in LOCATIONS.values():
@@ -96,4 +96,4 @@ def _training(folder: Path) -> BankScenes:
             frames = bank.read(folder, place.name, weather)
             found += frames
             weathers += [weather] * len(frames)
-    return BankScenes(found, weathers)
+    return TrainingScenes(found, weathers)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import torch
 
-from envs.camera import faces
+from envs.camera import faces, training_faces
 from envs.camera.develop import light_of, tone
 from envs.camera.world import StopSignApproach
 from tests.camera.scenes import scenes
@@ -34,6 +36,29 @@ def test_a_decoy_changes_the_sign_and_nothing_else() -> None:
         assert changed[y0:y1, x0:x1].float().mean() > 0.2, decoy.name
         changed[y0:y1, x0:x1] = False
         assert not changed.any(), decoy.name
+
+
+def test_training_decoys_are_others_than_the_scored_ones_and_most_are_octagons() -> None:
+    scenes = StopSignApproach().training_scenes()
+    decoys = scenes.decoys
+    assert not {one.name for one in (*decoys, *scenes.redrawn(1).decoys)} & {one.name for one in faces.DECOYS}
+    assert not set(decoys) & set(scenes.redrawn(1).decoys)
+    assert scenes.redrawn(0).decoys == decoys
+    assert 0.4 < np.mean([one.octagonal for one in decoys]) < 0.75
+    pictures = [training_faces.drawn(one.name) for one in decoys[:20]]
+    for first, second in combinations(pictures, 2):
+        assert any((a != b).any() for a, b in zip(first, second, strict=True))
+    again, _ = training_faces.drawn(decoys[0].name)
+    assert (again == pictures[0][0]).all()
+
+
+def test_no_training_decoy_is_red_from_rim_to_rim() -> None:
+    """A red octagon with a patch may be a stop sign."""
+    for one in training_faces.decoys(0, 60):
+        picture, cover = training_faces.drawn(one.name)
+        red, green, blue = picture[cover > 0].reshape(-1, 3).T.astype(float)
+        if len(red):
+            assert ((red > 120) & (red > 2 * green) & (red > 2 * blue)).mean() < 0.75, one.name
 
 
 def test_without_a_sign_the_background_is_seen_and_around_a_triangle_too() -> None:

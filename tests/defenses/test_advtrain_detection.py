@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
+from safetensors.torch import load_file
+from torch import Tensor, nn
 
 from attacks.eot import EOT
-from bench.detection import STOP_SIGN, Detector, PatchThreat
+from bench.detection import STOP_SIGN, Detector, DetectorVictim, PatchThreat, Predictions
 from bench.detection.boxes import confidence
 from bench.detection.enforcer import PatchEnforcer
+from bench.detection.sight import look, look_at_decoys
 from bench.errors import UserError
+from bench.plugins.contracts import Facts
 from bench.run.config import component, run_config
 from bench.victims import zoo
 from bench.victims.detectors import yolov5_file
@@ -21,10 +24,14 @@ from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
 from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
 from defenses.advtrain_detection import DetectorAdversarialTraining
 from envs.camera.world import StopSignApproach
+from tests.framework.toy_camera import SIGN, RedDetector, RedStreet
 from tests.vision.drawn_street import DrawnStreet
 
 FACTS = StopSignApproach().facts
 QUICK = {"rounds": 2, "updates": 2, "batch": 2, "attack_params": "steps=2 batch=2 window=224"}
+
+
+LARGEST = 20_000
 
 
 @pytest.fixture
@@ -48,13 +55,16 @@ def test_it_trains_the_given_detector_and_the_zoo_finds_it(
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
     before, pictures = victim.load(0, FACTS), torch.rand(1, 3, 64, 64)
-    defense = DetectorAdversarialTraining(**QUICK, trained_in="DrawnStreet")
+    defense = DetectorAdversarialTraining(**QUICK, largest=LARGEST, trained_in="DrawnStreet")
     made = defense.train(victim, DrawnStreet(), seed=0, progress=lambda share, text: None)
     assert all(
         torch.equal(a, b)
         for a, b in zip(before.state_dict().values(), victim.load(0, FACTS).state_dict().values(), strict=True)
     )
-    zoo.save(made.network, zoo.Recipe.of(victim, defense), seed=0, world=DrawnStreet(), card=made.card)
+    recipe = zoo.Recipe.of(victim, defense)
+    path = zoo.save(made.network, recipe, seed=0, world=DrawnStreet(), card=made.card, start=made.start)
+    small = {name for name, weight in before.named_parameters() if weight.numel() <= LARGEST}
+    assert load_file(path).keys() == small < before.state_dict().keys()
     again = defense.load(victim, 5, FACTS)
     torch.testing.assert_close(again(pictures).scores, made.network(pictures).scores, rtol=0.02, atol=1e-3)
     assert not torch.equal(again(pictures).scores, before(pictures).scores)
@@ -75,10 +85,59 @@ def test_training_depends_on_the_seed_and_the_control_is_never_attacked(victim: 
     assert not torch.equal(one.state_dict()["model.24.m.0.weight"], control.state_dict()["model.24.m.0.weight"])
 
 
+class Coloured(RedDetector):
+    """Takes red and green squares for stop signs, until it learns which colour is one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.colour = nn.Linear(3, 1)
+        self.colour.weight.data = torch.tensor([[4.0, 4.0, -4.0]])
+        self.colour.bias.data = torch.tensor([-1.5])
+
+    def predict(self, pictures: Tensor) -> Predictions:
+        found = super().predict(pictures)
+        middle, corner = pictures[:, :, SIGN, SIGN], pictures[:, :, :8, :8]
+        seen = torch.stack([self.colour(part.mean((2, 3)))[:, 0] for part in (middle, corner)], 1)
+        return Predictions(found.boxes, seen.sigmoid(), found.classes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColouredVictim(DetectorVictim):
+    """The victim of `Coloured`."""
+
+    def load(self, seed: int, facts: Facts) -> Detector:
+        return Coloured().requires_grad_(False).eval()
+
+
+def test_decoys_in_the_loop_lower_the_confidence_in_decoys_and_not_in_the_sign() -> None:
+    street, kept = RedStreet(), {}
+    (approach,) = street.approaches(street.axes.cell(lanes=3, density=1.0, weather="clear"), range(1))
+    for share in (0.0, 0.5):
+        defense = DetectorAdversarialTraining(
+            decoys=share,
+            rounds=2,
+            updates=50,
+            window=32,
+            learning_rate=0.3,
+            caution=0.5,
+            attack_params="steps=3 batch=2 window=32",
+        )
+        made = defense.train(ColouredVictim(), street, seed=0, progress=lambda share, text: None)
+        with torch.no_grad():
+            decoys = look_at_decoys(made.network, approach.scenes)
+            kept[share] = look(made.network, approach.scenes, None, 0.5).confidence.mean(), decoys.confidence.mean()
+    (sign, fooled), (of_sign, of_decoys) = kept[0.0], kept[0.5]
+    assert of_decoys < fooled - 0.1
+    assert of_sign > of_decoys + 0.5
+    assert of_sign > sign - 0.1
+
+
 def test_impossible_options_are_refused_in_one_line(victim: YOLOv5) -> None:
     for bad in ({"skip": 1.5}, {"rounds": 0}, {"learning_rate": 0.0}, {"budget": 2.0}, {"fidelity": -1.0}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             DetectorAdversarialTraining(**bad)
+    with pytest.raises(UserError, match="largest=1 leaves no tensor of the detector to train"):
+        trained(victim, largest=1)
     with pytest.raises(UserError, match="makes no patches"):
         trained(victim, attack="zo", attack_params="")
     with pytest.raises(UserError, match=r"attack_params takes name=value pairs, .*, got 'steps'"):
@@ -117,3 +176,15 @@ def test_the_shipped_detector_withstands_patches_that_hide_the_sign_from_the_und
         left[name] = seen(detector, attack.craft(oracle, scenes, lambda share, text: None))
     assert left["hardened"] > 0.8 > 0.5 > left["undefended"]
     assert seen(hardened, None) > seen(published, None) - 0.05
+
+
+@pytest.mark.slow
+def test_the_shipped_detector_knows_the_sign_from_faces_that_it_never_saw(published: YOLOv3TinyNetwork) -> None:
+    world = StopSignApproach()
+    (approach,) = world.approaches(world.axes.cell(lanes=3, density=1.0, weather="clear"), range(1))
+    hardened = DetectorAdversarialTraining().load(YOLOv3Tiny(), 0, FACTS)
+    with torch.no_grad():
+        of_sign = look(hardened, approach.scenes, None, 0.5).confidence.mean()
+        of_decoys, fooled = (look_at_decoys(one, approach.scenes).confidence for one in (hardened, published))
+    assert of_sign > 0.8
+    assert of_decoys.mean() < min(0.15, fooled.mean())

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from bench.detection import CameraWorld
 from bench.driving import DrivingWorld
@@ -258,6 +259,62 @@ def test_a_detector_is_stored_in_half_precision(home: Path) -> None:
     picture = torch.rand(1, 3, 64, 64)
     torch.testing.assert_close(again(picture).scores, network(picture).scores, rtol=0.01, atol=1e-4)
     assert path.stat().st_size < 2.1 * sum(weight.numel() for weight in network.state_dict().values())
+
+
+START = "5" * 64
+
+
+def start(sha256: str = START) -> QPolicy:
+    """The network that a training starts from, with a hash."""
+    torch.manual_seed(0)
+    network = QPolicy(5, 5, 8)
+    network.weights_sha256 = sha256
+    return network
+
+
+@pytest.fixture
+def partial(home: Path, highway: DrivingWorld) -> tuple[Path, QPolicy]:
+    """An entry whose training changed one tensor, and its network."""
+    network = start()
+    with torch.no_grad():
+        next(iter(network.parameters())).add_(1)
+    path = zoo.save(network, RECIPE, seed=3, world=highway, card={}, start=start())
+    return path, network
+
+
+def test_only_what_a_training_changed_is_stored_and_the_rest_is_its_start(partial: tuple[Path, QPolicy]) -> None:
+    path, network = partial
+    key, *others = network.state_dict()
+    assert list(load_file(path)) == [key]
+    assert zoo.card(RECIPE, 3)["start"] == {"sha256": START, "tensors": others}
+    again = zoo.load(RECIPE, 3, lambda **_: start())
+    for name, value in network.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value), name
+    assert again.weights_sha256 == zoo.card(RECIPE, 3)["sha256"] != START
+
+
+def test_another_start_is_refused(partial: tuple[Path, QPolicy]) -> None:
+    for other in ("6" * 64, ""):
+        with pytest.raises(
+            UserError, match=r"'dqn', seed 3, started from weights 555555555555….*`bench train victim=dqn"
+        ):
+            zoo.load(RECIPE, 3, lambda other=other, **_: start(other))
+
+
+def test_a_card_that_does_not_name_every_tensor_once_is_refused(partial: tuple[Path, QPolicy]) -> None:
+    path, network = partial
+    key, *others = network.state_dict()
+    for tensors in (others[1:], [key, *others], ["tail", *others]):
+        changed(path, lambda entry, tensors=tensors: entry["start"].update(tensors=tensors))
+        with pytest.raises(UserError, match="do not fit 'dqn'") as error:
+            zoo.load(RECIPE, 3, lambda **_: start())
+        assert "\n" not in str(error.value)
+
+
+def test_without_a_hash_of_the_start_everything_is_stored(home: Path, highway: DrivingWorld) -> None:
+    path = zoo.save(start(""), RECIPE, seed=3, world=highway, card={}, start=start(""))
+    assert load_file(path).keys() == start().state_dict().keys()
+    assert "start" not in zoo.card(RECIPE, 3)
 
 
 def changed(path: Path, change: object) -> None:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from bench.detection import Predictions
 from bench.detection.boxes import detections
-from bench.victims.detectors.loss import complete_overlap, missed, supervised, unlike
+from bench.victims.detectors.loss import complete_overlap, missed, mistaken, supervised, unlike
 
 BOXES = torch.tensor([[10.0, 10.0, 40.0, 40.0], [50.0, 20.0, 70.0, 60.0]])
 LABELS = torch.tensor([1, 0])
@@ -74,6 +74,13 @@ def test_a_detection_elsewhere_counts_as_missed() -> None:
     assert missed(predicted(1.0, there), 1, BOXES[:1]).item() == 0
     assert missed(predicted(0.5, there), 1, BOXES[:1]).item() == torch.tensor(2.0).log()
     assert missed(predicted(1.0, away), 1, BOXES[:1]) > 9
+
+
+def test_a_detection_is_mistaken_unless_it_is_on_the_object() -> None:
+    here, present = BOXES[:1], torch.tensor([True])
+    assert mistaken(predicted(0.9, here[0]), 1, here, present).item() == 0
+    for box, there in ((here[0] + 35, present), (here[0], ~present)):
+        assert torch.isclose(mistaken(predicted(0.75, box), 1, here, there), torch.tensor([4.0]).log())
 
 
 def test_complete_overlap_is_one_for_a_box_itself_and_falls_with_distance_and_shape() -> None:

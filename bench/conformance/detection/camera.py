@@ -112,7 +112,7 @@ class CameraSuite(Suite):
         require(torch.equal(shown, scenes.render_decoys(frames)), "the decoys of a frame change from call to call")
         signs = scenes.render(frames, None, SHARE)
         require(bool((shown != signs).flatten(1).any(1).all()), "a decoy's image is that of the stop sign")
-        return ", ".join(sorted(known))
+        return f"{len(known)} in the training scenes"
 
     def every_cell(self) -> str:
         """Every cell of the default grid has approaches."""

@@ -75,9 +75,9 @@ def complete_overlap(a: Tensor, b: Tensor) -> Tensor:
 
 
 def unlike(predictions: Predictions, teacher: Predictions) -> Tensor:
-    """Distillation loss: cross-entropy with a teacher's predictions, minus the teacher's entropy, and box distance (1 - IoU).
+    """[N] distillation loss: cross-entropy with a teacher's predictions, minus the teacher's entropy, and box distance (1 - IoU).
 
-    Classes and boxes are weighted by the teacher's objectness. A sum over predictions, a mean over images.
+    Classes and boxes are weighted by the teacher's objectness. A sum over predictions.
     """
 
     def entropy(output: Tensor, target: Tensor) -> Tensor:
@@ -87,7 +87,20 @@ def unlike(predictions: Predictions, teacher: Predictions) -> Tensor:
     objectness = entropy(predictions.objectness, weight) - entropy(weight, weight)
     classes = (entropy(predictions.classes, teacher.classes) - entropy(teacher.classes, teacher.classes)).sum(-1)
     boxes = 1 - overlap(predictions.boxes, teacher.boxes)
-    return (objectness + weight * (classes + boxes)).sum(1).mean()
+    return (objectness + weight * (classes + boxes)).sum(1)
+
+
+def mistaken(predictions: Predictions, label: int, boxes: Tensor, there: Tensor) -> Tensor:
+    """[N] negative logarithm of 1 minus the best score of a class away from its only object in each image.
+
+    Args:
+        predictions: predictions on N images.
+        label: the class.
+        boxes: [N, 4] box of the object.
+        there: bool [N], whether the object is in the image; if not, every prediction is away from it.
+    """
+    away = (overlap(predictions.boxes, boxes.unsqueeze(1)) == 0) | ~there.unsqueeze(1)
+    return -(1 - (predictions.scores_of(label) * away).amax(1)).clamp(min=1e-4).log()
 
 
 def missed(predictions: Predictions, label: int, boxes: Tensor, *, iou: float = 0.5) -> Tensor:

@@ -56,8 +56,7 @@ class Windows:
         generator: torch.Generator,
     ) -> None:
         self.scenes, self.side, self.zoom, self.away, self.generator = scenes, side, zoom, away, generator
-        batches = torch.arange(len(scenes)).split(BATCH)
-        self.pictures = torch.cat([(scenes.render(frames, None, 1.0) * 255).round().byte() for frames in batches])
+        self.pictures = kept(scenes, lambda frames: scenes.render(frames, None, 1.0))
         self._objects = cache(scenes.objects)
 
     def draw(self, count: int) -> Views:
@@ -80,7 +79,7 @@ class Windows:
 
         Args:
             views: places of the windows.
-            pictures: images [N, 3, H, W] of their frames; None uses the frames without a patch.
+            pictures: images [N, 3, H, W] of their frames, or `kept` ones; None uses the frames without a patch.
         """
         windows = []
         for number, (frame, (x, y), side) in enumerate(
@@ -88,7 +87,7 @@ class Windows:
         ):
             picture = self.pictures[frame] if pictures is None else pictures[number]
             window = picture[:, y : y + side, x : x + side]
-            window = window.float() / 255 if pictures is None else window
+            window = window if window.is_floating_point() else window.float() / 255
             windows.append(window if side == self.side else _resized(window, self.side))
         return torch.stack(windows)
 
@@ -114,6 +113,12 @@ class Windows:
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.generator)
+
+
+def kept(scenes: Scenes, render: Callable[[Tensor], Tensor]) -> Tensor:
+    """All frames of scenes with 8 bits, uint8 [M, 3, H, W], as `render` shows them."""
+    batches = torch.arange(len(scenes)).split(BATCH)
+    return torch.cat([(render(frames) * 255).round().byte() for frames in batches])
 
 
 def _area(boxes: Tensor) -> Tensor:

@@ -1,6 +1,10 @@
 """Zoo entries on disk: safetensors weights with a JSON card each. Hashes are checked on loading; nothing is unpickled.
 
-An entry is `<name>-<first digits of the recipe's digest>/seed<k>.safetensors`; its card is the `.json` file beside it.
+An entry is `<name>-<first digits of the recipe's digest>/seed<k>.safetensors`; its card is the `.json` file beside it. If the
+training started from a network that is loaded anyway, such as the victim's, the entry holds only the tensors that the training
+changed. Its card then has the hash of the start's weights and the names of the tensors that are taken from it:
+
+    "start": {"sha256": "dccea06f…", "tensors": ["deep.2.conv.weight", …]}
 """
 
 from __future__ import annotations
@@ -9,12 +13,13 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+import torch
 from platformdirs import user_data_path
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
@@ -61,7 +66,14 @@ def own() -> Path:
 
 
 def save(
-    network: Shaped, recipe: Recipe, *, seed: int, world: World, card: Mapping[str, object], root: Path | None = None
+    network: Shaped,
+    recipe: Recipe,
+    *,
+    seed: int,
+    world: World,
+    card: Mapping[str, object],
+    start: Network | None = None,
+    root: Path | None = None,
 ) -> Path:
     """Write the weights and the card of a trained network, atomically, and return the path of the weights.
 
@@ -71,6 +83,8 @@ def save(
         seed: training seed.
         world: the training world.
         card: further facts about the training, for instance the checkpoint selection.
+        start: the network that the training started from, if loading builds it again: only tensors that differ from its are
+            written. A start without `weights_sha256` is ignored, because loading could not recognise it.
         root: folder of a zoo; by default the user's own, which takes precedence over the shipped one.
 
     Raises:
@@ -80,6 +94,10 @@ def save(
     folder = (root or own()) / recipe.key
     folder.mkdir(parents=True, exist_ok=True)
     state = {key: value.contiguous() for key, value in network.state_dict().items()}
+    if start is not None and start.weights_sha256:
+        taken = _unchanged(state, start)
+        card = {**card, "start": {"sha256": start.weights_sha256, "tensors": taken}}
+        state = {key: value for key, value in state.items() if key not in taken}
     if getattr(network, "half_precision", False):
         state = {key: value.half() if value.ndim > 1 else value for key, value in state.items()}
     blob = save_tensors(state)
@@ -122,12 +140,13 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
     Args:
         recipe: its recipe.
         seed: training seed.
-        build: builds the network from the card's `shape` before the weights are loaded; usually its class.
+        build: builds the network from the card's `shape` before the weights are loaded; usually its class. For an entry that
+            holds only what its training changed it must return the network that the training started from.
         against: for an adversary, the hash of the weights of its victim; empty if they do not matter.
 
     Raises:
-        UserError: if there is no such entry, a default has changed since, the weights do not match the card, or an adversary
-            was trained against other weights.
+        UserError: if there is no such entry, a default has changed since, the weights do not match the card, an adversary
+            was trained against other weights, or a training started from others.
     """
     path, entry = _find(recipe, seed), card(recipe, seed)
     _check_parameters(recipe, seed, entry)
@@ -145,7 +164,11 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
         )
     try:
         network: N = build(**entry["shape"])
-        network.load_state_dict(load_tensors(blob))
+        tensors: Mapping[str, Tensor] = load_tensors(blob)
+        if begun := entry.get("start"):
+            _check_start(recipe, seed, begun, network)
+            tensors = _completed(tensors, begun["tensors"], network)
+        network.load_state_dict(tensors)
     except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"the weights {path} do not fit {recipe.name!r}: {reason}") from None
@@ -182,6 +205,29 @@ def _check_parameters(recipe: Recipe, seed: int, entry: Mapping[str, Any]) -> No
                     f"the zoo's {recipe.name!r} of training seed {seed} was made with {part.kind}.{name}={made[name]}, "
                     f"and the default is {value} now; `{recipe.train(seed)}` trains it again"
                 )
+
+
+def _unchanged(state: Mapping[str, Tensor], start: Network) -> list[str]:
+    """The names of the tensors that are those of the start, bit for bit."""
+    own = start.state_dict()
+    return [key for key, value in state.items() if key in own and torch.equal(value, own[key])]
+
+
+def _check_start(recipe: Recipe, seed: int, begun: Mapping[str, Any], start: Network) -> None:
+    """Check that the training started from the weights of `start`."""
+    if begun["sha256"] != start.weights_sha256:
+        raise UserError(
+            f"the training of the zoo's {recipe.name!r}, seed {seed}, started from weights {str(begun['sha256'])[:12]}…, and the "
+            f"victim has {start.weights_sha256[:12] or 'unknown ones'}… now; `{recipe.train(seed)}` trains it again"
+        )
+
+
+def _completed(stored: Mapping[str, Tensor], taken: Sequence[str], start: Network) -> dict[str, Tensor]:
+    """The stored tensors and those taken from the start; each tensor comes from one of the two."""
+    own = start.state_dict()
+    if both := stored.keys() & set(taken):
+        raise KeyError(f"{min(both)} is stored, and taken from the start")
+    return {**stored, **{key: own[key] for key in taken}}
 
 
 def _find(recipe: Recipe, seed: int) -> Path:

@@ -1,0 +1,123 @@
+"""Faces of the decoys in the training scenes, drawn at random, so that none of the faces that are scored is learnt by heart."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.detection import Decoy
+from envs.camera import sign
+
+Image = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
+OUTLINES = ("octagon",) * 7 + ("disc", "triangle", "diamond", "rectangle", "nothing")
+"""Drawn with equal probability."""
+_NAME = "training "
+_SIDE = sign.TEXELS
+_FULL = 255
+
+
+def decoys(first: int, count: int) -> tuple[Decoy, ...]:
+    """The training decoys with the numbers from `first` on."""
+    names = (f"{_NAME}{number}" for number in range(first, first + count))
+    return tuple(Decoy(name, octagonal=_begun(name)[1] == "octagon") for name in names)
+
+
+def drawn(name: str) -> tuple[Image, Image]:
+    """The face of a training decoy: colours sRGB [S, S, 3], and where its plate is [S, S], 0 to 255."""
+    chance, outline = _begun(name)
+    cover = np.zeros((_SIDE, _SIDE), np.uint8) if outline == "nothing" else _polygon(outline, 1.0)
+    picture = np.full((_SIDE, _SIDE, 3), _colour(chance), np.uint8)
+    inner = _polygon(outline, chance.uniform(0.75, 0.97)) if outline != "nothing" else cover
+    picture[inner > 0] = _ground(chance)
+    for _ in range(int(chance.integers(1, 4))):
+        painting = (_word, _word, _shape, _bars, _blocks)
+        painting[int(chance.integers(len(painting)))](picture, chance)
+    return picture, cover
+
+
+def _begun(name: str) -> tuple[np.random.Generator, str]:
+    """The random generator of a face, and its outline, which is drawn first."""
+    chance = np.random.default_rng(int(name.removeprefix(_NAME)))
+    return chance, str(chance.choice(OUTLINES))
+
+
+def _polygon(outline: str, size: float) -> Image:
+    """Where a centred plate of an outline is, its size as a share of the face's."""
+    mask, middle, radius = np.zeros((_SIDE, _SIDE), np.uint8), _SIDE / 2, size * _SIDE / 2
+    first, corners = {
+        "octagon": (22.5, 8),
+        "triangle": (90.0, 3),
+        "diamond": (0.0, 4),
+        "rectangle": (45.0, 4),
+        "disc": (0.0, 64),
+    }[outline]
+    if outline == "octagon":
+        radius /= np.cos(np.pi / 8)
+    angles = np.deg2rad(first + 360 / corners * np.arange(corners))
+    points = middle + radius * np.stack([np.cos(angles), np.sin(angles)], 1)
+    cv2.fillPoly(mask, [points.round().astype(np.int32)], _FULL)
+    return mask
+
+
+def _colour(chance: np.random.Generator) -> Colour:
+    """White, black, or any hue."""
+    match chance.choice(["white", "black", "hue"], p=[0.2, 0.1, 0.7]):
+        case "white":
+            return (235, 235, 230)
+        case "black":
+            return (14, 14, 14)
+    hsv = np.array([[[chance.integers(180), chance.integers(90, 256), chance.integers(70, 250)]]], np.uint8)
+    red, green, blue = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0].tolist()
+    return red, green, blue
+
+
+def _ground(chance: np.random.Generator) -> Colour:
+    """A colour that is not the red of a stop sign: with a patch on it, a red octagon may be one."""
+    while True:
+        red, green, blue = colour = _colour(chance)
+        if red < 1.8 * max(green, blue):
+            return colour
+
+
+def _word(picture: Image, chance: np.random.Generator) -> None:
+    """A word of up to six letters or digits."""
+    text = "".join(chance.choice(list(LETTERS), size=int(chance.integers(1, 7))))
+    font = int(chance.choice([cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_TRIPLEX]))
+    share = chance.uniform(0.4, 0.9) * _SIDE
+    thick = int(chance.uniform(0.01, 0.05) * _SIDE) + 1
+    (wide, high), _ = cv2.getTextSize(text, font, 1.0, 1)
+    scale = min(share / wide, 0.4 * _SIDE / high)
+    x, y = _SIDE / 2 - scale * wide / 2, _SIDE * chance.uniform(0.35, 0.65) + scale * high / 2
+    cv2.putText(picture, text, (round(x), round(y)), font, scale, _colour(chance), thick, cv2.LINE_AA)
+
+
+def _shape(picture: Image, chance: np.random.Generator) -> None:
+    """A disc, a ring, a triangle, a diamond or a rectangle."""
+    name = str(chance.choice(["octagon", "disc", "triangle", "diamond", "rectangle"]))
+    size = chance.uniform(0.3, 0.9)
+    mask = _polygon(name, size) > 0
+    if chance.random() < 0.5:
+        mask &= _polygon(name, size * chance.uniform(0.5, 0.85)) == 0
+    picture[mask] = _colour(chance)
+
+
+def _bars(picture: Image, chance: np.random.Generator) -> None:
+    """Stripes across, down or aslant."""
+    rows, columns = np.mgrid[:_SIDE, :_SIDE] / _SIDE
+    angle = chance.choice([0.0, 0.25, 0.5, 0.75]) * np.pi
+    along = np.cos(angle) * rows + np.sin(angle) * columns
+    low = chance.uniform(-0.2, 0.9)
+    picture[(along > low) & (along < low + chance.uniform(0.08, 0.3))] = _colour(chance)
+
+
+def _blocks(picture: Image, chance: np.random.Generator) -> None:
+    """A square of random blocks in the middle, fine or coarse, as patches of attacks are."""
+    cells, side = int(2 ** chance.uniform(1, 6)), int(chance.uniform(0.3, 0.6) * _SIDE)
+    colours = chance.integers(0, 256, (cells, cells, 3), np.uint8)
+    first = (_SIDE - side) // 2
+    how = int(chance.choice([cv2.INTER_NEAREST, cv2.INTER_LINEAR]))
+    picture[first : first + side, first : first + side] = cv2.resize(colours, (side, side), interpolation=how)
