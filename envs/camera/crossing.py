@@ -12,7 +12,7 @@ import numpy as np
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from bench.detection import Approach, CameraWorld
+from bench.detection import Approach, CameraWorld, Scenes
 from bench.detection.closed_loop import Plan
 from bench.errors import UserError
 from bench.plugins.contracts import Progress
@@ -81,7 +81,7 @@ class StopSignCrossing(CameraWorld):
         """Folder of the frames."""
         return Path(self.bank).expanduser() if self.bank else bank.SHIPPED
 
-    def training_scenes(self) -> BankScenes:
+    def training_scenes(self) -> Scenes:
         """Those of the world `camera`."""
         return StopSignApproach().training_scenes()
 
