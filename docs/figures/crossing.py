@@ -12,7 +12,8 @@ from bench.detection.stopping import SPEED_MPS
 from docs.figures import style
 from docs.figures.sightings import show
 from envs.camera.braking import Motion, brakes_in
-from envs.camera.crossing import AXES, StopSignCrossing
+from envs.camera.crossing import StopSignCrossing
+from envs.camera.crossing_axes import AXES
 from envs.camera.environment import CLEARED_M
 from envs.camera.poses import CLOSED_LOOP_DISTANCES
 from envs.camera.street.layout import CROSSING

@@ -16,10 +16,11 @@ from bench.detection import Approach, CameraWorld, Scenes
 from bench.detection.closed_loop import Plan
 from bench.errors import UserError
 from bench.plugins.contracts import Progress
-from bench.scenarios import Axes, Axis, Cell, Grid
+from bench.scenarios import Axes, Cell
 from envs.camera import bank, poses
 from envs.camera.bank import BankScenes
 from envs.camera.braking import brakes_in
+from envs.camera.crossing_axes import AXES, CROSSING_V1
 from envs.camera.environment import CAR_M, ApproachEnv
 from envs.camera.objects import NAMES
 from envs.camera.street import layout
@@ -27,33 +28,6 @@ from envs.camera.street.vehicles import footprint
 from envs.camera.world import StopSignApproach
 from envs.weather import WEATHERS
 
-AXES = Axes(
-    (
-        Axis(
-            name="weather",
-            kind="str",
-            meaning="air, light and the friction of the road",
-            choices=("clear", "rain", "fog"),
-            default="clear",
-        ),
-        Axis(
-            name="speed",
-            kind="float",
-            meaning="speed of the car until it brakes",
-            unit="m/s",
-            low=4.0,
-            high=14.0,
-            default=10.0,
-        ),
-    )
-)
-CROSSING_V1 = Grid(
-    name="crossing-v1",
-    world="crossing",
-    axes=AXES,
-    values={"weather": ("clear", "rain", "fog"), "speed": (8.0, 10.0, 12.0)},
-    episodes=50,
-)
 PLACE = layout.LOCATIONS["crossing"]
 
 

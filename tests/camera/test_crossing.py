@@ -20,7 +20,8 @@ from bench.plugins.pair import Chosen, Pair, choose
 from bench.plugins.track import Driven, Job, track
 from bench.recording.film import save
 from bench.recording.film.drawing import BLUE, VERMILLION
-from envs.camera.crossing import AXES, CROSSING_V1, StopSignCrossing
+from envs.camera.crossing import StopSignCrossing
+from envs.camera.crossing_axes import AXES, CROSSING_V1
 from envs.camera.street import layout
 
 WORLD = StopSignCrossing()
