@@ -42,7 +42,7 @@ ALONE = ("pessimist",)
 """The members that are not driven in batches."""
 DRIVER_MS = 1.0 + 0.1 + 0.3
 """What a unit costs the driver with Ray: the task, its outcome, its records (`benchmarks/executor_speed.py`)."""
-WORKER_MS = 5.0
+WORKER_MS = 2.7
 """What a task costs a worker besides its unit (the same)."""
 START_S = 15.0
 """From the command to the first task: imports, the plan, the start of the workers."""
