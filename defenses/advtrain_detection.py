@@ -34,8 +34,6 @@ AWAY = 0.2
 """Share of the windows at uniformly random places; the others are near the sign."""
 SEEN = 0.5
 """A sign with a smaller visible share is not a target."""
-
-
 DECAY = 0.98
 """Of the average of the weights, which is that of about the last 50 updates: a longer one would be close to the start."""
 IN_THE_LOOP = (

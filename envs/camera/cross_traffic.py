@@ -1,4 +1,4 @@
-"""The traffic on the crossing road, which has the right of way, and the collision test.
+"""The traffic on the crossing road, which has the right of way.
 
 Coordinates as in `envs.camera.camera`: the line at y = 0, the middle of the ego's lane at x = 0.
 """
@@ -65,8 +65,3 @@ class CrossTraffic:
         x = (seconds[:, None, None] - self.passes) * self.speed
         middle = torch.stack((x, self.y.expand_as(x)), -1)
         return torch.cat([middle - self.half, middle + self.half], -1)
-
-
-def overlap(a: Tensor, b: Tensor) -> Tensor:
-    """Whether rectangles [..., 4] and [..., 4] (x0, y0, x1, y1) share more than an edge, broadcast."""
-    return (torch.maximum(a[..., :2], b[..., :2]) < torch.minimum(a[..., 2:], b[..., 2:])).all(-1)

@@ -9,20 +9,19 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from platformdirs import user_cache_path
 from torch import Tensor
 
-from bench.detection import Approach, CameraWorld, Scenes
+from bench.detection import Approach, Scenes
 from bench.detection.closed_loop import Plan
 from bench.errors import UserError
-from bench.plugins.contracts import Progress
 from bench.scenarios import Axes, Cell
 from envs.camera import bank, poses
 from envs.camera.bank import BankScenes
+from envs.camera.bank_world import BankWorld
 from envs.camera.braking import brakes_in
 from envs.camera.crossing_axes import AXES, CROSSING_V1
 from envs.camera.environment import CAR_M, ApproachEnv
-from envs.camera.objects import NAMES
+from envs.camera.poses import Pose
 from envs.camera.street import layout
 from envs.camera.street.vehicles import footprint
 from envs.camera.world import StopSignApproach
@@ -32,28 +31,17 @@ PLACE = layout.LOCATIONS["crossing"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class StopSignCrossing(CameraWorld):
+class StopSignCrossing(BankWorld):
     """A car driven by the detector up to a stop sign, in closed loop: it stops at the line, or crosses a road with traffic.
 
     Args:
         bank: folder of the rendered frames; empty for the shipped frames.
     """
 
+    title: ClassVar[str] = "crossing"
     axes: ClassVar[Axes] = AXES
     grid: ClassVar[str] = CROSSING_V1.name
     locations: ClassVar[tuple[str, ...]] = (PLACE.name,)
-    classes: ClassVar[tuple[str, ...]] = NAMES
-
-    bank: str = ""
-
-    def __post_init__(self) -> None:
-        if self.bank and not Path(self.bank).expanduser().is_dir():
-            raise ValueError(f"crossing.bank must be a folder of rendered frames, got {self.bank}")
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the frames."""
-        return Path(self.bank).expanduser() if self.bank else bank.SHIPPED
 
     def training_scenes(self) -> Scenes:
         """Those of the world `camera`."""
@@ -75,20 +63,8 @@ class StopSignCrossing(CameraWorld):
             plan=_plan(),
         )
 
-    def render(self, out: Path | None, progress: Progress) -> list[Path]:
-        """Trace the missing poses, and write the bank.
-
-        Args:
-            out: folder of the bank; None for the shipped bank.
-            progress: called with the share done.
-
-        Raises:
-            UserError: if the renderer is not installed.
-        """
-        from envs.camera import rendering
-
-        kept = user_cache_path("cavbench") / "street"
-        return rendering.make(poses.closed_loop(), kept=kept, out=out or self.folder, progress=progress)
+    def every_pose(self) -> tuple[Pose, ...]:
+        return poses.closed_loop()
 
 
 @lru_cache(maxsize=4)

@@ -10,10 +10,11 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from bench.detection import Scenes
+from bench.detection.boxes import overlap
 from bench.detection.closed_loop import STANDS_MPS, DrivingEnv, Plan
 from bench.detection.stopping import SPEED_MPS
 from envs.camera.braking import Brakes, Motion
-from envs.camera.cross_traffic import CrossTraffic, overlap
+from envs.camera.cross_traffic import CrossTraffic
 from envs.camera.street.layout import CROSSING
 
 TICK_S = 0.01
@@ -122,7 +123,7 @@ class ApproachEnv(DrivingEnv):
         """Whether each car overlaps a vehicle in each draw, [B, K]."""
         front, half = -self.motion.distance, torch.full_like(self.motion.distance, CAR_M[1] / 2)
         car = torch.stack([-half, front - CAR_M[0], half, front], -1)
-        return overlap(car[:, None, None], self.traffic.at(self.seconds)).any(-1)
+        return (overlap(car[:, None, None], self.traffic.at(self.seconds)) > 0).any(-1)
 
     def _shown(self) -> TensorDict:
         frames = (self.motion.distance[:, None] - self.distances).abs().argmin(-1)

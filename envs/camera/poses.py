@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, cached_property
 from typing import get_args
@@ -70,11 +71,13 @@ class Pose:
         return f"{self.location}-{self.lighting}-{road}-{self.distance:.2f}m-{self.seed:08x}"
 
 
-def approach(location: str, lanes: int, density: float, lighting: Lighting) -> tuple[Pose, ...]:
-    """The ten poses of an approach, farthest first."""
+def approach(
+    location: str, lanes: int, density: float, lighting: Lighting, distances: Sequence[float] = DISTANCES
+) -> tuple[Pose, ...]:
+    """The poses of an approach, farthest first."""
     return tuple(
         Pose(location=location, lanes=lanes, density=density, lighting=lighting, distance=distance)
-        for distance in DISTANCES
+        for distance in distances
     )
 
 
@@ -96,17 +99,11 @@ def scored() -> tuple[Pose, ...]:
 def closed_loop() -> tuple[Pose, ...]:
     """Every pose of the road that is driven in closed loop, farthest first under each lighting."""
     return tuple(
-        Pose(
-            location=location.name,
-            lanes=CLOSED_LOOP_LANES,
-            density=CLOSED_LOOP_DENSITY,
-            lighting=lighting,
-            distance=distance,
-        )
+        pose
         for location in LOCATIONS.values()
         if location.closed_loop
         for lighting in CLOSED_LOOP_LIGHTINGS
-        for distance in CLOSED_LOOP_DISTANCES
+        for pose in approach(location.name, CLOSED_LOOP_LANES, CLOSED_LOOP_DENSITY, lighting, CLOSED_LOOP_DISTANCES)
     )
 
 

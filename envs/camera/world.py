@@ -7,45 +7,31 @@ from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
 
-from platformdirs import user_cache_path
-
-from bench.detection import Approach, CameraWorld
+from bench.detection import Approach
 from bench.errors import UserError
-from bench.plugins.contracts import Progress
 from bench.scenarios import Axes, Cell
 from envs.camera import bank, poses
 from envs.camera.axes import APPROACH_V1, AXES
 from envs.camera.bank import BankScenes, TrainingScenes
-from envs.camera.objects import NAMES
+from envs.camera.bank_world import BankWorld
+from envs.camera.poses import Pose
 from envs.camera.street.layout import LOCATIONS
 
 TRAINING_WEATHERS = ("clear", "rain", "fog")
 
 
 @dataclass(frozen=True, kw_only=True)
-class StopSignApproach(CameraWorld):
+class StopSignApproach(BankWorld):
     """An approach to a stop sign at three places: the sun behind the ego, beside it, and behind the sign.
 
     Args:
         bank: folder of the rendered frames; empty for the shipped frames.
     """
 
+    title: ClassVar[str] = "camera"
     axes: ClassVar[Axes] = AXES
     grid: ClassVar[str] = APPROACH_V1.name
     locations: ClassVar[tuple[str, ...]] = tuple(place.name for place in LOCATIONS.values() if place.scored)
-
-    classes: ClassVar[tuple[str, ...]] = NAMES
-
-    bank: str = ""
-
-    def __post_init__(self) -> None:
-        if self.bank and not Path(self.bank).expanduser().is_dir():
-            raise ValueError(f"camera.bank must be a folder of rendered frames, got {self.bank}")
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the frames."""
-        return Path(self.bank).expanduser() if self.bank else bank.SHIPPED
 
     def training_scenes(self) -> TrainingScenes:
         return _training(self.folder)
@@ -65,21 +51,8 @@ class StopSignApproach(CameraWorld):
         scenes = BankScenes(frames, [cell.weather] * len(frames))
         return Approach(seed=seed, location=location, scenes=scenes)
 
-    def render(self, out: Path | None, progress: Progress) -> list[Path]:
-        """Trace the missing poses, and write the bank.
-
-        Args:
-            out: folder of the bank; None for the shipped bank.
-            progress: called with the share done.
-
-        Raises:
-            UserError: if the renderer is not installed.
-        """
-        from envs.camera import rendering
-
-        every = (*poses.training(), *poses.scored())
-        kept = user_cache_path("cavbench") / "street"
-        return rendering.make(every, kept=kept, out=out or self.folder, progress=progress)
+    def every_pose(self) -> tuple[Pose, ...]:
+        return (*poses.training(), *poses.scored())
 
 
 @lru_cache(maxsize=4)

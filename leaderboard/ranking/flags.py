@@ -231,18 +231,21 @@ def _curves(of: Subject, families: Sequence[Sequence[Comparison]]) -> list[Curve
 
 
 def too_little(of: Subject) -> Finding:
-    """Fires with fewer than 3 seeds, too few scenarios a cell for the track, or where cells of the world's grid are missing."""
+    """Fires with fewer than 3 seeds, too few scenarios a cell for the track, or where a part of the world's grid is missing."""
     runs, cells, episodes = of.worst.scores.shape
     weights = {value for one in of.attacks for value in pc.unique(one.own.table["weights_sha256"]).to_pylist()}
     seeded = of.track.artefact is not None or bool(weights - {""})
+    seeds, scenarios = ENOUGH_SEEDS, of.track.enough_episodes
+    driven, missing = f"{cells} cell{'s' * (cells != 1)}", 0
     grid = _grid(of)
-    driven = f"{cells} cell{'s' * (cells != 1)}"
-    missing = 0
     if grid:
         there = len(set(grid.cells()) & set(of.worst.cells))
         driven, missing = f"{there} of {len(grid.cells())} cells of {grid.name}", len(grid.cells()) - there
-    few = (seeded and runs < ENOUGH_SEEDS) or episodes < of.track.enough_episodes or missing > 0
-    return few, f"It was driven with {runs} seed{'s' * (runs != 1)}, {driven}, {episodes} scenarios each."
+        if grid.block:
+            seeds, scenarios = grid.training_seeds, grid.episodes
+    few = (seeded and runs < seeds) or episodes < scenarios or missing > 0
+    asked = f" ({seeds} seeds and {scenarios} scenarios are asked)" if few else ""
+    return few, f"It was driven with {runs} seed{'s' * (runs != 1)}, {driven}, {episodes} scenarios each{asked}."
 
 
 def decoy(of: Subject) -> Finding:

@@ -111,6 +111,13 @@ NOT_MEASURED: dict[str, tuple[pa.Table, ...]] = {
 }
 
 
+@pytest.mark.parametrize(("runs", "episodes"), [(10, 20), (9, 30), (10, 30)])
+def test_the_best_part_of_a_grid_in_blocks_cannot_be_chosen(runs: int, episodes: int) -> None:
+    part = {"runs": range(runs), "episodes": episodes, "grid": "standard-v2", "weights": "ab"}
+    found = flag("too_little", *(probed(drive(skill=0.8, attack=attack, **part), **SEEN) for attack in ("none", "zo")))  # type: ignore[arg-type]
+    assert found.fired is ((runs, episodes) != (10, 30))
+
+
 def test_every_flag_is_tested_both_ways() -> None:
     assert set(FIRES) == set(FIRES_NOT) == set(FLAGS)
 

@@ -149,7 +149,6 @@ def traffic(location: Location, lanes: int, density: float) -> tuple[Placed, ...
 
 def _drawn(rng: Rng, lanes: int, density: float) -> tuple[Placed, ...]:
     """Vehicles in every lane. Those to the right of the ego slow down or wait at the crossing, so the ego passes them."""
-    models = get_args(Model)
     placed = []
     for lane in range(lanes):
         x = LANE_M * (lane - LANES_TO_THE_LEFT)
@@ -157,21 +156,26 @@ def _drawn(rng: Rng, lanes: int, density: float) -> tuple[Placed, ...]:
         y = -DISTANCES[0] + (14.0 if side == 0 else 5.0) + rng.uniform(0, 18 / density)
         speed = SPEED_MPS * (rng.uniform(0.0, 0.5) if side > 0 else rng.uniform(0.95, 1.15))
         while y < 90:
-            model = models[int(rng.choice(4, p=SHARES))]
+            model = _model(rng)
             half = LENGTH[model] / 2
             placed.append(Placed(model, x + rng.normal(0, 0.1), y + half, speed, int(rng.integers(len(PAINTS)))))
             y += 2 * half + 6.0 + rng.exponential(30 / density)
     return tuple(placed)
 
 
+def _model(rng: Rng) -> Model:
+    """A kind of vehicle, as often as it is on the roads."""
+    found: Model = get_args(Model)[int(rng.choice(4, p=SHARES))]
+    return found
+
+
 def _waiting(rng: Rng, density: float) -> tuple[Placed, ...]:
     """Vehicles that stand at the line in the lanes to the left of the ego; its own lane is free."""
-    models = get_args(Model)
     placed = []
     for lane in range(LANES_TO_THE_LEFT):
         front = -rng.uniform(0.5, 1.5)
         for _ in range(1 + rng.poisson(density)):
-            model = models[int(rng.choice(4, p=SHARES))]
+            model = _model(rng)
             rear, ahead, _ = footprint(model)
             x = LANE_M * (lane - LANES_TO_THE_LEFT) + rng.normal(0, 0.1)
             placed.append(Placed(model, x, front - ahead, 0.0, int(rng.integers(len(PAINTS)))))
