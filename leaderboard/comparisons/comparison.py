@@ -210,6 +210,16 @@ def mean(records: pa.Table, name: str) -> float:
 
 
 def parameters(canonical: object) -> dict[str, object]:
-    """The parameters of a component from the canonical JSON of a record."""
+    """The parameters of a component from the canonical JSON of a record; those of the links of a chain as `LINK.NAME`."""
     found = json.loads(str(canonical) or "{}")
-    return dict(found) if isinstance(found, dict) else {}
+    return _flat(found) if isinstance(found, dict) else {}
+
+
+def _flat(params: dict[str, object]) -> dict[str, object]:
+    found: dict[str, object] = {}
+    for name, value in params.items():
+        inner = (
+            {f"{name}.{each}": one for each, one in _flat(value).items()} if isinstance(value, dict) else {name: value}
+        )
+        found |= inner
+    return found

@@ -24,7 +24,7 @@ def varying(comparisons: Sequence[Comparison], column: str) -> set[str]:
 def component(one: Comparison, column: str, shown: set[str] | None = None) -> str:
     """A component's name with the parameters in `shown` (all of them by default)."""
     found = parameters(one.identity[f"{column}_params"])
-    words = [f"{name}={value}" for name, value in found.items() if shown is None or name in shown]
+    words = [f"{name}={value}" for name, value in found.items() if (shown is None or name in shown) and value != ""]
     return " ".join([str(one.identity[column]), *words])
 
 
@@ -56,7 +56,7 @@ def labels(comparisons: Sequence[Comparison], column: str) -> dict[tuple[object,
         words = [
             f"{key}={value}"
             for key, value in parameters(params).items()
-            if key in names and usual.get((name, key)) != repr(value)
+            if key in names and value != "" and usual.get((name, key)) != repr(value)
         ]
         found[name, params] = " ".join([str(name), *words])
     return found

@@ -20,11 +20,13 @@ from typer.main import get_command
 from bench.cli.main import app
 from bench.cli.words import split
 from bench.errors import UserError
+from bench.plugins.pair import choose
 from bench.plugins.track import tracks
 from bench.records import reading
 from bench.run.config import run_config
 from bench.scenarios import Cell
 from bench.statistics.episodes import as_text
+from leaderboard.comparisons.naming import labels
 from leaderboard.comparisons.reading import measurements, read_tracks
 from leaderboard.page.cards import run_command
 from leaderboard.page.document import document, schema
@@ -92,6 +94,21 @@ def test_a_card_says_what_to_type() -> None:
     assert {"attack.steps=10", "threat.budget=0.1", "lanes=3,4,5", "density=1,2", "episodes=20", "seeds=0,1,2"} <= set(
         words
     )
+
+
+def test_the_command_of_a_chain_gives_the_parameters_of_its_links_and_the_grid() -> None:
+    chain = choose("defense", "tracker+shield")
+    records = drive(defense=chain.name, defense_params=json.loads(chain.params), grid="standard-v2", episodes=10)
+    (one,) = read_tracks({"driving": records})
+    config = run_config(shlex.split(run_command(one))[2:])
+    assert [pair.defense for pair in config.pairs] == [chain]
+    assert (config.grid.name, config.grid.episodes) == ("standard-v2", 10)
+
+
+def test_a_label_leaves_out_what_is_empty() -> None:
+    behind = [drive(victim_params={"behind": name}) for name in ("", "shield", "tracker")]
+    found = labels(read_tracks({"driving": pa.concat_tables(behind)}), "victim")
+    assert set(found.values()) == {"dqn", "dqn behind=shield", "dqn behind=tracker"}
 
 
 def test_every_published_run_command_makes_the_same_pair_on_the_same_scenarios() -> None:
