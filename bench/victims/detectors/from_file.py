@@ -28,7 +28,7 @@ MOST_IMAGES, MOST_PIXELS = 64, 4096
 """The largest fixed batch size, and the largest fixed height and width."""
 SIDE = 320
 """Side in pixels of the images on which a file is tried: the window of `eot`."""
-TOLERANCE = 1e-3
+TOLERANCE = {torch.float32: 1e-4, torch.float16: 1e-2}
 """By so much may scores be outside of [0, 1] or depend on the batch, from rounding."""
 SMALL, LARGE = 2.0, 10.0
 """Boxes in pixels reach beyond the first; boxes in shares of the image stay below the second."""
@@ -47,8 +47,8 @@ class DetectorFile(DetectorVictim):
 
     Args:
         path: the file.
-        names: class names in the order of the scores, one of which is "stop sign": joined by `+`, as in "car+stop sign", or a text
-            file with one in each line; empty for the 80 classes of COCO.
+        names: class names in the order of the scores, one of which is "stop sign": joined by `+`, as in "car+stop sign", or a
+            text file with one in each line; empty for the 80 classes of COCO.
         boxes: `corners`: [x1, y1, x2, y2]; `centre`: [x, y, width, height]; `auto`: corners if boxes are an output of their own,
             otherwise centre, as in YOLO.
         normalised: boxes are shares of the input's width and height, not pixels.
@@ -75,6 +75,14 @@ class DetectorFile(DetectorVictim):
             # Both depend on the file's format.
             object.__setattr__(self, "answers", "scores")
             object.__setattr__(self, "libraries", (onnx_runtime.LIBRARY,))
+
+    def zoo_name(self) -> str:
+        """A file has no trained or defended versions.
+
+        Raises:
+            UserError: always.
+        """
+        raise UserError("a detector in a file cannot be trained: leave out the training or the defence that needs one")
 
     def load(self, seed: int, facts: Facts) -> FileDetector:
         """The detector in the file, the same for any seed.
@@ -114,9 +122,9 @@ class DetectorFile(DetectorVictim):
         match shape:
             case [batch, 3 | None, None, None] if batch is None or 0 < batch <= MOST_IMAGES:
                 return batch, None
-            case [batch, 3 | None, int(height), int(width)] if (
-                (batch is None or 0 < batch <= MOST_IMAGES) and 0 < min(height, width) <= max(height, width) <= MOST_PIXELS
-            ):
+            case [batch, 3 | None, int(height), int(width)] if (batch is None or 0 < batch <= MOST_IMAGES) and 0 < min(
+                height, width
+            ) <= max(height, width) <= MOST_PIXELS:
                 return batch, (height, width)
         sides = ", ".join("any" if side is None else str(side) for side in shape)
         raise UserError(
@@ -166,14 +174,15 @@ def _torch(path: Path, name: str, sha256: str) -> tuple[Network, tuple[int | Non
 
 @cache
 def _check(victim: DetectorFile, names: tuple[str, ...], sha256: str) -> None:
-    """Try a file on images of noise and a grey one, once in a process. Its kernels may crash on a crafted file.
+    """Try a file on noise, a white image and a grey one, once in a process. Its kernels may crash on a crafted file.
 
     Raises:
         UserError: if it fails, or its predictions are not those of a detector.
     """
     detector = victim.read(names, sha256)
+    tolerance = TOLERANCE[detector.given.dtype]
     pictures = torch.rand(3, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
-    pictures[2] = 0.5
+    pictures[1], pictures[2] = 1.0, 0.5
     with torch.no_grad():
         alone, grey, together = detector.raw(pictures[:1]), detector.raw(pictures[2:]), detector.raw(pictures)
     boxes, objectness, classes = together[:3]
@@ -186,14 +195,14 @@ def _check(victim: DetectorFile, names: tuple[str, ...], sha256: str) -> None:
     if not all(bool(part.isfinite().all()) for part in (*alone[:3], boxes, objectness, classes)):
         raise UserError(f"{path} returns boxes or scores that are NaN or infinite")
     low, high = min(float(objectness.min()), float(classes.min())), max(float(objectness.max()), float(classes.max()))
-    if low < -TOLERANCE or high > 1 + TOLERANCE:
+    if low < -tolerance or high > 1 + tolerance:
         raise UserError(
             f"{path} returns scores between {low:.3g} and {high:.3g}, they must be in [0, 1]: "
             "export it with its sigmoid or softmax"
         )
     _check_boxes(victim, boxes, together[3], together[4])
     first, among = ((part[1][0, :, None] * part[2][0]).sort(0).values for part in (alone, together))
-    if not torch.allclose(first, among, rtol=TOLERANCE, atol=TOLERANCE):
+    if not torch.allclose(first, among, rtol=tolerance, atol=tolerance):
         raise UserError(
             f"{path} returns other scores for an image if other images are in its batch: export it in eval mode"
         )
