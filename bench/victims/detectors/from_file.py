@@ -119,12 +119,11 @@ class DetectorFile(DetectorVictim):
 
     def _sizes(self, shape: Sequence[int | None]) -> tuple[int | None, tuple[int, int] | None]:
         """The batch size, and height and width, of the shape of an input; None for any."""
-        match shape:
-            case [batch, 3 | None, None, None] if batch is None or 0 < batch <= MOST_IMAGES:
+        batch, *rest = shape or (0,)
+        match rest if batch is None or 0 < batch <= MOST_IMAGES else []:
+            case [3 | None, None, None]:
                 return batch, None
-            case [batch, 3 | None, int(height), int(width)] if (batch is None or 0 < batch <= MOST_IMAGES) and 0 < min(
-                height, width
-            ) <= max(height, width) <= MOST_PIXELS:
+            case [3 | None, int(height), int(width)] if 0 < min(height, width) and max(height, width) <= MOST_PIXELS:
                 return batch, (height, width)
         sides = ", ".join("any" if side is None else str(side) for side in shape)
         raise UserError(
