@@ -41,8 +41,7 @@ class Chain(Defense):
         first, others = (named[0], named[1:]) if named[0][1].trains else (None, named)
         if len(others) < 2:
             return first, next(iter(others), None)
-        whole = chained(tuple((name, type(link)) for name, link in others))
-        return first, (MARK.join(name for name, _ in others), whole(**dict(others)))
+        return first, (MARK.join(name for name, _ in others), _linked(*others))
 
     @property
     def trains(self) -> bool:
@@ -68,6 +67,10 @@ class Chain(Defense):
         for link in behind:
             victim = _defended(victim, link)
         return victim.load(seed, facts)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # The class is in no module, so a worker process makes it again.
+        return _linked, tuple((name, getattr(self, name)) for name in self._fields())
 
     @classmethod
     def _fields(cls) -> tuple[str, ...]:
@@ -98,6 +101,11 @@ def chained(links: tuple[tuple[str, type[Defense]], ...]) -> type[Chain]:
     if not made.tracks():
         raise UserError(f"the defences of {MARK.join(names)!r} are for different tracks")
     return made
+
+
+def _linked(*links: tuple[str, Defense]) -> Chain:
+    whole = chained(tuple((name, type(link)) for name, link in links))
+    return whole(**dict(links))
 
 
 def _defended(victim: Victim, link: Defense) -> Victim:

@@ -7,6 +7,7 @@ import re
 import types
 import typing
 from dataclasses import MISSING, Field, dataclass, fields
+from functools import cache
 from typing import Any, Literal, Union, get_args, get_origin
 
 from bench.errors import PluginError
@@ -61,6 +62,12 @@ def parameters(component: type) -> dict[str, Parameter]:
     Raises:
         PluginError: if a type annotation cannot be read at run time.
     """
+    kind: Any = component
+    return dict(_declared(kind))
+
+
+@cache
+def _declared(component: type) -> dict[str, Parameter]:
     try:
         hints, annotated = (typing.get_type_hints(component, include_extras=extras) for extras in (False, True))
     # Annotations are evaluated, and may be any expression.

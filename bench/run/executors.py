@@ -144,6 +144,7 @@ class ProcessExecutor:
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         waiting, retries = iter(tasks), Retries()
         busy: dict[Worker, Task] = {}
+        told: list[Task] = []
         try:
             while True:
                 ended: list[Finished] = []
@@ -160,7 +161,9 @@ class ProcessExecutor:
                     ended = []
                 if not busy:
                     return
-                watcher.working([work for task in busy.values() for work in (task.work, *task.others)])
+                if [*map(id, busy.values())] != [*map(id, told)]:
+                    told = list(busy.values())
+                    watcher.working([work for task in told for work in (task.work, *task.others)])
                 wait([source for worker in busy for source in worker.sources], NEWS_S)
                 for worker in list(busy):
                     for item in worker.news():

@@ -91,7 +91,7 @@ def test_a_chain_is_listed_with_the_parameters_of_its_links() -> None:
 
 
 def test_a_chain_is_recorded_and_its_code_counts(tmp_path: Path) -> None:
-    config = run_config([*WORDS, "defense=tracker+shield", "executor=serial", f"out={tmp_path}"])
+    config = run_config([*WORDS, "defense=tracker+shield", "workers=1", f"out={tmp_path}"])
     (unit,) = plan(config)
     assert {"defenses.shield", "defenses.tracker"} <= set(unit.modules)
     run(config, Silent())
