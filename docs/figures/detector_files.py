@@ -45,7 +45,9 @@ def detector_file() -> Figure:
             looks[name] = sight(victim.load(0, StopSignApproach().facts), approach).confidence
     apart = {name: float(abs(looks[name] - looks["before"]).max()) for name in ("whole.pt2", "whole.onnx")}
     same, near = (f"{most:.0e} apart" if most else "the same" for most in apart.values())
-    made = style.figure(4.0, "detector: yolov5 from files is as sure as before\nif the input has the size of the camera's frames")
+    made = style.figure(
+        4.0, "detector: yolov5 from files is as sure as before\nif the input has the size of the camera's frames"
+    )
     axes, distance = made.subplots(), approach.scenes.distance
     size = f"{width} x {height}"
     axes.plot(distance, looks["before"], color=style.GREEN, lw=2.2, label="before")
@@ -53,8 +55,8 @@ def detector_file() -> Figure:
     axes.plot(distance, looks["whole.onnx"], "x", ms=6, color=style.INK, label=f".onnx {size}")
     axes.plot(distance, looks["square.pt2"], "s--", ms=4, color=style.ORANGE, label=f".pt2 {SQUARE} x {SQUARE}")
     frame_axes(axes)
-    axes.set_title(f"confidence in the sign at {size}: .pt2 {same}, .onnx at most {near}", fontsize=10)
-    axes.legend(loc="center left", ncols=2, fontsize=9.5)
+    axes.set_title(f"at {size}: from .pt2 {same}, from .onnx {near}", fontsize=10)
+    axes.legend(loc=(0.02, 0.32), fontsize=9.5)
     return made
 
 

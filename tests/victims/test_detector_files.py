@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -221,6 +222,8 @@ def test_a_gradient_attack_on_an_onnx_detector_is_refused_before_any_work() -> N
         run_config(["attack=eot", "victim=detector", "victim.path=nowhere.onnx"])
     run_config(["attack=noise_patch", "victim=detector", "victim.path=nowhere.onnx"])
     run_config(["attack=eot", "victim=detector", "victim.path=nowhere.pt2"])
+    sent = pickle.loads(pickle.dumps(choose("victim", "detector", path="nowhere.onnx").component))
+    assert (sent.answers, sent.libraries) == ("scores", ("onnxruntime",))
 
 
 def made(
@@ -461,6 +464,16 @@ def test_an_operation_outside_of_the_list_is_refused(program: str, tmp_path: Pat
     assert not harm.exists()
 
 
+def test_an_operation_that_onnx_runtime_does_not_have_is_refused(black_box: str, tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(black_box)
+    model.graph.node[0].op_type, model.graph.node[0].domain = "Run", "com.example"
+    model.opset_import.append(onnx.helper.make_opsetid("com.example", 1))
+    onnx.save(model, tmp_path / "own.onnx")
+    line = refusal(str(tmp_path / "own.onnx"))
+    assert "it needs the operation com.example:Run, which ONNX Runtime does not have" in line
+
+
 def test_an_image_is_resized_by_scales_that_fit_its_size_only() -> None:
     _, resize = operation("torch.ops.aten.upsample_nearest2d.default")
     _, by_scale = operation("torch.ops.aten.upsample_bilinear2d.vec")
@@ -483,6 +496,8 @@ def test_class_names_come_from_a_file_and_are_part_of_the_hash(black_box: str, t
     first = load(black_box, str(listed)).weights_sha256
     listed.write_text("stop sign\ncar\n")
     assert load(black_box, str(listed)).weights_sha256 != first
+    listed.write_text("car\n\nstop sign")
+    assert "has an empty name, or one that cannot be printed" in refusal(black_box, str(listed))
     listed.write_bytes(b"\xff\xfe\x00")
     assert "cannot be read: UnicodeDecodeError" in refusal(black_box, str(listed))
 

@@ -123,7 +123,7 @@ class DetectorFile(DetectorVictim):
         match rest if batch is None or 0 < batch <= MOST_IMAGES else []:
             case [3 | None, None, None]:
                 return batch, None
-            case [3 | None, int(height), int(width)] if 0 < min(height, width) and max(height, width) <= MOST_PIXELS:
+            case [3 | None, int(height), int(width)] if min(height, width) > 0 and max(height, width) <= MOST_PIXELS:
                 return batch, (height, width)
         sides = ", ".join("any" if side is None else str(side) for side in shape)
         raise UserError(
@@ -138,6 +138,8 @@ class DetectorFile(DetectorVictim):
             UserError: if they cannot be read, or a stop sign is not among them.
         """
         names = _listed(self.names) if self.names else coco.NAMES
+        if not all(name and name.isprintable() for name in names):
+            raise UserError(f"victim.names={short(self.names)!r} has an empty name, or one that cannot be printed")
         if STOP_SIGN not in names:
             raise UserError(
                 f"none of the classes in victim.names is {STOP_SIGN!r}, which attacks hide: {short(', '.join(names))!r}; "

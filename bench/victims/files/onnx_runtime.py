@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench.errors import UserError
+from bench.errors import UserError, short
 from bench.victims.files.onnx_file import companions
 from bench.victims.files.trial import OperationError
 
@@ -80,7 +80,14 @@ def read(path: Path, name: str, sha256: str) -> Model:
     options = onnxruntime.SessionOptions()
     options.add_session_config_entry("session.load_model_format", "ONNX")
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    try:
+        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        if unknown := re.search(r"([\w.]+:\w+)\(-?\d+\) is not a registered", str(error)):
+            raise UserError(
+                f"{name} is refused: it needs the operation {short(unknown[1])}, which ONNX Runtime does not have"
+            ) from error
+        raise
     inputs, outputs = session.get_inputs(), session.get_outputs()
     if len(inputs) != 1 or inputs[0].type not in TYPES:
         raise UserError(f"{name} takes {_listed(inputs)}; it must take one tensor(float)")
