@@ -313,10 +313,23 @@ def test_every_layout_is_read_as_the_same_predictions() -> None:
     (one,) = (layout_of([(2, 9), (2, 9, 4)], 1),)
     assert one == "scores and boxes"
     assert split([scores[..., 0], boxes], one, 1)[2].shape == (2, 9, 1)
+    unknown = torch.cat((boxes, sure, torch.full((2, 9, 1), torch.nan)), -1)
+    assert not split([unknown], "labelled", 3)[2].any()
 
 
 @pytest.mark.parametrize(
-    "shapes", [[(2, 9, 4)], [(2, 9, 4), (2, 8, 3)], [(9, 4), (9, 3)], [(2, 9, 9)], [(2, 9, 4)] * 3, [], [()]]
+    "shapes",
+    [
+        [(2, 9, 4)],
+        [(2, 9, 4), (2, 8, 3)],
+        [(9, 4), (9, 3)],
+        [(2, 7, 8)],
+        [(2, 7, 6)],
+        [(2, 9, 9)],
+        [(2, 9, 4)] * 3,
+        [],
+        [()],
+    ],
 )
 def test_other_outputs_have_no_layout(shapes: list[tuple[int, ...]]) -> None:
     assert layout_of(shapes, 3) is None

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 Layout = Literal["boxes and scores", "scores and boxes", "objectness", "rows", "columns", "labelled"]
 """Two outputs; or one: a row [box, objectness, scores] (YOLOv5), [box, scores] (RT-DETR) or [box, score, label] (YOLOv10) for
@@ -30,6 +30,9 @@ def layout_of(shapes: Sequence[Sequence[int]], count: int) -> Layout | None:
             return "boxes and scores"
         case [scores, boxes] if _paired(boxes, scores, count):
             return "scores and boxes"
+        case [(_, middle, last)] if middle == 4 + count and last in (4 + count, 5 + count, 6):
+            # Rows and columns are equally long.
+            return None
         case [(_, _, last)] if last == 5 + count:
             return "objectness"
         case [(_, _, last)] if last == 4 + count:
@@ -59,6 +62,7 @@ def split(outputs: Sequence[Tensor], layout: Layout, count: int) -> tuple[Tensor
     if layout == "objectness":
         return boxes, scores[..., 0], scores[..., 1:]
     if layout == "labelled":
-        labels = scores[..., 1].detach().clamp(0, count - 1).long()
-        return boxes, scores[..., 0], nn.functional.one_hot(labels, count).to(scores)
+        # A label that is none of a class, NaN included, counts for no class.
+        one_hot = scores[..., 1:].round() == torch.arange(count, device=scores.device)
+        return boxes, scores[..., 0], one_hot.to(scores.dtype)
     return boxes, torch.ones_like(scores[..., 0]), scores
