@@ -18,6 +18,7 @@ from bench.plugins import registry
 from bench.plugins.device import recorded as recorded_device
 from bench.plugins.framework import Snapshot
 from bench.plugins.pair import IN_PROCESS, Chosen, Pair, choose
+from bench.plugins.parameters import parameters
 from bench.plugins.track import track
 from bench.records import reading, store
 from bench.records.schema import IDENTITY, SEQUENTIAL
@@ -248,8 +249,19 @@ def _chosen(kind: registry.Kind, record: Mapping[str, Any]) -> Chosen[Any]:
             f"{kind} {record[kind]!r} was an object of a Python process and cannot be loaded again; record=N of "
             "cavbench.score records episodes while they are driven"
         )
-    params = json.loads(record[f"{kind}_params"])
-    return choose(kind, record[kind], **{k: tuple(v) if isinstance(v, list) else v for k, v in params.items()})
+    component = registry.load(kind, record[kind])
+    return choose(kind, record[kind], **_values(component, json.loads(record[f"{kind}_params"])))
+
+
+def _values(component: type, params: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a component from JSON; those of a chain are its links."""
+    own = parameters(component)
+    found = {name: tuple(value) if isinstance(value, list) else value for name, value in params.items()}
+    for name, value in params.items():
+        if isinstance(value, dict) and name in own:
+            link: Any = own[name].hint
+            found[name] = link(**_values(link, value))
+    return found
 
 
 def _equal(before: pa.ChunkedArray, after: pa.ChunkedArray) -> bool:

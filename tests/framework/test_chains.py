@@ -18,6 +18,7 @@ from bench.plugins.pair import choose
 from bench.records import reading
 from bench.run.config import run_config
 from bench.run.plan import plan
+from bench.run.replay import find, replay
 from bench.run.runner import run
 from bench.victims.drivers.dqn import DQN
 from bench.victims.drivers.networks import QPolicy
@@ -90,7 +91,7 @@ def test_a_chain_is_listed_with_the_parameters_of_its_links() -> None:
     assert "defense.shield.band" in text
 
 
-def test_a_chain_is_recorded_and_its_code_counts(tmp_path: Path) -> None:
+def test_a_chain_is_recorded_and_replayed_and_its_code_counts(tmp_path: Path) -> None:
     config = run_config([*WORDS, "defense=tracker+shield", "workers=1", f"out={tmp_path}"])
     (unit,) = plan(config)
     assert {"defenses.shield", "defenses.tracker"} <= set(unit.modules)
@@ -98,6 +99,8 @@ def test_a_chain_is_recorded_and_its_code_counts(tmp_path: Path) -> None:
     (records,) = reading.read_all(tmp_path).values()
     assert set(records["defense"].to_pylist()) == {"tracker+shield"}
     assert all(share > 0.5 for share in records["assured"].to_pylist())
+    again = replay(tmp_path, find(records, {"attack": "none"}))
+    assert (again.differences, again.changed) == ((), "")
     other = run_config([*WORDS, "defense=tracker+shield", "defense.shield.band=5", f"out={tmp_path}"])
     assert plan(other)[0].fingerprint != unit.fingerprint
 
