@@ -16,8 +16,8 @@ from tests.framework.distributions import install
 from tests.framework.test_cli import assert_one_line
 
 Bench = Callable[..., Said]
-FROM_FILES = {"sb3", "torch", "onnx"}
-"""Victims that need a file of the user: `tests/victims/test_from_file.py` checks them."""
+FROM_FILES = {"sb3", "torch", "onnx", "detector"}
+"""Victims that need a file of the user: `tests/victims/test_from_file.py` and `test_detector_files.py` check them."""
 ADAPTERS = {"art"}
 """Adapters, which need a choice: `tests/attacks/test_art.py` checks some."""
 QUICK = {"noise", "noise_patch", "grey_patch", "blind", "random", "idm"}

@@ -136,10 +136,11 @@ def _twice(draw: random.Random, files: list[Path]) -> list[str]:
 
 
 def _file(draw: random.Random, files: list[Path]) -> list[str]:
-    """A policy from a broken file."""
+    """A policy or a detector from a broken file."""
     path = draw.choice(files)
-    victim = draw.choice((["victim=torch"], ["victim=onnx"], ["victim=sb3", "victim.algo=dqn"], ["victim=yolov5"]))
-    return ["run", *victim, f"victim.path={path}", "reference=false"]
+    victims = ["torch"], ["onnx"], ["sb3", "victim.algo=dqn"], ["yolov5"], ["detector"]
+    victim, *more = draw.choice(victims)
+    return ["run", f"victim={victim}", *more, f"victim.path={path}", "reference=false"]
 
 
 def _place(draw: random.Random, files: list[Path]) -> list[str]:

@@ -24,8 +24,9 @@ from bench.archive import Archive
 from bench.errors import UserError
 from bench.run.config import component
 from bench.victims.detectors import yolov5_file
-from bench.victims.drivers.from_file import FileDriver, FilePolicy, RefusedError
-from bench.victims.drivers.torch_operations import operation
+from bench.victims.drivers.from_file import FileDriver, FilePolicy
+from bench.victims.files.torch_operations import operation
+from bench.victims.files.trial import RefusedError
 from envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts

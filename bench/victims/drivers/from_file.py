@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import multiprocessing
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -16,21 +13,13 @@ from torch import Tensor, nn
 
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from bench.errors import UserError
-from bench.plugins.foreign import harm
 from bench.plugins.ranges import Count
+from bench.victims.files.trial import RefusedError, failure, hashed, refuse_harm
 
 CONTROLS = 2
 """Size of a continuous action: acceleration and steering."""
 TRIED = (1, 2, 1500)
 """Batch sizes on which a policy is tested: attacks query many points of many episodes at once."""
-
-
-class RefusedError(Exception):
-    """A part of a file that is not carried out. The message completes "the file is refused:"."""
-
-
-class OperationError(Exception):
-    """An operation of a network failed. The message is its name."""
 
 
 class FilePolicy(Policy):
@@ -116,16 +105,8 @@ class FileDriver(DrivingVictim):
         Raises:
             UserError: if the file is missing, cannot be read or does not match the other parameters.
         """
-        path = Path(self.path).expanduser()
-        if not path.is_file():
-            raise UserError(f"there is no file {self.path}; set victim.path=… to the policy's file")
-        try:
-            sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        except OSError as error:
-            raise UserError(f"{self.path} cannot be read: {error.strerror}") from error
-        # A worker is itself a process that may end.
-        if multiprocessing.parent_process() is None and (why := _harm(self, facts, sha256)):
-            raise UserError(f"{self.path} is refused: reading and trying it {why}")
+        sha256 = hashed(self.path, "policy")
+        refuse_harm(self.path, type(self)._loaded, self, facts, sha256)
         return self._loaded(facts, sha256)
 
     def _loaded(self, facts: DrivingFacts, sha256: str) -> FilePolicy:
@@ -181,19 +162,13 @@ class FileDriver(DrivingVictim):
                 )
 
 
-@cache
-def _harm(driver: FileDriver, facts: DrivingFacts, sha256: str) -> str:
-    """What reading and trying a file does to a copy of this process; empty for nothing."""
-    return harm(partial(driver._loaded, facts, sha256))
-
-
 def _observations(batch: int) -> str:
     return "1 observation" if batch == TRIED[0] else f"{batch} observations"
 
 
 def _what(error: Exception, batch: int) -> str:
     """What failed, and what may help."""
-    operation = f"the operation {error}" if isinstance(error, OperationError) else type(error).__name__
+    what = failure(error)
     if batch == TRIED[0]:
-        return f"{operation} fails; if its batch size is fixed, export it with a dynamic one"
-    return f"{operation} fails, but not on fewer: export it with a dynamic batch size"
+        return f"{what} fails; if its batch size is fixed, export it with a dynamic one"
+    return f"{what} fails, but not on fewer: export it with a dynamic batch size"

@@ -8,7 +8,8 @@ from typing import ClassVar
 
 from bench.errors import UserError
 from bench.victims.drivers.from_file import FileDriver, FilePolicy
-from bench.victims.drivers.torch_program import read
+from bench.victims.files.torch_graph import Single
+from bench.victims.files.torch_program import read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +24,8 @@ class TorchExport(FileDriver):
 
     def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
         program = read(path, self.path)
+        if (count := len(program.graph.outputs)) != 1:
+            raise UserError(f"{self.path} returns {count} values, a driver returns one tensor")
         batch, *shape = program.shape
         self.check_observation(shape)
         if batch is not None:
@@ -31,4 +34,4 @@ class TorchExport(FileDriver):
                 'dynamic_shapes={"observation": {0: torch.export.Dim("batch")}}'
             )
         sizes = [side for side in shape if side is not None]
-        return FilePolicy(program.graph, sizes, self.action_type, width, sha256)
+        return FilePolicy(Single(program.graph), sizes, self.action_type, width, sha256)

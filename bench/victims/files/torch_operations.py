@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch._ops import OpOverload, OpOverloadPacket
 
-from bench.victims.drivers.from_file import RefusedError
+from bench.victims.files.trial import RefusedError
 
 NAMES = """
 abs absolute acos acosh adaptive_avg_pool1d _adaptive_avg_pool2d adaptive_avg_pool2d adaptive_max_pool1d adaptive_max_pool2d
@@ -49,12 +49,15 @@ special_logit special_logsumexp special_ndtr special_round special_sinc special_
 split_with_sizes sqrt square squeeze stack std std_mean sub subtract sum sum_to_size swapaxes swapdims sym_numel sym_size
 sym_storage_offset sym_stride t take take_along_dim tan tanh tensor_split tensordot threshold tile to _to_copy topk trace
 transpose trapezoid tril tril_indices _trilinear triu triu_indices true_divide trunc type_as unbind unflatten unfold
-unsafe_chunk unsafe_split _unsafe_view unsqueeze vander var var_mean vdot view view_as vsplit vstack _weight_norm where xlogy
+unsafe_chunk unsafe_split _unsafe_view unsqueeze upsample_bicubic2d upsample_bilinear2d upsample_nearest2d
+_upsample_nearest_exact2d vander var var_mean vdot view view_as vsplit vstack _weight_norm where xlogy
 __xor__ zero zeros zeros_like
 """
 """Names of operations, with the overload where only that is allowed. Each may also change its first argument: `relu_`."""
 FORWARD = frozenset(NAMES.split())
 
+LEAST_SCALE, MOST_SCALE = 1 / 64, 64
+"""The scales by which an image may be resized."""
 Given = Mapping[str, Any]
 """The arguments of an operation by the names in its schema."""
 
@@ -171,6 +174,19 @@ def _recurrent(gates: int) -> Callable[[Given], str]:
     return check
 
 
+def _resize(given: Given) -> str:
+    """Torch looks up a pixel by the product of its place and a scale, and checks neither that it is a number nor its size."""
+    input, size = given["input" if "input" in given else "self"], given.get("output_size")
+    scales = given["scale_factors"] if "scale_factors" in given else [given["scales_h"], given["scales_w"]]
+    for axis, scale in enumerate(scales or ()):
+        fits = scale is None or (
+            LEAST_SCALE <= scale <= MOST_SCALE and (not size or abs(input.shape[2 + axis] * scale - size[axis]) <= 1)
+        )
+        if not fits:
+            return "an image is resized by a scale that does not fit its size"
+    return ""
+
+
 CHECKS: Mapping[str, Callable[[Given], str]] = {
     "batch_norm": _batch_norm,
     "_native_batch_norm_legit_no_training": _batch_norm,
@@ -179,6 +195,10 @@ CHECKS: Mapping[str, Callable[[Given], str]] = {
     "scaled_dot_product_attention": _attention,
     "_scaled_dot_product_flash_attention_for_cpu": _attention,
     "_weight_norm": _weight_norm,
+    "upsample_nearest2d": _resize,
+    "_upsample_nearest_exact2d": _resize,
+    "upsample_bilinear2d": _resize,
+    "upsample_bicubic2d": _resize,
     "gru": _recurrent(3),
     "rnn_relu": _recurrent(1),
     "rnn_tanh": _recurrent(1),

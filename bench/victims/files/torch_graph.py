@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch._ops import OpOverload
 
-from bench.victims.drivers.from_file import OperationError, RefusedError
-from bench.victims.drivers.torch_operations import operation
+from bench.victims.files.torch_operations import operation
+from bench.victims.files.trial import OperationError, RefusedError
 
 DTYPES = {
     1: torch.uint8, 2: torch.int8, 3: torch.int16, 4: torch.int32, 5: torch.int64, 6: torch.float16, 7: torch.float32,
@@ -47,6 +47,9 @@ WORDS = (
     "prod",
     "amax",
     "amin",
+    "constant",
+    "reflect",
+    "replicate",
 )
 """Words that may be arguments, for instance how a division is rounded. Others could be names of files."""
 ASSERTIONS = re.compile(r"torch\.ops\.aten\.(_assert_\w+|sym_constrain_range\w*)\.\w+")
@@ -74,7 +77,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Device:
-    """An argument: the device of the observation, whatever the file says."""
+    """An argument: the device of the input, whatever the file says."""
 
 
 @dataclass(frozen=True)
@@ -89,42 +92,60 @@ class Step:
 
 
 class Graph(nn.Module):
-    """The operations of a program as a module from the observation to the output.
+    """The operations of a program as a module from its input to its outputs.
 
     Args:
         graph: `Graph` of the format.
-        observation: name of the input.
+        given: name of the input.
         weights: the tensors that the program computes with, by the names of their values.
 
     Raises:
         RefusedError: if it contains anything but operations of ATen.
     """
 
-    def __init__(self, graph: Mapping[str, Any], observation: str, weights: Mapping[str, Tensor]) -> None:
+    def __init__(self, graph: Mapping[str, Any], given: str, weights: Mapping[str, Tensor]) -> None:
         super().__init__()
-        self.observation = observation
+        self.given = given
         self.names = {f"weight_{number}": name for number, name in enumerate(weights)}
         for place, name in self.names.items():
             self.register_buffer(place, weights[name])
         self.steps = _steps(graph)
-        ((output,),) = (list(value.values()) for value in graph["outputs"])
-        self.output = str(output["name"])
+        self.outputs = [_tensor_name(value) for value in graph["outputs"]]
 
-    def forward(self, observation: Tensor) -> Tensor:
+    def forward(self, given: Tensor) -> tuple[Tensor, ...]:
         values: dict[str, Any] = {name: self._buffers[place] for place, name in self.names.items()}
-        values[self.observation] = observation
+        values[self.given] = given
         versions = self._versions()
-        _run(self.steps, values, observation.device)
+        _run(self.steps, values, given.device)
         # Also by a view of a weight: all tensors that share their memory count together.
         if self._versions() != versions:
             raise RefusedError("it changes its own weights: export it in eval mode")
-        found = values[self.output]
-        assert isinstance(found, Tensor)
+        found = tuple(values[name] for name in self.outputs)
+        assert all(isinstance(one, Tensor) for one in found)
         return found
 
     def _versions(self) -> list[int]:
         """How often each weight was changed in place."""
         return [weight._version for weight in self._buffers.values() if weight is not None]
+
+
+class Single(nn.Module):
+    """A graph with one output, as a module that returns it."""
+
+    def __init__(self, graph: Graph) -> None:
+        super().__init__()
+        self.graph = graph
+
+    def forward(self, given: Tensor) -> Tensor:
+        (found,) = self.graph(given)
+        return found
+
+
+def _tensor_name(output: Mapping[str, Any]) -> str:
+    ((kind, value),) = output.items()
+    if kind != "as_tensor":
+        raise RefusedError(f"it returns something that is no tensor ({kind})")
+    return str(value["name"])
 
 
 def _run(steps: Sequence[Step], values: dict[str, Any], device: torch.device) -> None:

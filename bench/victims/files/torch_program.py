@@ -24,8 +24,8 @@ from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from bench.archive import Archive
 from bench.errors import UserError, short
-from bench.victims.drivers.from_file import RefusedError
-from bench.victims.drivers.torch_graph import DTYPES, Graph
+from bench.victims.files.torch_graph import DTYPES, Graph
+from bench.victims.files.trial import RefusedError
 
 SCHEMA = 8
 """Major version of the format that is read."""
@@ -47,10 +47,12 @@ class Program:
     Args:
         graph: the program as a module.
         shape: the shape of its input; None for an axis of any size.
+        dtype: the type of its input; None for a type that is not read.
     """
 
     graph: Graph
     shape: tuple[int | None, ...]
+    dtype: torch.dtype | None
 
 
 def read(path: Path, name: str) -> Program:
@@ -115,14 +117,14 @@ def _program(members: Mapping[str, bytes], name: str) -> Program:
         )
     weights = _tensors(members, "weights", "weight_") | _tensors(members, "constants", "tensor_")
     module = program["graph_module"]
-    inputs, observations = {}, []
+    inputs, user = {}, []
     for spec, value in zip(module["signature"]["input_specs"], module["graph"]["inputs"], strict=True):
         ((kind, given),) = spec.items()
         match kind:
             case "parameter" | "buffer" | "tensor_constant":
                 inputs[value["as_tensor"]["name"]] = weights[given[f"{kind}_name"]]
             case "user_input" if "as_tensor" in value:
-                observations.append(value["as_tensor"]["name"])
+                user.append(value["as_tensor"]["name"])
             case "constant_input":
                 pass
             case _:
@@ -130,13 +132,11 @@ def _program(members: Mapping[str, bytes], name: str) -> Program:
     outputs = [next(iter(spec)) for spec in module["signature"]["output_specs"]]
     if mutations := sorted({kind for kind in outputs if kind != "user_output"}):
         raise RefusedError(f"it changes its own state ({', '.join(mutations)}): export it in eval mode")
-    if len(observations) != 1:
-        raise UserError(f"{name} takes {len(observations)} inputs, a driver takes one: the observation")
-    if len(outputs) != 1:
-        raise UserError(f"{name} returns {len(outputs)} values, a driver returns one tensor")
-    meta = module["graph"]["tensor_values"][observations[0]]
+    if len(user) != 1:
+        raise UserError(f"{name} takes {len(user)} inputs, it must take one tensor")
+    meta = module["graph"]["tensor_values"][user[0]]
     shape = tuple(int(side["as_int"]) if "as_int" in side else None for side in meta["sizes"])
-    return Program(Graph(module["graph"], observations[0], inputs), shape)
+    return Program(Graph(module["graph"], user[0], inputs), shape, DTYPES.get(meta["dtype"]))
 
 
 def _tensors(members: Mapping[str, bytes], folder: str, prefix: str) -> dict[str, Tensor]:
