@@ -6,13 +6,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from docs.figures import road, style
-from envs.highway.axes import STANDARD_V1
+from envs.highway.axes import STANDARD_V2
 from envs.highway.batched import BatchedHighway
 from envs.highway.sensor import noise_sigma, sensor_range_m
 from envs.highway.world import HighwayWorld
 from envs.weather import WEATHERS
 
-GRID = STANDARD_V1
+GRID = STANDARD_V2
 SEED = GRID.first_seed
 REACH = (-15.0, 215.0)
 

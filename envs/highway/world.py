@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 from bench.driving import ActionType, Driver, DrivingWorld, Dynamics, Features, Kinematics
 from bench.scenarios import Axes, Cell
-from envs.highway.axes import AXES, STANDARD_V1
+from envs.highway.axes import AXES, STANDARD_V2
 from envs.highway.config import (
     ACTIONS,
     KINEMATICS,
@@ -50,7 +50,7 @@ class HighwayWorld(DrivingWorld):
     """
 
     axes: ClassVar[Axes] = AXES
-    grid: ClassVar[str] = STANDARD_V1.name
+    grid: ClassVar[str] = STANDARD_V2.name
     features: ClassVar[Features] = STANDARD_FEATURES
     actions: ClassVar[tuple[str, ...]] = ACTIONS
     drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm", "oracle")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bench.errors import UserError
 from bench.plugins.registry import load
 from bench.run.config import RunConfig, component, run_config, train_config
-from envs.highway.axes import STANDARD_V1, STANDARD_V2
+from envs.highway.axes import STANDARD_V2, STANDARD_V2
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
@@ -29,8 +29,13 @@ def test_the_defaults_are_the_clean_dqn_on_the_standard_grid() -> None:
         "dqn",
         "highway",
     )
-    assert config.grid == STANDARD_V1
-    assert (config.seeds, config.out, config.reference, config.record) == ((0, 1, 2), Path("results"), True, None)
+    assert config.grid == STANDARD_V2
+    assert (config.seeds, config.out, config.reference, config.record) == (
+        tuple(range(10)),
+        Path("results"),
+        True,
+        None,
+    )
 
 
 def test_options_set_every_part_of_the_configuration() -> None:
@@ -55,7 +60,7 @@ def test_a_grid_in_blocks_keeps_its_name_for_whole_blocks_of_all_cells() -> None
     for words in ("episodes=15", "episodes=40", "lanes=3"):
         assert read(f"attack=noise grid=standard-v2 {words}").grid.name == "custom"
     assert len(read("attack=noise grid=standard-v2 episodes=15").grid.blocks()) == 1
-    assert STANDARD_V1.blocks() == (STANDARD_V1.seeds(),)
+    assert STANDARD_V2.blocks() == (STANDARD_V2.seeds(),)
 
 
 def test_comma_lists_sweep_over_names_parameters_and_threats() -> None:
@@ -124,7 +129,7 @@ BAD = {
     "executor=dask": "unknown executor 'dask'; known: serial, processes, ray",
     "workers=0": "workers must be at least 1, got 0",
     "seeds=-1": "seeds must be distinct whole numbers of at least 0, got -1",
-    "record=101": "record must be between 0 and the 100 episodes, got 101",
+    "record=31": "record must be between 0 and the 30 episodes, got 31",
     "attack=zo attack=pgd": "attack is given twice; separate its values with commas: attack=a,b",
     "out=a out=b": "out is given twice",
     "seeds=0,0": "seeds has the value '0' twice",

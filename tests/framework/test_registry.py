@@ -85,7 +85,7 @@ def test_a_broken_grid_is_reported_when_it_is_used_and_breaks_no_other(plugins: 
         "cavbench.worlds": {"rough": "envs.highway.world:HighwayWorld"},
     }
     install(plugins, "rough-pack", points, {"rough": "1 / 0\n"})
-    assert run_config(["victim=blind"]).grid.name == "standard-v1"
+    assert run_config(["victim=blind"]).grid.name == "standard-v2"
     with pytest.raises(UserError, match=r"grid 'rough-v1' .* cannot be imported: ZeroDivisionError"):
         run_config(["victim=blind", "world=rough", "grid=rough-v1"])
 
