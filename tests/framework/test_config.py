@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bench.errors import UserError
 from bench.plugins.registry import load
 from bench.run.config import RunConfig, component, run_config, train_config
-from envs.highway.axes import STANDARD_V2, STANDARD_V2
+from envs.highway.axes import STANDARD_V1, STANDARD_V2
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
@@ -60,7 +60,7 @@ def test_a_grid_in_blocks_keeps_its_name_for_whole_blocks_of_all_cells() -> None
     for words in ("episodes=15", "episodes=40", "lanes=3"):
         assert read(f"attack=noise grid=standard-v2 {words}").grid.name == "custom"
     assert len(read("attack=noise grid=standard-v2 episodes=15").grid.blocks()) == 1
-    assert STANDARD_V2.blocks() == (STANDARD_V2.seeds(),)
+    assert STANDARD_V1.blocks() == (STANDARD_V1.seeds(),)
 
 
 def test_comma_lists_sweep_over_names_parameters_and_threats() -> None:
