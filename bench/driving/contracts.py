@@ -161,12 +161,12 @@ class TrainingHooks:
         return observation
 
     def loss(self, policy: Policy, sample: TensorDictBase, own: Callable[[TensorDictBase], Tensor]) -> Tensor:
-        """The loss of the policy on a batch of transitions; a critic always learns from the truth.
+        """The loss of the policy on a batch of transitions: a number, or [N]; a critic always learns from the truth.
 
         Args:
             policy: the policy in training.
             sample: transitions [N] with `observation` (after `replayed`), `truth` (after `remembered`), `action` and `next`.
-            own: the loss of the victim's algorithm on such a batch.
+            own: the loss [N] of the victim's algorithm on each transition of such a batch.
         """
         return own(sample)
 

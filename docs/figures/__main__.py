@@ -29,6 +29,8 @@ FIGURES = {
     "defense_shield.svg": "intervals:shield",
     "defense_tracker.svg": "intervals:tracker",
     "defense_advtrain.svg": "hardening:advtrain",
+    "defense_sa.svg": "hardening:sa",
+    "defense_car.svg": "hardening:car",
     "defense_advtrain_detection.svg": "hardening:advtrain_detection",
     "defense_median.png": "filters:median",
     "defense_jpeg.png": "filters:jpeg",

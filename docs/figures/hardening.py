@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.driving import ObservationThreat
+from bench.driving import DrivingDefense, ObservationThreat, Policy
 from bench.driving.attacker import Attacker
 from bench.driving.victim import CountedPolicy
 from bench.plugins.pair import choose
 from bench.victims import zoo
 from bench.victims.drivers.dqn import DQN
 from defenses.advtrain import AdversarialTraining
+from defenses.car import ConsistentAdversarialRobustness
+from defenses.robust_loss import RobustLoss
+from defenses.sa import StateAdversarial
 from docs.figures import style
 from docs.figures.driving import FEATURES, episode, policy
 from docs.figures.sightings import clean, curve, frame_axes, patched, undisturbed
@@ -63,7 +69,7 @@ def advtrain() -> Figure:
     turned.annotate("undefended", (7, 91), color=style.UNDEFENDED)
     turned.annotate("hardened", (11.5, 45), color=style.HARDENED)
     turned.annotate("budget of\nthe training", (10.3, 3), color=style.GREY, fontsize=9.5)
-    cards = {skip: [_card(skip, seed) for seed in SEEDS] for skip in SKIPS}
+    cards = {skip: [_scores(AdversarialTraining(skip=float(skip)), seed) for seed in SEEDS] for skip in SKIPS}
     for score, colour in (("clean", style.BLUE), ("attacked", style.RED)):
         known = {skip: _percent([card[score] for card in cards[skip]]) for skip in SKIPS if score in cards[skip][0]}
         means = [each.mean() for each in known.values()]
@@ -74,6 +80,50 @@ def advtrain() -> Figure:
     traded.set_title("hardened dqn, three seeds", fontsize=10.5)
     traded.legend(loc="lower right", fontsize=10)
     return made
+
+
+def sa() -> Figure:
+    """As `_robust`, for the regulariser of state-adversarial learning."""
+    return _robust("sa", StateAdversarial(), [{}, {"weight": 0.3}])
+
+
+def car() -> Figure:
+    """As `_robust`, for consistent adversarial robustness."""
+    return _robust("car", ConsistentAdversarialRobustness(), [{}, {"budget": 0.02}])
+
+
+def _robust(name: str, defense: RobustLoss, variants: Sequence[dict[str, float]]) -> Figure:
+    """What the DQN decides at the moments of one episode, and safe progress of trainings with other parameters."""
+    made = style.figure(3.9, f"{name}: decisions that cannot be turned depend on little")
+    decided, traded = made.subplots(1, 2)
+    moments = torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"])
+    drivers = {"undefended": "none", "advtrain": "advtrain", name: name}
+    shares = np.array([_shares(policy("dqn", each), moments) for each in drivers.values()])
+    left = np.zeros(len(drivers))
+    for (action, colour), share in zip(style.ACTIONS.items(), shares.T, strict=True):
+        decided.barh(list(drivers), share, left=left, color=colour, label=action.lower().replace("_", " "))
+        left += share
+    decided.invert_yaxis()
+    decided.set(xlabel="share of the decisions, %", xlim=(0, 100))
+    decided.set_title("dqn, one episode without an attack", fontsize=10.5)
+    decided.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3, fontsize=9.5)
+    cards = [_scores(replace(defense, **changes), 0) for changes in variants]
+    for place, (score, colour) in enumerate((("clean", style.BLUE), ("attacked", style.RED))):
+        where = np.arange(len(cards)) + 0.38 * (place - 0.5)
+        bars = traded.bar(where, _percent([card[score] for card in cards]), 0.36, color=colour, label=score)
+        traded.bar_label(bars, fmt="%.0f", fontsize=10)
+    named = ["\n".join(f"{key} {value:g}" for key, value in changes.items()) or "default" for changes in variants]
+    traded.set_xticks(range(len(named)), named)
+    traded.set(ylabel="safe progress, %", ylim=(0, 103))
+    traded.set_title(f"dqn + {name}", fontsize=10.5)
+    traded.legend(loc="upper left", fontsize=10)
+    return made
+
+
+def _shares(driver: Policy, moments: torch.Tensor) -> np.ndarray:
+    """Share of each action among the decisions at some moments, %."""
+    with torch.no_grad():
+        return _percent(np.bincount(driver.decide(moments).numpy(), minlength=len(style.ACTIONS)) / len(moments))
 
 
 def advtrain_detection() -> Figure:
@@ -103,10 +153,9 @@ def _changed(attack: str, defense: str, budget: float) -> float:
         return float((driver.decide(shown) != driver.decide(moments)).float().mean())
 
 
-def _card(skip: str, seed: int) -> dict[str, float]:
-    """Safe progress, `clean` and `attacked`, of a hardened DQN on the seeds that selected its checkpoint."""
-    recipe = zoo.Recipe.of(DQN(), AdversarialTraining(skip=float(skip)))
-    scores = zoo.card(recipe, seed)["selection"]["safe_progress"]
+def _scores(defense: DrivingDefense, seed: int) -> dict[str, float]:
+    """Safe progress, `clean` and `attacked`, of a DQN that a defence trained, on the seeds that selected its checkpoint."""
+    scores = zoo.card(zoo.Recipe.of(DQN(), defense), seed)["selection"]["safe_progress"]
     return {name: float(score["mean"]) for name, score in scores.items()}
 
 

@@ -85,12 +85,18 @@ class AttackMix(TrainingHooks):
     def _perturbed(
         self, attack: DrivingAttack, observation: Tensor, policy: Policy, state: State, memory: State
     ) -> tuple[Tensor, State]:
-        """The attacked observations [N, V, F], and what the attack remembers; with no memory it begins anew."""
         enforcer = Enforcer(CountedPolicy(policy), self.threat, attack.access, self.facts.features, self.noise)
-        oracle = enforcer.begin(observation, state)
-        memory = attack.initial(observation, oracle) if memory is None else memory
-        shown, memory = attack.step(observation, oracle, memory)
-        return enforcer.project(shown)[0], memory
+        return attacked(attack, enforcer, observation, state, memory)
+
+
+def attacked(
+    attack: DrivingAttack, enforcer: Enforcer, observation: Tensor, state: State, memory: State = None
+) -> tuple[Tensor, State]:
+    """The attacked observations [N, V, F], and what the attack remembers; with no memory it begins anew."""
+    oracle = enforcer.begin(observation, state)
+    memory = attack.initial(observation, oracle) if memory is None else memory
+    shown, memory = attack.step(observation, oracle, memory)
+    return enforcer.project(shown)[0], memory
 
 
 def attack_of(words: str) -> DrivingAttack:

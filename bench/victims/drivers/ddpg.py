@@ -81,6 +81,7 @@ class _ActorCriticLearner(Learner):
             policy_noise=0.2 * limit,
             noise_clip=0.5 * limit,
             deactivate_vmap=True,
+            reduction="none",
         )
         # The loss trains its own twin critics; the policy's critic is a copy of the first.
         self.policy.critic.requires_grad_(False)
@@ -95,13 +96,15 @@ class _ActorCriticLearner(Learner):
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
         self.updates += 1
         value, _ = self.loss.value_loss(sample.copy().set("observation", sample["truth"]))
-        _descend(self.critic_adam, value, learning_rate)
+        _descend(self.critic_adam, value.mean(), learning_rate)
         if self.updates % self.delay == 0:
-            _descend(self.actor_adam, self.hooks.loss(self.policy, sample, self._actor_loss), learning_rate)
+            loss = self.hooks.loss(self.policy, sample, self._actor_loss)
+            _descend(self.actor_adam, loss.mean(), learning_rate)
             self.target.step()
 
     def _actor_loss(self, sample: TensorDictBase) -> Tensor:
-        return self.loss.actor_loss(sample)[0]
+        loss: Tensor = self.loss.actor_loss(sample)[0]
+        return loss.flatten()
 
     def anneal(self) -> None:
         self.noise.step()

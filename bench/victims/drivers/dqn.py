@@ -66,7 +66,7 @@ class _QLearner(Learner):
             action_mask_key=self.mask,
         )
         self.explore = TensorDictSequential(actor, self.greedy)
-        self.loss = DQNLoss(actor, loss_function="smooth_l1", double_dqn=True, delay_value=True)
+        self.loss = DQNLoss(actor, loss_function="smooth_l1", double_dqn=True, delay_value=True, reduction="none")
         self.target = SoftUpdate(self.loss, tau=recipe.tau)
         self.adam = torch.optim.Adam(self.policy.parameters(), recipe.learning_rate)
 
@@ -82,13 +82,14 @@ class _QLearner(Learner):
             sample["next", "reward"] -= self.gap * self._disadvantage(sample)
         self.adam.param_groups[0]["lr"] = learning_rate
         self.adam.zero_grad()
-        self.hooks.loss(self.policy, sample, self._temporal_difference).backward()
+        self.hooks.loss(self.policy, sample, self._temporal_difference).mean().backward()
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
         self.adam.step()
         self.target.step()
 
     def _temporal_difference(self, sample: TensorDictBase) -> Tensor:
-        return self.loss(sample)["loss"]
+        loss: Tensor = self.loss(sample)["loss"]
+        return loss.flatten()
 
     @torch.no_grad()
     def _disadvantage(self, sample: TensorDictBase) -> Tensor:

@@ -1,0 +1,64 @@
+"""Training with the regulariser of state-adversarial reinforcement learning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from bench.driving import Policy
+from bench.plugins.ranges import NotNegative
+from defenses.robust_loss import Objective, RobustLoss
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateAdversarial(RobustLoss):
+    """Trains decisions that do not change within the perturbation set (Zhang et al. 2020, arXiv 2003.08938).
+
+    Adds to the victim's own loss, at the worst point s' of the set around each observation s: for discrete actions the hinge
+    max(max_{a != a*} Q(s', a) - Q(s', a*), -lead) with a* = argmax_a Q(s, a) (SA-DQN), for continuous ones |mu(s') - mu(s)|
+    (SA-DDPG).
+
+    Args:
+        weight: the paper's kappa; 0 is the control: the same training without the regulariser.
+        lead: the lead of the best action over all others that is enough, the paper's c; a value of 1 is perfect driving forever.
+            Discrete actions only.
+        norm: perturbation set of the training, `relative` or `linf`.
+        budget: size of this set after the ramp.
+        steps: gradient steps to the worst point, from a random one.
+        decisions: length of the training, on every road at once.
+        ramp_to: share of the training at which the budget, which grows from 0, reaches `budget`.
+        trained_in: non-default parameters of the training world, for instance `vehicles=5`; set by `bench train`.
+    """
+
+    name: ClassVar[str] = "sa"
+
+    weight: NotNegative = 0.03
+    lead: NotNegative = 0.02
+
+    def loss(
+        self,
+        policy: Policy,
+        sample: TensorDictBase,
+        own: Callable[[TensorDictBase], Tensor],
+        worst: Callable[[Objective], Tensor],
+    ) -> Tensor:
+        with torch.no_grad():
+            clean = policy.scores(sample["observation"])
+        if policy.action_type == "discrete":
+            least, best = -self.lead, clean.argmax(-1, keepdim=True)
+        else:
+            least = 0.0
+
+        def changed(observation: Tensor) -> Tensor:
+            scores = policy.scores(observation)
+            if policy.action_type == "discrete":
+                others = scores.scatter(-1, best, -torch.inf).amax(-1)
+                return others - scores.gather(-1, best).squeeze(-1)
+            return (scores - clean).norm(dim=-1)
+
+        return own(sample) + self.weight * changed(worst(changed)).clamp(min=least)
