@@ -84,7 +84,7 @@ def advtrain() -> Figure:
 
 def sa() -> Figure:
     """As `_robust`, for the regulariser of state-adversarial learning."""
-    return _robust("sa", StateAdversarial(), [{}, {"weight": 0.3}])
+    return _robust("sa", StateAdversarial(), [{}, {"weight": 0.3}, {"weight": 0.3, "budget": 0.02}])
 
 
 def car() -> Figure:
@@ -112,8 +112,8 @@ def _robust(name: str, defense: RobustLoss, variants: Sequence[dict[str, float]]
         where = np.arange(len(cards)) + 0.38 * (place - 0.5)
         bars = traded.bar(where, _percent([card[score] for card in cards]), 0.36, color=colour, label=score)
         traded.bar_label(bars, fmt="%.0f", fontsize=10)
-    named = ["\n".join(f"{key} {value:g}" for key, value in changes.items()) or "default" for changes in variants]
-    traded.set_xticks(range(len(named)), named)
+    named = ["\n".join(f"{key}\n{value:g}" for key, value in changes.items()) or "default" for changes in variants]
+    traded.set_xticks(range(len(named)), named, fontsize=9)
     traded.set(ylabel="safe progress, %", ylim=(0, 103))
     traded.set_title(f"dqn + {name}", fontsize=10.5)
     traded.legend(loc="upper left", fontsize=10)
