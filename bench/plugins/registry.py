@@ -62,8 +62,12 @@ class Entry:
 def entries(group: str) -> dict[str, tuple[Entry, ...]]:
     """All names of an entry-point group, sorted, with their entries: more than one entry is a clash."""
     found: dict[str, set[Entry]] = {}
+    # Each question for a name or a version reads the whole metadata of a distribution.
+    shipping: dict[int, tuple[str, str]] = {}
     for point in metadata.entry_points(group=group):
-        distribution, version = (point.dist.name, point.dist.version) if point.dist else ("unknown", "unknown")
+        if point.dist and id(point.dist) not in shipping:
+            shipping[id(point.dist)] = point.dist.name, point.dist.version
+        distribution, version = shipping.get(id(point.dist), ("unknown", "unknown"))
         entry = Entry(name=point.name, target=point.value, distribution=distribution, version=version)
         found.setdefault(point.name, set()).add(entry)
     return {name: tuple(sorted(found[name], key=lambda entry: entry.shipped_by)) for name in sorted(found)}

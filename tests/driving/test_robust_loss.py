@@ -126,6 +126,7 @@ def test_it_trains_saves_loads_and_changes_what_its_control_does_not(
     defense: type[RobustLoss], victim: LearningDriver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
+    monkeypatch.setattr(type(victim), "selection_episodes", 3)
     trained = victim.train(WORLD, seed=0, progress=silent)
     zoo.save(trained.network, zoo.Recipe.of(victim), seed=0, world=WORLD, card=trained.card)
     found = []

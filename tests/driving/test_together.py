@@ -184,7 +184,15 @@ def test_an_outcome_survives_the_way_from_a_worker() -> None:
 
 
 def test_a_run_without_recordings_drives_its_units_in_batches() -> None:
-    words = ("attack=noise", "lanes=3,4,5", "density=1,2", "weather=clear", "seeds=0", "reference=false")
+    words = (
+        "attack=noise",
+        "lanes=3,4,5",
+        "density=1,2",
+        "weather=clear",
+        "seeds=0",
+        "reference=false",
+        "grid=standard-v1",
+    )
     sizes = []
     for record in ("record=0", "record=1"):
         config = run_config([*words, record])

@@ -111,7 +111,7 @@ def test_listing_names_imports_no_torch() -> None:
 
 
 def test_listing_names_costs_little_more_than_a_command_line_that_does_nothing() -> None:
-    """Listing takes about 0.5 s; compared with the import of the console, because machines are not idle."""
+    """Listing takes about 0.5 s; compared with a command of the same library, because machines are not idle."""
 
     def cpu_seconds(*command: str) -> float:
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -119,7 +119,9 @@ def test_listing_names_costs_little_more_than_a_command_line_that_does_nothing()
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
-    nothing = (sys.executable, "-c", "import typer, typer.main, rich.console, rich.table, importlib.metadata")
+    imports = "import importlib.metadata, rich.console, rich.table, typer"
+    does_nothing = f"{imports}\ndef nothing(name: str = ''): pass\ntyper.run(nothing)"
+    nothing = (sys.executable, "-c", does_nothing)
     pairs = [(cpu_seconds(*BENCH, "list"), cpu_seconds(*nothing)) for _ in range(4)]
     listing, idle = (min(seconds) for seconds in zip(*pairs, strict=True))
-    assert listing < 4 * idle, f"{listing:.2f} s against {idle:.2f} s"
+    assert listing < 3 * idle, f"{listing:.2f} s against {idle:.2f} s"
