@@ -109,7 +109,8 @@ def _records(victim: str | None = None) -> pa.Table:
 def _scores() -> dict[str, tuple[float, float]]:
     """Reward as a share of the maximum, and safe progress, of each driver; mean over scenarios and training seeds."""
     found: dict[str, tuple[float, float]] = {}
-    means = _records().group_by(["victim", "victim_params"]).aggregate([("return", "mean"), ("safe_progress", "mean")])
+    groups = _records().group_by(["victim", "victim_params"], use_threads=False)
+    means = groups.aggregate([("return", "mean"), ("safe_progress", "mean")])
     for row in means.to_pylist():
         params = json.loads(row["victim_params"])
         name = params["policy"] if row["victim"] == "blind" else row["victim"]
