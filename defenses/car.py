@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -13,8 +12,8 @@ from torch import Tensor
 from bench.driving import DrivingVictim, DrivingWorld, Policy
 from bench.errors import UserError
 from bench.plugins.contracts import Progress, Trained
-from bench.plugins.ranges import Positive
-from defenses.robust_loss import Objective, RobustLoss
+from bench.plugins.ranges import Positive, Share
+from defenses.robust_loss import Own, RobustLoss, Worst
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,16 +27,11 @@ class ConsistentAdversarialRobustness(RobustLoss):
     Args:
         weight: weight of this loss, from 0 (the victim's own loss only: the control) to 1 (the paper: this loss only).
         temperature: the paper's lambda, as a share of the mean loss of the batch; the higher, the more alike the weights.
-        norm: perturbation set of the training, `relative` or `linf`.
-        budget: size of this set after the ramp.
-        steps: gradient steps to the worst point, from a random one.
-        decisions: length of the training, on every road at once.
-        ramp_to: share of the training at which the budget, which grows from 0, reaches `budget`.
-        trained_in: non-default parameters of the training world, for instance `vehicles=5`; set by `bench train`.
     """
 
     name: ClassVar[str] = "car"
 
+    weight: Share = 1.0
     temperature: Positive = 1.0
 
     def train(self, victim: DrivingVictim, world: DrivingWorld, *, seed: int, progress: Progress) -> Trained[Policy]:
@@ -45,13 +39,7 @@ class ConsistentAdversarialRobustness(RobustLoss):
             raise UserError(f"car needs a victim with discrete actions, those of this one are {victim.action_type}")
         return super().train(victim, world, seed=seed, progress=progress)
 
-    def loss(
-        self,
-        policy: Policy,
-        sample: TensorDictBase,
-        own: Callable[[TensorDictBase], Tensor],
-        worst: Callable[[Objective], Tensor],
-    ) -> Tensor:
+    def loss(self, policy: Policy, sample: TensorDictBase, own: Own, worst: Worst) -> Tensor:
         def error(observation: Tensor) -> Tensor:
             return own(sample.copy().set("observation", observation))
 

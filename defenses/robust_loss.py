@@ -38,6 +38,10 @@ STEP = 1.5
 
 Objective = Callable[[Tensor], Tensor]
 """What is largest at the worst point: observations [N, V, F] to [N], with a gradient."""
+Own = Callable[[TensorDictBase], Tensor]
+"""The loss [N] of the victim's algorithm on each transition of a batch."""
+Worst = Callable[[Objective], Tensor]
+"""Searches the sets around the observations of a batch for the points [N, V, F] with the highest objective."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,20 +73,14 @@ class RobustLoss(DrivingDefense):
     trained_in: str = ""
 
     @abstractmethod
-    def loss(
-        self,
-        policy: Policy,
-        sample: TensorDictBase,
-        own: Callable[[TensorDictBase], Tensor],
-        worst: Callable[[Objective], Tensor],
-    ) -> Tensor:
+    def loss(self, policy: Policy, sample: TensorDictBase, own: Own, worst: Worst) -> Tensor:
         """The loss of a batch of transitions: a number, or [N].
 
         Args:
             policy: the policy in training.
             sample: transitions [N] with the true `observation` [N, V, F], `action` and `next`.
-            own: the loss [N] of the victim's algorithm on each transition of such a batch.
-            worst: searches the sets around the observations for the points [N, V, F] with the highest objective.
+            own: the victim's own loss.
+            worst: the search for worst points.
         """
 
     def zoo_name(self, victim: DrivingVictim) -> str:
@@ -127,7 +125,7 @@ class RobustTraining(TrainingHooks):
         self.scale = min(1.0, share / self.recipe.ramp_to)
         return observation
 
-    def loss(self, policy: Policy, sample: TensorDictBase, own: Callable[[TensorDictBase], Tensor]) -> Tensor:
+    def loss(self, policy: Policy, sample: TensorDictBase, own: Own) -> Tensor:
         def worst(objective: Objective) -> Tensor:
             return self.worst(sample["observation"], objective)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from bench.driving import Policy
 from bench.plugins.ranges import NotNegative
-from defenses.robust_loss import Objective, RobustLoss
+from defenses.robust_loss import Own, RobustLoss, Worst
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,12 +26,6 @@ class StateAdversarial(RobustLoss):
         weight: the paper's kappa; 0 is the control: the same training without the regulariser.
         lead: the lead of the best action over all others that is enough, the paper's c; a value of 1 is perfect driving forever.
             Discrete actions only.
-        norm: perturbation set of the training, `relative` or `linf`.
-        budget: size of this set after the ramp.
-        steps: gradient steps to the worst point, from a random one.
-        decisions: length of the training, on every road at once.
-        ramp_to: share of the training at which the budget, which grows from 0, reaches `budget`.
-        trained_in: non-default parameters of the training world, for instance `vehicles=5`; set by `bench train`.
     """
 
     name: ClassVar[str] = "sa"
@@ -40,13 +33,7 @@ class StateAdversarial(RobustLoss):
     weight: NotNegative = 0.03
     lead: NotNegative = 0.02
 
-    def loss(
-        self,
-        policy: Policy,
-        sample: TensorDictBase,
-        own: Callable[[TensorDictBase], Tensor],
-        worst: Callable[[Objective], Tensor],
-    ) -> Tensor:
+    def loss(self, policy: Policy, sample: TensorDictBase, own: Own, worst: Worst) -> Tensor:
         with torch.no_grad():
             clean = policy.scores(sample["observation"])
         if policy.action_type == "discrete":

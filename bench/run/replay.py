@@ -18,7 +18,6 @@ from bench.plugins import registry
 from bench.plugins.device import recorded as recorded_device
 from bench.plugins.framework import Snapshot
 from bench.plugins.pair import IN_PROCESS, Chosen, Pair, choose
-from bench.plugins.parameters import parameters
 from bench.plugins.track import track
 from bench.records import reading, store
 from bench.records.schema import IDENTITY, SEQUENTIAL
@@ -249,19 +248,18 @@ def _chosen(kind: registry.Kind, record: Mapping[str, Any]) -> Chosen[Any]:
             f"{kind} {record[kind]!r} was an object of a Python process and cannot be loaded again; record=N of "
             "cavbench.score records episodes while they are driven"
         )
-    component = registry.load(kind, record[kind])
-    return choose(kind, record[kind], **_values(component, json.loads(record[f"{kind}_params"])))
+    params = json.loads(record[f"{kind}_params"])
+    # Of a chain, each parameter holds those of a link.
+    links = {
+        name: choose(kind, name, **_values(value)).component
+        for name, value in params.items()
+        if isinstance(value, dict)
+    }
+    return choose(kind, record[kind], **{**_values(params), **links})
 
 
-def _values(component: type, params: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of a component from JSON; those of a chain are its links."""
-    own = parameters(component)
-    found = {name: tuple(value) if isinstance(value, list) else value for name, value in params.items()}
-    for name, value in params.items():
-        if isinstance(value, dict) and name in own:
-            link: Any = own[name].hint
-            found[name] = link(**_values(link, value))
-    return found
+def _values(params: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in params.items()}
 
 
 def _equal(before: pa.ChunkedArray, after: pa.ChunkedArray) -> bool:

@@ -218,8 +218,8 @@ def parameters(canonical: object) -> dict[str, object]:
 def _flat(params: dict[str, object]) -> dict[str, object]:
     found: dict[str, object] = {}
     for name, value in params.items():
-        inner = (
-            {f"{name}.{each}": one for each, one in _flat(value).items()} if isinstance(value, dict) else {name: value}
-        )
-        found |= inner
+        if isinstance(value, dict):
+            found |= {f"{name}.{inner}": each for inner, each in _flat(value).items()}
+        else:
+            found[name] = value
     return found

@@ -79,10 +79,8 @@ def run_command(one: Comparison) -> str:
         # Every frame is the default, and tracks without frames do not know the option.
         given = [name for name in THREAT if (name, identity[name]) != ("threat_share", 1)]
         words += [f"threat.{name.removeprefix('threat_')}={_word(identity[name])}" for name in given]
-    named = _values(one.own.table, "grid")
-    words += [
-        f"grid={name}" for name in named if name in {grid.name for grid in registry.grids(str(identity["world"]))}
-    ]
+    named = {grid.name for grid in registry.grids(str(identity["world"]))}
+    words += [f"grid={name}" for name in _values(one.own.table, "grid") if name in named]
     for axis in one.axes:
         values = dict.fromkeys(cell[axis] for cell in one.cells)
         words.append(f"{axis}={','.join(_word(value) for value in values)}")

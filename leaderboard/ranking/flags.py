@@ -244,7 +244,8 @@ def too_little(of: Subject) -> Finding:
         if grid.block:
             seeds, scenarios = grid.training_seeds, grid.episodes
     few = (seeded and runs < seeds) or episodes < scenarios or missing > 0
-    asked = f" ({seeds} seeds and {scenarios} scenarios are asked)" if few else ""
+    wanted = f"{seeds} seeds and {scenarios} scenarios" if seeded else f"{scenarios} scenarios"
+    asked = f" ({wanted} are asked for)" if few else ""
     return few, f"It was driven with {runs} seed{'s' * (runs != 1)}, {driven}, {episodes} scenarios each{asked}."
 
 

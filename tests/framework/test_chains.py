@@ -101,6 +101,10 @@ def test_a_chain_is_recorded_and_replayed_and_its_code_counts(tmp_path: Path) ->
     assert all(share > 0.5 for share in records["assured"].to_pylist())
     again = replay(tmp_path, find(records, {"attack": "none"}))
     assert (again.differences, again.changed) == ((), "")
+    for params in ('{"tracker": {"nosuch": 1}, "shield": {}}', '{"nosuch": {}}', '{"tracker": {"assumed_budget": {}}}'):
+        with pytest.raises(UserError) as refused:
+            replay(tmp_path, find(records, {"attack": "none"}) | {"defense_params": params})
+        assert "\n" not in str(refused.value)
     other = run_config([*WORDS, "defense=tracker+shield", "defense.shield.band=5", f"out={tmp_path}"])
     assert plan(other)[0].fingerprint != unit.fingerprint
 
