@@ -14,7 +14,7 @@ from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, P
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.corridor import Corridor, CorridorJudge
 from bench.driving.intervals.ego import Ego
-from bench.driving.intervals.margins import Caution, Judge, Margins
+from bench.driving.intervals.margins import Caution, Judge, Margins, cars_of
 from bench.driving.intervals.policy import IntervalPolicy, corrected, with_inner
 from bench.driving.threat import Norm
 from bench.errors import UserError
@@ -103,7 +103,7 @@ class Shielded(Filter):
         assert state is not None
         ego = self.ego(boxes, state)
         values = self.policy.scores(corrected(observation, ego, self.assumed), state.get("inner", None))
-        allowed = self.allowed(self.judge(ego, boxes))
+        allowed = self.allowed(self.margins(ego, boxes))
         # The masked values are below the others; no step of this hides the victim's gradient.
         spread = (values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)).detach() + 1
         return values - spread * (1 - allowed)
@@ -111,11 +111,15 @@ class Shielded(Filter):
     def filtered(self, observation: Tensor, boxes: Boxes, state: State) -> Passed:
         assert state is not None
         ego = self.ego(boxes, state)
-        return Passed(corrected(observation, ego, self.assumed), self.allowed(self.judge(ego, boxes)) > 0.5)
+        return Passed(corrected(observation, ego, self.assumed), self.allowed(self.margins(ego, boxes)) > 0.5)
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        return self.judge(self.ego(boxes, state), boxes).safe
+        ego = self.ego(boxes, state)
+        return self.margins(ego, boxes).safe
+
+    def margins(self, ego: Ego, boxes: Boxes) -> Margins:
+        return self.judge(ego, cars_of(ego, boxes))
 
     def allowed(self, margins: Margins) -> Tensor:
         """[..., A] 1 for the allowed actions and 0 for the others, with the gradient of a soft threshold (straight-through)."""

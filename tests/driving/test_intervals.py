@@ -16,7 +16,7 @@ from attacks.pgd import PGD
 from bench.driving import DrivingVictim, ObservationThreat, Policy
 from bench.driving.intervals.boxes import Assumed
 from bench.driving.intervals.ego import Ego
-from bench.driving.intervals.margins import Caution, Judge
+from bench.driving.intervals.margins import Caution, Judge, cars_of
 from bench.driving.intervals.policy import reckoning
 from bench.driving.rollout import rollout
 from bench.driving.threat import Norm
@@ -142,7 +142,7 @@ def test_no_leader_that_brakes_as_assumed_is_hit(seed: int) -> None:
 
     speed, leader, start, one = drawn(12, 30), drawn(17, 30), drawn(0, 60).floor(), torch.ones(count)
     ego = Ego(y=4 * one, heading=0 * one, speed=speed, target_lane=one, target_speed=speed, edge=2 * one)
-    gap = 6.0 + judge.following(speed, leader, rate * one) + drawn(0, 20)
+    gap = 6.0 + judge.following(speed, leader, rate * one)[0] + drawn(0, 20)
     half, once = FACTS.features.half_range(), torch.zeros(count, dtype=torch.bool)
     for step in range(120):
         truth = torch.zeros(count, 2, 5)
@@ -151,7 +151,7 @@ def test_no_leader_that_brakes_as_assumed_is_hit(seed: int) -> None:
         truth[:, 1, 1:] = torch.stack([gap, 0 * one, leader - ego.speed, 0 * one], -1) / half
         radius = ObservationThreat().radius(truth, FACTS.features)
         shown = (truth + radius * (2 * torch.randint(0, 2, truth.shape, generator=generator) - 1)).clamp(-1, 1)
-        stay = judge(ego, assumed.boxes(shown)).stay
+        stay = judge(ego, cars_of(ego, assumed.boxes(shown))).stay
         once |= (stay >= 0).any(-1)
         gap = gap + (leader - ego.speed) * period
         leader = leader - rate * period * ((start <= step) & (step < start + 22))

@@ -88,7 +88,7 @@ class CorridorJudge:
     def _rooms(self, ego: Ego, boxes: Boxes) -> tuple[Tensor, Tensor]:
         """Room to the cars ahead on the left, own and right lane for each acceleration, [..., 3, LEVELS]; behind, [..., 2]."""
         car, cars = self.reckoning.kinematics, cars_of(ego, boxes)
-        in_lane, ahead = lanes_of(ego, cars, car)[..., BESIDE], cars.ahead.unsqueeze(-1)
+        in_lane, ahead = lanes_of(ego, cars, car, BESIDE), cars.ahead.unsqueeze(-1)
         levels = torch.linspace(-1, 1, LEVELS).to(ego.speed) * (car.acceleration_limit * self.period)
         own = (ego.speed.unsqueeze(-1) + levels).clamp(min=0).unsqueeze(-2)
         along = (ego.speed * ego.heading.cos()).unsqueeze(-1)
@@ -96,7 +96,7 @@ class CorridorJudge:
         rate = braking_of(cars, car, self.caution.braking)
         length = car.length + self.caution.distance
         gap = cars.x[0] + (leader - along) * self.period - length
-        used = self.following(own, leader.unsqueeze(-1), rate.unsqueeze(-1))
+        (used,) = self.following(own, leader.unsqueeze(-1), rate.unsqueeze(-1))
         front = least(gap.unsqueeze(-1) - used, in_lane & ahead)
         behind = room_behind(cars, own[..., LEVELS // 2], length)
         return front, least(behind.unsqueeze(-1), in_lane & ~ahead)[..., [0, 2], 0]

@@ -25,7 +25,7 @@ class FollowingDistance:
         kinematics: kinematics of the ego.
         period: seconds per decision.
         seconds: how long the leader brakes.
-        within: seconds that count; None for all until the speeds are the same.
+        within: seconds that count, for each of the results; None for all until the speeds are the same.
         braking: the ego's own deceleration in m/s2, for continuous actions; None for repeated SLOWER.
     """
 
@@ -35,7 +35,7 @@ class FollowingDistance:
         period: float,
         seconds: float,
         *,
-        within: float | None = None,
+        within: tuple[float | None, ...] = (None,),
         braking: float | None = None,
     ) -> None:
         speeds = torch.arange(0.0, FASTEST + STEP, STEP, dtype=torch.float64)
@@ -45,7 +45,9 @@ class FollowingDistance:
         table, lost, target = torch.zeros_like(own), torch.zeros_like(own), own
         # The leader has braked for one decision when the ego begins to.
         other = (other - rate * min(period, seconds)).clamp(min=0)
-        for frame in range(round((within or LASTING_S) / dt)):
+        ends = [round((counted or LASTING_S) / dt) for counted in within]
+        tables = {}
+        for frame in range(max(ends)):
             if frame % kinematics.frames == 0:
                 target = slower(own, kinematics.target_speeds)
             lost = lost + (own - other) * dt
@@ -54,23 +56,30 @@ class FollowingDistance:
             own = (own + change * dt).clamp(min=0)
             if period + frame * dt < seconds - 1e-9:
                 other = (other - rate * dt).clamp(min=0)
+            if frame + 1 in ends:
+                tables[frame + 1] = table.float().flatten()
         self.side = len(speeds)
-        self.table = table.float().flatten()
+        self.tables = [tables[end] for end in ends]
 
-    def __call__(self, own: Tensor, leader: Tensor, rate: Tensor) -> Tensor:
+    def __call__(self, own: Tensor, leader: Tensor, rate: Tensor) -> list[Tensor]:
         """D [...] for the ego's speeds after its next decision, the leader's speeds now and its rates of braking.
 
-        It is differentiable in the speeds; the rates are rounded up.
+        One for each number of seconds that count. It is differentiable in the speeds; the rates are rounded up.
         """
-        first, second = (speed.clamp(0, FASTEST - 1e-3) / STEP for speed in torch.broadcast_tensors(own, leader))
+        first, second = (speed.clamp(0, FASTEST - 1e-3) / STEP for speed in (own, leader))
         row, column = first.detach().floor(), second.detach().floor()
         down, right = first - row, second - column
         level = rate.detach().clamp(0, HARDEST).ceil()
         place = ((level * self.side + row) * self.side + column).long()
-        self.table = table = self.table.to(place.device)
-        upper = table[place] * (1 - right) + table[place + 1] * right
-        lower = table[place + self.side] * (1 - right) + table[place + self.side + 1] * right
-        return upper * (1 - down) + lower * down
+        self.tables = [table.to(place.device) for table in self.tables]
+        places = (place, place + 1, place + self.side, place + self.side + 1)
+        found = []
+        for table in self.tables:
+            corners = [table[each] for each in places]
+            upper = corners[0] * (1 - right) + corners[1] * right
+            lower = corners[2] * (1 - right) + corners[3] * right
+            found.append(upper * (1 - down) + lower * down)
+        return found
 
 
 def slower(speed: Tensor, target_speeds: tuple[float, ...]) -> Tensor:

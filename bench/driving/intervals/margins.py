@@ -31,8 +31,8 @@ ROOM, HORIZON_S = 12.0, 3.0
 """Room to a car ahead that does not count as free, in m, and the time in which the free room counts as speed."""
 SIDES = (-4, -3, -2, -1, 0, 1, 2, 3, 4)
 """The lanes in question, relative to the ego's target lane."""
-BESIDE = slice(3, 6)
-"""The lanes on the left, own and right among `SIDES`."""
+BESIDE = (-1, 0, 1)
+"""The lanes on the left, own and right."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +56,12 @@ class Margins(NamedTuple):
     Args:
         stay: of FASTER, IDLE and SLOWER, [..., 3].
         change: of LANE_LEFT and LANE_RIGHT, [..., 2].
-        speed: the speed that each of the lanes `SIDES` allows for, in m/s, [..., 9].
         settled: bool [...], whether the ego is in its target lane.
         straddled: -1 or 1, the side of the lane that the ego is leaving, 0 if there is none, [...].
     """
 
     stay: Tensor
     change: Tensor
-    speed: Tensor
     settled: Tensor
     straddled: Tensor
 
@@ -92,14 +90,6 @@ class Cars(NamedTuple):
     def ahead(self) -> Tensor:
         return (self.x[0] + self.x[1]) > 0
 
-    @property
-    def place(self) -> Tensor:
-        return _middle(*self.x)
-
-    @property
-    def speed(self) -> Tensor:
-        return _middle(*self.vx)
-
 
 class Judge:
     """Computes margins.
@@ -113,22 +103,19 @@ class Judge:
     def __init__(self, reckoning: DeadReckoning, period: float, caution: Caution) -> None:
         self.reckoning, self.period, self.caution = reckoning, period, caution
         car = reckoning.kinematics
-        self.following = FollowingDistance(car, period, caution.seconds)
-        self.crossing = FollowingDistance(car, period, caution.seconds, within=CROSSING_S)
+        self.following = FollowingDistance(car, period, caution.seconds, within=(None, CROSSING_S))
 
-    def __call__(self, ego: Ego, boxes: Boxes) -> Margins:
+    def __call__(self, ego: Ego, cars: Cars) -> Margins:
         car, reckoning = self.reckoning.kinematics, self.reckoning
-        cars = cars_of(ego, boxes)
-        in_lane = lanes_of(ego, cars, car)
-        beside, ahead = in_lane[..., BESIDE], cars.ahead.unsqueeze(-1)
+        beside, ahead = lanes_of(ego, cars, car, BESIDE), cars.ahead.unsqueeze(-1)
         options = torch.stack([reckoning.commanded(ego, change) for change in (1, 0, -1)], -1)
         own = reckoning.speed_after(ego.speed.unsqueeze(-1), options).unsqueeze(-2)
         along = (ego.speed * ego.heading.cos()).unsqueeze(-1)
         leader = cars.vx[0].clamp(min=0)
         rate = braking_of(cars, car, self.caution.braking).unsqueeze(-1)
         gap = (cars.x[0] + (leader - along) * self.period - car.length - self.caution.distance).unsqueeze(-1)
-        front = least(gap - self.following(own, leader.unsqueeze(-1), rate), beside & ahead)
-        cross = least(gap - self.crossing(own, leader.unsqueeze(-1), rate), beside & ahead)
+        used = torch.cat(self.following(own, leader.unsqueeze(-1), rate), -1)
+        front, cross = least(gap - used, beside & ahead).split(3, -1)
         room = room_behind(cars, own[..., 1], car.length + self.caution.distance)
         rear = least(room.unsqueeze(-1), beside & ~ahead)[..., 0]
 
@@ -142,31 +129,34 @@ class Judge:
         return Margins(
             stay=torch.minimum(front[..., 1, :], leaving),
             change=torch.where(exists, change, -FREE),
-            speed=self._speeds(cars, in_lane & ahead),
             settled=(off.abs() < SETTLED_M) & (ego.heading.abs() < SETTLED_RAD),
             straddled=straddled,
         )
 
-    def _speeds(self, cars: Cars, counts: Tensor) -> Tensor:
-        """[..., 9] the speed that the cars ahead allow for on each lane: theirs, and the free room over the horizon."""
-        allowed = cars.speed + (cars.place - ROOM).clamp(min=0) / HORIZON_S
-        top = self.reckoning.kinematics.target_speeds[-1]
-        return torch.where(counts, allowed.unsqueeze(-1), FREE).amin(-2).clamp(max=top)
+    def speeds(self, ego: Ego, cars: Cars) -> Tensor:
+        """[..., 9] the speed in m/s that each of the lanes `SIDES` allows for: the cars', and the free room over the horizon."""
+        car = self.reckoning.kinematics
+        counts = lanes_of(ego, cars, car, SIDES) & cars.ahead.unsqueeze(-1)
+        allowed = _middle(*cars.vx) + (_middle(*cars.x) - ROOM).clamp(min=0) / HORIZON_S
+        return torch.where(counts, allowed.unsqueeze(-1), FREE).amin(-2).clamp(max=car.target_speeds[-1])
 
 
-def lanes_of(ego: Ego, cars: Cars, car: Kinematics) -> Tensor:
-    """bool [..., V - 1, 9]: the lanes `SIDES` that each car may be in, or soon enter."""
+@torch.no_grad()
+def lanes_of(ego: Ego, cars: Cars, car: Kinematics, sides: tuple[int, ...]) -> Tensor:
+    """bool [..., V - 1, S]: the lanes that each car may be in, or soon enter; `sides` are relative to the ego's target lane."""
     left = cars.y[0] + (cars.vy[0] + DEAD_BAND).clamp(max=0) * DRIFT_S
     right = cars.y[1] + (cars.vy[1] - DEAD_BAND).clamp(min=0) * DRIFT_S
-    middle = car.lane_width * (ego.target_lane.unsqueeze(-1) + torch.tensor(SIDES).to(ego.y)).unsqueeze(-2)
+    middle = car.lane_width * (ego.target_lane.unsqueeze(-1) + torch.tensor(sides).to(ego.y)).unsqueeze(-2)
     reach = car.width + CLEARANCE
     inside = (right.unsqueeze(-1) > middle - reach) & (left.unsqueeze(-1) < middle + reach)
     return inside & cars.present.unsqueeze(-1)
 
 
+@torch.no_grad()
 def braking_of(cars: Cars, car: Kinematics, lowest: float) -> Tensor:
     """[..., V - 1] how hard every car brakes for the next one ahead of it, by its car-following model, in m/s2."""
-    model, place, speed, reach = car.following, cars.place, cars.speed, car.width + CLEARANCE
+    model, reach = car.following, car.width + CLEARANCE
+    place, speed = _middle(*cars.x), _middle(*cars.vx)
     gap = place.unsqueeze(-2) - place.unsqueeze(-1)
     same = (cars.y[0].unsqueeze(-2) < cars.y[1].unsqueeze(-1) + reach) & (
         cars.y[1].unsqueeze(-2) > cars.y[0].unsqueeze(-1) - reach
@@ -204,4 +194,7 @@ def _middle(low: Tensor, high: Tensor) -> Tensor:
 
 def least(room: Tensor, counts: Tensor) -> Tensor:
     """The least room [..., lanes, options], from -`FREE` to `FREE`, over the cars that count, bool [..., V - 1, lanes]."""
-    return torch.where(counts.unsqueeze(-1), room.unsqueeze(-2), FREE).amin(-3).clamp(min=-FREE)
+    with torch.no_grad():
+        least, car = torch.where(counts.unsqueeze(-1), room.unsqueeze(-2), FREE).min(-3)
+    # The gradient through the car that was found is faster than through the choice.
+    return torch.where(least < FREE, room.gather(-2, car), FREE).clamp(min=-FREE)

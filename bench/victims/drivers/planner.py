@@ -12,7 +12,7 @@ from torch import Tensor
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import UNKNOWN_EDGE, Ego
-from bench.driving.intervals.margins import SIDES, Caution, Judge
+from bench.driving.intervals.margins import SIDES, Caution, Judge, cars_of
 from bench.driving.intervals.policy import IntervalPolicy
 from bench.driving.threat import Norm
 from bench.plugins.ranges import NotNegative, Share
@@ -79,8 +79,9 @@ class IntervalPlanner(IntervalPolicy):
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
         ego = self.reckoning.now(boxes, state)
-        found = self.judge(ego, boxes)
-        left, own, right = self._worth(ego, found.speed).unbind(-1)
+        cars = cars_of(ego, boxes)
+        found = self.judge(ego, cars)
+        left, own, right = self._worth(ego, self.judge.speeds(ego, cars)).unbind(-1)
         orders = torch.tensor([ORDER_SAFE, ORDER_UNSAFE]).to(own)
         safe = own.unsqueeze(-1) + orders[0] + TIE_BREAK * found.stay
         stay = torch.where(found.stay < 0, UNSAFE + orders[1] + PER_METRE * found.stay, safe)
@@ -91,7 +92,8 @@ class IntervalPlanner(IntervalPolicy):
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        return self.judge(self.reckoning.now(boxes, state), boxes).safe
+        ego = self.reckoning.now(boxes, state)
+        return self.judge(ego, cars_of(ego, boxes)).safe
 
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None
