@@ -14,8 +14,9 @@ from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, P
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.corridor import Corridor, CorridorJudge
 from bench.driving.intervals.ego import Ego
-from bench.driving.intervals.margins import Caution, Judge, Margins, cars_of
+from bench.driving.intervals.margins import Judge, Margins
 from bench.driving.intervals.policy import IntervalPolicy, corrected, with_inner
+from bench.driving.intervals.rooms import Caution, cars_of
 from bench.driving.threat import Norm
 from bench.errors import UserError
 from bench.plugins.ranges import NotNegative
@@ -162,4 +163,4 @@ class ShieldedControls(Filter):
         return self.corridor(self.ego(boxes, state), boxes, state).safe
 
     def corridor(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Corridor:
-        return self.judge(ego, boxes, self.edge(ego, boxes, state))
+        return self.judge(ego, cars_of(ego, boxes), self.edge(ego, boxes, state))

@@ -16,8 +16,10 @@ from attacks.pgd import PGD
 from bench.driving import DrivingVictim, ObservationThreat, Policy
 from bench.driving.intervals.boxes import Assumed
 from bench.driving.intervals.ego import Ego
-from bench.driving.intervals.margins import Caution, Judge, cars_of
+from bench.driving.intervals.kernels import used
+from bench.driving.intervals.margins import Judge
 from bench.driving.intervals.policy import reckoning
+from bench.driving.intervals.rooms import Cars, Caution, cars_of
 from bench.driving.rollout import rollout
 from bench.driving.threat import Norm
 from bench.errors import UserError
@@ -129,6 +131,34 @@ def test_a_lane_that_does_not_exist_is_noticed() -> None:
     assert bool(found.any())
 
 
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_the_gradients_of_rooms_and_speeds_are_those_of_finite_differences(seed: int) -> None:
+    count, others = 64, 6
+    generator = torch.Generator().manual_seed(seed)
+    judge = Judge(reckoning(FACTS, "discrete"), 1 / FACTS.decision_hz, Caution(braking=0.5, seconds=2.0, distance=0.4))
+    scale, one = torch.tensor([60.0, 5.0, 8.0, 1.0]), torch.ones(count)
+    low = torch.rand(count, others, 4, generator=generator) * scale + torch.tensor([-20.0, 0.0, 15.0, -0.5])
+    width = torch.rand(low.shape, generator=generator)
+    speed = 20 + 8 * torch.rand(count, generator=generator)
+    ego = Ego(y=4 * one, heading=0 * one, speed=speed, target_lane=one, target_speed=speed, edge=2 * one)
+    weights = [torch.randn(shape, generator=generator) for shape in ((count, 2, 3, 3), (count, 3), (count, 9))]
+
+    def weighed(low: Tensor, speed: Tensor) -> Tensor:
+        """[count] a weighted sum of all rooms and speeds."""
+        moving, cars = ego._replace(speed=speed), Cars(torch.ones(count, others, dtype=torch.bool), low, low + width)
+        found = (*judge.rooms(moving, cars, speed[:, None].expand(-1, 3)), judge.rooms.speeds(moving, cars))
+        return torch.stack([(w * each).flatten(1).sum(1) for w, each in zip(weights, found, strict=True)]).sum(0)
+
+    step, direction = 1e-2, torch.randn(low.shape, generator=generator) * torch.tensor([1.0, 0.0, 1.0, 0.0])
+    asked, own = low.clone().requires_grad_(), speed.clone().requires_grad_()
+    by_low, by_own = torch.autograd.grad(weighed(asked, own).sum(), (asked, own))
+    slope = (by_low * direction).sum((1, 2)) + by_own
+    ahead, back = weighed(low + step * direction, speed + step), weighed(low - step * direction, speed - step)
+    # Where another car becomes the nearest one within the step, there is no slope.
+    assert float(((ahead - back) / (2 * step) - slope).abs().median()) < 0.02 * float(slope.abs().mean())
+
+
 @settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_no_leader_that_brakes_as_assumed_is_hit(seed: int) -> None:
@@ -142,7 +172,9 @@ def test_no_leader_that_brakes_as_assumed_is_hit(seed: int) -> None:
 
     speed, leader, start, one = drawn(12, 30), drawn(17, 30), drawn(0, 60).floor(), torch.ones(count)
     ego = Ego(y=4 * one, heading=0 * one, speed=speed, target_lane=one, target_speed=speed, edge=2 * one)
-    gap = 6.0 + judge.following(speed, leader, rate * one)[0] + drawn(0, 20)
+    table, pairs = judge.following.tables[0], zip(speed.tolist(), leader.tolist(), strict=True)
+    needed = [used(table, judge.following.side, own, other, int(rate))[0] for own, other in pairs]
+    gap = 6.0 + torch.tensor(needed) + drawn(0, 20)
     half, once = FACTS.features.half_range(), torch.zeros(count, dtype=torch.bool)
     for step in range(120):
         truth = torch.zeros(count, 2, 5)

@@ -24,12 +24,6 @@ class Boxes(NamedTuple):
     low: Tensor
     high: Tensor
 
-    def meet(self, low: Tensor, high: Tensor, matched: Tensor) -> Boxes:
-        """The intersection with other bounds [..., V, F - 1] where `matched` [..., V] and not empty; else these bounds."""
-        lower, upper = torch.maximum(self.low, low), torch.minimum(self.high, high)
-        keep = matched.unsqueeze(-1) & (lower <= upper)
-        return Boxes(self.present, torch.where(keep, lower, self.low), torch.where(keep, upper, self.high))
-
 
 @dataclass(frozen=True)
 class Assumed:

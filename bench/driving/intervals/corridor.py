@@ -7,19 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import DeadReckoning, Ego
 from bench.driving.intervals.following import FollowingDistance
-from bench.driving.intervals.margins import (
-    BESIDE,
-    FREE,
-    Caution,
-    braking_of,
-    cars_of,
-    lanes_of,
-    least,
-    room_behind,
-)
+from bench.driving.intervals.kernels import FREE
+from bench.driving.intervals.rooms import Cars, Caution, Rooms
 
 LEVELS = 9
 """Number of accelerations for which margins are computed; between them they are interpolated."""
@@ -53,19 +44,21 @@ class CorridorJudge:
     """
 
     def __init__(self, reckoning: DeadReckoning, period: float, caution: Caution, band: float) -> None:
-        self.reckoning, self.period, self.caution, self.band = reckoning, period, caution, band
-        car = reckoning.kinematics
-        self.following = FollowingDistance(car, period, caution.seconds, braking=car.acceleration_limit)
+        self.reckoning, self.band = reckoning, band
+        limit = reckoning.kinematics.acceleration_limit
+        self.gained = limit * period
+        following = FollowingDistance(reckoning.kinematics, period, caution.seconds, braking=limit)
+        self.rooms = Rooms(reckoning, period, caution, following, steady=LEVELS // 2)
 
-    def __call__(self, ego: Ego, boxes: Boxes, edge: Tensor) -> Corridor:
+    def __call__(self, ego: Ego, cars: Cars, edge: Tensor) -> Corridor:
         """The corridor [...].
 
         Args:
             ego: the ego's motion.
-            boxes: what is known about every row, [..., V, F - 1].
+            cars: the other cars.
             edge: the highest number of a lane that is known to exist, [...].
         """
-        front, rear = self._rooms(ego, boxes)
+        front, rear = self._rooms(ego, cars)
         lane = ego.target_lane
         off = ego.y - self.reckoning.kinematics.lane_width * lane
         inside = torch.stack([off < -SIDEWAYS, off > SIDEWAYS], -1)
@@ -85,21 +78,11 @@ class CorridorJudge:
             torch.stack([slow, most_left], -1), torch.stack([fast, most_right], -1), safe=ahead[..., 0] >= 0
         )
 
-    def _rooms(self, ego: Ego, boxes: Boxes) -> tuple[Tensor, Tensor]:
+    def _rooms(self, ego: Ego, cars: Cars) -> tuple[Tensor, Tensor]:
         """Room to the cars ahead on the left, own and right lane for each acceleration, [..., 3, LEVELS]; behind, [..., 2]."""
-        car, cars = self.reckoning.kinematics, cars_of(ego, boxes)
-        in_lane, ahead = lanes_of(ego, cars, car, BESIDE), cars.ahead.unsqueeze(-1)
-        levels = torch.linspace(-1, 1, LEVELS).to(ego.speed) * (car.acceleration_limit * self.period)
-        own = (ego.speed.unsqueeze(-1) + levels).clamp(min=0).unsqueeze(-2)
-        along = (ego.speed * ego.heading.cos()).unsqueeze(-1)
-        leader = cars.vx[0].clamp(min=0)
-        rate = braking_of(cars, car, self.caution.braking)
-        length = car.length + self.caution.distance
-        gap = cars.x[0] + (leader - along) * self.period - length
-        (used,) = self.following(own, leader.unsqueeze(-1), rate.unsqueeze(-1))
-        front = least(gap.unsqueeze(-1) - used, in_lane & ahead)
-        behind = room_behind(cars, own[..., LEVELS // 2], length)
-        return front, least(behind.unsqueeze(-1), in_lane & ~ahead)[..., [0, 2], 0]
+        levels = torch.linspace(-1, 1, LEVELS).to(ego.speed) * self.gained
+        front, rear = self.rooms(ego, cars, (ego.speed.unsqueeze(-1) + levels).clamp(min=0))
+        return front[..., 0, :, :], rear[..., [0, 2]]
 
     def _accelerations(self, ego: Ego, room: Tensor) -> tuple[Tensor, Tensor]:
         """The lowest and the highest acceleration that is left, [...] in [-1, 1], from the room [..., LEVELS]."""

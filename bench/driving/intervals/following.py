@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from bench.driving.intervals.kernels import FASTEST, HARDEST, STEP
 from bench.driving.kinematics import Kinematics
 
-FASTEST, STEP = 40.0, 0.5
-"""Largest speed and resolution of a table, in m/s."""
-HARDEST = 6
-"""Hardest braking of a leader in a table, in m/s2."""
 LASTING_S = 8.0
 
 
@@ -57,29 +55,9 @@ class FollowingDistance:
             if period + frame * dt < seconds - 1e-9:
                 other = (other - rate * dt).clamp(min=0)
             if frame + 1 in ends:
-                tables[frame + 1] = table.float().flatten()
+                tables[frame + 1] = table.float().flatten().numpy()
         self.side = len(speeds)
-        self.tables = [tables[end] for end in ends]
-
-    def __call__(self, own: Tensor, leader: Tensor, rate: Tensor) -> list[Tensor]:
-        """D [...] for the ego's speeds after its next decision, the leader's speeds now and its rates of braking.
-
-        One for each number of seconds that count. It is differentiable in the speeds; the rates are rounded up.
-        """
-        first, second = (speed.clamp(0, FASTEST - 1e-3) / STEP for speed in (own, leader))
-        row, column = first.detach().floor(), second.detach().floor()
-        down, right = first - row, second - column
-        level = rate.detach().clamp(0, HARDEST).ceil()
-        place = ((level * self.side + row) * self.side + column).long()
-        self.tables = [table.to(place.device) for table in self.tables]
-        places = (place, place + 1, place + self.side, place + self.side + 1)
-        found = []
-        for table in self.tables:
-            corners = [table[each] for each in places]
-            upper = corners[0] * (1 - right) + corners[1] * right
-            lower = corners[2] * (1 - right) + corners[3] * right
-            found.append(upper * (1 - down) + lower * down)
-        return found
+        self.tables = np.stack([tables[end] for end in ends])
 
 
 def slower(speed: Tensor, target_speeds: tuple[float, ...]) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import Ego
+from bench.driving.intervals.rooms import met
 from bench.driving.kinematics import Kinematics
 
 LONGITUDINAL, LATERAL = 6.0, 40.0
@@ -67,30 +68,10 @@ def narrowed(boxes: Boxes, tracks: TensorDictBase) -> Boxes:
     Args:
         tracks: the result of `predicted` for the same episodes.
     """
-    low, high = boxes.low[..., 1:, :].mT.unsqueeze(-2), boxes.high[..., 1:, :].mT.unsqueeze(-2)
-    track_low, track_high = tracks["low"].mT.unsqueeze(-1), tracks["high"].mT.unsqueeze(-1)
     # New cars appear where the sensor's range ends.
     known = boxes.present[..., 1:] & boxes.high[..., 1:, 0].isfinite()
-    fits = tracks["present"].unsqueeze(-1) & known.unsqueeze(-2)
-    # One feature after the other: a reduction over four is slower.
-    for feature in range(low.shape[-3]):
-        fits = fits & (low[..., feature, :, :] <= track_high[..., feature, :, :])
-        fits = fits & (track_low[..., feature, :, :] <= high[..., feature, :, :])
-    others = torch.where(fits, 0.0, torch.inf).unsqueeze(-3)
-    hull_low, hull_high = _least(track_low, others), -_least(-track_high, others)
+    low, high = met(
+        boxes.low[..., 1:, :], boxes.high[..., 1:, :], known, (tracks["low"], tracks["high"], tracks["present"])
+    )
     ego_low, ego_high = boxes.low[..., :1, :], boxes.high[..., :1, :]
-    matched = torch.cat((torch.zeros_like(fits[..., :1, 0]), fits.any(-2)), -1)
-    return boxes.meet(torch.cat((ego_low, hull_low), -2), torch.cat((ego_high, hull_high), -2), matched)
-
-
-def _least(bound: Tensor, others: Tensor) -> Tensor:
-    """The least bound [..., V, F] of those that count; it may be infinite.
-
-    Args:
-        bound: [..., F, T, 1] of the tracks.
-        others: 0 for the tracks that count and infinite for the others, [..., 1, T, V].
-    """
-    end = torch.finfo(bound.dtype).max
-    # A sum is faster than a choice, but has no result for opposite infinities.
-    least = (bound.clamp(-end, end) + others).amin(-2)
-    return torch.where(least <= -end, -torch.inf, least).mT
+    return Boxes(boxes.present, torch.cat((ego_low, low), -2), torch.cat((ego_high, high), -2))

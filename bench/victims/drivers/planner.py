@@ -12,8 +12,10 @@ from torch import Tensor
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import UNKNOWN_EDGE, Ego
-from bench.driving.intervals.margins import SIDES, Caution, Judge, cars_of
+from bench.driving.intervals.kernels import SIDES
+from bench.driving.intervals.margins import Judge
 from bench.driving.intervals.policy import IntervalPolicy
+from bench.driving.intervals.rooms import Caution, cars_of
 from bench.driving.threat import Norm
 from bench.plugins.ranges import NotNegative, Share
 
@@ -81,7 +83,7 @@ class IntervalPlanner(IntervalPolicy):
         ego = self.reckoning.now(boxes, state)
         cars = cars_of(ego, boxes)
         found = self.judge(ego, cars)
-        left, own, right = self._worth(ego, self.judge.speeds(ego, cars)).unbind(-1)
+        left, own, right = self._worth(ego, self.judge.rooms.speeds(ego, cars)).unbind(-1)
         orders = torch.tensor([ORDER_SAFE, ORDER_UNSAFE]).to(own)
         safe = own.unsqueeze(-1) + orders[0] + TIE_BREAK * found.stay
         stay = torch.where(found.stay < 0, UNSAFE + orders[1] + PER_METRE * found.stay, safe)

@@ -1,0 +1,326 @@
+"""Compiled loops over the cars of each episode, with their gradients. Many small tensor operations take ten times as long."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FREE = 200.0
+"""The room where there is no car, in m."""
+FASTEST, STEP = 40.0, 0.5
+"""Largest speed and resolution of a table of following distances, in m/s."""
+HARDEST = 6
+"""Hardest braking of a leader in a table, in m/s2."""
+DRIFT_S, DEAD_BAND = 0.6, 0.5
+"""A car may be as far to the side as it gets in this time in s with the part of its lateral speed above this, in m/s."""
+CLEARANCE = 0.4
+"""Lateral room between two cars, in m, below which they are in the same lane."""
+REAR_S, REAR_BRAKING = 0.14, 4.0
+"""A car behind reacts after this time in s, and brakes at this rate in m/s2."""
+SIDES = (-4, -3, -2, -1, 0, 1, 2, 3, 4)
+"""The lanes whose speeds are computed, relative to the ego's target lane."""
+ROOM, HORIZON_S = 12.0, 3.0
+"""Room to a car ahead that does not count as free, in m, and the time in which the free room counts as speed."""
+NOBODY = -1
+
+Floats = NDArray[np.float32]
+Numbers = NDArray[np.int8]
+Flags = NDArray[np.bool_]
+
+
+class Rules(NamedTuple):
+    """What rooms depend on besides the cars. SI units.
+
+    Args:
+        period: seconds per decision.
+        length: of a car, and the distance that is always kept.
+        width: of a car, and `CLEARANCE`.
+        lane_width: of a lane.
+        braking: least rate at which a car ahead may brake.
+        acceleration, jam_distance, time_gap, free_share: of the car-following model, `bench.driving.kinematics.CarFollowing`.
+        scale: the divisor in its desired gap.
+        steady: number of the option that keeps the speed.
+    """
+
+    period: float
+    length: float
+    width: float
+    lane_width: float
+    braking: float
+    acceleration: float
+    jam_distance: float
+    time_gap: float
+    free_share: float
+    scale: float
+    steady: int
+
+
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compiled, and cached on disk if there is a writable folder."""
+    try:
+        return njit(nogil=True, cache=True)(function)
+    except RuntimeError:
+        return njit(nogil=True)(function)
+
+
+@njit
+def _middle(low: float, high: float) -> float:
+    """The middle of an interval; where one bound is infinite, the other one; 0 where both are."""
+    if np.isinf(low):
+        return 0.0 if np.isinf(high) else high
+    return low if np.isinf(high) else (low + high) / 2
+
+
+@njit
+def used(table: Floats, side: int, own: float, leader: float, level: int) -> tuple[float, float, float]:
+    """The following distance in a table [levels * side * side], and its slopes in both speeds."""
+    top = FASTEST - 1e-3
+    first, second = min(max(own, 0.0), top) / STEP, min(max(leader, 0.0), top) / STEP
+    row, column = int(first), int(second)
+    down, right = first - row, second - column
+    place = (level * side + row) * side + column
+    a, b, c, d = table[place], table[place + 1], table[place + side], table[place + side + 1]
+    upper, lower = a + (b - a) * right, c + (d - c) * right
+    slope_own = (lower - upper) / STEP if 0 <= own <= top else 0.0
+    slope_leader = ((b - a) * (1 - down) + (d - c) * down) / STEP if 0 <= leader <= top else 0.0
+    return upper + (lower - upper) * down, slope_own, slope_leader
+
+
+@njit
+def _level(low: Floats, high: Floats, present: Flags, car: int, rules: Rules) -> int:
+    """How hard a car brakes for the next one ahead of it, by its car-following model, rounded up to a level of the tables."""
+    place, speed, rate = _middle(low[car, 0], high[car, 0]), _middle(low[car, 2], high[car, 2]), 0.0
+    for other in range(len(low)):
+        gap = _middle(low[other, 0], high[other, 0]) - place
+        if not present[other] or gap <= 0:
+            continue
+        if low[other, 1] < high[car, 1] + rules.width and high[other, 1] > low[car, 1] - rules.width:
+            closing = speed - _middle(low[other, 2], high[other, 2])
+            wanted = max(rules.jam_distance + rules.time_gap * speed + speed * closing / rules.scale, 0.0)
+            share = wanted / max(gap, 1.0)
+            rate = max(rate, rules.acceleration * (share * share - rules.free_share))
+    return int(np.ceil(min(max(rate, rules.braking), float(HARDEST))))
+
+
+@_compiled
+def rooms(
+    low: Floats,
+    high: Floats,
+    present: Flags,
+    along: Floats,
+    lane: Floats,
+    own: Floats,
+    tables: Floats,
+    side: int,
+    rules: Rules,
+    front: Floats,
+    front_car: Numbers,
+    rear: Floats,
+    rear_car: Numbers,
+    level: Numbers,
+) -> None:
+    """The least room to the cars ahead and behind, on the lanes to the left, own and right; fills `front`, `rear` and the cars.
+
+    Args:
+        low, high: bounds in the road's frame (x relative to the ego), [N, C, 4].
+        present: [N, C].
+        along: the ego's speed along the road, [N].
+        lane: middle of the ego's target lane, in m, [N].
+        own: the ego's speed after each option, [N, O].
+        tables: following distances [T, levels * side * side].
+        side: number of speeds in a table.
+        rules: see `Rules`.
+        front, front_car: room [N, T, 3, O] from -`FREE` to `FREE`, and the car that limits it or `NOBODY`.
+        rear, rear_car: the same of the cars behind for the steady option, [N, 3].
+        level: how hard each car ahead brakes, [N, C]; needed for the gradient.
+    """
+    options = own.shape[1]
+    for n in range(len(low)):
+        front[n], front_car[n], rear[n], rear_car[n] = FREE, NOBODY, FREE, NOBODY
+        for car in range(low.shape[1]):
+            if not present[n, car]:
+                continue
+            left = low[n, car, 1] + min(low[n, car, 3] + DEAD_BAND, 0.0) * DRIFT_S
+            right = high[n, car, 1] + max(high[n, car, 3] - DEAD_BAND, 0.0) * DRIFT_S
+            nearest = lane[n] - rules.lane_width
+            if right <= nearest - rules.width or left >= nearest + 2 * rules.lane_width + rules.width:
+                continue
+            ahead = low[n, car, 0] + high[n, car, 0] > 0
+            if ahead:
+                leader = max(low[n, car, 2], 0.0)
+                gap = low[n, car, 0] + (leader - along[n]) * rules.period - rules.length
+                level[n, car] = _level(low[n], high[n], present[n], car, rules)
+                for table in range(len(tables)):
+                    for option in range(options):
+                        room = gap - used(tables[table], side, own[n, option], leader, level[n, car])[0]
+                        for beside in range(3):
+                            middle = nearest + beside * rules.lane_width
+                            inside = right > middle - rules.width and left < middle + rules.width
+                            if inside and room < front[n, table, beside, option]:
+                                front[n, table, beside, option] = room
+                                front_car[n, table, beside, option] = car
+            else:
+                closing = max(high[n, car, 2] - own[n, rules.steady], 0.0)
+                room = -high[n, car, 0] - rules.length - REAR_S * closing - closing * closing / (2 * REAR_BRAKING)
+                for beside in range(3):
+                    middle = nearest + beside * rules.lane_width
+                    inside = right > middle - rules.width and left < middle + rules.width
+                    if inside and room < rear[n, beside]:
+                        rear[n, beside], rear_car[n, beside] = room, car
+        for beside in range(3):
+            if rear[n, beside] < -FREE:
+                rear[n, beside], rear_car[n, beside] = -FREE, NOBODY
+            for table in range(len(tables)):
+                for option in range(options):
+                    if front[n, table, beside, option] < -FREE:
+                        front[n, table, beside, option], front_car[n, table, beside, option] = -FREE, NOBODY
+
+
+@_compiled
+def rooms_backward(
+    low: Floats,
+    high: Floats,
+    along: Floats,
+    own: Floats,
+    tables: Floats,
+    side: int,
+    rules: Rules,
+    front_car: Numbers,
+    rear_car: Numbers,
+    level: Numbers,
+    by_front: Floats,
+    by_rear: Floats,
+    by_low: Floats,
+    by_high: Floats,
+    by_along: Floats,
+    by_own: Floats,
+) -> None:
+    """The gradients in the bounds and the ego's speeds, added to `by_low`, `by_high`, `by_along` and `by_own`.
+
+    Args:
+        low, high, along, own, tables, side, rules, front_car, rear_car, level: as in `rooms`.
+        by_front, by_rear: gradients in the rooms.
+        by_low, by_high, by_along, by_own: zeros in the shape of the inputs.
+    """
+    for n in range(len(low)):
+        for beside in range(3):
+            for table in range(len(tables)):
+                for option in range(own.shape[1]):
+                    car, slope = front_car[n, table, beside, option], by_front[n, table, beside, option]
+                    if car == NOBODY or slope == 0:
+                        continue
+                    leader = max(low[n, car, 2], 0.0)
+                    _, in_own, in_leader = used(tables[table], side, own[n, option], leader, level[n, car])
+                    by_low[n, car, 0] += slope
+                    if low[n, car, 2] >= 0:
+                        by_low[n, car, 2] += slope * (rules.period - in_leader)
+                    by_along[n] -= slope * rules.period
+                    by_own[n, option] -= slope * in_own
+            car, slope = rear_car[n, beside], by_rear[n, beside]
+            if car != NOBODY and slope != 0:
+                by_high[n, car, 0] -= slope
+                closing = high[n, car, 2] - own[n, rules.steady]
+                if closing >= 0:
+                    change = slope * (REAR_S + closing / REAR_BRAKING)
+                    by_high[n, car, 2] -= change
+                    by_own[n, rules.steady] += change
+
+
+@_compiled
+def speeds(
+    low: Floats, high: Floats, present: Flags, lane: Floats, rules: Rules, top: float, fastest: Floats, car_of: Numbers
+) -> None:
+    """The speed that the cars ahead allow for on each of the lanes `SIDES`: theirs, and the free room over the horizon.
+
+    Args:
+        low, high, present, lane, rules: as in `rooms`.
+        top: the highest speed in m/s.
+        fastest, car_of: the speed [N, S], filled, and the car that limits it or `NOBODY`.
+    """
+    for n in range(len(low)):
+        fastest[n], car_of[n] = top, NOBODY
+        for car in range(low.shape[1]):
+            if not present[n, car] or not low[n, car, 0] + high[n, car, 0] > 0:
+                continue
+            left = low[n, car, 1] + min(low[n, car, 3] + DEAD_BAND, 0.0) * DRIFT_S
+            right = high[n, car, 1] + max(high[n, car, 3] - DEAD_BAND, 0.0) * DRIFT_S
+            free = max(_middle(low[n, car, 0], high[n, car, 0]) - ROOM, 0.0)
+            allowed = _middle(low[n, car, 2], high[n, car, 2]) + free / HORIZON_S
+            for place in range(len(SIDES)):
+                middle = lane[n] + SIDES[place] * rules.lane_width
+                inside = right > middle - rules.width and left < middle + rules.width
+                if inside and allowed < fastest[n, place]:
+                    fastest[n, place], car_of[n, place] = allowed, car
+
+
+@_compiled
+def speeds_backward(
+    low: Floats, high: Floats, car_of: Numbers, by_fastest: Floats, by_low: Floats, by_high: Floats
+) -> None:
+    """The gradients in the bounds, added to `by_low` and `by_high`, which are zeros; the others as in `speeds`."""
+    for n in range(len(low)):
+        for place in range(len(SIDES)):
+            car, slope = car_of[n, place], by_fastest[n, place]
+            if car == NOBODY or slope == 0:
+                continue
+            _to_bounds(low[n, car], high[n, car], 2, slope, by_low[n, car], by_high[n, car])
+            if _middle(low[n, car, 0], high[n, car, 0]) >= ROOM:
+                _to_bounds(low[n, car], high[n, car], 0, slope / HORIZON_S, by_low[n, car], by_high[n, car])
+
+
+@njit
+def _to_bounds(low: Floats, high: Floats, f: int, slope: float, by_low: Floats, by_high: Floats) -> None:
+    """The gradient of `_middle` in the bounds of a feature."""
+    finite = int(np.isfinite(low[f])) + int(np.isfinite(high[f]))
+    if np.isfinite(low[f]):
+        by_low[f] += slope / finite
+    if np.isfinite(high[f]):
+        by_high[f] += slope / finite
+
+
+@_compiled
+def hulls(
+    low: Floats,
+    high: Floats,
+    known: Flags,
+    track_low: Floats,
+    track_high: Floats,
+    tracked: Flags,
+    out_low: Floats,
+    out_high: Floats,
+) -> None:
+    """Each box, intersected with the hull of all tracks that it may belong to; fills `out_low` and `out_high` [N, C, F].
+
+    Args:
+        low, high: bounds of the boxes, [N, C, F].
+        known: [N, C], the boxes that may belong to a track.
+        track_low, track_high: bounds of the tracks, [N, K, F].
+        tracked: [N, K], the tracks that exist.
+        out_low, out_high: the narrowed bounds. A box that fits no track stays, and so does a feature whose intersection is empty.
+    """
+    features = low.shape[2]
+    least, most = np.empty(features, np.float32), np.empty(features, np.float32)
+    for n in range(len(low)):
+        for box in range(low.shape[1]):
+            least[:], most[:] = np.inf, -np.inf
+            fits_any = False
+            for track in range(track_low.shape[1]):
+                fits = known[n, box] and tracked[n, track]
+                for f in range(features):
+                    if not fits:
+                        break
+                    fits = low[n, box, f] <= track_high[n, track, f] and track_low[n, track, f] <= high[n, box, f]
+                if fits:
+                    fits_any = True
+                    for f in range(features):
+                        least[f] = min(least[f], track_low[n, track, f])
+                        most[f] = max(most[f], track_high[n, track, f])
+            for f in range(features):
+                lower, upper = max(low[n, box, f], least[f]), min(high[n, box, f], most[f])
+                keep = fits_any and lower <= upper
+                out_low[n, box, f] = lower if keep else low[n, box, f]
+                out_high[n, box, f] = upper if keep else high[n, box, f]

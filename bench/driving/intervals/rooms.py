@@ -1,0 +1,218 @@
+"""Room to the cars around in the worst case of the intervals: the compiled loops of `kernels` as differentiable functions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from bench.driving.intervals import kernels
+from bench.driving.intervals.boxes import Boxes
+from bench.driving.intervals.ego import DeadReckoning, Ego
+from bench.driving.intervals.following import FollowingDistance
+
+
+@dataclass(frozen=True, kw_only=True)
+class Caution:
+    """What is assumed of other cars.
+
+    Args:
+        braking: least rate at which a car ahead may brake, in m/s2; it is higher where another car is close ahead of it.
+        seconds: how long a car ahead may brake.
+        distance: room between two cars that is always kept, in m.
+    """
+
+    braking: float
+    seconds: float
+    distance: float
+
+
+class Cars(NamedTuple):
+    """The other cars: bounds of x relative to the ego, and of y, vx and vy in the road's frame.
+
+    Args:
+        present: bool [..., V - 1].
+        low, high: [..., V - 1, 4].
+    """
+
+    present: Tensor
+    low: Tensor
+    high: Tensor
+
+
+def cars_of(ego: Ego, boxes: Boxes) -> Cars:
+    along, across = ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
+    own = torch.stack([torch.zeros_like(along), ego.y, along, across], -1).unsqueeze(-2)
+    return Cars(boxes.present[..., 1:], boxes.low[..., 1:, :] + own, boxes.high[..., 1:, :] + own)
+
+
+class Rooms:
+    """Computes rooms.
+
+    Args:
+        reckoning: the ego's kinematics.
+        period: seconds per decision.
+        caution: what is assumed of other cars.
+        following: following distances.
+        steady: number of the option that keeps the speed.
+    """
+
+    def __init__(
+        self, reckoning: DeadReckoning, period: float, caution: Caution, following: FollowingDistance, steady: int
+    ) -> None:
+        car = reckoning.kinematics
+        model = car.following
+        self.following, self.top = following, car.target_speeds[-1]
+        self.rules = kernels.Rules(
+            period=period,
+            length=car.length + caution.distance,
+            width=car.width + kernels.CLEARANCE,
+            lane_width=car.lane_width,
+            braking=caution.braking,
+            acceleration=model.acceleration,
+            jam_distance=model.jam_distance,
+            time_gap=model.time_gap,
+            free_share=model.free_share,
+            scale=2 * math.sqrt(model.acceleration * model.braking),
+            steady=steady,
+        )
+
+    def __call__(self, ego: Ego, cars: Cars, own: Tensor) -> tuple[Tensor, Tensor]:
+        """The least room in m, from -`FREE` to `FREE`, on the lanes to the left, own and right.
+
+        Args:
+            ego: the ego's motion.
+            cars: the other cars.
+            own: the ego's speed after each option, [..., O].
+
+        Returns:
+            To the cars ahead, [..., T, 3, O], one for each table of following distances; and to the cars behind, [..., 3].
+        """
+        along = ego.speed * ego.heading.cos()
+        lane = self.rules.lane_width * ego.target_lane
+        front, rear = _Rooms.apply(cars.low, cars.high, along, own, cars.present, lane, self)
+        return front, rear
+
+    def speeds(self, ego: Ego, cars: Cars) -> Tensor:
+        """[..., 9] the speed in m/s that each of the lanes `SIDES` allows for: the cars', and the free room over the horizon."""
+        lane = self.rules.lane_width * ego.target_lane
+        fastest: Tensor = _Speeds.apply(cars.low, cars.high, cars.present, lane, self)
+        return fastest
+
+
+def met(low: Tensor, high: Tensor, known: Tensor, tracks: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """The bounds [..., C, F], each intersected with the hull of all tracks that it may belong to.
+
+    Args:
+        low, high: bounds of the boxes, [..., C, F].
+        known: bool [..., C], the boxes that may belong to a track.
+        tracks: bounds of the tracks [..., K, F] each, and which exist, bool [..., K].
+    """
+    found: tuple[Tensor, Tensor] = _Hulls.apply(low, high, known, *tracks)
+    return found
+
+
+class _Rooms(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, low: Tensor, high: Tensor, along: Tensor, own: Tensor, present: Tensor, lane: Tensor, of: Rooms
+    ) -> tuple[Tensor, Tensor]:
+        shape, options, tables = along.shape, own.shape[-1], len(of.following.tables)
+        flat = _flat(low, 2), _flat(high, 2), _flat(along, 0), _flat(own, 1)
+        count, cars = flat[0].shape[:2]
+        front = np.empty((count, tables, 3, options), np.float32)
+        rear = np.empty((count, 3), np.float32)
+        found = np.empty(front.shape, np.int8), np.empty(rear.shape, np.int8), np.zeros((count, cars), np.int8)
+        kernels.rooms(
+            flat[0],
+            flat[1],
+            _flat(present, 1),
+            flat[2],
+            _flat(lane, 0),
+            flat[3],
+            of.following.tables,
+            of.following.side,
+            of.rules,
+            front,
+            found[0],
+            rear,
+            found[1],
+            found[2],
+        )
+        ctx.of, ctx.flat, ctx.found = of, flat, found
+        ctx.shapes, ctx.like = [each.shape for each in (low, high, along, own)], low.new_empty(0)
+        return _shaped(front, shape, low), _shaped(rear, shape, low)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_front: Tensor, by_rear: Tensor) -> tuple[Tensor | None, ...]:
+        gradients = [np.zeros_like(each) for each in ctx.flat]
+        kernels.rooms_backward(
+            *ctx.flat,
+            ctx.of.following.tables,
+            ctx.of.following.side,
+            ctx.of.rules,
+            *ctx.found,
+            _flat(by_front, 3),
+            _flat(by_rear, 1),
+            *gradients,
+        )
+        back = [torch.from_numpy(each).to(ctx.like).reshape(to) for each, to in zip(gradients, ctx.shapes, strict=True)]
+        return *back, None, None, None
+
+
+class _Speeds(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, low: Tensor, high: Tensor, present: Tensor, lane: Tensor, of: Rooms) -> Tensor:
+        flat = _flat(low, 2), _flat(high, 2)
+        fastest = np.empty((len(flat[0]), len(kernels.SIDES)), np.float32)
+        car = np.empty(fastest.shape, np.int8)
+        kernels.speeds(*flat, _flat(present, 1), _flat(lane, 0), of.rules, of.top, fastest, car)
+        ctx.flat, ctx.car, ctx.shape, ctx.like = flat, car, low.shape, low.new_empty(0)
+        return _shaped(fastest, lane.shape, low)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_fastest: Tensor) -> tuple[Tensor | None, ...]:
+        by_low, by_high = (np.zeros_like(each) for each in ctx.flat)
+        kernels.speeds_backward(*ctx.flat, ctx.car, _flat(by_fastest, 1), by_low, by_high)
+        back = [torch.from_numpy(each).to(ctx.like).reshape(ctx.shape) for each in (by_low, by_high)]
+        return *back, None, None, None
+
+
+class _Hulls(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, low: Tensor, high: Tensor, known: Tensor, track_low: Tensor, track_high: Tensor, tracked: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        flat = _flat(low, 2), _flat(high, 2)
+        out = np.empty_like(flat[0]), np.empty_like(flat[1])
+        kernels.hulls(*flat, _flat(known, 1), _flat(track_low, 2), _flat(track_high, 2), _flat(tracked, 1), *out)
+        lower, upper = (_shaped(each, low.shape[:-2], low) for each in out)
+        # The gradient goes to the bounds that were not moved.
+        ctx.save_for_backward(lower == low, upper == high)
+        return lower, upper
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_low: Tensor, by_high: Tensor) -> tuple[Tensor | None, ...]:
+        own_low, own_high = ctx.saved_tensors
+        return by_low * own_low, by_high * own_high, None, None, None, None
+
+
+def _flat(tensor: Tensor, kept: int) -> NDArray[Any]:
+    """The values [N, ...] of a tensor, with all but the last `kept` dimensions in one; numbers as float32."""
+    values = tensor.detach() if tensor.dtype == torch.bool else tensor.detach().float()
+    flat: NDArray[Any] = values.reshape(-1, *tensor.shape[tensor.ndim - kept :]).contiguous().cpu().numpy()
+    return flat
+
+
+def _shaped(values: NDArray[Any], leading: torch.Size, like: Tensor) -> Tensor:
+    """A tensor [*leading, ...] of values [N, ...]."""
+    return torch.from_numpy(values).to(like).reshape(*leading, *values.shape[1:])
