@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from torch import Tensor
-
 
 @dataclass(frozen=True, kw_only=True)
 class CarFollowing:
@@ -25,10 +23,10 @@ class CarFollowing:
     time_gap: float
     free_share: float
 
-    def desired_gap(self, speed: Tensor, closing: Tensor) -> Tensor:
-        """d* in m, from a car's speed and the speed at which it closes on the next one, in m/s."""
-        scale = 2 * math.sqrt(self.acceleration * self.braking)
-        return self.jam_distance + self.time_gap * speed + speed * closing / scale
+    @property
+    def scale(self) -> float:
+        """2 sqrt(a b) in m/s2, the divisor in the desired gap d_0 + T v + v dv / (2 sqrt(a b))."""
+        return 2 * math.sqrt(self.acceleration * self.braking)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.highway.compiled import entry_point, inner
+from bench.compiled import entry_point, inner
 from envs.highway.dynamics import (
     DISCRETE,
     closest_lane,

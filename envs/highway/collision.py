@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from envs.highway.compiled import inner
+from bench.compiled import inner
 from envs.highway.dynamics import VEHICLE_LENGTH, VEHICLE_WIDTH
 from envs.highway.state import Floats, Integers, Vehicle, Vehicles
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from envs.highway.compiled import inner
+from bench.compiled import inner
 from envs.highway.state import EgoKind, Vehicle
 
 DISCRETE, CONTINUOUS, IDM = int(EgoKind.DISCRETE), int(EgoKind.CONTINUOUS), int(EgoKind.IDM)

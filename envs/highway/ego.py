@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from envs.highway.compiled import inner
+from bench.compiled import inner
 from envs.highway.dynamics import (
     DISCRETE,
     IDM,

@@ -10,8 +10,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.compiled import entry_point, inner
 from envs.highway.collision import find_collisions
-from envs.highway.compiled import entry_point, inner
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.dynamics import move
 from envs.highway.ego import apply_action, score, time_to_collision

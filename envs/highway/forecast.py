@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from bench.compiled import entry_point
 from bench.driving.dynamics import Dynamics, Forecast
 from envs.highway.belief import track_batch
 from envs.highway.collision import find_collisions
-from envs.highway.compiled import entry_point
 from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.dynamics import is_on_lane, move
 from envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED, apply_action, lane_share, speed_share

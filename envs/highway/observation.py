@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.highway.compiled import inner
+from bench.compiled import inner
 from envs.highway.dynamics import VEHICLE_LENGTH, clip, linear_map
 from envs.highway.sensor import FEATURES, add_noise
 from envs.highway.state import Episode, Floats, Integers, Vehicle, Vehicles

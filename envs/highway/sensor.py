@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.highway.compiled import entry_point, inner
+from bench.compiled import entry_point, inner
 from envs.weather import Weather
 
 CLEAR_RANGE_M = 200.0

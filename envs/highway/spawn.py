@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.highway.compiled import entry_point, inner
+from bench.compiled import entry_point, inner
 from envs.highway.dynamics import CONTINUOUS, IDM, LANE_WIDTH, SPEED_LIMIT, closest_lane, update_direction
 from envs.highway.ego import nearest_target_speed
 from envs.highway.state import Floats, Integers, Parameters, Vehicle, Vehicles

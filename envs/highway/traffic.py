@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from envs.highway.compiled import inner
+from bench.compiled import inner
 from envs.highway.dynamics import (
     CONTINUOUS,
     DISCRETE,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from bench.compiled import entry_point, inner
 
 FREE = 200.0
 """The room where there is no car, in m."""
@@ -59,15 +59,7 @@ class Rules(NamedTuple):
     steady: int
 
 
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compiled, and cached on disk if there is a writable folder."""
-    try:
-        return njit(nogil=True, cache=True)(function)
-    except RuntimeError:
-        return njit(nogil=True)(function)
-
-
-@njit
+@inner
 def _middle(low: float, high: float) -> float:
     """The middle of an interval; where one bound is infinite, the other one; 0 where both are."""
     if np.isinf(low):
@@ -75,7 +67,7 @@ def _middle(low: float, high: float) -> float:
     return low if np.isinf(high) else (low + high) / 2
 
 
-@njit
+@entry_point
 def used(table: Floats, side: int, own: float, leader: float, level: int) -> tuple[float, float, float]:
     """The following distance in a table [levels * side * side], and its slopes in both speeds."""
     top = FASTEST - 1e-3
@@ -90,7 +82,7 @@ def used(table: Floats, side: int, own: float, leader: float, level: int) -> tup
     return upper + (lower - upper) * down, slope_own, slope_leader
 
 
-@njit
+@inner
 def _level(low: Floats, high: Floats, present: Flags, car: int, rules: Rules) -> int:
     """How hard a car brakes for the next one ahead of it, by its car-following model, rounded up to a level of the tables."""
     place, speed, rate = _middle(low[car, 0], high[car, 0]), _middle(low[car, 2], high[car, 2]), 0.0
@@ -106,7 +98,7 @@ def _level(low: Floats, high: Floats, present: Flags, car: int, rules: Rules) ->
     return int(np.ceil(min(max(rate, rules.braking), float(HARDEST))))
 
 
-@_compiled
+@entry_point
 def rooms(
     low: Floats,
     high: Floats,
@@ -180,7 +172,7 @@ def rooms(
                         front[n, table, beside, option], front_car[n, table, beside, option] = -FREE, NOBODY
 
 
-@_compiled
+@entry_point
 def rooms_backward(
     low: Floats,
     high: Floats,
@@ -230,7 +222,7 @@ def rooms_backward(
                     by_own[n, rules.steady] += change
 
 
-@_compiled
+@entry_point
 def speeds(
     low: Floats, high: Floats, present: Flags, lane: Floats, rules: Rules, top: float, fastest: Floats, car_of: Numbers
 ) -> None:
@@ -257,7 +249,7 @@ def speeds(
                     fastest[n, place], car_of[n, place] = allowed, car
 
 
-@_compiled
+@entry_point
 def speeds_backward(
     low: Floats, high: Floats, car_of: Numbers, by_fastest: Floats, by_low: Floats, by_high: Floats
 ) -> None:
@@ -272,7 +264,7 @@ def speeds_backward(
                 _to_bounds(low[n, car], high[n, car], 0, slope / HORIZON_S, by_low[n, car], by_high[n, car])
 
 
-@njit
+@inner
 def _to_bounds(low: Floats, high: Floats, f: int, slope: float, by_low: Floats, by_high: Floats) -> None:
     """The gradient of `_middle` in the bounds of a feature."""
     finite = int(np.isfinite(low[f])) + int(np.isfinite(high[f]))
@@ -282,7 +274,7 @@ def _to_bounds(low: Floats, high: Floats, f: int, slope: float, by_low: Floats, 
         by_high[f] += slope / finite
 
 
-@_compiled
+@entry_point
 def hulls(
     low: Floats,
     high: Floats,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -79,7 +78,7 @@ class Rooms:
             jam_distance=model.jam_distance,
             time_gap=model.time_gap,
             free_share=model.free_share,
-            scale=2 * math.sqrt(model.acceleration * model.braking),
+            scale=model.scale,
             steady=steady,
         )
 

@@ -1,4 +1,4 @@
-"""Compilation of the engine's functions with numba, cached on disk if possible.
+"""Compilation of functions with numba, cached on disk if possible.
 
 Inner functions are compiled into the entry points; only entry points are cached.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +15,21 @@ from numba import njit
 from numba.core.caching import FunctionCache
 
 
-def _fingerprint() -> str:
-    """Hash of this folder's sources: numba checks only the file of the cached function, not of the functions it calls."""
+@cache
+def _fingerprint(folder: Path) -> str:
+    """Hash of a folder's sources: numba checks only the file of the cached function, not of the functions it calls."""
     digest = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    for source in sorted(folder.glob("*.py")):
         digest.update(source.read_bytes())
     return digest.hexdigest()
 
 
-FINGERPRINT = _fingerprint()
-
-
 class _SourcesCache(FunctionCache):
-    """numba's disk cache with this folder's sources in the key; write errors are ignored."""
+    """numba's disk cache with the sources of the function's folder in the key; write errors are ignored."""
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
-        return (*super()._index_key(sig, codegen), FINGERPRINT)
+        folder = Path(self._py_func.__code__.co_filename).parent
+        return (*super()._index_key(sig, codegen), _fingerprint(folder))
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
@@ -52,6 +52,6 @@ def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
     try:
         dispatcher._cache = _SourcesCache(function)
     except RuntimeError:
-        # numba found no writable folder: the engine is compiled in memory, once per process.
+        # numba found no writable folder: the function is compiled in memory, once per process.
         return dispatcher
     return dispatcher
