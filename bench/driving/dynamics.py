@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from bench.driving.features import ActionType
+from bench.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,24 @@ class Forecast:
     failed: Tensor
     crashed: Tensor
     progress: Tensor
+
+
+class Rehearsal(ABC):
+    """Simulated episodes that begin with a belief, in several copies: [K, B] for K copies of B episodes.
+
+    Attributes:
+        observation: the true observation in the simulation, without sensor noise, [K, B, V, F].
+        progress: progress of the last decision, [K, B]; 0 from a failure on.
+        failed: bool [K, B], whether the car has crashed or left the road.
+    """
+
+    observation: Tensor
+    progress: Tensor
+    failed: Tensor
+
+    @abstractmethod
+    def step(self, action: Tensor) -> None:
+        """Simulate one decision: int64 [K, B], or float [K, B, 2] for continuous actions."""
 
 
 class Dynamics(ABC):
@@ -64,3 +83,15 @@ class Dynamics(ABC):
             belief: the state to start from, batch size [B].
             plans: actions of T decisions: int64 [P, T] or [B, P, T], or for continuous actions float [P, T, 2] or [B, P, T, 2].
         """
+
+    def rehearsal(self, belief: TensorDictBase, copies: int) -> Rehearsal:
+        """Simulated episodes, decision by decision.
+
+        Args:
+            belief: the state to start from, batch size [B].
+            copies: K, copies of each episode.
+
+        Raises:
+            UserError: if the world has no such simulation.
+        """
+        raise UserError("the attack needs a simulation of the world step by step, which this world does not offer")

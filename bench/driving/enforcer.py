@@ -120,6 +120,10 @@ class Enforcer:
         state = self._state if rows is None else rows_of(self._state, rows)
         return repeated(state, observation.shape[:-3])
 
+    def imagined(self, copies: int) -> State:
+        """The victim's state for `copies` of each episode, batch size [copies * B]."""
+        return repeated(self._state, torch.Size([copies]))
+
     def spend(self, access: Access, step: int, observation: Tensor, rows: Tensor | None) -> None:
         """Count queries [..., B, V, F] before they are answered.
 
@@ -166,6 +170,20 @@ class _Door:
         if self._enforcer.dynamics is None:
             raise UserError("the attack needs the dynamics of the world, which this world does not offer")
         return self._enforcer.dynamics
+
+    def imagined(self, copies: int) -> State:
+        permit("dynamics", self._enforcer.access)
+        state = self._enforcer.imagined(copies)
+        return None if state is None else state.clone()
+
+    def rehearse(self, observation: Tensor, state: State) -> tuple[Tensor, State]:
+        enforcer = self._enforcer
+        enforcer.spend("dynamics", self._step, observation, None)
+        flat, subject = observation.flatten(0, -3), enforcer.subject
+        with subject.asked(), torch.no_grad():
+            action = subject.policy.choose(subject.answered(flat, state))
+            after = subject.advance(flat.clone(), action, state)
+        return action.unflatten(0, observation.shape[:-2]).clone(), after
 
     def decide(self, observation: Tensor, rows: Tensor | None) -> Tensor:
         return self._enforcer.subject.policy.choose(self._answered("decisions", observation, rows))

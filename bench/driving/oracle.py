@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bench.driving.dynamics import Dynamics
 from bench.driving.features import ActionType, Features
+from bench.driving.policy import State
 from bench.driving.threat import ObservationThreat, within
 
 Loss = Callable[[Tensor], Tensor]
@@ -52,6 +53,12 @@ class Door(Protocol):
 
     def dynamics(self) -> Dynamics:
         """As `Oracle.dynamics`."""
+
+    def imagined(self, copies: int) -> State:
+        """As `Oracle.imagined`."""
+
+    def rehearse(self, observation: Tensor, state: State) -> tuple[Tensor, State]:
+        """As `Oracle.rehearse`."""
 
 
 class Oracle:
@@ -115,6 +122,22 @@ class Oracle:
             UserError: if the attack declares less access, or the world does not offer them.
         """
         return self._door.dynamics()
+
+    def imagined(self, copies: int) -> State:
+        """A copy of the victim's state of this step for simulated episodes, batch size [K * B]; needs access `dynamics`.
+
+        None if the victim has no state. It belongs to the victim: an attack passes it to `rehearse`.
+        """
+        return self._door.imagined(copies)
+
+    def rehearse(self, observation: Tensor, state: State) -> tuple[Tensor, State]:
+        """What the victim does in simulated episodes, and its state after that; needs access `dynamics`.
+
+        Args:
+            observation: what it is shown there, [K, B, V, F]. Each is a query.
+            state: from `imagined`, or from the last call.
+        """
+        return self._door.rehearse(observation, state)
 
     def project(self, perturbed: Tensor, rows: Tensor | None = None) -> Tensor:
         """Project `perturbed` [..., B, V, F] (of all episodes, or of `rows`) onto the perturbation set. Costs no query."""

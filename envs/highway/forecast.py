@@ -16,6 +16,7 @@ from envs.highway.config import ACTIONS, HighwayConfig
 from envs.highway.dynamics import is_on_lane, move
 from envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED, apply_action, lane_share, speed_share
 from envs.highway.engine import physical_controls
+from envs.highway.rehearsal import HighwayRehearsal
 from envs.highway.sensor import sensor_range_m
 from envs.highway.state import VEHICLE, EgoKind, Floats, Integers, Parameters, parameters
 from envs.highway.traffic import act, sort_by_position
@@ -141,6 +142,9 @@ class HighwayDynamics(Dynamics):
         crashed = np.zeros(shape[:2], np.bool_)
         roll_batch(cars, counts, actions, controls, belief["lanes"].numpy(), self.parameters, failed, crashed, progress)
         return Forecast(torch.from_numpy(failed), torch.from_numpy(crashed), torch.from_numpy(progress))
+
+    def rehearsal(self, belief: TensorDictBase, copies: int) -> HighwayRehearsal:
+        return HighwayRehearsal(self.config, *self._records(belief), belief, copies)
 
     def _records(self, belief: TensorDictBase) -> tuple[NDArray[np.void], Integers]:
         """A belief as records of the engine [B, N], and the number of known cars [B]."""

@@ -44,6 +44,7 @@ class Rules(NamedTuple):
         acceleration, jam_distance, time_gap, free_share: of the car-following model, `bench.driving.kinematics.CarFollowing`.
         scale: the divisor in its desired gap.
         steady: number of the option that keeps the speed.
+        lost: what the ego loses to a car behind if it has to brake while it changes lanes.
     """
 
     period: float
@@ -57,6 +58,7 @@ class Rules(NamedTuple):
     free_share: float
     scale: float
     steady: int
+    lost: float
 
 
 @inner
@@ -157,7 +159,13 @@ def rooms(
                                 front_car[n, table, beside, option] = car
             else:
                 closing = max(high[n, car, 2] - own[n, rules.steady], 0.0)
-                room = -high[n, car, 0] - rules.length - REAR_S * closing - closing * closing / (2 * REAR_BRAKING)
+                room = (
+                    -high[n, car, 0]
+                    - rules.length
+                    - rules.lost
+                    - REAR_S * closing
+                    - closing * closing / (2 * REAR_BRAKING)
+                )
                 for beside in range(3):
                     middle = nearest + beside * rules.lane_width
                     inside = right > middle - rules.width and left < middle + rules.width

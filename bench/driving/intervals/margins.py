@@ -10,10 +10,8 @@ from torch import Tensor
 from bench.driving.intervals.ego import DeadReckoning, Ego
 from bench.driving.intervals.following import FollowingDistance
 from bench.driving.intervals.kernels import FREE
-from bench.driving.intervals.rooms import Cars, Caution, Rooms
+from bench.driving.intervals.rooms import CROSSING_S, Cars, Caution, Rooms
 
-CROSSING_S = 0.8
-"""Time in which the ego leaves a lane."""
 STRADDLING = 1.4
 """The ego is still in the lane that it comes from while it is this far from the middle of its target lane, in m."""
 SETTLED_M, SETTLED_RAD = 0.5, 0.1

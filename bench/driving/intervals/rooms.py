@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,6 +16,10 @@ from bench.driving.intervals import kernels
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import DeadReckoning, Ego
 from bench.driving.intervals.following import FollowingDistance
+from bench.driving.kinematics import Kinematics
+
+CROSSING_S = 0.8
+"""Time in which the ego leaves a lane."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +85,7 @@ class Rooms:
             free_share=model.free_share,
             scale=model.scale,
             steady=steady,
+            lost=_lost(car),
         )
 
     def __call__(self, ego: Ego, cars: Cars, own: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,6 +109,12 @@ class Rooms:
         lane = self.rules.lane_width * ego.target_lane
         fastest: Tensor = _Speeds.apply(cars.low, cars.high, cars.present, lane, self)
         return fastest
+
+
+def _lost(car: Kinematics) -> float:
+    """What the ego loses in m if it brakes towards the next lower target speed while it leaves a lane."""
+    slower = car.target_speeds[1] - car.target_speeds[0]
+    return slower * (CROSSING_S - (1 - math.exp(-car.speed_gain * CROSSING_S)) / car.speed_gain)
 
 
 def met(low: Tensor, high: Tensor, known: Tensor, tracks: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:

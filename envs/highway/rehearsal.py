@@ -1,0 +1,73 @@
+"""Simulated episodes for attackers, decision by decision, on the compiled engine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from bench.driving.dynamics import Rehearsal
+from envs.highway.config import HighwayConfig
+from envs.highway.engine import Flag, HighwayEngine, Number, observe_batch
+from envs.highway.state import Integers
+
+FAR_BEHIND, APART = 5000.0, 60.0
+"""Cars that were never seen stand so far behind, in m, and so far from each other."""
+UNSEEN_SPEED = 20.0
+"""Their speed in m/s."""
+
+
+class HighwayRehearsal(Rehearsal):
+    """Copies of the highway that start from beliefs.
+
+    Args:
+        config: configuration of the world.
+        cars: beliefs as records of the engine, [B, N].
+        counts: number of known cars [B]; the first ones of each row.
+        belief: lanes and sensor range of the B episodes.
+        copies: copies of each episode.
+    """
+
+    def __init__(
+        self, config: HighwayConfig, cars: NDArray[np.void], counts: Integers, belief: TensorDictBase, copies: int
+    ) -> None:
+        batch, size = cars.shape
+        number = np.arange(size)
+        unseen = number >= counts[:, None]
+        cars["x"] = np.where(unseen, -FAR_BEHIND - APART * number, cars["x"])
+        cars["cos_heading"] = np.where(unseen, 1.0, cars["cos_heading"])
+        for name in ("speed", "target_speed"):
+            cars[name] = np.where(unseen, UNSEEN_SPEED, cars[name])
+        self.shape = (copies, batch)
+        self.engine = HighwayEngine(replace(config, cells=config.cells[:1] * (copies * batch), action_repeat=1))
+        episodes = self.engine.episodes
+        self.engine.vehicles[:] = np.tile(cars, (copies, 1))
+        self.engine.order[:] = np.argsort(self.engine.vehicles["x"], 1, kind="stable")
+        episodes["lanes"] = np.tile(belief["lanes"].numpy(), copies)
+        episodes["sensor_range"] = np.tile(belief["sensor_range"].numpy(), copies)
+        episodes["noise_sigma"], episodes["truncated"] = 0.0, False
+        observe_batch(
+            self.engine.vehicles,
+            self.engine.order,
+            episodes,
+            np.arange(copies * batch),
+            self.engine.parameters,
+            self.engine.observation,
+            self.engine.numbers,
+            self.engine.flags,
+        )
+        self._read()
+
+    def step(self, action: Tensor) -> None:
+        self.engine.step(action.flatten(0, 1).numpy())
+        self._read()
+
+    def _read(self) -> None:
+        engine = self.engine
+        self.observation = torch.from_numpy(engine.observation.copy()).unflatten(0, self.shape)
+        self.progress = torch.from_numpy(engine.numbers[Number.PROGRESS].copy()).unflatten(0, self.shape)
+        self.failed = torch.from_numpy(engine.flags[Flag.TERMINATED].copy()).unflatten(0, self.shape)
