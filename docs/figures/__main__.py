@@ -14,6 +14,7 @@ FIGURES = {
     "attack_bias.svg": "memory:bias",
     "attack_pessimist.svg": "attacks:pessimist",
     "attack_plan.svg": "attacks:plan",
+    "attack_rehearse.svg": "attacks:rehearse",
     "attack_zo.svg": "attacks:zo",
     "attack_pgd.svg": "attacks:pgd",
     "attack_two_stage.svg": "attacks:two_stage",

@@ -48,6 +48,13 @@ def plan() -> Figure:
     return _figure(moment, asked, f"plan: {len(asked)} queries turn {_turned(moment)}", "query")
 
 
+def rehearse() -> Figure:
+    """The rehearsing attack: the lie that it chooses."""
+    moment = attacked(choose("attack", "rehearse").component, _moment())
+    points = torch.cat((moment.true[None], moment.shown))
+    return _figure(moment, points, "rehearse: the worst of eight lies", "true and shown observation")
+
+
 def zo() -> Figure:
     """ZO-SignSGD: all of its queries."""
     moment = attacked(choose("attack", "zo").component, _moment())

@@ -9,7 +9,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from attacks.plan import Plan
-from bench.driving import ActionType, ObservationThreat, Policy
+from attacks.rehearse import Rehearse
+from bench.driving import ActionType, DrivingAttack, ObservationThreat, Policy
 from bench.driving.attacker import Attacker
 from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
@@ -34,7 +35,7 @@ def started(batch: int, action_type: ActionType = "discrete") -> tuple[BatchedHi
 
 
 def attacker(
-    policy: Policy, attack: Plan | None = None, threat: ObservationThreat = THREAT, episodes: int = 3
+    policy: Policy, attack: DrivingAttack | None = None, threat: ObservationThreat = THREAT, episodes: int = 3
 ) -> Attacker:
     dynamics = WORLD.dynamics([CELL] * episodes, policy.action_type)
     return Attacker(
@@ -43,7 +44,8 @@ def attacker(
 
 
 @pytest.mark.parametrize("action_type", ["discrete", "continuous"])
-def test_hidden_state_cannot_reach_it(action_type: ActionType) -> None:
+@pytest.mark.parametrize("attack", [Plan(horizon=1.0), Rehearse(horizon=0.5, renew=2)])
+def test_hidden_state_cannot_reach_it(action_type: ActionType, attack: DrivingAttack) -> None:
     """Two runs with equal observations and different hidden state give equal perturbations, frame by frame."""
     env, observation = started(3, action_type)
     other, same = started(3, action_type)
@@ -53,7 +55,7 @@ def test_hidden_state_cannot_reach_it(action_type: ActionType) -> None:
     other.engine.episodes["steps"] = 7
     assert torch.equal(observation, same)
     policy = victim(action_type)
-    first, second = attacker(policy), attacker(policy)
+    first, second = attacker(policy, attack), attacker(policy, attack)
     everyone = torch.ones(3, dtype=torch.bool)
     for _ in range(4):
         shown, again = (one.show(observation, everyone, None).observation for one in (first, second))
@@ -171,10 +173,11 @@ def test_it_leads_the_victim_into_the_action_that_crashes() -> None:
 
 @pytest.mark.parametrize("queries", [0, 3, 4, 20, 1000])
 @pytest.mark.parametrize("action_type", ["discrete", "continuous"])
-def test_it_keeps_to_the_query_budget(queries: int, action_type: ActionType) -> None:
+@pytest.mark.parametrize("attack", [Plan(horizon=1.0), Rehearse(horizon=1.0)])
+def test_it_keeps_to_the_query_budget(queries: int, action_type: ActionType, attack: DrivingAttack) -> None:
     policy, threat = victim(action_type), ObservationThreat(access="dynamics", queries=queries)
     _, observation = started(2, action_type)
-    shown = attacker(policy, threat=threat, episodes=2).show(observation, torch.ones(2, dtype=torch.bool), None)
+    shown = attacker(policy, attack, threat, episodes=2).show(observation, torch.ones(2, dtype=torch.bool), None)
     assert int(shown.queries.max()) <= queries
 
 

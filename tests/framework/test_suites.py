@@ -15,8 +15,8 @@ SMALL = ["lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0"]
 
 
 def test_the_newest_version_is_meant_by_the_plain_name() -> None:
-    assert suites.suite("standard") is suites.suite("standard-1")
-    assert {"standard", "standard-1"} <= set(suites.names())
+    assert suites.suite("standard") is suites.suite("standard-2")
+    assert {"standard", "standard-1", "standard-2"} <= set(suites.names())
     with pytest.raises(UserError, match="unknown suite 'standard-9'"):
         suites.suite("standard-9")
 
@@ -48,8 +48,8 @@ def test_a_member_is_the_pair_that_its_own_options_make() -> None:
 def test_members_above_the_threat_model_are_skipped_with_a_line() -> None:
     config = run_config(["attack=standard", "threat.access=scores", *SMALL])
     assert [pair.attack.name for pair in config.pairs] == ["pessimist", "zo", "noise"]
-    assert len(config.skipped) == 8
-    assert any(line.startswith("standard-1 skips plan: attack 'plan' needs access") for line in config.skipped)
+    assert len(config.skipped) == 9
+    assert any(line.startswith("standard-2 skips plan: attack 'plan' needs access") for line in config.skipped)
     # The same attack chosen by its name is refused.
     with pytest.raises(UserError, match="attack 'plan' needs access 'dynamics'"):
         run_config(["attack=plan", "threat.access=scores", *SMALL])
@@ -62,7 +62,7 @@ def test_a_suite_and_attacks_by_name_can_be_mixed() -> None:
 
 
 def test_what_cannot_be_is_refused_in_one_line() -> None:
-    with pytest.raises(UserError, match=r"suite standard-1 have fixed parameters, got attack\.steps"):
+    with pytest.raises(UserError, match=r"suite standard-2 have fixed parameters, got attack\.steps"):
         run_config(["attack=standard", "attack.steps=3", *SMALL])
     with pytest.raises(UserError, match="suite 'standard-1' is for the driving track; suites for the detection track"):
         run_config(["attack=standard-1", "victim=yolov5"])
@@ -99,10 +99,10 @@ def test_the_command_line_lists_and_helps_with_suites(capsys: pytest.CaptureFixt
     listed, page, helped = (
         CliRunner().invoke(app, words).output for words in (["list"], ["list", "standard"], ["run", "--help"])
     )
-    assert "standard-1" in listed
-    assert "suite standard-1" in page
+    assert "standard-2" in listed
+    assert "suite standard-2" in page
     assert "oblivious and" in page
-    assert "standard-1" in helped
+    assert "standard-2" in helped
 
 
 @pytest.mark.slow
@@ -130,5 +130,5 @@ def test_a_suite_runs_end_to_end(tmp_path: Path) -> None:
     assert shares == {("none", 1.0), ("pessimist", 0.1), ("noise", 0.1)}
     print_run(str(tmp_path), tmp_path, console, lambda track, table: None)
     text = console.export_text()
-    assert "standard-1: 2 of 16 members" in text
+    assert "standard-2: 2 of 17 members" in text
     assert "10 % of the frames" in text
