@@ -60,7 +60,7 @@ def decoys() -> Figure:
 
 def windscreen() -> Figure:
     """One frame with each lens, clear and in rain."""
-    made = style.figure(2.0, "windscreen: drops, glare and motion blur")
+    made = style.figure(1.75, "windscreen: drops, glare and motion blur")
     panels = made.subplots(2, len(LENSES))
     for row, weather in zip(panels, ("clear", "rain"), strict=True):
         for axes, lens in zip(row, LENSES, strict=True):

@@ -180,7 +180,9 @@ class BankScenes(Scenes):
             picture = plate.cut(window)
             patched = common(window, plate.crop, _reach(self.poses[number], share))
             if patches is not None and patched:
-                picture[within(patched, window)] = plate.signed(faces[detail(plate.crop)][place % len(patches)], patched)
+                picture[within(patched, window)] = plate.signed(
+                    faces[detail(plate.crop)][place % len(patches)], patched
+                )
             shown.append(picture)
         return shown
 

@@ -1,7 +1,7 @@
 """Drops on the windscreen, veiling glare and motion blur: maps of the linear light of whole frames.
 
-Drops and motion blur are linear in the light, glare is affine, so the texels of a patch keep their gradient. Everything random comes
-from the seed of the pose, or of its place for glare.
+Drops and motion blur are linear in the light, glare is affine, so the texels of a patch keep their gradient. Everything random
+comes from the seed of the pose, or of its place for glare.
 """
 
 from __future__ import annotations
