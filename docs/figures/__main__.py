@@ -51,6 +51,7 @@ FIGURES = {
     "world_highway.svg": "highway:world",
     "world_camera.png": "camera:world",
     "world_crossing.png": "crossing:world",
+    "world_windscreen.png": "camera:windscreen",
     "decoys.png": "camera:decoys",
     "leaderboard.svg": "leaderboard:standard",
 }

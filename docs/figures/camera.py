@@ -1,4 +1,4 @@
-"""The camera world: every place in every weather, and the decoys."""
+"""The camera world: every place in every weather, the decoys, and the windscreen."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ import torch
 from matplotlib.figure import Figure
 
 from docs.figures import style
-from docs.figures.sightings import FRAME, approaches, picture, show
+from docs.figures.sightings import DENSITY, FRAME, LANES, approaches, picture, show
 from envs.camera.faces import DECOYS
+from envs.camera.windscreen import Windscreen
+from envs.camera.windscreen_axes import AXES, LENSES
 from envs.weather import WEATHERS
 
 WINDOW = 400, 230
 """Width and height in pixels of the shown part of each frame."""
+NEAR = 8
+"""Index of the frame that is shown through the windscreen: some 10 m before the sign, where motion blur is seen."""
 
 
 def world() -> Figure:
@@ -51,4 +55,21 @@ def decoys() -> Figure:
         row[0].set_ylabel(weather)
     for axes, name in zip(panels[0], ("stop sign", *(decoy.name for decoy in DECOYS)), strict=True):
         axes.set_title(name, fontsize=10)
+    return made
+
+
+def windscreen() -> Figure:
+    """One frame with each lens, clear and in rain."""
+    made = style.figure(1.75, "windscreen: drops, glare and motion blur")
+    panels = made.subplots(2, len(LENSES))
+    for row, weather in zip(panels, ("clear", "rain"), strict=True):
+        for axes, lens in zip(row, LENSES, strict=True):
+            cell = AXES.cell(lanes=LANES, density=DENSITY, weather=weather, lens=lens)
+            (approach,) = Windscreen().approaches(cell, range(1))
+            left, top, right, _ = approach.scenes.boxes[NEAR].tolist()
+            x, y = round((left + right) / 2 - WINDOW[0] / 2), max(round(top) - 60, 0)
+            show(axes, picture(approach, NEAR)[:, y : y + WINDOW[1], x : x + WINDOW[0]])
+        row[0].set_ylabel(weather)
+    for axes, lens in zip(panels[0], LENSES, strict=True):
+        axes.set_title(lens, fontsize=10)
     return made

@@ -126,26 +126,49 @@ class BankScenes(Scenes):
         self.decoys = tuple(faces.DECOYS[(first + n) % len(faces.DECOYS)] for n in range(len(self.poses)))
         self._plates: dict[int, Plate] = {}
 
+    def redrawn(self, number: int) -> BankScenes:
+        return self
+
     def objects(self, frame: int) -> Objects:
         found = objects(self.poses[frame])
         boxes = np.array([box for _, box in found]).reshape(-1, 4)
         return Objects(torch.from_numpy(boxes).float(), tuple(name for name, _ in found))
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
-        return self.windows(frames, patches, share, torch.zeros(len(frames), 2, dtype=torch.int64), self.size)
+        return self.with_noise(self.developed(frames, patches, share), frames)
 
     def render_decoys(self, frames: Tensor) -> Tensor:
-        whole = (0, 0, self.size[1], self.size[0])
-        return torch.stack(
-            [
-                self._add_noise(self._plate(number).carrying(faces.face(self.decoys[number].name)), number, whole)
-                for number in frames.tolist()
-            ]
-        )
+        return self.with_noise(self.developed_decoys(frames), frames)
 
     def windows(
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
     ) -> Tensor:
+        shown = self._developed(frames, patches, share, corners, size)
+        parts = [(x, y, x + size[1], y + size[0]) for x, y in corners.tolist()]
+        return torch.stack([self._noisy(*one) for one in zip(shown, frames.tolist(), parts, strict=True)])
+
+    def developed(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
+        """The images of `render` without sensor noise."""
+        corners = torch.zeros(len(frames), 2, dtype=torch.int64)
+        return torch.stack(self._developed(frames, patches, share, corners, self.size))
+
+    def developed_decoys(self, frames: Tensor) -> Tensor:
+        """The images of `render_decoys` without sensor noise."""
+        return torch.stack(
+            [self._plate(number).carrying(faces.face(self.decoys[number].name)) for number in frames.tolist()]
+        )
+
+    def with_noise(self, pictures: Tensor, frames: Tensor) -> Tensor:
+        """Images [N, 3, H, W] of frames with sensor noise."""
+        whole = (0, 0, self.size[1], self.size[0])
+        return torch.stack(
+            [self._noisy(picture, number, whole) for picture, number in zip(pictures, frames.tolist(), strict=True)]
+        )
+
+    def _developed(
+        self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
+    ) -> list[Tensor]:
+        """Windows of the images without sensor noise, [3, h, w] each."""
         numbers = frames.tolist()
         faces: dict[int, tuple[Tensor, ...]] = {}
         if patches is not None:
@@ -154,13 +177,14 @@ class BankScenes(Scenes):
         shown = []
         for place, (number, (x, y)) in enumerate(zip(numbers, corners.tolist(), strict=True)):
             plate, window = self._plate(number), (x, y, x + size[1], y + size[0])
-            picture = self._add_noise(plate.cut(window), number, window)
+            picture = plate.cut(window)
             patched = common(window, plate.crop, _reach(self.poses[number], share))
             if patches is not None and patched:
-                signed = plate.signed(faces[detail(plate.crop)][place % len(patches)], patched)
-                picture[within(patched, window)] = self._add_noise(signed, number, patched)
+                picture[within(patched, window)] = plate.signed(
+                    faces[detail(plate.crop)][place % len(patches)], patched
+                )
             shown.append(picture)
-        return torch.stack(shown)
+        return shown
 
     def reach(self, share: float) -> Tensor:
         return torch.tensor([_reach(pose, share) for pose in self.poses], dtype=torch.float32)
@@ -172,13 +196,13 @@ class BankScenes(Scenes):
             self._plates[number] = opened(self.frames[number], pose.camera, sign_x(pose.lanes))
         return self._plates[number]
 
-    def _add_noise(self, picture: Tensor, number: int, part: Box) -> Tensor:
-        """Add sensor noise in place to a part [3, h, w] of the image of a frame."""
+    def _noisy(self, picture: Tensor, number: int, part: Box) -> Tensor:
+        """A part [3, h, w] of the image of a frame with sensor noise."""
         height, width = self.size
         seed = self.poses[number].seed
         down, right = seed % GRAIN_SHIFT, seed // GRAIN_SHIFT % GRAIN_SHIFT
         grain = _grain(height + GRAIN_SHIFT, width + GRAIN_SHIFT)[within(part, (-right, -down, width, height))]
-        return picture.add_(grain, alpha=noise_level(WEATHERS[self.weathers[number]])).clamp_(0, 1)
+        return picture.add(grain, alpha=noise_level(WEATHERS[self.weathers[number]])).clamp_(0, 1)
 
 
 class TrainingScenes(BankScenes):

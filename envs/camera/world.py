@@ -37,10 +37,11 @@ class StopSignApproach(BankWorld):
         return _training(self.folder)
 
     def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
-        return [self._approach(cell, seed) for seed in seeds]
+        return [Approach(seed=seed, location=self._place(seed), scenes=self.scenes(cell, seed)) for seed in seeds]
 
-    def _approach(self, cell: Cell, seed: int) -> Approach:
-        location = self.locations[seed % len(self.locations)]
+    def scenes(self, cell: Cell, seed: int) -> BankScenes:
+        """The frames of the approach of a seed, farthest first."""
+        location = self._place(seed)
         frames = [
             (pose, frame)
             for pose, frame in _read(self.folder, location, cell.weather)
@@ -48,8 +49,10 @@ class StopSignApproach(BankWorld):
         ]
         if not frames:
             raise UserError(f"no frames of {location} with {cell} in {self.folder}; `bench render` makes them")
-        scenes = BankScenes(frames, [cell.weather] * len(frames))
-        return Approach(seed=seed, location=location, scenes=scenes)
+        return BankScenes(frames, [cell.weather] * len(frames))
+
+    def _place(self, seed: int) -> str:
+        return self.locations[seed % len(self.locations)]
 
     def every_pose(self) -> tuple[Pose, ...]:
         return (*poses.training(), *poses.scored())
