@@ -67,10 +67,12 @@ class Rehearse(DrivingAttack):
 
     def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor, State]:
         assert state is not None
+        if not len(observation):
+            return observation, state
         belief = oracle.dynamics.believe(observation, state)
         belief["age"], belief["lie"] = state["age"] + 1, state["lie"]
         # All episodes of a step have the same age.
-        if len(state) and int(state["age"][0]) % self.renew == 0:
+        if int(state["age"][0]) % self.renew == 0:
             belief["lie"] = self._worst(belief, oracle)
         return oracle.project(shown(observation, SIGNS[belief["lie"]], oracle)), belief
 
@@ -83,7 +85,8 @@ class Rehearse(DrivingAttack):
         signs = SIGNS[:, None].expand(-1, len(belief), -1)
         worth = torch.zeros(signs.shape[:2])
         for _ in range(decisions):
-            action, victim = oracle.rehearse(shown(world.observation, signs, oracle), victim)
+            told = shown(world.observation.to(oracle.observation), signs, oracle)
+            action, victim = oracle.rehearse(told, victim)
             world.step(action)
             worth += world.progress
         worth -= self.crash * world.failed
