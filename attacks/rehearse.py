@@ -7,10 +7,11 @@ from itertools import product
 from typing import ClassVar
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from bench.driving import DrivingAttack, Oracle, State
-from bench.driving.threat import bounds
+from bench.driving.threat import project
 from bench.plugins.contracts import Access
 from bench.plugins.ranges import Count, NotNegative, Positive
 
@@ -20,6 +21,8 @@ HALF_LANE = 2.0
 """A car is in the ego's lane if its place across the road differs by less than this, in m."""
 SOON_S = 1.0
 """It counts where the ego will be after this time in s."""
+KEEPING = 0.05
+"""A lie is kept unless another one takes more than this, in decisions of full progress."""
 NEEDED = ("x", "y", "vx", "vy")
 
 
@@ -74,11 +77,10 @@ class Rehearse(DrivingAttack):
         # All episodes of a step have the same age.
         if int(state["age"][0]) % self.renew == 0:
             belief["lie"] = self._worst(belief, oracle)
-        return oracle.project(shown(observation, SIGNS[belief["lie"]], oracle)), belief
+        return shown(observation, SIGNS[belief["lie"]], oracle), belief
 
-    def _worst(self, belief: State, oracle: Oracle) -> Tensor:
-        """The number of the worst lie [B], int64; the present one where it is as bad."""
-        assert belief is not None
+    def _worst(self, belief: TensorDict, oracle: Oracle) -> Tensor:
+        """The number of the worst lie [B], int64; the present one if no other is worse by more than `KEEPING`."""
         lies = len(SIGNS)
         decisions = min(max(1, round(self.horizon / oracle.dynamics.period)), int(oracle.remaining.min()) // lies)
         world, victim = oracle.dynamics.rehearsal(belief, lies), oracle.imagined(lies)
@@ -90,7 +92,7 @@ class Rehearse(DrivingAttack):
             world.step(action)
             worth += world.progress
         worth -= self.crash * world.failed
-        worth.scatter_add_(0, belief["lie"][None], torch.full((1, len(belief)), -0.05))
+        worth.scatter_add_(0, belief["lie"][None], torch.full((1, len(belief)), -KEEPING))
         return worth.argmin(0)
 
 
@@ -110,5 +112,4 @@ def shown(observation: Tensor, signs: Tensor, oracle: Oracle) -> Tensor:
     shift[..., 1:, y] = shift[..., 1:, vy] = across
     shift[..., 0, y] = 1.0
     radius = oracle.threat.radius(observation, features)
-    low, high = bounds(observation, radius)
-    return torch.maximum(torch.minimum(observation + shift * radius, high), low)
+    return project(observation + shift * radius, observation, radius)

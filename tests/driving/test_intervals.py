@@ -172,8 +172,9 @@ def test_no_leader_that_brakes_as_assumed_is_hit(seed: int) -> None:
 
     speed, leader, start, one = drawn(12, 30), drawn(17, 30), drawn(0, 60).floor(), torch.ones(count)
     ego = Ego(y=4 * one, heading=0 * one, speed=speed, target_lane=one, target_speed=speed, edge=2 * one)
-    table, pairs = judge.following.tables[0], zip(speed.tolist(), leader.tolist(), strict=True)
-    needed = [used(table, judge.following.side, own, other, int(rate))[0] for own, other in pairs]
+    following = judge.rooms.following
+    table, pairs = following.tables[0], zip(speed.tolist(), leader.tolist(), strict=True)
+    needed = [used(table, following.side, own, other, int(rate))[0] for own, other in pairs]
     gap = 6.0 + torch.tensor(needed) + drawn(0, 20)
     half, once = FACTS.features.half_range(), torch.zeros(count, dtype=torch.bool)
     for step in range(120):

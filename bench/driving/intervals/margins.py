@@ -58,8 +58,8 @@ class Judge:
 
     def __init__(self, reckoning: DeadReckoning, period: float, caution: Caution) -> None:
         self.reckoning = reckoning
-        self.following = FollowingDistance(reckoning.kinematics, period, caution.seconds, within=(None, CROSSING_S))
-        self.rooms = Rooms(reckoning, period, caution, self.following, steady=KEEPS)
+        following = FollowingDistance(reckoning.kinematics, period, caution.seconds, within=(None, CROSSING_S))
+        self.rooms = Rooms(reckoning, period, caution, following, steady=KEEPS)
 
     def __call__(self, ego: Ego, cars: Cars) -> Margins:
         options = torch.stack([self.reckoning.commanded(ego, change) for change in (1, 0, -1)], -1)
