@@ -100,6 +100,18 @@ def _level(low: Floats, high: Floats, present: Flags, car: int, rules: Rules) ->
     return int(np.ceil(min(max(rate, rules.braking), float(HARDEST))))
 
 
+@inner
+def _spread(low: Floats, high: Floats) -> tuple[float, float]:
+    """How far to the left and to the right a car may be, now or soon."""
+    return low[1] + min(low[3] + DEAD_BAND, 0.0) * DRIFT_S, high[1] + max(high[3] - DEAD_BAND, 0.0) * DRIFT_S
+
+
+@inner
+def _overlap(left: float, right: float, middle: float, width: float) -> bool:
+    """Whether a car between `left` and `right` may be in the lane around `middle`."""
+    return right > middle - width and left < middle + width
+
+
 @entry_point
 def rooms(
     low: Floats,
@@ -138,8 +150,7 @@ def rooms(
         for car in range(low.shape[1]):
             if not present[n, car]:
                 continue
-            left = low[n, car, 1] + min(low[n, car, 3] + DEAD_BAND, 0.0) * DRIFT_S
-            right = high[n, car, 1] + max(high[n, car, 3] - DEAD_BAND, 0.0) * DRIFT_S
+            left, right = _spread(low[n, car], high[n, car])
             nearest = lane[n] - rules.lane_width
             if right <= nearest - rules.width or left >= nearest + 2 * rules.lane_width + rules.width:
                 continue
@@ -153,8 +164,7 @@ def rooms(
                         room = gap - used(tables[table], side, own[n, option], leader, level[n, car])[0]
                         for beside in range(3):
                             middle = nearest + beside * rules.lane_width
-                            inside = right > middle - rules.width and left < middle + rules.width
-                            if inside and room < front[n, table, beside, option]:
+                            if _overlap(left, right, middle, rules.width) and room < front[n, table, beside, option]:
                                 front[n, table, beside, option] = room
                                 front_car[n, table, beside, option] = car
             else:
@@ -168,8 +178,7 @@ def rooms(
                 )
                 for beside in range(3):
                     middle = nearest + beside * rules.lane_width
-                    inside = right > middle - rules.width and left < middle + rules.width
-                    if inside and room < rear[n, beside]:
+                    if _overlap(left, right, middle, rules.width) and room < rear[n, beside]:
                         rear[n, beside], rear_car[n, beside] = room, car
         for beside in range(3):
             if rear[n, beside] < -FREE:
@@ -246,14 +255,12 @@ def speeds(
         for car in range(low.shape[1]):
             if not present[n, car] or not low[n, car, 0] + high[n, car, 0] > 0:
                 continue
-            left = low[n, car, 1] + min(low[n, car, 3] + DEAD_BAND, 0.0) * DRIFT_S
-            right = high[n, car, 1] + max(high[n, car, 3] - DEAD_BAND, 0.0) * DRIFT_S
+            left, right = _spread(low[n, car], high[n, car])
             free = max(_middle(low[n, car, 0], high[n, car, 0]) - ROOM, 0.0)
             allowed = _middle(low[n, car, 2], high[n, car, 2]) + free / HORIZON_S
             for place in range(len(SIDES)):
                 middle = lane[n] + SIDES[place] * rules.lane_width
-                inside = right > middle - rules.width and left < middle + rules.width
-                if inside and allowed < fastest[n, place]:
+                if _overlap(left, right, middle, rules.width) and allowed < fastest[n, place]:
                     fastest[n, place], car_of[n, place] = allowed, car
 
 
