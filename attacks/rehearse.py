@@ -82,7 +82,9 @@ class Rehearse(DrivingAttack):
     def _worst(self, belief: TensorDict, oracle: Oracle) -> Tensor:
         """The number of the worst lie [B], int64; the present one if no other is worse by more than `KEEPING`."""
         lies = len(SIGNS)
-        decisions = min(max(1, round(self.horizon / oracle.dynamics.period)), int(oracle.remaining.min()) // lies)
+        # A rehearsal has its own draws of a random victim.
+        affordable = int(oracle.remaining.min()) * oracle.draws // lies
+        decisions = min(max(1, round(self.horizon / oracle.dynamics.period)), affordable)
         world, victim = oracle.dynamics.rehearsal(belief, lies), oracle.imagined(lies)
         signs = SIGNS[:, None].expand(-1, len(belief), -1)
         worth = torch.zeros(signs.shape[:2])

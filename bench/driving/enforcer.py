@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bench.driving.dynamics import Dynamics
 from bench.driving.features import Features
-from bench.driving.oracle import Loss, Oracle, Part
+from bench.driving.oracle import DRAWS, Loss, Oracle, Part
 from bench.driving.policy import State, repeated, rows_of
 from bench.driving.threat import ObservationThreat, bounds
 from bench.driving.victim import CountedPolicy
@@ -84,6 +84,7 @@ class Enforcer:
             features=features,
             parts=parts or (Part(slice(0, len(observation)), self.generator),),
             action_type=self.subject.action_type,
+            draws=DRAWS if self.subject.draws and self.threat.queries >= DRAWS else 1,
         )
 
     def project(self, answer: Tensor) -> tuple[Tensor, Tensor]:

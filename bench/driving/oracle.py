@@ -16,6 +16,9 @@ from bench.driving.threat import ObservationThreat, within
 
 Loss = Callable[[Tensor], Tensor]
 
+DRAWS = 8
+"""How often a random victim is asked about each point."""
+
 
 class Part(NamedTuple):
     """The episodes of one unit among those of a step, and the random generator of its attack."""
@@ -69,12 +72,16 @@ class Oracle:
     gradient and a value of the critic are one query each. The victim answers with its state of this step; queries do not change
     the state.
 
+    A random victim is asked `DRAWS` times about each point, and the mean of its answers counts (of discrete decisions the most
+    frequent one): the expectation over transformation of Athalye et al. 2018. Each draw is a query.
+
     Everything here is the attack's own copy. The run keeps its own truth, perturbation set and counters: nothing that is changed
     on this object changes what the attack may do or what is recorded. After its step the oracle answers no more.
 
     Args:
         door: answers the queries.
         limits: copies of the true observation, the radius, and the bounds of the perturbation set, [B, V, F] each.
+        draws: how often the victim is asked about each point.
 
     Attributes:
         observation: the true observation, [B, V, F].
@@ -85,6 +92,7 @@ class Oracle:
         parts: the units of the episodes, one after the other, each with a generator of its own; one unit, unless the attack is
             `joint`.
         action_type: whether the victim decides discretely or continuously.
+        draws: how often the victim is asked about each point: 1 unless it is random.
     """
 
     def __init__(
@@ -96,9 +104,11 @@ class Oracle:
         features: Features,
         parts: Sequence[Part],
         action_type: ActionType,
+        draws: int = 1,
     ) -> None:
         self._door = door
         self.threat, self.features, self.parts, self.action_type = threat, features, parts, action_type
+        self.draws = draws
         self.generator = parts[0].generator
         self.observation, self.radius, low, high = limits
         self._set = self._subset = (self.observation, low, high)
@@ -111,8 +121,8 @@ class Oracle:
 
     @property
     def remaining(self) -> Tensor:
-        """[B] number of queries left for each episode in this step."""
-        return self.threat.queries - self._door.spent()
+        """[B] number of points that each episode may still ask about in this step: its queries, divided by `draws`."""
+        return (self.threat.queries - self._door.spent()) // self.draws
 
     @property
     def dynamics(self) -> Dynamics:
@@ -150,18 +160,24 @@ class Oracle:
 
     def decide(self, observation: Tensor, rows: Tensor | None = None) -> Tensor:
         """The victim's actions; needs access `decisions`."""
-        return self._door.decide(observation, rows)
+        actions = self._door.decide(self._repeated(observation), rows)
+        if self.draws == 1:
+            return actions
+        return actions.mean(0) if actions.is_floating_point() else actions.mode(0).values
 
     def scores(self, observation: Tensor, rows: Tensor | None = None) -> Tensor:
         """The victim's Q-values [..., B, A] or its continuous action [..., B, 2]; needs access `scores`."""
-        return self._door.scores(observation, rows)
+        return self._mean(self._door.scores(self._repeated(observation), rows))
 
     def gradient(self, observation: Tensor, loss: Loss, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The loss [..., B] of the victim's scores and its gradient [..., B, V, F] in the observation; needs `gradients`.
 
         The gradient of a non-differentiable victim is 0.
         """
-        return self._door.gradient(observation, loss, rows)
+        value, gradient = self._door.gradient(
+            self._repeated(observation), lambda scores: loss(self._mean(scores)), rows
+        )
+        return value, gradient if self.draws == 1 else gradient.sum(0)
 
     def value(self, observation: Tensor, action: Tensor, rows: Tensor | None = None) -> Tensor:
         """The victim's own critic Q(observation, action) [..., B], differentiable in a continuous action; needs `gradients`.
@@ -169,4 +185,12 @@ class Oracle:
         Raises:
             NotImplementedError: if the victim has no critic.
         """
-        return self._door.value(observation, action, rows)
+        return self._mean(self._door.value(self._repeated(observation), self._repeated(action), rows))
+
+    def _repeated(self, points: Tensor) -> Tensor:
+        """`draws` copies of the points, [D, ...]; the points themselves if one is enough."""
+        return points if self.draws == 1 else points.expand(self.draws, *points.shape)
+
+    def _mean(self, answers: Tensor) -> Tensor:
+        """The mean over the draws of answers [D, ...]."""
+        return answers if self.draws == 1 else answers.mean(0)

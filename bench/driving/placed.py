@@ -21,6 +21,7 @@ class Placed(PolicyWrapper):
 
     def __init__(self, policy: Policy, device: str) -> None:
         super().__init__(policy)
+        self.noise = policy.noise
         self._there = torch.device(device)
         move(policy, self._there)
 

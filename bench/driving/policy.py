@@ -39,6 +39,9 @@ class Policy(nn.Module, ABC):
     driver: Driver = "agent"
     weights_sha256: str = ""
     """Hash of the policy's weights file; empty if there is none."""
+    noise: float = 0.0
+    """Standard deviation of independent Gaussian noise that it adds to every measured value of each observation, before anything
+    else sees it; 0 if it does not. The certificate of its score follows from it (`bench.statistics.certificate`)."""
 
     def forward(self, observation: Tensor) -> Tensor:
         """The scores of a stateless policy (see `scores`).

@@ -132,7 +132,9 @@ def rollout(
                 break
     if several and (victims_draws.used() or attacks_draws.used()):
         raise NotJointError
-    return {"seed": episodes.numpy(), **meter.columns(), **probe.columns()}
+    reach = threat.reach(td["observation"].shape[-2], facts.features, facts.max_steps)
+    shift = np.full(len(seeds), reach / policy.noise if policy.noise else np.nan)
+    return {"seed": episodes.numpy(), **meter.columns(), **probe.columns(), "shift": shift}
 
 
 def _check_actions(subject: CountedPolicy, observation: Tensor, state: State, facts: DrivingFacts) -> None:

@@ -63,6 +63,19 @@ class ObservationThreat(ThreatModel):
         bound = bound * (observation[..., :1] > 0)
         return torch.cat((torch.zeros_like(observation[..., :1]), bound), -1)
 
+    def reach(self, rows: int, features: Features, steps: int) -> float:
+        """The largest L2 norm of all that an attack can change in an episode, on the normalised scale.
+
+        Args:
+            rows: rows of an observation.
+            features: names and ranges of the measured features.
+            steps: decisions of a full episode.
+        """
+        extremes = torch.ones(rows, 1 + len(features.names)) * torch.tensor([1.0, -1.0])[:, None, None]
+        extremes[..., 0] = 1.0
+        largest = self.radius(extremes, features).amax(0)
+        return float(largest.norm()) * math.sqrt(self.frames(steps))
+
 
 def project(perturbed: Tensor, observation: Tensor, radius: Tensor) -> Tensor:
     """The nearest point of the perturbation set: within `radius` of `observation` and within the sensors' range [-1, 1].

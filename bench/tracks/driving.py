@@ -80,6 +80,17 @@ ASSURED = field(
     high=1,
 )
 
+SHIFT = field(
+    "shift",
+    FLOAT,
+    "L2 norm of all that the threat model lets an attack change in an episode, in units of the noise that the victim adds to its "
+    "input; null if it adds none",
+    "standard deviations",
+    nullable=True,
+    low=0,
+    high=inf,
+)
+
 
 class DrivingTrack(Track):
     """Driving policies on a road, attacked through their observations, ranked by `safe_progress`."""
@@ -90,7 +101,7 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT)
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"

@@ -26,6 +26,7 @@ FIGURES = {
     "attack_grey_patch.png": "sign_patches:grey_patch",
     "defense_none.svg": "hardening:none",
     "defense_frame_stack.svg": "memory:frame_stack",
+    "defense_smoothing.svg": "smoothing:smoothing",
     "defense_pessimist_q.svg": "intervals:pessimist_q",
     "defense_shield.svg": "intervals:shield",
     "defense_tracker.svg": "intervals:tracker",

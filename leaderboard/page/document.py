@@ -210,6 +210,7 @@ def _row(row: Row, keys: Mapping[int, int], called: Labels) -> dict[str, Any]:
         "failed": _interval(worst.failure),
         "worst_cell": {"cell": dict(lowest), **(_interval(lowest_score) or {})},
         "clean": _interval(worst.clean),
+        "certified": worst.certified,
         "lead": _interval(worst.lead),
         "strongest": keys[id(first)],
         "pairs": [keys[id(attack)] for attack in row.attacks],

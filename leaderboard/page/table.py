@@ -14,7 +14,7 @@ CSV = (
     "track", "world", "grid", "threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share",
     "group", "flagged", "flags",
     "defense", "defense_params", "victim", "victim_params", "score", "low", "high", "failed", "failed_low", "failed_high",
-    "worst_cell", "worst_cell_score", "worst_cell_low", "worst_cell_high", "clean", "clean_low", "clean_high",
+    "worst_cell", "worst_cell_score", "worst_cell_low", "worst_cell_high", "clean", "clean_low", "clean_high", "certified",
     "lead", "lead_low", "lead_high", "strongest_attack", "strongest_attack_params", "training_seeds", "cells", "scenarios",
 )  # fmt: skip
 """The columns of `leaderboard.csv`, a line a ranked row."""
@@ -42,6 +42,7 @@ def table(made: Mapping[str, Any]) -> str:
                 "strongest_attack": strongest["name"],
                 "strongest_attack_params": json.dumps(strongest["params"], sort_keys=True),
                 "training_seeds": " ".join(map(str, row["training_seeds"])),
+                "certified": row["certified"],
                 "cells": len(row["cells"]),
                 "scenarios": row["scenarios"],
             }

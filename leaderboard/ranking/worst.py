@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -11,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.scenarios import Cell
+from bench.statistics.certificate import certificate
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
 from bench.statistics.strongest import strongest_of
-from leaderboard.comparisons.comparison import Comparison
+from leaderboard.comparisons.comparison import Comparison, mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +169,12 @@ class Worst:
         """The same cells and scenarios without an attack; None where a part of them was not driven."""
         found = self._control(lambda one: one.clean, self._metric)
         return None if found is None or np.isnan(found).any() else share_interval(found)
+
+    @cached_property
+    def certified(self) -> float | None:
+        """A lower bound of the score under every attack of the threat model, with 97.5 % confidence; None if there is none."""
+        shift = mean(self.most.own.table, "shift")
+        return None if self.clean is None or math.isnan(shift) else certificate(self.clean, shift)
 
     @cached_property
     def rival(self) -> Array:

@@ -99,6 +99,8 @@ def _columns(board: Board) -> list[Column[Row]]:
         Column("\n ", lambda row: Text(cell_name(row.worst.worst_cell[0]), style="dim"), "left", spare=2),
         Column("\nclean", lambda row: estimate(row.worst.clean, style=CLEAN), "left", spare=3),
     ]
+    if any(row.worst.certified is not None for row in board.rows):
+        columns.append(Column("certi-\nfied", lambda row: number(row.worst.certified, 2)))
     if contrast and contrast.side == "victim":
         columns.append(Column(contrast.short, lambda row: verdict(row.worst.lead)))
     return [

@@ -78,7 +78,7 @@ class AfterSomeTime(OfAllOtherBatches):
         self.start = time.monotonic()
 
     def suspects(self, observation: Tensor) -> bool:
-        return super().suspects(observation) and time.monotonic() > self.start + 0.05
+        return super().suspects(observation) and time.monotonic() > self.start + 0.005
 
 
 class AlmostDeterministic(OfAllOtherBatches):

@@ -1,9 +1,10 @@
-"""Defences that do not defend: one hides the input, two have no gradient, one is random."""
+"""Defences that do not defend: one hides the input, two have no gradient, two are random."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,12 @@ class _Dicing(PolicyWrapper):
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         scores = self.policy.scores(observation, state)
         return scores + 0.5 * torch.randn_like(scores)
+
+
+class _Hiding(PolicyWrapper):
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        scores = self.policy.scores(observation, state)
+        return scores + 0.5 * torch.from_numpy(np.random.default_rng().normal(size=tuple(scores.shape))).to(scores)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,3 +68,11 @@ class Dicing(DrivingDefense):
 
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
         return _Dicing(victim.load(seed, facts))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hiding(DrivingDefense):
+    """Adds noise to the scores, from a generator of its own, so that the run does not see that it is random."""
+
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
+        return _Hiding(victim.load(seed, facts))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.conformance.check import Check, NotApplicableError, Subject, Suite, require
+from bench.conformance.driving.state import not_noisy
 from bench.conformance.driving.traffic import observations, rows_of_observation
 from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.driving import DrivingWorld, Policy, State
@@ -78,6 +79,7 @@ class PolicySuite(Suite):
                 action.shape == (*observation.shape[:-2], 2), f"decide returns shape {list(action.shape)}, not [B, 2]"
             )
             require(bool((action.abs() <= 1).all()), "decide returns actions outside [-1, 1]")
+        not_noisy(policy)
         require(
             torch.equal(policy.choose(scores), action),
             "choose(scores(observation, state)) differs from decide(observation, state): override choose, not decide",
@@ -98,6 +100,7 @@ class PolicySuite(Suite):
         """Two loads and two calls give the same scores."""
         observation = self._observations()
         policy, state = self._ready()
+        not_noisy(policy)
         first = policy.scores(observation, state)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(1)

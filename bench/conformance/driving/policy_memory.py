@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.conformance.check import Check, NotApplicableError, Subject, Suite, one_line, require
 from bench.conformance.driving.remembering import Remembering
-from bench.conformance.driving.state import ATOL, RTOL, check_state, close, named, same
+from bench.conformance.driving.state import ATOL, RTOL, check_state, close, named, not_noisy, same
 from bench.conformance.driving.traffic import observations, rows_of_observation
 from bench.driving import ObservationThreat, Policy, State
 from bench.driving.enforcer import Enforcer
@@ -64,6 +64,7 @@ class PolicyMemorySuite(Suite):
     def scores_are_pure(self) -> None:
         """Scoring changes no state, and gives the same scores for the same input and state, also after the step."""
         policy = self.subject.load()
+        not_noisy(policy)
         state = policy.initial(_episodes())
         for step in range(STEPS):
             before = None if state is None else state.clone()
@@ -82,6 +83,7 @@ class PolicyMemorySuite(Suite):
     def any_subset_in_any_chunk(self) -> None:
         """Scores do not depend on which episodes are queried, in which order, and with how many points."""
         policy, state = self._after_some_steps()
+        not_noisy(policy)
         observation = self._observations(STEPS)
         together = policy.scores(observation, state)
         for subset in SUBSETS:
@@ -125,6 +127,7 @@ class PolicyMemorySuite(Suite):
     def keeps_nothing(self) -> None:
         """The policy object stores no memory: other batches and queries in between change nothing."""
         policy, state = self._after_some_steps()
+        not_noisy(policy)
         expected = policy.scores(self._observations(STEPS), state)
         asked = self.subject.load()
         state, other = asked.initial(_episodes()), asked.initial(_episodes() + EPISODES)

@@ -5,11 +5,17 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 
-from bench.conformance.check import require
-from bench.driving import State
+from bench.conformance.check import NotApplicableError, require
+from bench.driving import Policy, State
 
 RTOL, ATOL = 1e-4, 1e-5
 """Tolerances for rounding, which depends on the number of observations in a batch."""
+
+
+def not_noisy(policy: Policy) -> None:
+    """Leave a check out for a policy that draws noise for every answer, as it declares."""
+    if policy.noise:
+        raise NotApplicableError("it adds noise to what it sees, as declared (noise above 0)")
 
 
 def check_state(state: object, method: str, episodes: int) -> None:

@@ -1,0 +1,32 @@
+"""The certified score of a row: from its clean score and the records of its attacks, or nothing."""
+
+from __future__ import annotations
+
+import pyarrow as pa
+import pytest
+from full_house import SEEN
+from synthetic import drive, probed
+
+from bench.statistics.certificate import certificate
+from leaderboard.comparisons.reading import read_tracks
+from leaderboard.ranking.boards import Row, boards
+
+
+def row(**probes: float) -> Row:
+    """A row under `zo`, whose records have these probes."""
+    clean = probed(drive(skill=0.8, weights="ab"), **SEEN)
+    attacked = probed(drive(skill=0.3, weights="ab", attack="zo", queries=44.0), **(SEEN | probes))
+    (found,) = boards(read_tracks({"driving": pa.concat_tables([clean, attacked])}))[0].rows
+    return found
+
+
+def test_a_row_without_noise_certifies_nothing() -> None:
+    assert row().worst.certified is None
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5, 900.0])
+def test_a_row_certifies_what_its_clean_score_and_its_noise_allow(shift: float) -> None:
+    worst = row(shift=shift).worst
+    assert worst.clean is not None
+    assert worst.certified == pytest.approx(certificate(worst.clean, shift))
+    assert 0.0 <= worst.certified <= worst.clean.low + 1e-9
