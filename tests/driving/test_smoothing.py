@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from attacks.suites import STANDARD_2
 from bench.driving import ObservationThreat, Oracle
 from bench.driving.oracle import DRAWS
 from bench.driving.threat import Norm
@@ -126,3 +127,15 @@ def test_a_continuous_victim_is_asked_for_its_mean_action_and_value() -> None:
 
     columns = drive(ask, Smoothed(inner, 0.1))
     assert np.allclose(columns["queries"], 2 * DRAWS)
+
+
+def test_the_attacks_of_the_suite_ask_about_as_many_points_as_before() -> None:
+    """Eight draws of each fit into the budget of the suite."""
+    attacks = [
+        member.chosen.component for member in STANDARD_2.members if member.suits(choose("victim", "dqn").component)
+    ]
+    asked_of = [one.perturb for one in attacks if one.access in ("scores", "gradients")]
+    assert len(asked_of) > 5
+    for ask in asked_of:
+        once, often = (drive(ask, policy, queries=1000)["queries"] for policy in (Victim(), Smoothed(Victim(), 0.05)))
+        assert np.allclose(often, DRAWS * once)
