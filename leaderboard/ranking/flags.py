@@ -112,11 +112,11 @@ def masked_gradients(of: Subject) -> Finding:
     if any(attack.knowledge == "unknown" for attack in of.attacks):
         return None, "Not measured: the records have no count of gradients."
     if white is None or black is None:
-        return None, f"Not measured: no {'white' if white is None else 'black'}-box attack was run."
+        return None, f"Not measured: no attack {'with' if white is None else 'without'} gradients was run."
     found = margin(white, black)
     if found is None:
-        return None, "Not measured: the black-box and the white-box attack share no scenario."
-    names = f"{_under(black)} (black box), {_under(white)} (white box)"
+        return None, "Not measured: the attacks with and without gradients share no scenario."
+    names = f"{_under(black)} (without gradients), {_under(white)} (with gradients)"
     return found.low > 0, f"{names}; the difference is {_signed(found)}."
 
 
@@ -308,7 +308,7 @@ FLAGS: dict[str, tuple[str, Callable[[Subject], Finding]]] = {
     "octagon": ("takes other faces on an octagon for the stop sign", octagon),
     "decoy": ("its answers to attacks differ from its actions", decoy),
     "left_out": ("an attack that is left out lowers the score more", left_out),
-    "masked_gradients": ("a black-box attack beats the white-box one", masked_gradients),
+    "masked_gradients": ("an attack without gradients beats those with them", masked_gradients),
     "zero_gradients": ("gradients are zero", zero_gradients),
     "noise": ("random noise lowers the score as much as the attack", noise),
     "one_draw": ("random, but attacked with one draw", one_draw),
