@@ -36,6 +36,7 @@ FIGURES = {
     "defense_advtrain_detection.svg": "hardening:advtrain_detection",
     "defense_median.png": "filters:median",
     "defense_jpeg.png": "filters:jpeg",
+    "defense_segmenter.png": "filters:segmenter",
     "victim_dqn.svg": "decisions:dqn",
     "victim_ddpg.svg": "decisions:ddpg",
     "victim_oracle_planner.svg": "references:oracle_planner",

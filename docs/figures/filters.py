@@ -7,10 +7,14 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from bench.detection.stopping import THRESHOLD
+from defenses.segmenter import Completed
 from defenses.smoothing import Guarded
 from docs.figures import style
 from docs.figures.patches import texels_of
-from docs.figures.sightings import FRAME, approaches, crop, detector, frame_axes, picture, show, sight
+from docs.figures.sightings import FRAME, approaches, crop, detector, frame_axes, picture, said, show, sight
+
+FAR = 4
+"""Index of the frame in the figure of `segmenter`: small, for a small file."""
 
 
 def median() -> Figure:
@@ -21,6 +25,34 @@ def median() -> Figure:
 def jpeg() -> Figure:
     """JPEG compression; 40 crafting steps instead of 150 are enough against it."""
     return _figure("jpeg", texels_of("eot", "jpeg", steps=40))
+
+
+def segmenter() -> Figure:
+    """What is marked and filled, with a patch crafted without the defence and with one crafted against it."""
+    guarded = detector(defense="segmenter")
+    assert isinstance(guarded, Completed)
+    approach = approaches()[0]
+    made = style.figure(2.1, "segmenter: what it marks, and what the detector sees")
+    # Shifts only, as the stronger `eot` of the standard suite.
+    off = dict.fromkeys(
+        ("rotation", "scale", "perspective", "brightness", "contrast", "saturation", "hue", "noise"), 0.0
+    )
+    stronger = {"loss": "log_odds", "steps": 300, "batch": 6, "window": 160, "tv": 0.05, **off}
+    patches = (
+        ("patch that does not know it", texels_of("eot", steps=40)),
+        ("patch that does", texels_of("eot", "segmenter", **stronger)),
+    )
+    for row, (name, texels) in zip(made.subfigures(1, 2), patches, strict=True):
+        shown = picture(approach, FAR, texels)
+        with torch.no_grad():
+            seen, marks = guarded.transform(shown[None])[0], guarded.log_odds(shown[None])[0] > 0
+        marked = torch.where(marks, torch.tensor([0.0, 0.45, 0.7])[:, None, None], shown)
+        row.suptitle(name, fontsize=10)
+        for axes, part, title in zip(row.subplots(1, 2), (marked, seen), ("marked", "completed"), strict=True):
+            axes.imshow(crop(part, approach, FAR).permute(1, 2, 0).numpy(), interpolation="nearest")
+            axes.set_xlabel(f"{title}: {said(guarded.inner, part, approach, FAR):.2f}" if part is seen else title)
+            style.bare(axes)
+    return made
 
 
 def _figure(defense: str, aware: Tensor) -> Figure:

@@ -1,0 +1,59 @@
+"""Scores defences against a patch that does not know of them: `eot` crafts it against the undefended detector.
+
+    python benchmarks/unaware_patch.py segmenter [--victim yolov3_tiny] [--steps 150] [--lanes 3 4] [--weathers clear rain]
+
+`bench run` crafts against the defended detector. The difference between the two scores is what an attack gains that knows of the
+defence. The columns are those of the records, means over all approaches.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from attacks.eot import EOT
+from bench.detection import PatchThreat
+from bench.detection.approach import score
+from bench.detection.crafting import craft
+from bench.plugins import registry
+from bench.run.process import settle
+from envs.camera.world import StopSignApproach
+
+WORLD = StopSignApproach()
+MEASURES = ("stop_score", "confidence_mean", "average_precision", "decoy_confidence", "false_stops", "ran")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("defenses", nargs="+")
+    parser.add_argument("--victim", default="yolov3_tiny")
+    parser.add_argument("--steps", type=int, default=150, help="of `eot`")
+    parser.add_argument("--lanes", nargs="+", type=int, default=[3, 4])
+    parser.add_argument("--weathers", nargs="+", default=["clear", "rain"])
+    asked = parser.parse_args()
+    settle()
+    threat, victim = PatchThreat(), registry.load("victim", asked.victim)()
+    undefended = victim.load(0, WORLD.facts)
+    patch = craft(
+        EOT(steps=asked.steps),
+        undefended,
+        WORLD.training_scenes(),
+        threat,
+        attack_seed=0,
+        progress=lambda share, text: None,
+    )
+    cells = [WORLD.axes.cell(lanes=n, density=1.0, weather=weather) for n in asked.lanes for weather in asked.weathers]
+    print(f"{'':<24}" + "".join(f"{name:>20}" for name in MEASURES))
+    for name in ("none", *asked.defenses):
+        detector = registry.load("defense", name)().load(victim, 0, WORLD.facts)
+        columns = [
+            score(detector, WORLD.approaches(cell, range(len(WORLD.locations))), patch, share=threat.budget)
+            for cell in cells
+        ]
+        means = "".join(f"{np.nanmean([one[measure] for one in columns]):>20.2f}" for measure in MEASURES)
+        print(f"{name:<24}{means}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
