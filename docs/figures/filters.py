@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from bench.detection.stopping import THRESHOLD
 from defenses.segmenter import Completed
@@ -13,8 +14,8 @@ from docs.figures import style
 from docs.figures.patches import texels_of
 from docs.figures.sightings import FRAME, approaches, crop, detector, frame_axes, picture, said, show, sight
 
-FAR = 4
-"""Index of the frame in the figure of `segmenter`: small, for a small file."""
+NEAR = 8
+"""Index of the frame in the figure of `segmenter`, in which the patch that knows of it avoids the marks."""
 
 
 def median() -> Figure:
@@ -43,14 +44,14 @@ def segmenter() -> Figure:
         ("patch that does", texels_of("eot", "segmenter", **stronger)),
     )
     for row, (name, texels) in zip(made.subfigures(1, 2), patches, strict=True):
-        shown = picture(approach, FAR, texels)
+        shown = picture(approach, NEAR, texels)
         with torch.no_grad():
             seen, marks = guarded.transform(shown[None])[0], guarded.log_odds(shown[None])[0] > 0
         marked = torch.where(marks, torch.tensor([0.0, 0.45, 0.7])[:, None, None], shown)
         row.suptitle(name, fontsize=10)
         for axes, part, title in zip(row.subplots(1, 2), (marked, seen), ("marked", "completed"), strict=True):
-            axes.imshow(crop(part, approach, FAR).permute(1, 2, 0).numpy(), interpolation="nearest")
-            axes.set_xlabel(f"{title}: {said(guarded.inner, part, approach, FAR):.2f}" if part is seen else title)
+            axes.imshow(avg_pool2d(crop(part, approach, NEAR), 3).permute(1, 2, 0).numpy(), interpolation="nearest")
+            axes.set_xlabel(f"{title}: {said(guarded.inner, part, approach, NEAR):.2f}" if part is seen else title)
             style.bare(axes)
     return made
 
