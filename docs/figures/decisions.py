@@ -29,10 +29,19 @@ ROADS = {"lanes beside free": (), "cars on both sides": BLOCKED}
 
 def dqn() -> Figure:
     """The greedy action by distance and closing speed, with the neighbouring lanes free and blocked."""
-    made = style.figure(4.1, "dqn: passes on the right, brakes where it is boxed in")
+    return _greedy("dqn", "dqn: passes on the right, brakes where it is boxed in")
+
+
+def ppo() -> Figure:
+    """The most likely action, as for `dqn`."""
+    return _greedy("ppo", "ppo: the most likely action")
+
+
+def _greedy(victim: str, title: str) -> Figure:
+    made = style.figure(4.1, title)
     with torch.no_grad():
         for axes, (name, beside) in zip(made.subplots(1, 2, sharey=True), ROADS.items(), strict=True):
-            action = policy("dqn").decide(_observations(beside))
+            action = policy(victim).decide(_observations(beside))
             _map(axes, action, name, ListedColormap(list(style.ACTIONS.values())), (-0.5, len(ACTIONS) - 0.5))
     made.axes[0].set_ylabel("closing speed (m/s), own: 25")
     patches = [Patch(color=style.ACTIONS[name], label=name) for name in ACTIONS]

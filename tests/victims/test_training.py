@@ -19,12 +19,15 @@ from bench.victims.drivers.behind import Guard, GuardedPractice, defense_of
 from bench.victims.drivers.ddpg import DDPG
 from bench.victims.drivers.dqn import DQN
 from bench.victims.drivers.networks import ActorPolicy, QPolicy
+from bench.victims.drivers.ppo import PPO
 from bench.victims.drivers.practice import ALLOWED, Practice, roads
 from bench.victims.drivers.training import LearningDriver
 from defenses.advtrain import AdversarialTraining, AttackInLoop
 
 SHORT = {"decisions": 160, "copies": 1, "hidden": 8, "batch": 16, "memory": 2000, "checkpoints": 1}
 VICTIMS = [DQN(**SHORT), DDPG(**SHORT)]
+LEARNERS = [*VICTIMS, PPO(**SHORT)]
+NAMES = ["dqn", "ddpg", "ppo"]
 
 
 def silent(share: float, text: str) -> None:
@@ -37,7 +40,7 @@ def world() -> DrivingWorld:
     return registry.load("world", "highway")()
 
 
-@pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
+@pytest.mark.parametrize("victim", LEARNERS, ids=NAMES)
 def test_a_training_depends_on_its_seed_only(victim: LearningDriver, world: DrivingWorld) -> None:
     first, again, other = (victim.train(world, seed=seed, progress=silent).network.state_dict() for seed in (1, 1, 2))
     assert all(torch.equal(first[name], again[name]) for name in first)
@@ -182,7 +185,7 @@ def test_a_margin_makes_lane_changes_less_likely(world: DrivingWorld) -> None:
     assert bool((reluctant[[0, 2]] < 0.7 * without[[0, 2]]).all())
 
 
-@pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
+@pytest.mark.parametrize("victim", LEARNERS, ids=NAMES)
 @pytest.mark.parametrize("start", ["trained", "scratch"])
 def test_adversarial_training_trains_saves_and_loads(
     victim: LearningDriver, start: str, world: DrivingWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -200,7 +203,7 @@ def test_adversarial_training_trains_saves_and_loads(
     assert not torch.equal(loaded.scores(x), victim.load(0, world.facts).scores(x))
 
 
-@pytest.mark.parametrize("victim", VICTIMS, ids=["dqn", "ddpg"])
+@pytest.mark.parametrize("victim", [*LEARNERS], ids=NAMES)
 def test_a_policy_behind_a_filter_learns_from_what_passes_it(victim: LearningDriver, world: DrivingWorld) -> None:
     """Stored actions are allowed (or clipped when they are carried out), and a new episode begins with a fresh state."""
     recipe = replace(victim, behind="tracker+shield")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 
 from bench.driving import Policy, TrainingHooks
 
@@ -42,6 +43,8 @@ class Learner(ABC):
         hooks: the changes of a defence; the policy continues from `hooks.start` if it is set.
     """
 
+    on_policy: ClassVar[bool] = False
+    """Whether it learns from its latest transitions alone, without a replay buffer."""
     policy: Policy
     """The network in training."""
     explore: nn.Module
@@ -53,6 +56,19 @@ class Learner(ABC):
     @abstractmethod
     def enter(self, phase: Phase) -> None:
         """Set the discount and exploration of a phase."""
+
+    def progress(self, info: TensorDictBase) -> Tensor:
+        """The reward [B, 1] of a decision without a failure, summed over its frames, from the environment's `info`."""
+        progress: Tensor = info["progress"]
+        return progress
+
+    def collect(self, chunk: TensorDictBase) -> None:
+        """Take a chunk of transitions [B, T], if the algorithm is `on_policy`."""
+        raise NotImplementedError(f"{type(self).__name__} learns from a replay buffer")
+
+    def learn(self, learning_rate: float, share: float) -> None:
+        """Learn from what was collected, if the algorithm is `on_policy`; `share` of the training is finished."""
+        raise NotImplementedError(f"{type(self).__name__} learns from a replay buffer")
 
     @abstractmethod
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:

@@ -48,6 +48,18 @@ class QNetwork(nn.Module):
         return value + advantage - advantage.mean(-1, keepdim=True)
 
 
+class StateValue(nn.Module):
+    """V(s) [..., 1] from an observation [..., V, F]."""
+
+    def __init__(self, features: int, hidden: int) -> None:
+        super().__init__()
+        self.encoder = Encoder(features)
+        self.head = _head(self.encoder.out_features, 1, hidden)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.head(self.encoder(observation))
+
+
 FEW = 16
 """A matrix product of fewer rows than this may differ in the last bit from the same rows in a product of many."""
 

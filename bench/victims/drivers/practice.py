@@ -63,7 +63,11 @@ class Practice:
     @torch.no_grad()
     def drive(self, decisions: int, share: float) -> None:
         """Make `decisions` decisions on every road; `share` of the training is finished."""
-        transitions = self.multi_step.inv(torch.stack([self.decide(share) for _ in range(decisions)], -1))
+        chunk = torch.stack([self.decide(share) for _ in range(decisions)], -1)
+        if self.learner.on_policy:
+            self.learner.collect(chunk)
+            return
+        transitions = self.multi_step.inv(chunk)
         if transitions is not None and transitions.numel():
             self.buffer.extend(transitions.exclude("gamma", "nonterminal", ("next", "original_reward")).reshape(-1))
 
@@ -93,8 +97,8 @@ class Practice:
         """The transitions [B] with their rewards, from a step of the environment."""
         after, phase = step["next"], self.phase
         failed = after["info", "crashed"] | after["info", "offroad"]
-        reward = self.sign * (after["info", "progress"] - self.crash_penalty * failed.float())
+        reward = self.sign * (self.learner.progress(after["info"]) - self.crash_penalty * failed.float())
         after = after.select("observation", ALLOWED, "terminated", "done", strict=False)
         after.set("reward", reward * ((1 - phase.gamma) / phase.repeat))
-        before = step.select("observation", ALLOWED, "action", strict=False)
+        before = step.select("observation", ALLOWED, "action", "action_log_prob", strict=False)
         return TensorDict({**before, "next": after}, batch_size=step.batch_size)
