@@ -40,7 +40,7 @@ FIGURES = {
     "victim_dqn.svg": "decisions:dqn",
     "victim_ddpg.svg": "decisions:ddpg",
     "victim_oracle_planner.svg": "references:oracle_planner",
-    "victim_ppo.svg": "decisions:ppo",
+    "victim_ppo.png": "decisions:ppo",
     "victim_planner.svg": "intervals:planner",
     "victim_blind.svg": "references:blind",
     "victim_random.svg": "references:random",
