@@ -22,7 +22,7 @@ from docs.figures import style
 from docs.figures.patches import SHARE
 from envs.camera.axes import APPROACH_V1, AXES
 from envs.camera.world import StopSignApproach
-from leaderboard.comparisons.comparison import Comparison
+from leaderboard.comparisons.comparison import Comparison, parameters
 from leaderboard.comparisons.pairing import beside
 from leaderboard.comparisons.reading import read_comparisons
 from leaderboard.published import published
@@ -96,12 +96,17 @@ def patched(attack: str, defense: str = "none") -> Comparison:
     """The published approaches of `yolov3_tiny` under the default attack in clear weather, with their controls."""
     wanted: dict[str, object] = {
         "attack": attack,
-        "attack_params": choose("attack", attack).params,
         "defense": defense,
         "victim": "yolov3_tiny",
         "threat_budget": SHARE,
     }
-    (found,) = (pair for pair in _comparisons() if wanted.items() <= pair.identity.items())
+    # Older records lack parameters that came later.
+    defaults = parameters(choose("attack", attack).params).items()
+    (found,) = (
+        pair
+        for pair in _comparisons()
+        if wanted.items() <= pair.identity.items() and parameters(pair.identity["attack_params"]).items() <= defaults
+    )
     return found.only(cells=[cell for cell in found.cells if cell.weather == "clear"])
 
 

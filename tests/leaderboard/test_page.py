@@ -285,7 +285,7 @@ def test_both_tracks_the_thesis_and_the_threat_models_can_be_chosen(opened: Open
     assert not page.locator("#board").is_visible()
     assert any("Table 4.1" in title for title in texts(page, "#thesis h3"))
     page.get_by_role("button", name="How to read this").click()
-    assert "black-box" in page.locator("#method").inner_text()
+    assert "without gradients" in page.locator("#method").inner_text()
 
 
 def test_one_plot_has_a_line_for_each_defended_victim(opened: Open) -> None:
