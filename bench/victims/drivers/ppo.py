@@ -16,13 +16,11 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from bench.driving import ActionType, Policy, TrainingHooks
-from bench.plugins.ranges import Count, Share
+from bench.plugins.ranges import Count, Positive, Share
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
 from bench.victims.drivers.networks import QPolicy, StateValue
 from bench.victims.drivers.practice import ALLOWED
 from bench.victims.drivers.training import LearningDriver
-
-Positive = Annotated[float, Interval(gt=0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,8 +147,8 @@ class _ProximalLearner(Learner):
         whole, self.chunks = torch.cat(self.chunks, -1), []
         with torch.no_grad():
             flat = self.advantage(whole).exclude("next").reshape(-1)
-        spread = flat["advantage"]
-        flat.set("advantage", (spread - spread.mean()) / spread.std().clamp_min(1e-6))
+        advantage = flat["advantage"]
+        flat.set("advantage", (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6))
         flat.set("truth", flat["observation"])
         for _ in range(recipe.epochs):
             for rows in torch.randperm(len(flat)).split(recipe.batch):
