@@ -1,13 +1,15 @@
 """Our own published records, shipped with the package.
 
     python -m leaderboard.published RESULTS leaderboard/data/NAME.parquet
+    python -m leaderboard.published RESULTS leaderboard/data/NAME.parquet --add
 
-publishes the newest records of a results folder; a file holds one track.
+The first publishes the newest records of a results folder, the second adds them to those of the file. A file holds one track.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -21,6 +23,9 @@ from bench.plugins.track import Track, tracks
 from bench.records import reading
 from bench.records.generations import check
 from bench.records.schema import schema
+
+SERIES = ("pair", "training_seed", "grid")
+"""The columns that records are renewed by."""
 
 
 def published(track: Track) -> pa.Table:
@@ -37,31 +42,49 @@ def every_track() -> dict[str, pa.Table]:
     return {name: records for name, records in found.items() if records.num_rows}
 
 
-def publish(folder: Path, file: Path) -> int:
+def publish(folder: Path, file: Path, *, add: bool = False) -> int:
     """Write the newest records of a results folder as one file of published records.
 
     Args:
         folder: what `bench run out=` was given.
         file: where to write, usually in `leaderboard/data`.
+        add: keep the file's records of all pairs, training seeds and grids of which the folder has fewer episodes.
 
     Returns:
-        How many episodes that are.
+        How many episodes the file has then.
 
     Raises:
-        UserError: if the folder has records of no track, or of several.
+        UserError: if the folder has records of no track, or of several, or of another one than the file.
     """
     found = reading.read_all(folder)
     if len(found) > 1:
         raise UserError(f"{folder} has records of the tracks {' and '.join(found)}; publish one track at a time")
-    (records,) = found.values()
+    ((name, records),) = found.items()
+    if add:
+        if check(file)[0].name != name:
+            raise UserError(f"{folder} has records of the track {name}, {file} has others")
+        records = added(reading.upgraded(file), records)
     with whole(file) as made:
         pq.write_table(records, made, compression="zstd", compression_level=19)
     return int(records.num_rows)
+
+
+def added(old: pa.Table, new: pa.Table) -> pa.Table:
+    """Both tables; of each pair, training seed and grid, the new records count where they are not fewer."""
+    tables = [old, new.select(old.column_names).cast(old.schema)]
+    keys = [list(zip(*(table[name].to_pylist() for name in SERIES), strict=True)) for table in tables]
+    counts = [Counter(one) for one in keys]
+    renewed = {key for key, count in counts[1].items() if count >= counts[0][key]}
+    kept = [[(key in renewed) is bool(number) for key in one] for number, one in enumerate(keys)]
+    return pa.concat_tables(
+        [table.filter(pa.array(rows, pa.bool_())) for table, rows in zip(tables, kept, strict=True)]
+    )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Publish the newest records of a results folder.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("file", type=Path)
+    parser.add_argument("--add", action="store_true", help="add them to the records of the file")
     words = parser.parse_args()
-    Console().print(f"{publish(words.folder, words.file)} episodes in {words.file}")
+    Console().print(f"{publish(words.folder, words.file, add=words.add)} episodes in {words.file}")

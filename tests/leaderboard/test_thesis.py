@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
@@ -149,6 +150,42 @@ def test_what_is_published_is_what_was_recorded(tmp_path: Path, name: str, recor
     shipped = pq.read_table(tmp_path / "published.parquet")
     assert shipped.schema.equals(schema(track(name)))
     assert sorted(shipped[score].to_pylist()) == sorted(recorded[score].to_pylist())
+
+
+def scores_of(records: pa.Table, run: int) -> list[float]:
+    """The scores of a training seed, sorted."""
+    return sorted(records["safe_progress"].filter(pc.equal(records["training_seed"], run)).to_pylist())
+
+
+def test_added_records_renew_a_training_seed_and_leave_the_others(tmp_path: Path) -> None:
+    """A folder with fewer episodes of a pair and seed than the file renews nothing of it."""
+    file = tmp_path / "published.parquet"
+    first = drive(cells=CLEAR, skill=0.3)
+    again, few = drive(cells=CLEAR, runs=(1,), skill=0.9), drive(cells=CLEAR[:1], runs=(2,), skill=0.8)
+    for number, records in enumerate((first, again, few)):
+        folder = tmp_path / str(number)
+        results.prepare(folder)
+        results.write(folder, records)
+        assert publish(folder, file, add=number > 0) == first.num_rows
+    shipped = pq.read_table(file)
+    assert [scores_of(shipped, run) for run in (0, 1, 2)] == [
+        scores_of(first, 0),
+        scores_of(again, 1),
+        scores_of(first, 2),
+    ]
+    assert scores_of(again, 1) != scores_of(first, 1)
+
+
+def test_records_of_another_track_are_not_added(tmp_path: Path) -> None:
+    file = tmp_path / "published.parquet"
+    for number, records in enumerate((drive(cells=CLEAR[:1]), approach(0.9))):
+        folder = tmp_path / str(number)
+        results.prepare(folder)
+        results.write(folder, records)
+        if number == 0:
+            publish(folder, file)
+    with pytest.raises(UserError, match="has others"):
+        publish(folder, file, add=True)
 
 
 def test_records_of_two_tracks_are_not_published_as_one_file(tmp_path: Path) -> None:
