@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from attacks.noise import Noise
@@ -71,6 +72,22 @@ class Draws(DrivingAttack):
         return oracle.project(observation + torch.rand(observation.shape))
 
 
+def gradients_depend_on_the_batch(policy: Policy) -> bool:
+    """Whether this processor rounds the gradient of some observations otherwise if there are fewer of them."""
+
+    def slope(observation: Tensor) -> Tensor:
+        leaf = observation.clone().requires_grad_(True)
+        (gradient,) = torch.autograd.grad(policy(leaf).sum(), leaf)
+        return gradient
+
+    cells = [cell for cell in CELLS for _ in SEEDS]
+    env = HIGHWAY.make(cells, action_type=policy.action_type)
+    seeds = torch.tensor(list(SEEDS) * len(CELLS))
+    seen = env.reset(TensorDict({"seed": seeds}, batch_size=[len(cells)]))["observation"]
+    whole = slope(seen)
+    return any(not torch.equal(slope(seen[-size:]), whole[-size:]) for size in range(1, len(cells)))
+
+
 ATTACKS: dict[str, DrivingAttack | None] = {
     "none": None,
     "uniform": Noise(),
@@ -91,6 +108,11 @@ def test_units_in_one_batch_have_the_records_that_each_has_alone(name: str, kind
     policy: Policy = QPolicy(5, 5, 128) if kind == "discrete" else ActorPolicy(5, 64, 0.1)
     policy.eval().requires_grad_(False)
     attack = ATTACKS[name]
+    if attack and attack.access in ("gradients", "dynamics") and gradients_depend_on_the_batch(policy):
+        # A product of matrices rounds by its size on some processors; a run then drives the units one by one.
+        with pytest.raises(NotJointError):
+            driven(attack, policy, (0, 1, 2), share=0.7)
+        return
     together = driven(attack, policy, (0, 1, 2), share=0.7)
     alone = [driven(attack, policy, (unit,), share=0.7) for unit in range(3)]
     for column in set(together) - PROBES - {"attack_ms"}:
