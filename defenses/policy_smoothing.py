@@ -36,7 +36,7 @@ class PolicySmoothing(DrivingDefense):
             raise UserError("defense 'smoothing' needs a victim that sees")
         policy = victim.load(seed, facts)
         if policy.initial(torch.zeros(1, dtype=torch.int64)) is not None:
-            raise UserError("defense 'smoothing' needs a victim without a state")
+            raise UserError("defense 'smoothing' needs a victim without a state: nothing behind it may have a memory")
         return Smoothed(policy, self.sigma).eval()
 
 

@@ -75,10 +75,9 @@ def added(old: pa.Table, new: pa.Table) -> pa.Table:
     keys = [list(zip(*(table[name].to_pylist() for name in SERIES), strict=True)) for table in tables]
     counts = [Counter(one) for one in keys]
     renewed = {key for key, count in counts[1].items() if count >= counts[0][key]}
-    kept = [[(key in renewed) is bool(number) for key in one] for number, one in enumerate(keys)]
-    return pa.concat_tables(
-        [table.filter(pa.array(rows, pa.bool_())) for table, rows in zip(tables, kept, strict=True)]
-    )
+    of_old = pa.array([key not in renewed for key in keys[0]], pa.bool_())
+    of_new = pa.array([key in renewed for key in keys[1]], pa.bool_())
+    return pa.concat_tables([tables[0].filter(of_old), tables[1].filter(of_new)])
 
 
 if __name__ == "__main__":

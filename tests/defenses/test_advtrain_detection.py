@@ -19,9 +19,8 @@ from bench.errors import UserError
 from bench.plugins.contracts import Facts
 from bench.run.config import component, run_config
 from bench.victims import zoo
-from bench.victims.detectors import yolov5_file
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
-from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
+from bench.victims.detectors.yolov5 import YOLOv5
 from defenses.advtrain_detection import DetectorAdversarialTraining
 from envs.camera.world import StopSignApproach
 from tests.framework.toy_camera import SIGN, RedDetector, RedStreet
@@ -32,15 +31,6 @@ QUICK = {"rounds": 2, "updates": 2, "batch": 2, "attack_params": "steps=2 batch=
 
 
 LARGEST = 20_000
-
-
-@pytest.fixture
-def victim(tmp_path: Path) -> YOLOv5:
-    """A small untrained detector."""
-    torch.manual_seed(0)
-    path = tmp_path / "own.safetensors"
-    yolov5_file.save(YOLOv5Network("n", (STOP_SIGN, "car")), path)
-    return YOLOv5(path=str(path))
 
 
 def trained(victim: YOLOv5, **params: object) -> tuple[Detector, list[str]]:

@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from bench.detection import STOP_SIGN
 from bench.errors import UserError
 from bench.victims import zoo
-from bench.victims.detectors import yolov5_file
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
-from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
+from bench.victims.detectors.yolov5 import YOLOv5
 from defenses.completion import closed, filled
 from defenses.marker import Marker
 from defenses.segmenter import SMOOTH, Completed, Segmenter
@@ -118,15 +116,6 @@ def test_textures_are_images_and_repeat_with_their_generator() -> None:
     assert one.min() >= 0
     assert one.max() <= 1
     assert torch.equal(one, again)
-
-
-@pytest.fixture
-def victim(tmp_path: Path) -> YOLOv5:
-    """A small untrained detector."""
-    torch.manual_seed(0)
-    path = tmp_path / "own.safetensors"
-    yolov5_file.save(YOLOv5Network("n", (STOP_SIGN, "car")), path)
-    return YOLOv5(path=str(path))
 
 
 def test_it_trains_the_marks_only_and_the_zoo_finds_them(

@@ -153,8 +153,9 @@ class LearningDriver(DrivingVictim):
                     rate = self.learning_rate * max(0.05, min(1.0 if hooks.start is None else 0.5, 2 * (1 - share)))
                     if learner.on_policy:
                         learner.learn(rate, share)
-                    for _ in range(0 if learner.on_policy else CHUNK * self.updates):
-                        learner.update(practice.sample(share), rate)
+                    else:
+                        for _ in range(CHUNK * self.updates):
+                            learner.update(practice.sample(share), rate)
                 if self._due(done / total, len(best.history), hooks):
                     best.offer(learner.averaged(), done / total)
                 progress(done / total, f"safe_progress {best.score:.2f}" if best.score is not None else "")
