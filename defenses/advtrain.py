@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated, Literal
 
@@ -50,6 +50,8 @@ class AdversarialTraining(DrivingDefense):
         skip: probability that an observation is not attacked, in [0, 1].
         attack: any registered stateless attack on driving policies.
         attack_params: its parameters, as on the command line but separated by spaces.
+        others: further attacks, separated by commas, each with its parameters: `zo, pgd objective=target target_action=4`. Each
+            time one of all attacks is drawn, and checkpoints are selected under each of them.
         norm: perturbation set of the training attack, `relative` or `linf`.
         budget: size of this set after the ramp.
         start: `trained` continues from the victim of the same training seed, `scratch` trains a new one.
@@ -69,6 +71,7 @@ class AdversarialTraining(DrivingDefense):
     skip: Share = 0.3
     attack: str = "pgd"
     attack_params: str = "steps=1 step_size=1 temperature=1"
+    others: str = ""
     norm: Norm = "relative"
     budget: Annotated[float, Interval(ge=0, le=2)] = 0.1
     start: Literal["trained", "scratch"] = "trained"
@@ -86,7 +89,9 @@ class AdversarialTraining(DrivingDefense):
             raise ValueError(f"ramp_from must be at most ramp_to, got {self.ramp_from} and {self.ramp_to}")
 
     def zoo_name(self, victim: DrivingVictim) -> str:
-        return f"{victim.zoo_name()}-advtrain-{self.attack}-skip{self.skip:g}"
+        others = [words.split()[0] for words in self.others.split(",") if words.strip()]
+        attacks = "+".join(dict.fromkeys((self.attack, *others)))
+        return f"{victim.zoo_name()}-advtrain-{attacks}-skip{self.skip:g}"
 
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
         if victim.policy_type is None:
@@ -99,22 +104,28 @@ class AdversarialTraining(DrivingDefense):
         Raises:
             UserError: if the attack does not fit the victim, or `start=trained` and the zoo has no such victim.
         """
-        attack = configured("attack", self.attack, parameter_words(self.attack_params)).component
+        others = [words.strip() for words in self.others.split(",") if words.strip()]
+        attacks = [self._in_loop(words, victim) for words in (f"{self.attack} {self.attack_params}", *others)]
+        start = victim.load(seed, world.facts) if self.start == "trained" else None
+        loop = AttackInLoop(self, attacks, world.facts, start, seed)
+        trained = victim.train(world, seed=seed, hooks=loop, progress=progress)
+        of_attack = {"attack": asdict(attacks[0]), "attacked_decisions": loop.attacked}  # type: ignore[call-overload]
+        return Trained(trained.network, {**trained.card, **of_attack, "threat": asdict(loop.threat)})
+
+    @staticmethod
+    def _in_loop(words: str, victim: DrivingVictim) -> DrivingAttack:
+        """The attack in a text such as `pgd steps=2`, if it can be in the loop."""
+        name, _, parameters = words.partition(" ")
+        attack = configured("attack", name, parameter_words(parameters)).component
         if not isinstance(attack, DrivingAttack) or type(attack).perturb is DrivingAttack.perturb:
-            raise UserError(
-                f"adversarial training needs a stateless attack on driving policies, {self.attack!r} is not one"
-            )
+            raise UserError(f"adversarial training needs a stateless attack on driving policies, {name!r} is not one")
         if attack.learns:
             raise UserError(
-                f"attack {self.attack!r} needs a trained victim: adversarial training takes attacks that do not learn"
+                f"attack {name!r} needs a trained victim: adversarial training takes attacks that do not learn"
             )
         if misfit := attack.misfit(victim):
-            raise UserError(f"attack {self.attack!r} does not fit the victim, {misfit}")
-        start = victim.load(seed, world.facts) if self.start == "trained" else None
-        loop = AttackInLoop(self, attack, world.facts, start, seed)
-        trained = victim.train(world, seed=seed, hooks=loop, progress=progress)
-        of_attack = {"attack": asdict(attack), "attacked_decisions": loop.attacked}  # type: ignore[call-overload]
-        return Trained(trained.network, {**trained.card, **of_attack, "threat": asdict(loop.threat)})
+            raise UserError(f"attack {name!r} does not fit the victim, {misfit}")
+        return attack
 
 
 class AttackInLoop(TrainingHooks):
@@ -122,7 +133,7 @@ class AttackInLoop(TrainingHooks):
 
     Args:
         recipe: the defence.
-        attack: the training attack.
+        attacks: the training attacks.
         facts: facts of the world: features of the observation, names of the actions.
         start: the policy to continue from, also the teacher of the consistency loss; None trains from fresh weights.
         seed: training seed.
@@ -132,9 +143,14 @@ class AttackInLoop(TrainingHooks):
     checkpoints = 0.5
 
     def __init__(
-        self, recipe: AdversarialTraining, attack: DrivingAttack, facts: DrivingFacts, start: Policy | None, seed: int
+        self,
+        recipe: AdversarialTraining,
+        attacks: Sequence[DrivingAttack],
+        facts: DrivingFacts,
+        start: Policy | None,
+        seed: int,
     ) -> None:
-        self.recipe, self.attack, self.facts = recipe, attack, facts
+        self.recipe, self.attacks, self.facts = recipe, attacks, facts
         self.changes_lane = torch.tensor([float(action in CHANGES_LANE) for action in facts.actions])
         self.start, self.decisions = start, recipe.decisions
         self.threat = ObservationThreat(norm=recipe.norm, budget=recipe.budget)
@@ -159,20 +175,32 @@ class AttackInLoop(TrainingHooks):
         if not bool(hit.any()):
             return observation
         scale = min(1.0, (share - recipe.ramp_from) / max(recipe.ramp_to - recipe.ramp_from, 1e-9))
+        drawn = int(torch.randint(len(self.attacks), (1,), generator=self.skips)) if len(self.attacks) > 1 else 0
         result = observation.clone()
-        result[hit] = self.perturbed(observation[hit], policy, rows_of(state, hit), scale)
+        result[hit] = self.perturbed(self.attacks[drawn], observation[hit], policy, rows_of(state, hit), scale)
         self.attacked += int(hit.sum())
         return result
 
-    def perturbed(self, observation: Tensor, policy: Policy, state: State = None, scale: float = 1.0) -> Tensor:
+    def perturbed(
+        self, attack: DrivingAttack, observation: Tensor, policy: Policy, state: State = None, scale: float = 1.0
+    ) -> Tensor:
         """attack(policy, o) [B, V, F], with a budget multiplied by `scale`."""
-        enforcer = Enforcer(CountedPolicy(policy), self.threat, self.attack.access, self.facts.features, self.noise)
-        return enforcer.project(self.attack.perturb(observation, enforcer.begin(observation, state, scale)))[0]
+        enforcer = Enforcer(CountedPolicy(policy), self.threat, attack.access, self.facts.features, self.noise)
+        return enforcer.project(attack.perturb(observation, enforcer.begin(observation, state, scale)))[0]
 
     def selection(self, policy: Policy) -> dict[str, Callable[[Tensor, State], Tensor]]:
         if self.recipe.skip >= 1:
             return {}
-        return {"attacked": lambda observation, state: self.perturbed(observation, policy, state)}
+        names = ["attacked", *(f"attacked {number}" for number in range(1, len(self.attacks)))]
+        return {
+            name: lambda observation, state, attack=attack: self.perturbed(attack, observation, policy, state)  # type: ignore[misc]
+            for name, attack in zip(names, self.attacks, strict=True)
+        }
+
+    def ranked(self, scores: Mapping[str, float]) -> float:
+        """The mean of the score without an attack and of the lowest one under an attack."""
+        attacked = [score for name, score in scores.items() if name != "clean"]
+        return (scores["clean"] + min(attacked, default=scores["clean"])) / 2
 
     def loss(self, policy: Policy, sample: TensorDictBase, own: Callable[[TensorDictBase], Tensor]) -> Tensor:
         """Discrete: the victim's own loss on (o', a, r, s'). Continuous: -Q(o, mu(o')), with the critic on the true observation.

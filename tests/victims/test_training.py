@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from bench.driving import DrivingWorld, Policy, State, TrainingHooks
+from bench.errors import UserError
 from bench.plugins import registry
 from bench.victims import zoo
 from bench.victims.drivers.attack_mix import AttackMix
@@ -86,11 +87,32 @@ def test_the_skip_probability_sets_the_rate_of_attacks(skip: float, world: Drivi
 def test_the_budget_follows_the_ramp() -> None:
     defense = AdversarialTraining(skip=0.0, attack="noise", attack_params="", ramp_from=0.2, ramp_to=0.6)
     world = registry.load("world", "highway")()
-    loop = AttackInLoop(defense, registry.load("attack", "noise")(), world.facts, None, seed=0)
+    loop = AttackInLoop(defense, [registry.load("attack", "noise")()], world.facts, None, seed=0)
     policy, seen = QPolicy(5, 5, 8), 0.5 * torch.ones(16, 10, 5)
     moved = [float((loop.shown(seen, policy, share) - seen).abs().max()) for share in (0.1, 0.3, 0.4, 0.6, 0.9)]
     assert moved == pytest.approx([0.0, moved[4] / 4, moved[4] / 2, moved[4], moved[4]], rel=0.01)
     assert moved[4] > 0
+
+
+def test_each_attack_of_the_loop_is_drawn_and_selects(world: DrivingWorld) -> None:
+    defense = AdversarialTraining(skip=0.0, ramp_to=0.0)
+    attacks = [registry.load("attack", "noise")(scale=scale) for scale in (0.01, 1.0)]
+    loop = AttackInLoop(defense, attacks, world.facts, None, seed=0)
+    policy, seen = QPolicy(5, 5, 8), 0.5 * torch.ones(2, 10, 5)
+    strong = [bool((loop.shown(seen, policy, 0.5) - seen).abs().max() > 0.02) for _ in range(40)]
+    assert 10 < sum(strong) < 30
+    scored = {name: float((show(seen, None) - seen).abs().max()) for name, show in loop.selection(policy).items()}
+    assert [moved > 0.02 for moved in scored.values()] == [False, True]
+    assert loop.ranked({"clean": 0.8, **dict(zip(scored, (0.6, 0.2), strict=True))}) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("others", "wrong"),
+    [("zo, nothing", "'nothing'"), ("zo, plan", "'plan' is not one"), ("zo steps", "'steps'")],
+)
+def test_an_attack_that_cannot_be_in_the_loop_is_refused(others: str, wrong: str, world: DrivingWorld) -> None:
+    with pytest.raises(UserError, match=wrong):
+        AdversarialTraining(others=others).train(VICTIMS[0], world, seed=0, progress=silent)
 
 
 class Calm(TrainingHooks):
@@ -152,7 +174,7 @@ class Lesson:
         """The learner's decisions on the perturbed observations after 150 updates: softmax probabilities, or the action."""
         defense = AdversarialTraining(**{"consistency": 0.0, "margin": 0.0, **params})
         facts = registry.load("world", "highway")().facts
-        hooks = AttackInLoop(defense, registry.load("attack", "none")(), facts, self.teacher, seed=0)
+        hooks = AttackInLoop(defense, [registry.load("attack", "none")()], facts, self.teacher, seed=0)
         learner = self.victim.learner(self.env, hooks)
         learner.enter(self.victim.phases(hooks)[0])
         for _ in range(150):

@@ -32,7 +32,8 @@ class PPO(LearningDriver):
     `memory`, `tau` and `updates` have no meaning for it.
 
     From scratch it has no phase of single frames: the policy that holds decisions for `repeat` frames scores as well if it is
-    asked at every frame. `fine` is the share of the training, at its end, over which the checkpoints are spread.
+    asked at every frame. `fine` is the share of the training, at its end, over which the checkpoints are spread. Behind a defence
+    it explores more than at the end of the training without one (`BEHIND`).
 
     Args:
         rollout: decisions on every road between two rounds of updates.
@@ -58,6 +59,7 @@ class PPO(LearningDriver):
     entropy: Positive = 0.5
     final_entropy: Positive = 0.02
     explore_until: Annotated[float, Interval(gt=0, le=1)] = 0.8
+    behind_decisions: Count = 8_000
 
     @property
     def action_type(self) -> ActionType:
@@ -77,6 +79,8 @@ SPEEDS = (20.0, 30.0)
 """The speeds in m/s between which Eq. 4.1 of the thesis rewards speed."""
 SPEED = 0.8
 """The largest part of `progress` that is for speed; the rest is for the rightmost lane."""
+BEHIND = 0.5
+"""How far the exploration has got when the training behind a defence begins: there, a random lane change is not dangerous."""
 
 
 class _ProximalLearner(Learner):
@@ -86,7 +90,8 @@ class _ProximalLearner(Learner):
         super().__init__(hooks)
         self.recipe = recipe
         self.chunks: list[TensorDictBase] = []
-        self.explored = 0.0 if hooks.start is None else 1.0
+        self.first = 0.0 if hooks.start is None else BEHIND if recipe.behind else 1.0
+        self.explored = self.first
         features, actions = env.observation_spec["observation"].shape[-1], int(env.action_spec.space.n)
         self.policy: QPolicy = QPolicy(features, actions, recipe.hidden)
         if hooks.start is not None:
@@ -141,8 +146,7 @@ class _ProximalLearner(Learner):
         recipe = self.recipe
         if len(self.chunks) * CHUNK < recipe.rollout:
             return
-        if self.hooks.start is None:
-            self.explored = min(1.0, share / recipe.explore_until)
+        self.explored = min(1.0, self.first + (1 - self.first) * share / recipe.explore_until)
         self.loss.entropy_coeff.fill_(recipe.entropy * (recipe.final_entropy / recipe.entropy) ** self.explored)
         whole, self.chunks = torch.cat(self.chunks, -1), []
         with torch.no_grad():
