@@ -141,6 +141,8 @@ class AlternatingTraining(DrivingDefense):
 def _dqn(victim: DrivingVictim) -> DQN:
     if not isinstance(victim, DQN):
         raise UserError(f"atla continues from a dqn, and {type(victim).__name__} is none: use victim=dqn")
+    if victim.behind:
+        raise UserError(f"atla trains no driver behind {victim.behind!r}: leave victim.behind out")
     return victim
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.victims import zoo
@@ -26,16 +23,11 @@ def atla() -> Figure:
     ):
         scores = [100 * one[name] for one in curve]
         axes.plot(turns, scores, color=colour, ls=dashes, marker="o", ms=4, lw=2.2, label=label)
-    _mark(axes, curve)
+    full = next(turn for turn, one in enumerate(curve) if one["scale"] == 1)
+    best = max(range(full, len(curve)), key=lambda turn: curve[turn]["clean"] + curve[turn]["attacked"])
+    for turn, text, height in ((full, "full budget", 91), (best, "ships", 97)):
+        axes.axvline(turn, color=style.GREY, lw=1, ls=":")
+        axes.annotate(text, (turn + 0.1, height), color=style.GREY, fontsize=9.5)
     axes.set(xlabel="turns of the policy", ylabel="safe progress, %", ylim=(0, 103))
     axes.legend(loc="lower left", fontsize=10)
     return made
-
-
-def _mark(axes: Axes, curve: list[dict[str, Any]]) -> None:
-    """Mark where the budget is full, and the checkpoint that ships."""
-    full = next(turn for turn, one in enumerate(curve) if one["scale"] == 1)
-    ships = max(range(full, len(curve)), key=lambda turn: curve[turn]["clean"] + curve[turn]["attacked"])
-    for turn, text in ((full, "full budget"), (ships, "ships")):
-        axes.axvline(turn, color=style.GREY, lw=1, ls=":")
-        axes.annotate(text, (turn + 0.1, 97 if text == "ships" else 91), color=style.GREY, fontsize=9.5)

@@ -11,7 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.driving import ObservationThreat
+from attacks.pgd import PGD
+from attacks.rehearse import Rehearse
+from attacks.zo import ZOSignSGD
+from bench.driving import DrivingAttack, ObservationThreat
+from bench.driving.rollout import rollout
 from bench.errors import UserError
 from bench.plugins.pair import choose
 from bench.victims import zoo
@@ -23,6 +27,7 @@ from defenses.adversary import Adversary
 from defenses.alternating import Alternation, RecurrentPractice, Turn
 from defenses.atla import AlternatingTraining, Scored
 from defenses.recurrent import RecurrentPolicy
+from envs.highway.axes import AXES
 from envs.highway.world import HighwayWorld
 from tests.attacks.victims import FEATURES, observations, victim
 from tests.driving.policies import recurrent
@@ -204,3 +209,31 @@ def test_other_victims_are_refused(name: str) -> None:
         AlternatingTraining().load(other, 0, WORLD.facts)
     with pytest.raises(UserError, match="use victim=dqn"):
         AlternatingTraining().train(other, WORLD, seed=0, progress=silent)
+
+
+ATTACKS = [PGD(steps=2, restarts=1), ZOSignSGD(steps=1, directions=2), Rehearse()]
+
+
+@pytest.mark.parametrize("attack", ATTACKS, ids=["pgd", "zo", "rehearse"])
+def test_the_shipped_policy_is_driven_under_attack(attack: DrivingAttack) -> None:
+    world, seeds = HighwayWorld(max_steps=20), [1_000_000, 1_000_001]
+    cells = [AXES.cell(lanes=4, density=1.0)] * len(seeds)
+    policy = AlternatingTraining().load(DQN(), 0, world.facts)
+    columns = rollout(
+        world.make(cells),
+        policy,
+        attack,
+        ObservationThreat(access="dynamics"),
+        seeds,
+        facts=world.facts,
+        attack_seed=0,
+        dynamics=world.dynamics(cells, "discrete"),
+    )
+    assert bool((columns["queries"] > 0).all())
+    if attack.access == "gradients":
+        assert bool((columns["zero_gradients"] == 0).all())
+
+
+def test_a_driver_behind_a_defence_is_refused() -> None:
+    with pytest.raises(UserError, match="behind 'tracker': leave victim.behind out"):
+        AlternatingTraining().load(DQN(behind="tracker"), 0, WORLD.facts)
