@@ -235,5 +235,5 @@ def test_the_shipped_policy_is_driven_under_attack(attack: DrivingAttack) -> Non
 
 
 def test_a_driver_behind_a_defence_is_refused() -> None:
-    with pytest.raises(UserError, match="behind 'tracker': leave victim.behind out"):
+    with pytest.raises(UserError, match="atla trains no driver behind 'tracker'"):
         AlternatingTraining().load(DQN(behind="tracker"), 0, WORLD.facts)
