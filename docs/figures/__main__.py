@@ -33,6 +33,7 @@ FIGURES = {
     "defense_advtrain.svg": "hardening:advtrain",
     "defense_sa.svg": "hardening:sa",
     "defense_car.svg": "hardening:car",
+    "defense_atla.png": "alternating:atla",
     "defense_advtrain_detection.svg": "hardening:advtrain_detection",
     "defense_median.png": "filters:median",
     "defense_jpeg.png": "filters:jpeg",

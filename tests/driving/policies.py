@@ -12,6 +12,7 @@ from torch import Tensor
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from bench.victims.drivers.reference import Blind, RandomDriver
 from defenses.frame_stack import FrameStack, Reduction
+from defenses.recurrent import RecurrentPolicy
 from envs.highway.world import HighwayWorld
 from tests.attacks.victims import observations, victim
 
@@ -46,12 +47,24 @@ def stacked(inner: Policy, frames: int = 3, reduce: Reduction = "mean") -> Polic
     return FrameStack(frames=frames, reduce=reduce).load(Given(policy=inner), 0, FACTS)
 
 
+def recurrent() -> RecurrentPolicy:
+    """A policy with a GRU of random weights that are large enough to matter."""
+    torch.manual_seed(0)
+    policy = RecurrentPolicy(5, 5, 16, 8)
+    with torch.no_grad():
+        for weight in policy.parameters():
+            weight.mul_(2.0)
+    return policy.requires_grad_(False).eval()
+
+
 STATEFUL: dict[str, Callable[[], Policy]] = {
     "stacked dqn": lambda: stacked(victim("discrete")),
     "stacked ddpg": lambda: stacked(victim("continuous"), 4, "median"),
     "stack of stacks": lambda: stacked(stacked(victim("discrete"), 2), 3, "median"),
     "sequence": lambda: Blind().load(0, FACTS),
     "stacked sequence": lambda: stacked(Blind().load(0, FACTS)),
+    "recurrent": recurrent,
+    "stacked recurrent": lambda: stacked(recurrent()),
     "stacked random": lambda: stacked(RandomDriver().load(0, FACTS)),
 }
 
