@@ -42,6 +42,7 @@ FIGURES = {
     "victim_ddpg.svg": "decisions:ddpg",
     "victim_oracle_planner.svg": "references:oracle_planner",
     "victim_ppo.png": "decisions:ppo",
+    "victim_sac.png": "decisions:sac",
     "victim_planner.svg": "intervals:planner",
     "victim_blind.svg": "references:blind",
     "victim_random.svg": "references:random",

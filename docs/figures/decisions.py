@@ -37,6 +37,11 @@ def ppo() -> Figure:
     return _greedy("ppo", "ppo: the most likely action")
 
 
+def sac() -> Figure:
+    """The most likely action, as for `dqn`."""
+    return _greedy("sac", "sac: the most likely action")
+
+
 def _greedy(victim: str, title: str) -> Figure:
     made = style.figure(4.1, title)
     with torch.no_grad():

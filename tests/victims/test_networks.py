@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bench.driving import Policy
+from bench.victims.drivers.logits import SoftPolicy
 from bench.victims.drivers.networks import ActorPolicy, QPolicy
 
 
@@ -22,9 +23,11 @@ def observation(batch: tuple[int, ...], seed: int = 0) -> Tensor:
     return rows * present
 
 
-@pytest.fixture(params=["dqn", "ddpg"])
+@pytest.fixture(params=["dqn", "ddpg", "sac"])
 def policy(request: pytest.FixtureRequest) -> Policy:
     torch.manual_seed(0)
+    if request.param == "sac":
+        return SoftPolicy(5, 5, 16)
     return QPolicy(5, 5, 16) if request.param == "dqn" else ActorPolicy(5, 16, 0.1)
 
 

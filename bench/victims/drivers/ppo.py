@@ -10,7 +10,7 @@ import torch
 from annotated_types import Interval
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -18,6 +18,7 @@ from torchrl.objectives.value import GAE
 from bench.driving import ActionType, Policy, TrainingHooks
 from bench.plugins.ranges import Count, Positive, Share
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
+from bench.victims.drivers.logits import Logits
 from bench.victims.drivers.networks import QPolicy, StateValue
 from bench.victims.drivers.practice import ALLOWED
 from bench.victims.drivers.training import LearningDriver
@@ -101,7 +102,7 @@ class _ProximalLearner(Learner):
                 self.policy.network.head[-1].weight.mul_(0.1)
         read = ["observation", ALLOWED] if recipe.behind else ["observation"]
         actor = ProbabilisticTensorDictSequential(
-            TensorDictModule(_Logits(self.policy.network), in_keys=read, out_keys=["logits"]),
+            TensorDictModule(Logits(self.policy.network), in_keys=read, out_keys=["logits"]),
             ProbabilisticTensorDictModule(
                 in_keys=["logits"],
                 out_keys=["action"],
@@ -176,15 +177,3 @@ class _ProximalLearner(Learner):
 
     def averaged(self) -> Policy:
         return copy.deepcopy(self.policy)
-
-
-class _Logits(nn.Module):
-    """The logits [..., A] of a network; those of actions that are not allowed are next to impossible."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, observation: Tensor, allowed: Tensor | None = None) -> Tensor:
-        logits: Tensor = self.network(observation)
-        return logits if allowed is None else logits.masked_fill(~allowed, -1e4)
