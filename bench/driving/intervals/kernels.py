@@ -124,14 +124,10 @@ def _lost(closing: float, rules: Rules) -> tuple[float, float]:
     at a = `REAR_BRAKING`. With c = d + closing they are equally fast at about t = s + c / a; by then the ego has lost
     c s + c^2 / 2a - d T (1 - exp(-t / T)).
     """
-    faster = rules.slowing + closing
-    if faster <= 0:
-        return 0.0, 0.0
+    faster = rules.slowing + max(closing, 0.0)
     left = rules.slowing * np.exp(-(REAR_S + faster / REAR_BRAKING) / rules.delay)
     lost = faster * (REAR_S + faster / (2 * REAR_BRAKING)) - rules.delay * (rules.slowing - left)
-    if lost <= 0:
-        return 0.0, 0.0
-    return lost, REAR_S + (faster - left) / REAR_BRAKING
+    return max(lost, 0.0), (REAR_S + (faster - left) / REAR_BRAKING if closing > 0 and lost > 0 else 0.0)
 
 
 @entry_point
