@@ -16,7 +16,7 @@ from attacks.pgd import PGD
 from bench.driving import DrivingVictim, ObservationThreat, Policy
 from bench.driving.intervals.boxes import Assumed
 from bench.driving.intervals.ego import Ego
-from bench.driving.intervals.kernels import used
+from bench.driving.intervals.kernels import LEVELS_PER_UNIT, REAR_BRAKING, used
 from bench.driving.intervals.margins import Judge
 from bench.driving.intervals.policy import reckoning
 from bench.driving.intervals.rooms import Cars, Caution, cars_of
@@ -159,11 +159,11 @@ def test_the_gradients_of_rooms_and_speeds_are_those_of_finite_differences(seed:
     assert float(((ahead - back) / (2 * step) - slope).abs().median()) < 0.02 * float(slope.abs().mean())
 
 
-@settings(max_examples=3, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_no_leader_that_brakes_as_assumed_is_hit(seed: int) -> None:
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 10_000), rate=st.sampled_from([1.25, 4.0]))
+def test_no_leader_that_brakes_as_assumed_is_hit(seed: int, rate: float) -> None:
     """FASTER whenever it is safe, behind leaders that brake at the assumed rate for the assumed time, each at its own moment."""
-    moves, period, rate, count = reckoning(FACTS, "discrete"), 1 / FACTS.decision_hz, 4.0, 256
+    moves, period, count = reckoning(FACTS, "discrete"), 1 / FACTS.decision_hz, 256
     judge = Judge(moves, period, Caution(braking=rate, seconds=1.5, distance=0.4))
     assumed, generator = Assumed(FACTS.features, "relative", 0.1), torch.Generator().manual_seed(seed)
 
@@ -174,7 +174,7 @@ def test_no_leader_that_brakes_as_assumed_is_hit(seed: int) -> None:
     ego = Ego(y=4 * one, heading=0 * one, speed=speed, target_lane=one, target_speed=speed, edge=2 * one)
     following = judge.rooms.following
     table, pairs = following.tables[0], zip(speed.tolist(), leader.tolist(), strict=True)
-    needed = [used(table, following.side, own, other, int(rate))[0] for own, other in pairs]
+    needed = [used(table, following.side, own, other, int(rate * LEVELS_PER_UNIT))[0] for own, other in pairs]
     gap = 6.0 + torch.tensor(needed) + drawn(0, 20)
     half, once = FACTS.features.half_range(), torch.zeros(count, dtype=torch.bool)
     for step in range(120):
@@ -192,6 +192,24 @@ def test_no_leader_that_brakes_as_assumed_is_hit(seed: int) -> None:
         ego = Ego(*(after[name] for name in Ego._fields))
         assert bool((gap > 5.0)[once].all())
     assert once.float().mean() > 0.5
+
+
+@settings(max_examples=20, deadline=None)
+@given(speed=st.sampled_from([15.0, 20.0, 25.0, 30.0]), closing=st.floats(-6, 4))
+def test_the_least_room_behind_allows_for_braking_within_a_lane_change(speed: float, closing: float) -> None:
+    """The ego changes lanes and slows down at once; the car behind brakes as soon as the ego has moved a metre."""
+    moves, period, one = reckoning(FACTS, "discrete"), 1 / FACTS.decision_hz, torch.ones(1)
+    judge = Judge(moves, period, Caution(braking=0.5, seconds=2.0, distance=0.4))
+    ego = Ego(y=0 * one, heading=0 * one, speed=speed * one, target_lane=0 * one, target_speed=speed * one, edge=one)
+    far = torch.tensor([[[-100.0, 4.0, speed + closing, 0.0]]])
+    gap = 100 - float(judge(ego, Cars(torch.ones(1, 1, dtype=torch.bool), far, far)).change[0, 1])
+    behind = speed + closing
+    for action in ("LANE_RIGHT", "SLOWER", *["IDLE"] * 40):
+        gap, seen = gap + (float(ego.speed) - behind) * period, float(ego.y) > 1
+        behind = max(behind - REAR_BRAKING * period * seen, 0.0)
+        after = moves.after(ego, torch.tensor([FACTS.actions.index(action)]))
+        ego = Ego(*(after[name] for name in Ego._fields))
+        assert gap > 5.0
 
 
 @pytest.mark.parametrize("attack", [None, Noise(), PGD(objective="target", target_action=FAST, steps=3, restarts=1)])

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.driving.intervals.kernels import FASTEST, HARDEST, STEP
+from bench.driving.intervals.kernels import FASTEST, HARDEST, LEVELS_PER_UNIT, STEP
 from bench.driving.kinematics import Kinematics
 
 LASTING_S = 8.0
@@ -37,7 +37,7 @@ class FollowingDistance:
         braking: float | None = None,
     ) -> None:
         speeds = torch.arange(0.0, FASTEST + STEP, STEP, dtype=torch.float64)
-        rates = torch.arange(HARDEST + 1.0, dtype=torch.float64)
+        rates = torch.arange(HARDEST * LEVELS_PER_UNIT + 1.0, dtype=torch.float64) / LEVELS_PER_UNIT
         dt = period / kinematics.frames
         rate, own, other = torch.meshgrid(rates, speeds, speeds, indexing="ij")
         table, lost, target = torch.zeros_like(own), torch.zeros_like(own), own

@@ -15,12 +15,14 @@ FASTEST, STEP = 40.0, 0.5
 """Largest speed and resolution of a table of following distances, in m/s."""
 HARDEST = 6
 """Hardest braking of a leader in a table, in m/s2."""
+LEVELS_PER_UNIT = 4
+"""Levels of a leader's braking in a table for each m/s2."""
 DRIFT_S, DEAD_BAND = 0.6, 0.5
 """A car may be as far to the side as it gets in this time in s with the part of its lateral speed above this, in m/s."""
 CLEARANCE = 0.4
 """Lateral room between two cars, in m, below which they are in the same lane."""
-REAR_S, REAR_BRAKING = 0.14, 4.0
-"""A car behind reacts after this time in s, and brakes at this rate in m/s2."""
+REAR_S, REAR_BRAKING = 0.27, 6.0
+"""A car behind reacts after this time in s, when the ego has moved a metre towards its lane, and brakes at this rate in m/s2."""
 SIDES = (-4, -3, -2, -1, 0, 1, 2, 3, 4)
 """The lanes whose speeds are computed, relative to the ego's target lane."""
 ROOM, HORIZON_S = 12.0, 3.0
@@ -44,7 +46,8 @@ class Rules(NamedTuple):
         acceleration, jam_distance, time_gap, free_share: of the car-following model, `bench.driving.kinematics.CarFollowing`.
         scale: the divisor in its desired gap.
         steady: number of the option that keeps the speed.
-        lost: what the ego loses to a car behind if it has to brake while it changes lanes.
+        slowing: by how much the ego may have to slow down while it changes lanes.
+        delay: time constant in s with which it does so.
     """
 
     period: float
@@ -58,7 +61,8 @@ class Rules(NamedTuple):
     free_share: float
     scale: float
     steady: int
-    lost: float
+    slowing: float
+    delay: float
 
 
 @inner
@@ -97,7 +101,7 @@ def _level(low: Floats, high: Floats, present: Flags, car: int, rules: Rules) ->
             wanted = max(rules.jam_distance + rules.time_gap * speed + speed * closing / rules.scale, 0.0)
             share = wanted / max(gap, 1.0)
             rate = max(rate, rules.acceleration * (share * share - rules.free_share))
-    return int(np.ceil(min(max(rate, rules.braking), float(HARDEST))))
+    return int(np.ceil(min(max(rate, rules.braking), float(HARDEST)) * LEVELS_PER_UNIT))
 
 
 @inner
@@ -110,6 +114,20 @@ def _spread(low: Floats, high: Floats) -> tuple[float, float]:
 def _overlap(left: float, right: float, middle: float, width: float) -> bool:
     """Whether a car between `left` and `right` may be in the lane around `middle`."""
     return right > middle - width and left < middle + width
+
+
+@inner
+def _lost(closing: float, rules: Rules) -> tuple[float, float]:
+    """What the ego loses in m to a car that comes nearer at `closing` m/s from behind, at least 0, and its slope in `closing`.
+
+    The ego slows down by d = `slowing` with the time constant T = `delay`; the car keeps its speed for s = `REAR_S`, then brakes
+    at a = `REAR_BRAKING`. With c = d + closing they are equally fast at about t = s + c / a; by then the ego has lost
+    c s + c^2 / 2a - d T (1 - exp(-t / T)).
+    """
+    faster = rules.slowing + max(closing, 0.0)
+    left = rules.slowing * np.exp(-(REAR_S + faster / REAR_BRAKING) / rules.delay)
+    lost = faster * (REAR_S + faster / (2 * REAR_BRAKING)) - rules.delay * (rules.slowing - left)
+    return max(lost, 0.0), (REAR_S + (faster - left) / REAR_BRAKING if closing > 0 and lost > 0 else 0.0)
 
 
 @entry_point
@@ -168,14 +186,8 @@ def rooms(
                                 front[n, table, beside, option] = room
                                 front_car[n, table, beside, option] = car
             else:
-                closing = max(high[n, car, 2] - own[n, rules.steady], 0.0)
-                room = (
-                    -high[n, car, 0]
-                    - rules.length
-                    - rules.lost
-                    - REAR_S * closing
-                    - closing * closing / (2 * REAR_BRAKING)
-                )
+                lost = _lost(high[n, car, 2] - own[n, rules.steady], rules)[0]
+                room = -high[n, car, 0] - rules.length - lost
                 for beside in range(3):
                     middle = nearest + beside * rules.lane_width
                     if _overlap(left, right, middle, rules.width) and room < rear[n, beside]:
@@ -232,11 +244,9 @@ def rooms_backward(
             car, slope = rear_car[n, beside], by_rear[n, beside]
             if car != NOBODY and slope != 0:
                 by_high[n, car, 0] -= slope
-                closing = high[n, car, 2] - own[n, rules.steady]
-                if closing >= 0:
-                    change = slope * (REAR_S + closing / REAR_BRAKING)
-                    by_high[n, car, 2] -= change
-                    by_own[n, rules.steady] += change
+                change = slope * _lost(high[n, car, 2] - own[n, rules.steady], rules)[1]
+                by_high[n, car, 2] -= change
+                by_own[n, rules.steady] += change
 
 
 @entry_point

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,7 +15,6 @@ from bench.driving.intervals import kernels
 from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import DeadReckoning, Ego
 from bench.driving.intervals.following import FollowingDistance
-from bench.driving.kinematics import Kinematics
 
 CROSSING_S = 0.8
 """Time in which the ego leaves a lane."""
@@ -85,7 +83,8 @@ class Rooms:
             free_share=model.free_share,
             scale=model.scale,
             steady=steady,
-            lost=_lost(car),
+            slowing=car.target_speeds[1] - car.target_speeds[0],
+            delay=1 / car.speed_gain,
         )
 
     def __call__(self, ego: Ego, cars: Cars, own: Tensor) -> tuple[Tensor, Tensor]:
@@ -109,12 +108,6 @@ class Rooms:
         lane = self.rules.lane_width * ego.target_lane
         fastest: Tensor = _Speeds.apply(cars.low, cars.high, cars.present, lane, self)
         return fastest
-
-
-def _lost(car: Kinematics) -> float:
-    """What the ego loses in m if it brakes towards the next lower target speed while it leaves a lane."""
-    slower = car.target_speeds[1] - car.target_speeds[0]
-    return slower * (CROSSING_S - (1 - math.exp(-car.speed_gain * CROSSING_S)) / car.speed_gain)
 
 
 def met(low: Tensor, high: Tensor, known: Tensor, tracks: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
