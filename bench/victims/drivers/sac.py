@@ -54,13 +54,13 @@ class SAC(LearningDriver):
     algorithm = "sac"
     policy_type = SoftPolicy
 
-    decisions: Count = 28_000
-    batch: Count = 256
-    critics: Count = 2
+    decisions: Count = 36_000
+    batch: Count = 512
+    critics: Count = 1
     entropy: EntropyShare = 0.9
-    final_entropy: EntropyShare = 0.15
+    final_entropy: EntropyShare = 0.03
     final_epsilon: Share = 0.02
-    explore_until: Annotated[float, Interval(gt=0, le=1)] = 0.8
+    explore_until: Annotated[float, Interval(gt=0, le=1)] = 0.4
     temperature: Positive = 0.01
     least_temperature: Positive = 5e-4
     temperature_rate: Positive = 3e-3
