@@ -32,8 +32,8 @@ class Shield(DrivingDefense):
     The worst case is over the true values that an assumed perturbation set allows behind the shown ones. The ego's own motion
     is reckoned from its actions; the victim receives the reckoned row. An action is safe if the gap to every car ahead lasts
     when the ego brakes from the next decision on. Where FASTER leaves a margin of at least `band`, IDLE and SLOWER are masked,
-    so that an attack cannot make the car crawl. If no action is safe, it brakes. Continuous actions are clipped to
-    what this leaves of acceleration and steering.
+    so that an attack cannot make the car crawl. If no action is safe, it brakes, or leaves its lane for one with room.
+    Continuous actions are clipped to what this leaves of acceleration and steering.
 
     Args:
         assumed_budget: budget of the perturbation set that it assumes.
@@ -124,7 +124,7 @@ class Shielded(Filter):
 
     def allowed(self, margins: Margins) -> Tensor:
         """[..., A] 1 for the allowed actions and 0 for the others, with the gradient of a soft threshold (straight-through)."""
-        stay, change = margins.stay, margins.change
+        stay, change = margins.stay, margins.worth_changing
         safe = stay >= 0
         needless = stay[..., :1] >= self.band
         keeps = torch.cat((safe[..., :1], safe[..., 1:] & ~needless), -1)

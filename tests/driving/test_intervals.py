@@ -212,6 +212,24 @@ def test_the_least_room_behind_allows_for_braking_within_a_lane_change(speed: fl
         assert gap > 5.0
 
 
+@pytest.mark.parametrize("free", [True, False])
+def test_a_way_out_leads_past_a_leader_that_is_slower_than_the_ego_can_be(free: bool) -> None:
+    """Close behind it even a lane change is not safe; it is taken where the lane beside has room, and not counted as safe."""
+    moves, one = reckoning(FACTS, "discrete"), torch.ones(1)
+    judge = Judge(moves, 1 / FACTS.decision_hz, Caution(braking=0.5, seconds=2.0, distance=0.4))
+    slowest = moves.kinematics.target_speeds[0]
+    ego = Ego(
+        y=0 * one, heading=0 * one, speed=slowest * one, target_lane=0 * one, target_speed=slowest * one, edge=one
+    )
+    ahead, beside = [5.3, 0.0, slowest - 2, 0.0], [80.0 if free else 8.0, 4.0, slowest, 0.0]
+    cars = torch.tensor([[ahead, beside]])
+    margins = judge(ego, Cars(torch.ones(1, 2, dtype=torch.bool), cars, cars))
+    assert float(margins.change.amax()) < 0
+    assert not bool(margins.safe)
+    assert bool((margins.worth_changing >= 0)[0, 1]) == free
+    assert not bool((margins.worth_changing >= 0)[0, 0])
+
+
 @pytest.mark.parametrize("attack", [None, Noise(), PGD(objective="target", target_action=FAST, steps=3, restarts=1)])
 def test_the_shield_holds_the_guarantee_in_the_engine(attack: Any) -> None:
     """Behind a single car, which never brakes, a driver that only accelerates does not crash, whatever it is shown."""

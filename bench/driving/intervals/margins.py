@@ -26,12 +26,15 @@ class Margins(NamedTuple):
     Args:
         stay: of FASTER, IDLE and SLOWER, [..., 3].
         change: of LANE_LEFT and LANE_RIGHT, [..., 2].
+        out: of the same as a way out, [..., 2]: in the new lane alone, where staying is not safe and leaves less room
+            than leaving; else -`FREE`.
         settled: bool [...], whether the ego is in its target lane.
         straddled: -1 or 1, the side of the lane that the ego is leaving, 0 if there is none, [...].
     """
 
     stay: Tensor
     change: Tensor
+    out: Tensor
     settled: Tensor
     straddled: Tensor
 
@@ -39,6 +42,11 @@ class Margins(NamedTuple):
     def safe(self) -> Tensor:
         """bool [...], whether any action is."""
         return (self.stay >= 0).any(-1) | ((self.change >= 0) & self.changeable).any(-1)
+
+    @property
+    def worth_changing(self) -> Tensor:
+        """[..., 2] the margins of lane changes, with those of ways out, which are the best that is left, but not safe."""
+        return torch.maximum(self.change, self.out)
 
     @property
     def changeable(self) -> Tensor:
@@ -70,12 +78,16 @@ class Judge:
         straddled = torch.where(off.abs() > STRADDLING, off.sign(), 0.0)
         side = straddled.unsqueeze(-1)
         leaving = torch.where(side == 0, FREE, torch.where(side < 0, cross[..., 0, :], cross[..., 2, :]))
-        change = torch.minimum(front[..., [0, 2], KEEPS], rear[..., [0, 2]])
-        change = torch.minimum(change, cross[..., 1:2, KEEPS])
+        stay = torch.minimum(front[..., 1, :], leaving)
+        beside = torch.minimum(front[..., [0, 2], KEEPS], rear[..., [0, 2]])
+        leave = cross[..., 1:2, KEEPS]
+        best = stay.amax(-1, keepdim=True)
+        change, out = torch.minimum(beside, leave), torch.where((best < 0) & (best < leave), beside, -FREE)
         exists = torch.stack([ego.target_lane > 0, ego.target_lane < ego.edge], -1)
         return Margins(
-            stay=torch.minimum(front[..., 1, :], leaving),
+            stay=stay,
             change=torch.where(exists, change, -FREE),
+            out=torch.where(exists, out, -FREE),
             settled=(off.abs() < SETTLED_M) & (ego.heading.abs() < SETTLED_RAD),
             straddled=straddled,
         )

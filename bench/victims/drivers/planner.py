@@ -87,8 +87,9 @@ class IntervalPlanner(IntervalPolicy):
         orders = torch.tensor([ORDER_SAFE, ORDER_UNSAFE]).to(own)
         safe = own.unsqueeze(-1) + orders[0] + TIE_BREAK * found.stay
         stay = torch.where(found.stay < 0, UNSAFE + orders[1] + PER_METRE * found.stay, safe)
-        side = torch.stack([left, right], -1) - self.rules.gain + TIE_BREAK * found.change
-        side = torch.where(found.change < 0, FORBIDDEN + PER_METRE * found.change, side)
+        change = found.worth_changing
+        side = torch.stack([left, right], -1) - self.rules.gain + TIE_BREAK * change
+        side = torch.where(change < 0, FORBIDDEN + PER_METRE * change, side)
         side = torch.where(found.changeable, side, FORBIDDEN)
         return torch.cat((stay, side), -1)[..., self.reckoning.order]
 
