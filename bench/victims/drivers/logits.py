@@ -22,7 +22,7 @@ class Logits(nn.Module):
 
 
 class SoftPolicy(QPolicy):
-    """The most likely action of a soft actor-critic, with the twin critics of its training; the scores are the actor's logits.
+    """The most likely action of a soft actor-critic, with the critics of its training; the scores are the actor's logits.
 
     Args:
         features, actions, hidden: as of `QPolicy`; the actor and each critic have their own encoder.

@@ -35,7 +35,7 @@ EntropyShare = Annotated[float, Interval(gt=0, lt=1)]
 class SAC(LearningDriver):
     """Soft actor-critic (Haarnoja et al. 2018) for discrete actions (Christodoulou 2019): lane changes and target speeds.
 
-    TorchRL's DiscreteSACLoss with twin critics, n-step returns, a temperature that is learned for a target entropy, and
+    TorchRL's DiscreteSACLoss with n-step returns, a temperature that is learned for a target entropy, and
     Polyak-averaged weights of critics and actor. The policy drives greedily: the scores that an attack sees are the logits of
     the averaged actor, and the most likely action is taken.
 
