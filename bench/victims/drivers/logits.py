@@ -31,7 +31,7 @@ class SoftPolicy(QPolicy):
     `temperature` is the alpha of the training, on the scale of the critics; a training that continues starts with it.
     """
 
-    def __init__(self, features: int, actions: int, hidden: int, critics: int = 2) -> None:
+    def __init__(self, features: int, actions: int, hidden: int, critics: int = 1) -> None:
         super().__init__(features, actions, hidden)
         self.shape["critics"] = critics
         self.critics = nn.ModuleList(QNetwork(features, actions, hidden) for _ in range(critics))
