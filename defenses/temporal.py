@@ -174,7 +174,7 @@ class TemporalFusion(DetectorDefense):
 
     hit: Positive = 2.5
     miss: NotNegative = 0.4
-    neutral: Annotated[float, Interval(ge=LEAST_SCORE, lt=1)] = 0.1
+    neutral: Annotated[float, Interval(ge=LEAST_SCORE, lt=1)] = 0.15
     sign_m: Positive = 1.2
     focal: Positive = 721.0
     vanishing_x: float = 624.0
@@ -186,4 +186,8 @@ class TemporalFusion(DetectorDefense):
         return math.log(SINGLE / (1 - SINGLE)) - self.hit
 
     def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
-        return Fused(victim.load(seed, facts), self).eval()
+        return self.around(victim.load(seed, facts))
+
+    def around(self, detector: Detector) -> Fused:
+        """The defended detector."""
+        return Fused(detector, self).eval()
