@@ -1,10 +1,11 @@
 """Scores `temporal` with and without an attack that knows of it, on scored approaches and in closed loop.
 
-    python benchmarks/temporal_evidence.py [--steps 300] [--weathers clear rain] [--patches FOLDER]
+    python benchmarks/temporal_evidence.py [--defense segmenter] [--steps 300] [--weathers clear rain] [--patches FOLDER]
 
-Each frame is looked at once; `none` and `temporal` differ in what they make of the same predictions. The patches are `noise_patch`, the
-stronger `eot` of the suite `standard` with one start against the undefended detector, and the same through the aggregation. The
-columns are those of the records, means over three approaches with three lanes in each weather, and over 50 draws of the cross traffic.
+Each frame is looked at once; the rows with and without `temporal` differ in what they make of the same predictions. The patches are
+`noise_patch`, the stronger `eot` of the suite `standard` with one start, which does not know of `temporal`, and the same through its
+aggregation. The columns are those of the records, means over three approaches with three lanes in each weather, and over 50 draws of
+the cross traffic.
 """
 
 from __future__ import annotations
@@ -57,19 +58,21 @@ class Once(Wrapped):
 
 def main() -> None:
     parser = argparse.ArgumentParser()
+    parser.add_argument("--defense", default="none", help="what `temporal` is added to")
     parser.add_argument("--steps", type=int, default=300, help="of `eot`")
     parser.add_argument("--weathers", nargs="+", default=["clear", "rain"])
     parser.add_argument("--patches", type=Path, help="folder in which crafted patches are kept")
     asked = parser.parse_args()
     settle()
-    inner = Once(registry.load("victim", "yolov3_tiny")().load(0, WORLD.facts))
-    detectors = {"none": inner, "temporal": TemporalFusion().around(inner)}
+    victim = registry.load("victim", "yolov3_tiny")()
+    inner = Once(registry.load("defense", asked.defense)().load(victim, 0, WORLD.facts))
+    detectors = {"without": inner, "with": TemporalFusion().around(inner)}
     eot = EOT(steps=asked.steps, loss="log_odds", batch=6, window=160, tv=0.05, **dict.fromkeys(OFF, 0.0))
     patches: dict[str, Patch | None] = {
         "no patch": None,
         "noise_patch": _crafted(NoisePatch(), inner, None),
         "eot, unaware": _crafted(eot, inner, asked.patches and asked.patches / "unaware"),
-        "eot, adaptive": _crafted(eot, detectors["temporal"], asked.patches and asked.patches / "adaptive"),
+        "eot, adaptive": _crafted(eot, detectors["with"], asked.patches and asked.patches / "adaptive"),
     }
     print(f"{'':<40}" + "".join(f"{name:>18}" for name in (*MEASURES, "stopped", "confirmed_m", "overrun_m", "collided")))
     for weather in asked.weathers:

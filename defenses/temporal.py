@@ -109,12 +109,10 @@ class Fused(Wrapped):
         scores = predictions.objectness[number] * predictions.classes[number, :, self.label]
         (looked_at,) = (scores > LEAST_SCORE).nonzero(as_tuple=True)
         boxes, scores = predictions.boxes[number, looked_at], scores[looked_at]
-        if len(looked_at):
-            matches = scores[:, None] * (overlap(boxes[:, None], tracks.boxes) >= MATCH_IOU)
-            best, which = matches.max(0)
-        else:
-            best, which = torch.zeros(len(tracks.odds)), None
-        places = tracks.boxes if which is None else torch.where((best > 0)[:, None], boxes[which], tracks.boxes)
+        matches = scores[:, None] * (overlap(boxes[:, None], tracks.boxes) >= MATCH_IOU)
+        # The last row stands for no prediction.
+        best, which = torch.cat([matches, torch.zeros(1, len(tracks.odds))]).max(0)
+        places = torch.where((best > 0)[:, None], torch.cat([boxes, tracks.boxes[:1]])[which], tracks.boxes)
         old = Tracks(places, self.added(tracks.odds, self.evidence(best)))
         new = self._born(boxes, scores, old)
         both = Tracks(torch.cat([old.boxes, new.boxes]), torch.cat([old.odds, new.odds]))
