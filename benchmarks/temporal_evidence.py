@@ -2,10 +2,10 @@
 
     python benchmarks/temporal_evidence.py [--defense segmenter] [--steps 300] [--weathers clear rain] [--patches FOLDER]
 
-Each frame is looked at once; the rows with and without `temporal` differ in what they make of the same predictions. The patches are
-`noise_patch`, the stronger `eot` of the suite `standard` with one start, which does not know of `temporal`, and the same through its
-aggregation. The columns are those of the records, means over three approaches with three lanes in each weather, and over 50 draws of
-the cross traffic.
+Each frame is looked at once; the rows with and without `temporal` differ in what they make of the same predictions. The patches
+are `noise_patch`, the stronger `eot` of the suite `standard` with one start, which does not know of `temporal`, and the same
+through its aggregation. The columns are those of the records, means over three approaches with three lanes in each weather, and
+over 50 draws of the cross traffic.
 """
 
 from __future__ import annotations
@@ -74,7 +74,9 @@ def main() -> None:
         "eot, unaware": _crafted(eot, inner, asked.patches and asked.patches / "unaware"),
         "eot, adaptive": _crafted(eot, detectors["with"], asked.patches and asked.patches / "adaptive"),
     }
-    print(f"{'':<40}" + "".join(f"{name:>18}" for name in (*MEASURES, "stopped", "confirmed_m", "overrun_m", "collided")))
+    print(
+        f"{'':<40}" + "".join(f"{name:>18}" for name in (*MEASURES, "stopped", "confirmed_m", "overrun_m", "collided"))
+    )
     for weather in asked.weathers:
         cell = WORLD.axes.cell(lanes=3, density=1.0, weather=weather)
         approaches = WORLD.approaches(cell, range(len(WORLD.locations)))
@@ -89,9 +91,7 @@ def _crafted(attack: PatchAttack, detector: Detector, kept: Path | None) -> Patc
     path = kept and kept.with_suffix(".safetensors")
     if path and path.exists():
         return Patch.read(path.read_bytes())
-    patch = craft(
-        attack, detector, WORLD.training_scenes(), THREAT, attack_seed=0, progress=lambda share, text: None
-    )
+    patch = craft(attack, detector, WORLD.training_scenes(), THREAT, attack_seed=0, progress=lambda share, text: None)
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(patch.written("benchmarks/temporal_evidence.py"))

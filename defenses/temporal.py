@@ -16,9 +16,9 @@ from bench.plugins.contracts import Facts
 from bench.plugins.ranges import NotNegative, Positive
 
 SINGLE = 0.2
-"""Score after one frame with the greatest evidence: below `bench.detection.stopping.THRESHOLD`, so that one frame does not count."""
+"""Score after one frame with the greatest evidence: one frame is below `bench.detection.stopping.THRESHOLD` and does not count."""
 HIGHEST = 0.97
-"""Highest score of a track: OctoMap's upper clamp, log-odds of 3.5 (Hornung et al. 2013, section 5.1)."""
+"""Highest score of a track, with log-odds of 3.5: OctoMap's upper clamp (Hornung et al. 2013)."""
 SUREST = 1e-6
 """Scores closer to 0 or 1 than this have the log-odds of this."""
 MATCH_IOU, MERGE_IOU = 0.3, 0.45
@@ -88,7 +88,7 @@ class Fused(Wrapped):
         return straight_through(odds, -self.recipe.miss, self.recipe.hit)
 
     def added(self, odds: Tensor, evidence: Tensor) -> Tensor:
-        """The log-odds after a frame, clamped (Hornung et al. 2013, Eq. 4); the gradient is that without clamping."""
+        """The log-odds after a frame, clamped (Hornung et al. 2013); the gradient is that without clamping."""
         return straight_through(odds + evidence, self.recipe.floor, math.log(HIGHEST / (1 - HIGHEST)))
 
     def moved(self, boxes: Tensor, metres: float) -> Tensor:
@@ -157,9 +157,9 @@ def straight_through(values: Tensor, low: float, high: float) -> Tensor:
 class TemporalFusion(DetectorDefense):
     """Temporal fusion: a binary Bayes filter with clamped log-odds for each sign that is tracked over the frames of an approach.
 
-    The filter is that of an occupancy grid (Thrun, Burgard and Fox 2005, table 4.2; Hornung et al. 2013, OctoMap, Eq. 4), for the
-    hypothesis "there is a stop sign here". A sign's place in the next frame follows from the distance driven. A hit counts more
-    than a miss, so a sign that was seen twice is not forgotten at once; a single frame is not enough. Nothing is trained.
+    The filter is that of an occupancy grid (Thrun, Burgard and Fox 2005, section 4.2) with the clamping of OctoMap (Hornung et al.
+    2013), for the hypothesis "there is a stop sign here". A sign's place in the next frame follows from the distance driven. A hit
+    counts more than a miss, so a sign that was seen twice is not forgotten at once; a single frame is not enough. Nothing is trained.
 
     Args:
         hit: greatest evidence of a frame for a sign, in log-odds.

@@ -140,8 +140,8 @@ class Drives:
 def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Drive:
     """Let a detector drive the car of an environment of one car (`CameraWorld.environment`) until its episode ends.
 
-    Each new frame is shown to the detector, with the distance driven since the one before. Its confidence in the sign goes to the driver (`bench.detection.driver`), and the
-    deceleration that the driver asks for goes to the car.
+    Each new frame is shown to the detector, with the distance driven since the one before. Its confidence in the sign goes to the
+    driver (`bench.detection.driver`), and the deceleration that the driver asks for goes to the car.
 
     Args:
         detector: the (defended) victim.

@@ -88,7 +88,7 @@ class PatchOracle:
     def aggregate(self, scores: Tensor) -> Tensor:
         """[..., F] what the detector reports of a sign with the scores [..., F] in the frames of an approach, in driving order.
 
-        The scores themselves for a detector without a memory. It asks about no image, so it costs no query; needs access `scores`.
+        The scores themselves for a detector without a memory. It costs no query, for it shows no image; needs access `scores`.
         """
         return self._door.aggregate(scores)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -87,7 +89,7 @@ def test_each_frame_has_a_gradient_where_scores_are_clipped_too(scores: list[flo
 def test_a_sign_is_expected_where_it_will_be(lanes: int) -> None:
     poses, at = approach("sun-behind-ego", lanes, 1.0, "sun"), sign_x(lanes)
     boxes = torch.from_numpy(np.stack([sign.box(at, pose.camera) for pose in poses])).float()
-    moved = [before.distance - after.distance for before, after in zip(poses, poses[1:], strict=False)]
+    moved = [before.distance - after.distance for before, after in pairwise(poses)]
     detector = fused(TemporalFusion())
     expected = torch.cat([detector.moved(box[None], step) for box, step in zip(boxes, moved, strict=False)])
     assert overlap(expected, boxes[1:]).min() > 0.85
@@ -113,7 +115,7 @@ def test_false_detections_at_different_places_do_not_add_up() -> None:
 @settings(deadline=None, max_examples=10)
 @given(red=st.lists(st.floats(0, 1), min_size=2, max_size=40))
 def test_attacks_optimise_what_is_scored(red: list[float]) -> None:
-    """On an approach `advance` reports what `aggregate` says, whatever the batches; `neutral` keeps weak scores from starting a track."""
+    """On an approach `advance` reports what `aggregate` says, and nothing where the evidence is against a sign."""
     scenes = RedScenes(torch.linspace(30, 8, len(red)))
     scenes.red = torch.tensor(red)
     detector = fused()
