@@ -16,7 +16,7 @@ from bench.plugins.contracts import Facts
 from bench.plugins.ranges import NotNegative, Positive
 
 SINGLE = 0.2
-"""Score after one frame with the greatest evidence: one frame is below `bench.detection.stopping.THRESHOLD` and does not count."""
+"""Score after one frame with the greatest evidence: below `bench.detection.stopping.THRESHOLD`, so one frame does not count."""
 HIGHEST = 0.97
 """Highest score of a track, with log-odds of 3.5: OctoMap's upper clamp (Hornung et al. 2013)."""
 SUREST = 1e-6
@@ -157,9 +157,10 @@ def straight_through(values: Tensor, low: float, high: float) -> Tensor:
 class TemporalFusion(DetectorDefense):
     """Temporal fusion: a binary Bayes filter with clamped log-odds for each sign that is tracked over the frames of an approach.
 
-    The filter is that of an occupancy grid (Thrun, Burgard and Fox 2005, section 4.2) with the clamping of OctoMap (Hornung et al.
-    2013), for the hypothesis "there is a stop sign here". A sign's place in the next frame follows from the distance driven. A hit
-    counts more than a miss, so a sign that was seen twice is not forgotten at once; a single frame is not enough. Nothing is trained.
+    The filter is that of an occupancy grid (Thrun, Burgard and Fox 2005, section 4.2) with the clamping of OctoMap (Hornung et
+    al. 2013), for the hypothesis "there is a stop sign here". A sign's place in the next frame follows from the distance driven.
+    A hit counts more than a miss, so a sign that was seen twice is not forgotten at once; a single frame is not enough. Nothing
+    is trained.
 
     Args:
         hit: greatest evidence of a frame for a sign, in log-odds.

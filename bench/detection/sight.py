@@ -114,12 +114,10 @@ def glance(
         UserError: if a prediction is NaN or infinite.
     """
     label = detector.index(STOP_SIGN)
-    alone = detector(pictures)
+    alone = _finite(detector(pictures), detector)
     predictions, state = detector.advance(alone, moved_m, state)
-    if not all(
-        bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)
-    ):
-        raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
+    if predictions is not alone:
+        _finite(predictions, detector)
     boxes = boxes.to(predictions.boxes)
     sure = confidence(predictions, label, boxes, iou=SAME_IOU)
     by_frame = sure if predictions is alone else confidence(alone, label, boxes, iou=SAME_IOU)
@@ -128,6 +126,12 @@ def glance(
         for (score, found), of_sign in zip(best_other(predictions, label, boxes, iou=SAME_IOU), sure, strict=True)
     ]
     return Sight(sure.numpy(), candidates_of(predictions, label), others, by_frame.numpy()), state
+
+
+def _finite(predictions: Predictions, detector: Detector) -> Predictions:
+    if all(bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)):
+        return predictions
+    raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
 
 
 def candidates_of(predictions: Predictions, label: int) -> list[Detections]:
