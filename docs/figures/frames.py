@@ -21,7 +21,7 @@ def temporal() -> Figure:
         "eot that does not know it": texels_of("eot", **STRONGER),
         "eot that does": texels_of("eot", "temporal", **STRONGER),
     }
-    made = style.figure(5.0, "temporal: evidence adds up over the frames of an approach")
+    made = style.figure(4.4, "temporal: evidence adds up over the frames of an approach")
     for axes, (name, texels) in zip(made.subplots(2, 2, sharex=True, sharey=True).flat, patches.items(), strict=True):
         seen, distance = sight(guarded, approach, texels), approach.scenes.distance.numpy()
         axes.plot(distance, seen.by_frame, "o", color=style.ORANGE, ms=5, label="frame by itself")
