@@ -38,6 +38,9 @@ class EOT(PatchAttack):
     Where a detector is sure, the gradient of a probability vanishes; the log-odds log(p / (1 - p)) keep it (as the margin loss of
     Carlini and Wagner 2017 does). Of several restarts, the patch with the lowest loss in the last steps is kept.
 
+    Against a detector with a memory, the views of a step are taken as the frames of one approach, farthest first, and the loss is
+    that of the scores which it reports (`Detector.aggregate`): all frames are attacked together.
+
     With norm `print` each step ends with printable texels, so the patch that is optimised is the one that is scored.
 
     Args:
@@ -126,7 +129,7 @@ class EOT(PatchAttack):
             corners = self._corners(scenes.boxes[frames], scenes.size, oracle.generator)
             windows = scenes.windows(frames, patch, oracle.threat.budget, corners, size)
             predictions = oracle.differentiable(transform(windows, reach[frames] - corners.repeat(1, 2)))
-            scores = predictions.scores_of(oracle.label).amax(-1)
+            scores = reported(oracle, predictions.scores_of(oracle.label).amax(-1), scenes.distance[frames])
             found, variation = scores.mean(), total_variation(patch)
             oracle.report(patch[0], found=found, total_variation=variation)
             loss = self._loss(scores) + self.tv * variation
@@ -160,6 +163,12 @@ class EOT(PatchAttack):
         shift = (torch.rand(len(boxes), 2, generator=generator) * 2 - 1) * self.translation * self.window
         middle = (boxes[:, :2] + boxes[:, 2:]) / 2 + shift
         return torch.minimum((middle - side / 2).round().long().clamp(min=0), limit - side)
+
+
+def reported(oracle: PatchOracle, scores: Tensor, distance: Tensor) -> Tensor:
+    """[N] what the detector reports of scores [N] of views with the same patch, as if they were an approach, farthest first."""
+    order = distance.argsort(descending=True)
+    return oracle.aggregate(scores[order])[order.argsort()]
 
 
 def seen_at(boxes: Tensor, predictions: Predictions, label: int) -> Tensor:

@@ -11,7 +11,7 @@ from annotated_types import Interval
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, interpolate, max_pool2d
 
-from bench.detection import CameraWorld, Detector, DetectorDefense, DetectorVictim, Predictions, Scenes
+from bench.detection import CameraWorld, Detector, DetectorDefense, DetectorVictim, Predictions, Scenes, Wrapped
 from bench.errors import UserError
 from bench.plugins.contracts import Facts, Progress, Trained
 from bench.plugins.ranges import Count, Natural, Positive, Share
@@ -42,7 +42,7 @@ SMOOTH = 4.0
 """The backward pass divides log-odds by this: the gradient of a sure mark is small, but does not vanish."""
 
 
-class Completed(Detector):
+class Completed(Wrapped):
     """A detector whose input is completed: marked pixels are filled from those around them.
 
     Pixels are filled wholly or not at all. That has no useful gradient, so the backward pass is that of the same completion with
@@ -56,9 +56,8 @@ class Completed(Detector):
     """
 
     def __init__(self, inner: Detector, marker: nn.Module, certainty: float) -> None:
-        super().__init__()
-        self.inner, self.marker, self.least = inner, marker, math.log(certainty / (1 - certainty))
-        self.names, self.stride, self.weights_sha256 = inner.names, inner.stride, inner.weights_sha256
+        super().__init__(inner)
+        self.marker, self.least = marker, math.log(certainty / (1 - certainty))
         self.shape: dict[str, object] = {}
 
     def predict(self, pictures: Tensor) -> Predictions:

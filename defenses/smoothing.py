@@ -9,21 +9,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bench.detection import Detector, DetectorDefense, DetectorVictim, Predictions
+from bench.detection import Detector, DetectorDefense, DetectorVictim, Predictions, Wrapped
 from bench.plugins.contracts import Facts
 
 
-class Guarded(Detector):
+class Guarded(Wrapped):
     """A detector with an input transformation.
 
     The gradient of the transformation is the identity (BPDA, Athalye et al. 2018, "Obfuscated gradients give a false sense of
     security"), so that adaptive attacks are possible.
     """
-
-    def __init__(self, inner: Detector) -> None:
-        super().__init__()
-        self.inner = inner
-        self.names, self.stride, self.weights_sha256 = inner.names, inner.stride, inner.weights_sha256
 
     def predict(self, pictures: Tensor) -> Predictions:
         with torch.no_grad():

@@ -1,7 +1,7 @@
 """The detection track: stop-sign detectors, attacked with a patch on the sign. Plug-ins import from here."""
 
 from bench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
-from bench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions
+from bench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions, Wrapped
 from bench.detection.oracle import PatchOracle
 from bench.detection.scenes import Approach, Decoy, Scenes
 from bench.detection.threat import PatchThreat
@@ -21,4 +21,5 @@ __all__ = [
     "PatchThreat",
     "Predictions",
     "Scenes",
+    "Wrapped",
 ]

@@ -132,7 +132,7 @@ def probed(
     """Probes on a frame that the detector cannot foresee (`bench.records.schema.PROBES`).
 
     `redrawn`: another answer when asked again. `same_answer`: the same on a grey image. `inconsistent`: asked as an oracle asks,
-    alone, in another batch or with gradients, the answer is not the one that was scored.
+    alone, in another batch or with gradients, the answer is not the one that was scored. What a detector remembers is left out.
     """
     chance = random.Random(entropy)
     place = chance.randrange(len(approaches))
@@ -158,7 +158,7 @@ def probed(
         path = chance.choice(("alone", "batch", "gradients"))
         batch = torch.full_like(image, 0.5).repeat(3, 1, 1, 1).index_copy(0, torch.tensor([at]), image)
         answer = ask(batch, at) if path == "batch" else ask(image, gradients=path == "gradients")
-    scored = float(seen[place].confidence[frame])
+    scored = float(seen[place].by_frame[frame])
     spread = max(first, again, scored) - min(first, again, scored) if first != again else 0.0
     return {
         "redrawn": float(first != again),

@@ -140,8 +140,8 @@ class Drives:
 def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Drive:
     """Let a detector drive the car of an environment of one car (`CameraWorld.environment`) until its episode ends.
 
-    Each new frame is shown to the detector. Its confidence in the sign goes to the driver (`bench.detection.driver`), and the
-    deceleration that the driver asks for goes to the car.
+    Each new frame is shown to the detector, with the distance driven since the one before. Its confidence in the sign goes to the
+    driver (`bench.detection.driver`), and the deceleration that the driver asks for goes to the car.
 
     Args:
         detector: the (defended) victim.
@@ -156,12 +156,14 @@ def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Dri
     if batch != 1:
         raise ValueError(f"a drive is that of one car, got {batch}")
     memory, sight, now = Memory.initial(1), None, env.reset()
+    remembered, looked_at = detector.initial(), now["info"]["distance"][:, 0]
     moments: list[Moment] = []
     while len(moments) < MOST_STEPS:
         info = now["info"]
         distance, speed, frame = (info[name][:, 0] for name in ("distance", "speed", "frame"))
         if sight is None or int(frame) != int(memory.frame):
-            sight = glance(detector, now["observation"], info["box"])
+            moved, looked_at = looked_at - distance, distance
+            sight, remembered = glance(detector, now["observation"], info["box"], moved, remembered)
         memory = memory.seeing(torch.from_numpy(sight.confidence), frame, distance)
         asked, memory = memory.deciding(distance, speed)
         moments.append(

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
@@ -62,7 +62,11 @@ class Detections:
 
 
 class Detector(nn.Module, ABC):
-    """An object detector; the images of a batch do not influence each other."""
+    """An object detector; the images of a batch do not influence each other.
+
+    A detector with a memory reports more than it sees in one image: what `advance` makes of the predictions on the frames of an
+    approach. What it remembers is a value (`initial`), never an attribute.
+    """
 
     names: tuple[str, ...]
     """Class names, by label."""
@@ -91,6 +95,28 @@ class Detector(nn.Module, ABC):
             raise ValueError(f"pictures must be {wanted}, got {list(pictures.shape)}")
         return self.predict(pictures)
 
+    def initial(self) -> Any:
+        """What is remembered before the first frame of an approach; None for a detector without a memory."""
+        return None
+
+    def advance(self, predictions: Predictions, moved_m: Tensor, state: Any) -> tuple[Predictions, Any]:
+        """What is reported on the next F frames of an approach, and what is remembered after them; without side effects.
+
+        Args:
+            predictions: those of `forward` on the F frames, in driving order.
+            moved_m: [F] distance that the car has driven since the frame before, in m; 0 at the first.
+            state: what is remembered before them.
+        """
+        return predictions, state
+
+    def aggregate(self, scores: Tensor) -> Tensor:
+        """[..., F] the scores that `advance` reports on one object; attacks optimise these, so they need a gradient.
+
+        Args:
+            scores: [..., F] score of the object in each frame by itself, in driving order.
+        """
+        return scores
+
     def index(self, name: str) -> int:
         """The label of a class.
 
@@ -98,6 +124,28 @@ class Detector(nn.Module, ABC):
             UserError: if the detector does not have this class.
         """
         return label_of(name, self.names)
+
+
+class Wrapped(Detector):
+    """A detector around another one, with its classes and its memory.
+
+    Args:
+        inner: the other one.
+    """
+
+    def __init__(self, inner: Detector) -> None:
+        super().__init__()
+        self.inner = inner
+        self.names, self.stride, self.weights_sha256 = inner.names, inner.stride, inner.weights_sha256
+
+    def initial(self) -> Any:
+        return self.inner.initial()
+
+    def advance(self, predictions: Predictions, moved_m: Tensor, state: Any) -> tuple[Predictions, Any]:
+        return self.inner.advance(predictions, moved_m, state)
+
+    def aggregate(self, scores: Tensor) -> Tensor:
+        return self.inner.aggregate(scores)
 
 
 def label_of(name: str, names: Sequence[str]) -> int:

@@ -101,6 +101,22 @@ class PatchEnforcer:
             if away:
                 self._switch(True)
 
+    def aggregate(self, scores: Tensor) -> Tensor:
+        """What the detector reports of a sign over the frames of an approach (`Detector.aggregate`).
+
+        Raises:
+            UserError: if the attack declares less access.
+        """
+        permit("scores", self.access)
+        away = self.watch is not None and self.watch.away
+        if away:
+            self._switch(False)
+        try:
+            return self.detector.aggregate(scores)
+        finally:
+            if away:
+                self._switch(True)
+
     def _came_back(self, gradient: Tensor) -> None:
         self.backwards += len(gradient)
         self.zeros += int((gradient == 0).flatten(1).all(1).sum())

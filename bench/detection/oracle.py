@@ -25,6 +25,9 @@ class Door(Protocol):
     def ask(self, pictures: Tensor, access: Access) -> Predictions:
         """The detector's predictions."""
 
+    def aggregate(self, scores: Tensor) -> Tensor:
+        """`Detector.aggregate`."""
+
 
 class PatchOracle:
     """The only access to the (defended) detector while a patch is crafted. One image is one query.
@@ -81,6 +84,13 @@ class PatchOracle:
     def differentiable(self, pictures: Tensor) -> Predictions:
         """The detector's predictions on images [N, 3, H, W], with the graph back to the pixels; needs access `gradients`."""
         return self._door.ask(pictures, "gradients")
+
+    def aggregate(self, scores: Tensor) -> Tensor:
+        """[..., F] what the detector reports of a sign with the scores [..., F] in the frames of an approach, in driving order.
+
+        The scores themselves for a detector without a memory. It costs no query, for it shows no image; needs access `scores`.
+        """
+        return self._door.aggregate(scores)
 
     def report(self, patch: Tensor, **losses: Tensor | float) -> None:
         """Report an intermediate patch for recordings, once per crafting step: `oracle.report(patch, found=loss)`.

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.detection.detector import Detector, Predictions
+from bench.detection.detector import Detector, Predictions, Wrapped
 from bench.plugins.device import CPU, move
 
 
-class Placed(Detector):
+class Placed(Wrapped):
     """A detector on another device: images are copied there, and predictions and gradients come back to the processor.
 
     Args:
@@ -18,9 +18,7 @@ class Placed(Detector):
     """
 
     def __init__(self, detector: Detector, device: str) -> None:
-        super().__init__()
-        self.inner = detector
-        self.names, self.stride, self.weights_sha256 = detector.names, detector.stride, detector.weights_sha256
+        super().__init__(detector)
         self._there = torch.device(device)
         move(detector, self._there)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,11 +34,18 @@ class Sight:
         candidates: the stop signs with a score above `LEAST_SCORE` in each frame, after non-maximum suppression.
         others: the class other than a stop sign with the highest score at the place of the sign in each frame; empty if that
             is no higher than the confidence, or no detection.
+        alone: the confidence in each frame by itself, without what is remembered of others; None if it is the same.
     """
 
     confidence: NDArray[np.float32]
     candidates: Sequence[Detections]
     others: Sequence[str]
+    alone: NDArray[np.float32] | None = None
+
+    @property
+    def by_frame(self) -> NDArray[np.float32]:
+        """[F] the confidence in each frame by itself."""
+        return self.confidence if self.alone is None else self.alone
 
     @property
     def found(self) -> Sequence[Detections]:
@@ -77,35 +85,53 @@ def look_at_decoys(detector: Detector, scenes: Scenes) -> Sight | None:
 
 
 def _sight(detector: Detector, scenes: Scenes, render: Callable[[Tensor], Tensor]) -> Sight:
-    parts = [
-        glance(detector, render(frames), scenes.boxes[frames]) for frames in torch.arange(len(scenes)).split(BATCH)
-    ]
+    moved = -torch.diff(scenes.distance, prepend=scenes.distance[:1])
+    parts, state = [], detector.initial()
+    for frames in torch.arange(len(scenes)).split(BATCH):
+        part, state = glance(detector, render(frames), scenes.boxes[frames], moved[frames], state)
+        parts.append(part)
     return Sight(
         np.concatenate([part.confidence for part in parts]),
         [one for part in parts for one in part.candidates],
         [one for part in parts for one in part.others],
+        np.concatenate([part.by_frame for part in parts]),
     )
 
 
-def glance(detector: Detector, pictures: Tensor, boxes: Tensor) -> Sight:
-    """Run the detector on images [N, 3, H, W] with the true boxes [N, 4] of the sign.
+def glance(
+    detector: Detector, pictures: Tensor, boxes: Tensor, moved_m: Tensor, state: Any = None
+) -> tuple[Sight, Any]:
+    """Run the detector on the next frames of an approach, and return what it remembers after them.
+
+    Args:
+        detector: the (defended) victim.
+        pictures: images [N, 3, H, W] in driving order.
+        boxes: [N, 4], the true box of the sign in each.
+        moved_m: [N], as in `Detector.advance`.
+        state: what the detector remembers of the frames before.
 
     Raises:
         UserError: if a prediction is NaN or infinite.
     """
     label = detector.index(STOP_SIGN)
-    predictions = detector(pictures)
-    if not all(
-        bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)
-    ):
-        raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
+    alone = _finite(detector(pictures), detector)
+    predictions, state = detector.advance(alone, moved_m, state)
+    if predictions is not alone:
+        _finite(predictions, detector)
     boxes = boxes.to(predictions.boxes)
     sure = confidence(predictions, label, boxes, iou=SAME_IOU)
+    by_frame = sure if predictions is alone else confidence(alone, label, boxes, iou=SAME_IOU)
     others = [
         detector.names[found] if score > max(float(of_sign), stopping.THRESHOLD) else ""
         for (score, found), of_sign in zip(best_other(predictions, label, boxes, iou=SAME_IOU), sure, strict=True)
     ]
-    return Sight(sure.numpy(), candidates_of(predictions, label), others)
+    return Sight(sure.numpy(), candidates_of(predictions, label), others, by_frame.numpy()), state
+
+
+def _finite(predictions: Predictions, detector: Detector) -> Predictions:
+    if all(bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)):
+        return predictions
+    raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
 
 
 def candidates_of(predictions: Predictions, label: int) -> list[Detections]:

@@ -19,6 +19,7 @@ HOOKS = (
     "_state_dict_hooks",
     "_load_state_dict_pre_hooks",
 )
+METHODS = ("__call__", "forward", "scores", "predict", "initial", "advance", "aggregate")
 HOOK = -1
 """Key of the watch's own hook; torch counts its keys up from 0."""
 
@@ -121,7 +122,7 @@ def marks(network: nn.Module) -> Mapping[str, str]:
             for key, value in vars(module).items()
             if callable(value) and not isinstance(value, nn.Module)
         ]
-        inherited = [id(getattr(type(module), method, None)) for method in ("__call__", "forward", "scores", "predict")]
+        inherited = [id(getattr(type(module), method, None)) for method in METHODS]
         methods += [(name, id(type(module)), own, inherited)]
     return {"weights": weights.hexdigest(), "hooks": repr(hooks), "mode": repr(mode), "methods": repr(methods)}
 

@@ -38,6 +38,7 @@ FIGURES = {
     "defense_median.png": "filters:median",
     "defense_jpeg.png": "filters:jpeg",
     "defense_segmenter.png": "filters:segmenter",
+    "defense_temporal.png": "frames:temporal",
     "victim_dqn.svg": "decisions:dqn",
     "victim_ddpg.svg": "decisions:ddpg",
     "victim_oracle_planner.svg": "references:oracle_planner",

@@ -11,7 +11,7 @@ from bench.detection.stopping import THRESHOLD
 from defenses.segmenter import Completed
 from defenses.smoothing import Guarded
 from docs.figures import style
-from docs.figures.patches import texels_of
+from docs.figures.patches import STRONGER, texels_of
 from docs.figures.sightings import FRAME, approaches, crop, detector, frame_axes, picture, said, show, sight
 
 NEAR = 8
@@ -34,14 +34,9 @@ def segmenter() -> Figure:
     assert isinstance(guarded, Completed)
     approach = approaches()[0]
     made = style.figure(2.1, "segmenter: what it marks, and what the detector sees")
-    # Shifts only, as the stronger `eot` of the standard suite.
-    off = dict.fromkeys(
-        ("rotation", "scale", "perspective", "brightness", "contrast", "saturation", "hue", "noise"), 0.0
-    )
-    stronger = {"loss": "log_odds", "steps": 300, "batch": 6, "window": 160, "tv": 0.05, **off}
     patches = (
         ("patch that does not know it", texels_of("eot", steps=40)),
-        ("patch that does", texels_of("eot", "segmenter", **stronger)),
+        ("patch that does", texels_of("eot", "segmenter", **STRONGER)),
     )
     for row, (name, texels) in zip(made.subfigures(1, 2), patches, strict=True):
         shown = picture(approach, NEAR, texels)

@@ -15,6 +15,9 @@ from bench.run.unit import Preparation
 from envs.camera.axes import APPROACH_V1
 
 KEPT = user_cache_path("cavbench") / "figures"
+OFF = ("rotation", "scale", "perspective", "brightness", "contrast", "saturation", "hue", "noise")
+STRONGER = {"loss": "log_odds", "steps": 300, "batch": 6, "window": 160, "tv": 0.05, **dict.fromkeys(OFF, 0.0)}
+"""Parameters of the stronger `eot` of the standard suite, with one start: shifts only."""
 SHARE = PatchThreat().budget
 """Side of a patch as a share of the sign's side."""
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.conformance.check import Check, Suite, require
 from bench.conformance.detection.street import Street
 from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
-from bench.detection import STOP_SIGN, Detector
+from bench.detection import STOP_SIGN, Detector, Predictions
 
 PICTURES = 3
 
@@ -25,6 +25,7 @@ class DetectorSuite(Suite):
             "batching": self.neighbours_do_not_matter,
             "determinism": self.same_picture_same_answer,
             "sees": self.looks,
+            "memory": self.remembers,
             "gradient": self.differentiable,
             "weights left alone": self.keeps_weights,
         }
@@ -100,6 +101,33 @@ class DetectorSuite(Suite):
         require(scores.requires_grad, "its scores have no graph: do not use torch.no_grad, .detach or NumPy in predict")
         (gradient,) = torch.autograd.grad(scores.sum(), leaf)
         check_gradient(gradient)
+
+    def remembers(self) -> str:
+        """The frames of an approach are reported one by one as at once, and what is remembered is a value."""
+        detector = self.subject.load()
+        found, moved = detector(self._pictures()), torch.tensor([0.0, 1.0, 1.0])
+        label = detector.index(STOP_SIGN)
+
+        def best(predictions: Predictions) -> Tensor:
+            return predictions.scores_of(label).amax(-1)
+
+        start = detector.initial()
+        together, _ = detector.advance(found, moved, start)
+        state, parts = start, []
+        for number in range(PICTURES):
+            one = slice(number, number + 1)
+            frame = Predictions(found.boxes[one], found.objectness[one], found.classes[one])
+            part, state = detector.advance(frame, moved[one], state)
+            parts.append(best(part))
+        again, _ = detector.advance(found, moved, start)
+        require(torch.allclose(torch.cat(parts), best(together), atol=1e-5), "frames one by one are reported otherwise")
+        require(torch.equal(best(again), best(together)), "advance has a side effect: return what is remembered")
+        scores = best(found).detach().requires_grad_(True)
+        reported = detector.aggregate(scores)
+        require(reported.shape == scores.shape, "aggregate must return one score for each frame")
+        (gradient,) = torch.autograd.grad(reported.sum(), scores)
+        require(bool((gradient != 0).all()), "a frame's score has no gradient through aggregate")
+        return "none" if together is found else "frames add up"
 
     def keeps_weights(self) -> None:
         """Loading and calling it changes neither weights nor images."""
