@@ -7,28 +7,32 @@ from collections.abc import Sequence
 
 from leaderboard.comparisons.comparison import Comparison, parameters
 
+Varying = dict[object, set[str]]
+"""By the name of a component, the parameters that are not the same everywhere."""
 
-def varying(comparisons: Sequence[Comparison], column: str) -> set[str]:
-    """The parameters of a component that are not the same everywhere, looking only at comparisons with the same component."""
+
+def varying(comparisons: Sequence[Comparison], column: str) -> Varying:
+    """The parameters that tell components of the same name apart; names whose parameters are all the same are left out."""
     by_name: dict[object, list[dict[str, object]]] = {}
     for one in comparisons:
         by_name.setdefault(one.identity[column], []).append(parameters(one.identity[f"{column}_params"]))
-    return {
-        name
-        for sets in by_name.values()
-        for name in set().union(*sets)
-        if len({repr(each.get(name)) for each in sets}) > 1
-    }
+    found: Varying = {}
+    for component_name, sets in by_name.items():
+        for name in set().union(*sets):
+            if len({repr(each.get(name)) for each in sets}) > 1:
+                found.setdefault(component_name, set()).add(name)
+    return found
 
 
-def component(one: Comparison, column: str, shown: set[str] | None = None) -> str:
-    """A component's name with the parameters in `shown` (all of them by default)."""
+def component(one: Comparison, column: str, shown: Varying | None = None) -> str:
+    """A component's name with its parameters in `shown` (all of them by default)."""
     found = parameters(one.identity[f"{column}_params"])
-    words = [f"{name}={value}" for name, value in found.items() if (shown is None or name in shown) and value != ""]
+    wanted = None if shown is None else shown.get(one.identity[column], ())
+    words = [f"{name}={value}" for name, value in found.items() if (wanted is None or name in wanted) and value != ""]
     return " ".join([str(one.identity[column]), *words])
 
 
-def defended(one: Comparison, shown: dict[str, set[str]] | None = None) -> str:
+def defended(one: Comparison, shown: dict[str, Varying] | None = None) -> str:
     """The victim, with its defence where it has one."""
     kinds = ("victim", "defense") if one.identity["defense"] != "none" else ("victim",)
     return " + ".join(component(one, kind, shown[kind] if shown else None) for kind in kinds)
@@ -56,7 +60,7 @@ def labels(comparisons: Sequence[Comparison], column: str) -> dict[tuple[object,
         words = [
             f"{key}={value}"
             for key, value in parameters(params).items()
-            if key in names and value != "" and usual.get((name, key)) != repr(value)
+            if key in names.get(name, ()) and value != "" and usual.get((name, key)) != repr(value)
         ]
         found[name, params] = " ".join([str(name), *words])
     return found

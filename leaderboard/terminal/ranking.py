@@ -12,7 +12,7 @@ from rich.text import Text
 
 from bench.plugins.track import Track
 from bench.statistics.estimates import share_interval
-from leaderboard.comparisons.naming import component, varying
+from leaderboard.comparisons.naming import Varying, component, varying
 from leaderboard.published import every_track
 from leaderboard.ranking.boards import Board, Row, read_boards
 from leaderboard.ranking.flags import FLAGS
@@ -81,7 +81,7 @@ def _added(row: Row) -> str:
     return "; ".join(said) or f"no attack takes {ADDED:g} that the others together leave"
 
 
-def _shown(board: Board) -> dict[str, set[str]]:
+def _shown(board: Board) -> dict[str, Varying]:
     """The parameters that tell defences and victims apart."""
     return {kind: varying([row.attacks[0] for row in board.rows], kind) for kind in ("defense", "victim")}
 

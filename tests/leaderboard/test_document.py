@@ -27,7 +27,7 @@ from bench.records import reading
 from bench.run.config import run_config
 from bench.scenarios import Cell
 from bench.statistics.episodes import as_text
-from leaderboard.comparisons.naming import labels
+from leaderboard.comparisons.naming import labels, varying
 from leaderboard.comparisons.reading import measurements, read_tracks
 from leaderboard.page.cards import run_command
 from leaderboard.page.document import document, schema
@@ -110,6 +110,13 @@ def test_a_label_leaves_out_what_is_empty() -> None:
     behind = [drive(victim_params={"behind": name}) for name in ("", "shield", "tracker")]
     found = labels(read_tracks({"driving": pa.concat_tables(behind)}), "victim")
     assert set(found.values()) == {"dqn", "dqn behind=shield", "dqn behind=tracker"}
+
+
+def test_a_parameter_is_shown_only_where_components_of_the_same_name_differ_in_it() -> None:
+    driven = [
+        drive(victim=name, victim_params={"hidden": hidden}) for name, hidden in (("dqn", 1), ("ppo", 2), ("ppo", 3))
+    ]
+    assert varying(read_tracks({"driving": pa.concat_tables(driven)}), "victim") == {"ppo": {"hidden"}}
 
 
 def _value(params: dict[str, Any], name: str) -> object:
