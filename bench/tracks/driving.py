@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bench.driving import DrivingVictim, DrivingWorld
     from bench.recording.film import Film
 
-BEST_BLIND, IDM, RANDOM = "best blind", "idm", "random"
+BEST_BLIND, IDM, ORACLE, RANDOM = "best blind", "idm", "oracle_planner", "random"
 
 MEASUREMENTS: tuple[pa.Field, ...] = (
     field("steps", pa.int32(), "decisions until the episode ended", "steps", low=0, at_most="max_steps"),
@@ -124,6 +124,7 @@ class DrivingTrack(Track):
         BEST_BLIND: Baseline(title="best blind policy", heading="best\nblind", spare=0),
         RANDOM: Baseline(title="random", heading="ran-\ndom"),
         IDM: Baseline(title="IDM and MOBIL", heading="\nIDM"),
+        ORACLE: Baseline(title="perfect information", heading="per-\nfect"),
     }
     safe_driver: ClassVar[str] = IDM
     contrast: ClassVar[Contrast | None] = Contrast(
@@ -175,7 +176,7 @@ class DrivingTrack(Track):
 
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
         same_world = all(own[name] == other[name] for name in ("world", "world_params"))
-        same_actions = own["action_type"] == other["action_type"] or other["victim"] == IDM
+        same_actions = own["action_type"] == other["action_type"] or other["victim"] in (IDM, ORACLE)
         if (
             other["sees"]
             or other["defense"] != "none"

@@ -89,6 +89,7 @@ def _table(
             column.heading,
             justify=column.justify,
             no_wrap=whole,
+            overflow="ellipsis" if whole else "fold",
             max_width=None if whole else names,
             vertical="bottom",
         )
