@@ -19,6 +19,7 @@ from torch import Tensor
 
 from attacks.eot import EOT
 from attacks.noise_patch import NoisePatch
+from attacks.suites import STANDARD_DETECTION_1
 from bench.detection import Approach, Detector, PatchAttack, PatchThreat, Predictions, Wrapped
 from bench.detection.approach import measured
 from bench.detection.closed_loop import drive
@@ -35,7 +36,7 @@ from envs.camera.world import StopSignApproach
 WORLD, LOOP, THREAT = StopSignApproach(), StopSignCrossing(), PatchThreat()
 MEASURES = ("stop_score", "confidence_mean", "average_precision", "decoy_confidence", "false_stops", "ran")
 SPEED_MPS, DRAWS = 10.0, range(50)
-OFF = ("rotation", "scale", "perspective", "brightness", "contrast", "saturation", "hue", "noise")
+STRONGER = STANDARD_DETECTION_1.members[1].params
 
 
 class Once(Wrapped):
@@ -67,7 +68,7 @@ def main() -> None:
     victim = registry.load("victim", "yolov3_tiny")()
     inner = Once(registry.load("defense", asked.defense)().load(victim, 0, WORLD.facts))
     detectors = {"without": inner, "with": TemporalFusion().around(inner)}
-    eot = EOT(steps=asked.steps, loss="log_odds", batch=6, window=160, tv=0.05, **dict.fromkeys(OFF, 0.0))
+    eot = EOT(**{**STRONGER, "steps": asked.steps, "restarts": 1})
     patches: dict[str, Patch | None] = {
         "no patch": None,
         "noise_patch": _crafted(NoisePatch(), inner, None),

@@ -84,10 +84,7 @@ class PatchEnforcer:
                 f"the attack asked about {self.spent + len(pictures)} images, the threat model allows {self.threat.queries}"
             )
         self.spent += len(pictures)
-        away = self.watch is not None and self.watch.away
-        if away:
-            self._switch(False)
-        try:
+        with self._detectors_turn():
             self._evaluated += len(pictures)
             if access == "scores":
                 with torch.no_grad():
@@ -97,9 +94,6 @@ class PatchEnforcer:
             if asked.requires_grad:
                 asked.register_hook(self._came_back)
             return self.detector(asked)
-        finally:
-            if away:
-                self._switch(True)
 
     def aggregate(self, scores: Tensor) -> Tensor:
         """What the detector reports of a sign over the frames of an approach (`Detector.aggregate`).
@@ -108,11 +102,17 @@ class PatchEnforcer:
             UserError: if the attack declares less access.
         """
         permit("scores", self.access)
+        with self._detectors_turn():
+            return self.detector.aggregate(scores)
+
+    @contextmanager
+    def _detectors_turn(self) -> Iterator[None]:
+        """While the detector computes, its calls are no strays and it draws from its own stream."""
         away = self.watch is not None and self.watch.away
         if away:
             self._switch(False)
         try:
-            return self.detector.aggregate(scores)
+            yield
         finally:
             if away:
                 self._switch(True)

@@ -98,9 +98,7 @@ def _sight(detector: Detector, scenes: Scenes, render: Callable[[Tensor], Tensor
     )
 
 
-def glance(
-    detector: Detector, pictures: Tensor, boxes: Tensor, moved_m: Tensor, state: Any = None
-) -> tuple[Sight, Any]:
+def glance(detector: Detector, pictures: Tensor, boxes: Tensor, moved_m: Tensor, state: Any) -> tuple[Sight, Any]:
     """Run the detector on the next frames of an approach, and return what it remembers after them.
 
     Args:

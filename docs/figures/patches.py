@@ -5,6 +5,7 @@ from __future__ import annotations
 from platformdirs import user_cache_path
 from torch import Tensor
 
+from attacks.suites import STANDARD_DETECTION_1
 from bench.detection import PatchThreat
 from bench.detection.crafting import prepare
 from bench.detection.patch import Patch
@@ -15,8 +16,7 @@ from bench.run.unit import Preparation
 from envs.camera.axes import APPROACH_V1
 
 KEPT = user_cache_path("cavbench") / "figures"
-OFF = ("rotation", "scale", "perspective", "brightness", "contrast", "saturation", "hue", "noise")
-STRONGER = {"loss": "log_odds", "steps": 300, "batch": 6, "window": 160, "tv": 0.05, **dict.fromkeys(OFF, 0.0)}
+STRONGER = {**STANDARD_DETECTION_1.members[1].params, "restarts": 1}
 """Parameters of the stronger `eot` of the standard suite, with one start: shifts only."""
 SHARE = PatchThreat().budget
 """Side of a patch as a share of the sign's side."""
