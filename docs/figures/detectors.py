@@ -29,6 +29,11 @@ def yolov5() -> Figure:
     return _figure("yolov5")
 
 
+def fcos() -> Figure:
+    """The detector without anchors."""
+    return _figure("fcos")
+
+
 def _figure(victim: str) -> Figure:
     of, approach = detector(victim), approaches()[0]
     shown = picture(approach, FRAME)

@@ -126,9 +126,9 @@ class FCOSNetwork(Detector):
             cells = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).flatten(0, 1)
             distances = functional.softplus(place[..., :4] * scale) * stride
             parts.append((distances, self.score(hidden).flatten(2).mT, place[..., 4], cells, cells[:, 0] * 0 + stride))
-        distances, classes, centreness, cells, strides = zip(*parts, strict=True)
+        distance, score, central, cell, stride_of = zip(*parts, strict=True)
         return Raw(
-            torch.cat(distances, 1), torch.cat(classes, 1), torch.cat(centreness, 1), torch.cat(cells), torch.cat(strides)
+            torch.cat(distance, 1), torch.cat(score, 1), torch.cat(central, 1), torch.cat(cell), torch.cat(stride_of)
         )
 
     def predict(self, pictures: Tensor) -> Predictions:
@@ -209,7 +209,7 @@ class FCOS(DetectorVictim):
     learns: ClassVar[bool] = True
 
     trained: Natural = 0
-    updates: Count = 1500
+    updates: Count = 900
     batch: Count = 12
     window: int = 320
     decoys: Share = 0.3

@@ -19,13 +19,12 @@ from torch.optim.swa_utils import update_bn
 from bench.detection import CameraWorld, Detector, DetectorVictim, Predictions
 from bench.errors import UserError
 from bench.plugins.contracts import Facts, Progress, Trained
-from bench.plugins.ranges import Count, Natural, Positive, Share
+from bench.plugins.ranges import Count, Natural, Positive
 from bench.victims import zoo
 from bench.victims.detectors import coco, yolo, yolov5_file
-from bench.victims.detectors.examples import Examples
 from bench.victims.detectors.loss import supervised
 from bench.victims.detectors.training import descend
-from bench.victims.detectors.windows import Windows
+from bench.victims.detectors.windows import Views, Windows
 
 Size = Literal["n", "s", "m", "l", "x"]
 MULTIPLES: dict[Size, tuple[float, float]] = {
@@ -207,7 +206,6 @@ class YOLOv5(DetectorVictim):
         updates: number of weight updates in training.
         batch: windows per update.
         window: side of a window in pixels, a multiple of 32.
-        decoys: share of the training windows with a decoy in the place of the stop sign.
         learning_rate: maximum learning rate of AdamW.
         trained_in: non-default parameters of the training world; set by `bench train`.
     """
@@ -220,7 +218,6 @@ class YOLOv5(DetectorVictim):
     updates: Count = 1200
     batch: Count = 12
     window: int = 320
-    decoys: Share = 0.3
     learning_rate: Positive = 2e-3
     trained_in: str = ""
 
@@ -265,16 +262,20 @@ class YOLOv5(DetectorVictim):
             network.expect_little()
             generator = torch.Generator().manual_seed(seed)
             windows = Windows(scenes, self.window, zoom=ZOOM, away=AWAY, generator=generator)
-            examples = Examples(scenes, windows, network.index, decoys=self.decoys, generator=generator)
+
+            def drawn() -> tuple[Views, Tensor]:
+                views = windows.draw(self.batch)
+                (shown,) = windows.lit(windows.cut(views))
+                return views, shown
 
             def loss(update: int) -> Tensor:
-                example = examples.draw(self.batch)
-                return supervised(network(example.pictures), example.boxes, example.labels)
+                views, shown = drawn()
+                return supervised(network(shown), *windows.objects(views, network.index))
 
             trained, seconds = descend(
                 network, loss, updates=self.updates, learning_rate=self.learning_rate, progress=progress
             )
             # The averaged weights need their own batch-norm statistics.
-            update_bn((examples.draw(self.batch).pictures for _ in range(CALIBRATION)), trained)
+            update_bn((drawn()[1] for _ in range(CALIBRATION)), trained)
         card = {"frames": len(scenes), "cpu_seconds": round(seconds)}
         return Trained(trained.eval().requires_grad_(False), card)
