@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from matplotlib.figure import Figure
 
-from bench.detection.approach import NMS_IOU
+from bench.detection.sight import NMS_IOU
 from bench.detection.boxes import detections
 from bench.detection.stopping import THRESHOLD
 from docs.figures import style

@@ -194,7 +194,7 @@ def _unlike(a: Tensor, b: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class FCOS(DetectorVictim):
-    """An anchor-free detector of 1.6 million parameters, trained on the camera world's training places, with decoys.
+    """An anchor-free detector of 2.0 million parameters, trained on the camera world's training places, with decoys.
 
     Args:
         trained: training seed of the zoo's detector; the seeds of a run are patch seeds.
