@@ -11,7 +11,7 @@ from torch import Tensor
 from bench.detection import STOP_SIGN, Scenes
 from bench.victims.detectors.windows import Windows, kept
 
-DRAWS = 3
+DRAWS = 6
 """How often all decoys are drawn; each frame has one decoy per draw."""
 
 

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.optim.swa_utils import update_bn
 
-from bench.detection import CameraWorld, Detector, DetectorVictim, Predictions
-from bench.plugins.contracts import Facts, Progress, Trained
-from bench.plugins.ranges import Count, Natural, Positive, Share
+from bench.detection import Detector, Predictions
+from bench.plugins.contracts import Facts
 from bench.victims import zoo
 from bench.victims.detectors import yolo
-from bench.victims.detectors.examples import Example, Examples
-from bench.victims.detectors.training import descend
-from bench.victims.detectors.windows import Windows
+from bench.victims.detectors.examples import Example
+from bench.victims.detectors.learner import Learner
 
 STRIDES = (8, 16, 32)
 REACHES = ((0.0, 48.0), (48.0, 96.0), (96.0, torch.inf))
@@ -34,10 +30,6 @@ ALPHA, GAMMA = 0.25, 2.0
 """Of the focal loss (Lin et al. 2017, Eq. 5)."""
 RARE = -4.6
 """Initial bias of the classes: a score of 0.01."""
-ZOOM, AWAY = (0.6, 1.2), 0.3
-"""Sides of the training windows as multiples of `window`, and the share of them at uniformly random places."""
-CALIBRATION = 40
-"""Batches for computing the statistics of the batch normalisations after the training."""
 
 
 def _relu(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> yolo.Convolution:
@@ -110,7 +102,11 @@ class FCOSNetwork(Detector):
 
     def raw(self, pictures: Tensor) -> Raw:
         """The outputs for images [N, 3, H, W]."""
-        x, features = self.stem(pictures), []
+        return self.at_cells(self.levels(self.stem(pictures)))
+
+    def levels(self, x: Tensor) -> list[Tensor]:
+        """The feature pyramid, [N, `PYRAMID`, h, w] at each of `STRIDES`, from the output of the stem [N, 32, H / 4, W / 4]."""
+        features = []
         for stage in self.stages:
             x = stage(x)
             features.append(x)
@@ -118,6 +114,10 @@ class FCOSNetwork(Detector):
         for lateral, feature in zip(reversed(self.lateral), reversed(features), strict=True):
             level = lateral(feature)
             levels.insert(0, level + functional.interpolate(levels[0], scale_factor=2) if levels else level)
+        return levels
+
+    def at_cells(self, levels: Sequence[Tensor]) -> Raw:
+        """The outputs of the head on the levels of the pyramid."""
         parts: list[tuple[Tensor, ...]] = []
         for level, stride, scale in zip(levels, STRIDES, self.scales, strict=True):
             hidden = self.head(level)
@@ -193,7 +193,7 @@ def _unlike(a: Tensor, b: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FCOS(DetectorVictim):
+class FCOS(Learner[FCOSNetwork]):
     """An anchor-free detector of 2.0 million parameters, trained on the camera world's training places, with decoys.
 
     Args:
@@ -201,25 +201,11 @@ class FCOS(DetectorVictim):
         updates: number of weight updates in training.
         batch: windows per update.
         window: side of a window in pixels, a multiple of 32.
-        decoys: share of the training windows with a decoy in the place of the stop sign.
+        away: share of the windows at uniformly random places; the others are near the sign.
+        decoys: share of the windows with a decoy in the place of the stop sign.
         learning_rate: maximum learning rate of AdamW.
         trained_in: non-default parameters of the training world; set by `bench train`.
     """
-
-    learns: ClassVar[bool] = True
-
-    trained: Natural = 0
-    updates: Count = 900
-    batch: Count = 12
-    window: int = 320
-    decoys: Share = 0.3
-    learning_rate: Positive = 2e-3
-    trained_in: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.window < STRIDES[-1] or self.window % STRIDES[-1]:
-            raise ValueError(f"window must be a multiple of {STRIDES[-1]}, got {self.window}")
 
     def zoo_name(self) -> str:
         return "fcos"
@@ -228,24 +214,8 @@ class FCOS(DetectorVictim):
         """The zoo's detector, the same for any seed."""
         return yolo.frozen(zoo.load(zoo.Recipe.of(self), self.trained, FCOSNetwork))
 
-    def train(self, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
-        """Train a detector from scratch on windows of the training scenes, with all objects in them as targets."""
-        scenes = world.training_scenes()
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = FCOSNetwork(world.classes).train()
-            generator = torch.Generator().manual_seed(seed)
-            windows = Windows(scenes, self.window, zoom=ZOOM, away=AWAY, generator=generator)
-            examples = Examples(scenes, windows, network.index, decoys=self.decoys, generator=generator)
+    def begun(self, names: tuple[str, ...]) -> FCOSNetwork:
+        return FCOSNetwork(names)
 
-            def lost(update: int) -> Tensor:
-                example: Example = examples.draw(self.batch)
-                return loss(network.raw(example.pictures), example.boxes, example.labels)
-
-            trained, seconds = descend(
-                network, lost, updates=self.updates, learning_rate=self.learning_rate, progress=progress
-            )
-            # The averaged weights need their own batch-norm statistics.
-            update_bn((examples.draw(self.batch).pictures for _ in range(CALIBRATION)), trained)
-        card = {"frames": len(scenes), "cpu_seconds": round(seconds)}
-        return Trained(trained.eval().requires_grad_(False), card)
+    def loss(self, network: FCOSNetwork, example: Example) -> Tensor:
+        return loss(network.raw(example.pictures), example.boxes, example.labels)

@@ -10,21 +10,19 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import update_bn
 
-from bench.detection import CameraWorld, Detector, DetectorVictim, Predictions
+from bench.detection import CameraWorld, Detector, Predictions
 from bench.errors import UserError
 from bench.plugins.contracts import Facts, Progress, Trained
-from bench.plugins.ranges import Count, Natural, Positive
 from bench.victims import zoo
 from bench.victims.detectors import coco, yolo, yolov5_file
+from bench.victims.detectors.examples import Example
+from bench.victims.detectors.learner import Learner
 from bench.victims.detectors.loss import supervised
-from bench.victims.detectors.training import descend
-from bench.victims.detectors.windows import Views, Windows
 
 Size = Literal["n", "s", "m", "l", "x"]
 MULTIPLES: dict[Size, tuple[float, float]] = {
@@ -113,12 +111,6 @@ def _place(raw: Tensor, cell: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
     return doubled[..., :2] - 0.5 + cell, doubled[..., 2:].square() * anchor
 
 
-ZOOM = (0.6, 1.2)
-"""Smallest and largest side of a training window in the image, as multiples of `window`."""
-AWAY = 0.3
-"""Share of the training windows at uniformly random places; the others are near the sign."""
-CALIBRATION = 40
-"""Batches for computing the statistics of the batch normalisations after the training."""
 RARE = (-5.0, -1.5)
 """Initial bias of objectness and of classes: most predictions contain no object (Lin et al. 2017)."""
 
@@ -196,7 +188,7 @@ def _doubled(x: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class YOLOv5(DetectorVictim):
+class YOLOv5(Learner[YOLOv5Network]):
     """YOLOv5 in one of its sizes: trained on the camera world's training places, or with weights from your own file.
 
     Args:
@@ -206,25 +198,14 @@ class YOLOv5(DetectorVictim):
         updates: number of weight updates in training.
         batch: windows per update.
         window: side of a window in pixels, a multiple of 32.
+        away: share of the windows at uniformly random places; the others are near the sign.
+        decoys: share of the windows with a decoy in the place of the stop sign.
         learning_rate: maximum learning rate of AdamW.
         trained_in: non-default parameters of the training world; set by `bench train`.
     """
 
-    learns: ClassVar[bool] = True
-
     size: Size = "n"
     path: str = ""
-    trained: Natural = 0
-    updates: Count = 1200
-    batch: Count = 12
-    window: int = 320
-    learning_rate: Positive = 2e-3
-    trained_in: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.window < STRIDES[-1] or self.window % STRIDES[-1]:
-            raise ValueError(f"window must be a multiple of {STRIDES[-1]}, got {self.window}")
 
     def zoo_name(self) -> str:
         return f"yolov5{self.size}"
@@ -255,27 +236,12 @@ class YOLOv5(DetectorVictim):
         """
         if self.path:
             raise UserError("victim.path names a detector that is trained already; leave it out to train one")
-        scenes = world.training_scenes()
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = YOLOv5Network(self.size, world.classes).train()
-            network.expect_little()
-            generator = torch.Generator().manual_seed(seed)
-            windows = Windows(scenes, self.window, zoom=ZOOM, away=AWAY, generator=generator)
+        return super().train(world, seed=seed, progress=progress)
 
-            def drawn() -> tuple[Views, Tensor]:
-                views = windows.draw(self.batch)
-                (shown,) = windows.lit(windows.cut(views))
-                return views, shown
+    def begun(self, names: tuple[str, ...]) -> YOLOv5Network:
+        network = YOLOv5Network(self.size, names)
+        network.expect_little()
+        return network
 
-            def loss(update: int) -> Tensor:
-                views, shown = drawn()
-                return supervised(network(shown), *windows.objects(views, network.index))
-
-            trained, seconds = descend(
-                network, loss, updates=self.updates, learning_rate=self.learning_rate, progress=progress
-            )
-            # The averaged weights need their own batch-norm statistics.
-            update_bn((drawn()[1] for _ in range(CALIBRATION)), trained)
-        card = {"frames": len(scenes), "cpu_seconds": round(seconds)}
-        return Trained(trained.eval().requires_grad_(False), card)
+    def loss(self, network: YOLOv5Network, example: Example) -> Tensor:
+        return supervised(network(example.pictures), example.boxes, example.labels)
