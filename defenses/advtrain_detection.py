@@ -18,14 +18,19 @@ from bench.detection import (
     DetectorVictim,
     PatchAttack,
     PatchThreat,
+    Predictions,
     Scenes,
 )
+from bench.detection.boxes import detections
 from bench.detection.enforcer import PatchEnforcer
+from bench.detection.sight import NMS_IOU
 from bench.errors import UserError
 from bench.plugins.contracts import Facts, Progress, Trained
 from bench.plugins.options import configured, parameter_words
 from bench.plugins.ranges import Count, Natural, NotNegative, Positive, Share
 from bench.victims import zoo
+from bench.victims.detectors.examples import Example
+from bench.victims.detectors.learner import Learner
 from bench.victims.detectors.loss import missed, mistaken, unlike
 from bench.victims.detectors.training import descend
 from bench.victims.detectors.windows import Views, Windows, kept
@@ -34,6 +39,8 @@ AWAY = 0.2
 """Share of the windows at uniformly random places; the others are near the sign."""
 SEEN = 0.5
 """A sign with a smaller visible share is not a target."""
+SURE = 0.4
+"""The teacher's detections above this score are labels, where predictions cannot be compared one by one."""
 DECAY = 0.98
 """Of the average of the weights, which is that of about the last 50 updates: a longer one would be close to the start."""
 IN_THE_LOOP = (
@@ -51,7 +58,8 @@ class DetectorAdversarialTraining(DetectorDefense):
     with one of the newest patches on each sign. With probability `skip` a sign has no patch. If the world has decoys, a share of
     the windows has one in the place of the sign. The loss asks the detector to find the sign despite the patch, to find none in
     decoys and elsewhere, and otherwise to keep its original predictions on the same window without a patch. The only label is the
-    sign's box. `skip=1` is the control: the same training without patches.
+    sign's box. Predictions of a detector that is not `aligned` cannot be compared one by one: what it detected in the window
+    without a patch are then the labels of its own loss. `skip=1` is the control: the same training without patches.
 
     Tensors with more than `largest` values stay as they are, and the zoo stores only those that changed.
 
@@ -117,7 +125,9 @@ class DetectorAdversarialTraining(DetectorDefense):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             start = victim.load(seed, world.facts)
-            hardening = _Hardening(self, attack, start, world.training_scenes(), seed, progress)
+            if not start.aligned and not isinstance(victim, Learner):
+                raise UserError(f"{type(victim).__name__} has no loss for adversarial training, and is not aligned")
+            hardening = _Hardening(self, attack, victim, start, world.training_scenes(), seed, progress)
             detector, seconds = descend(
                 hardening.detector,
                 hardening.loss,
@@ -137,12 +147,14 @@ class _Hardening:
         self,
         recipe: DetectorAdversarialTraining,
         attack: PatchAttack,
+        victim: DetectorVictim,
         detector: Detector,
         scenes: Scenes,
         seed: int,
         progress: Progress,
     ) -> None:
         self.recipe, self.attack, self.scenes, self.progress = recipe, attack, scenes, progress
+        self.victim = victim
         self.teacher, self.detector = detector, copy.deepcopy(detector)
         self._train_weights()
         if not any(weight.requires_grad for weight in self.detector.parameters()):
@@ -168,9 +180,22 @@ class _Hardening:
         visible = signs & inside & (self.scenes.visible[views.frames] >= SEEN)
         found = (missed(current, self.label, boxes) * visible).mean()
         cautious = mistaken(current, self.label, boxes, signs).mean()
-        # What the teacher says of decoys is no example.
-        faithful = (unlike(current, original) * signs).mean()
+        if self.teacher.aligned:
+            # What the teacher says of decoys is no example.
+            faithful = (unlike(current, original) * signs).mean()
+        else:
+            assert isinstance(self.victim, Learner)
+            faithful = self.victim.loss(self.detector, self._taught(shown, original, signs))
         return found + self.recipe.caution * cautious + self.recipe.fidelity * faithful
+
+    def _taught(self, shown: Tensor, original: Predictions, signs: Tensor) -> Example:
+        """The windows with the teacher's detections, but no stop signs where decoys are."""
+        boxes, labels = [], []
+        for found, real in zip(detections(original, threshold=SURE, iou=NMS_IOU), signs.tolist(), strict=True):
+            kept_ones = found.labels != (-1 if real else self.label)
+            boxes.append(found.boxes[kept_ones])
+            labels.append(found.labels[kept_ones])
+        return Example(shown, boxes, labels)
 
     def _begin(self, number: int) -> None:
         """Begin a round: craft a patch, and draw decoys."""

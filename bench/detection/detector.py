@@ -74,6 +74,8 @@ class Detector(nn.Module, ABC):
     """Height and width of an image must be multiples of it."""
     weights_sha256: str = ""
     """Hash of the detector's weights file; empty if there is none."""
+    aligned: bool = True
+    """Whether the predictions with the same number are of the same place in every image of a size."""
     half_precision: ClassVar[bool] = True
     """Whether the zoo stores its kernels in half precision."""
 
@@ -137,6 +139,7 @@ class Wrapped(Detector):
         super().__init__()
         self.inner = inner
         self.names, self.stride, self.weights_sha256 = inner.names, inner.stride, inner.weights_sha256
+        self.aligned = inner.aligned
 
     def initial(self) -> Any:
         return self.inner.initial()

@@ -54,6 +54,7 @@ FIGURES = {
     "victim_yolov3_tiny.png": "detectors:yolov3_tiny",
     "victim_yolov5.png": "detectors:yolov5",
     "victim_fcos.png": "detectors:fcos",
+    "victim_rcnn.png": "detectors:rcnn",
     "victim_detector.svg": "detector_files:detector_file",
     "world_highway.svg": "highway:world",
     "world_camera.png": "camera:world",

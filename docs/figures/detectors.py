@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from matplotlib.figure import Figure
 
-from bench.detection.sight import NMS_IOU
 from bench.detection.boxes import detections
+from bench.detection.sight import NMS_IOU
 from bench.detection.stopping import THRESHOLD
 from docs.figures import style
 from docs.figures.sightings import FRAME, approaches, box, detector, frame_axes, picture, show, sight
@@ -32,6 +32,11 @@ def yolov5() -> Figure:
 def fcos() -> Figure:
     """The detector without anchors."""
     return _figure("fcos")
+
+
+def rcnn() -> Figure:
+    """The detector with two stages."""
+    return _figure("rcnn")
 
 
 def _figure(victim: str) -> Figure:

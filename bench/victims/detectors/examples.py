@@ -55,7 +55,7 @@ class Examples:
         pictures = self.windows.cut(views)
         boxes, labels = self.windows.objects(views, self.index)
         sign = self.index(STOP_SIGN)
-        for number in (torch.rand(count, generator=self.generator) < self.share).nonzero().flatten().tolist():
+        for number in self._chosen(count):
             one = views[torch.tensor([number])]
             drawn = self.decoys[int(torch.randint(DRAWS, (), generator=self.generator))]
             pictures[number] = self.windows.cut(one, drawn[one.frames])[0]
@@ -63,3 +63,9 @@ class Examples:
             boxes[number], labels[number] = boxes[number][others], labels[number][others]
         (lit,) = self.windows.lit(pictures)
         return Example(lit, boxes, labels)
+
+    def _chosen(self, count: int) -> list[int]:
+        """The windows with decoys; without any, no random number is drawn."""
+        if not self.share:
+            return []
+        return (torch.rand(count, generator=self.generator) < self.share).nonzero().flatten().tolist()

@@ -114,6 +114,7 @@ class RCNNNetwork(Detector):
     """
 
     stride = fcos.STRIDES[-1]
+    aligned = False
 
     def __init__(self, names: tuple[str, ...]) -> None:
         super().__init__()

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from bench.detection import CameraWorld, Detector, Predictions
 from bench.errors import UserError
 from bench.plugins.contracts import Facts, Progress, Trained
+from bench.plugins.ranges import Count, Share
 from bench.victims import zoo
 from bench.victims.detectors import coco, yolo, yolov5_file
 from bench.victims.detectors.examples import Example
@@ -206,6 +207,9 @@ class YOLOv5(Learner[YOLOv5Network]):
 
     size: Size = "n"
     path: str = ""
+    updates: Count = 1200
+    away: Share = 0.3
+    decoys: Share = 0.0
 
     def zoo_name(self) -> str:
         return f"yolov5{self.size}"
