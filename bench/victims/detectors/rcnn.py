@@ -178,7 +178,7 @@ def learnt(seen: Seen, example: Example, nothing: int) -> tuple[Tensor, Tensor, 
 
 @dataclass(frozen=True, kw_only=True)
 class RCNN(Learner[RCNNNetwork]):
-    """A two-stage detector of 2.6 million parameters, trained on the camera world's training places, with decoys.
+    """A two-stage detector of 2.5 million parameters, trained on the camera world's training places, with decoys.
 
     Args:
         trained: training seed of the zoo's detector; the seeds of a run are patch seeds.
