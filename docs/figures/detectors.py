@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from matplotlib.figure import Figure
 
-from bench.detection.sight import NMS_IOU
 from bench.detection.boxes import detections
+from bench.detection.sight import NMS_IOU
 from bench.detection.stopping import THRESHOLD
 from docs.figures import style
 from docs.figures.sightings import FRAME, approaches, box, detector, frame_axes, picture, show, sight
