@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,13 @@ def test_a_figure_is_made_the_same_again(file: str, tmp_path: Path) -> None:
 def test_a_figure_of_published_records_is_the_one_that_ships(tmp_path: Path) -> None:
     """Nothing in it is computed by a network, so it does not depend on the machine."""
     assert make("victim_blind.svg", tmp_path).read_bytes() == (FOLDER / "victim_blind.svg").read_bytes()
+
+
+@pytest.mark.parametrize("module", sorted({name.split(":")[0] for name in FIGURES.values()}))
+def test_the_module_of_every_figure_can_be_used(module: str) -> None:
+    functions = [name.split(":")[1] for name in FIGURES.values() if name.split(":")[0] == module]
+    used = import_module(f"docs.figures.{module}")
+    assert all(callable(getattr(used, function)) for function in functions)
 
 
 def test_every_figure_is_there_and_small() -> None:

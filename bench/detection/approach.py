@@ -26,6 +26,8 @@ Columns = dict[str, NDArray[np.generic]]
 
 SAME_CONFIDENCE = 0.01
 """Two confidences count as the same answer if they differ by at most this."""
+SAME_MEAN = 0.1
+"""Largest difference of an approach's mean confidence from that which attacks optimise. Fusion over frames has up to .01."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,8 @@ def probed(
     """Probes on a frame that the detector cannot foresee (`bench.records.schema.PROBES`).
 
     `redrawn`: another answer when asked again. `same_answer`: the same on a grey image. `inconsistent`: asked as an oracle asks,
-    alone, in another batch or with gradients, the answer is not the one that was scored. What a detector remembers is left out.
+    alone, in another batch or with gradients, the answer is not the one that was scored; or, on any approach, what it reports on
+    average is not what its `aggregate` makes of the frames' scores, which attacks optimise.
     """
     chance = random.Random(entropy)
     place = chance.randrange(len(approaches))
@@ -163,9 +166,17 @@ def probed(
     return {
         "redrawn": float(first != again),
         "same_answer": float(abs(first - grey) <= SAME_CONFIDENCE),
-        "inconsistent": float(abs(answer - scored) > SAME_CONFIDENCE + 4 * spread),
+        "inconsistent": float(
+            abs(answer - scored) > SAME_CONFIDENCE + 4 * spread or any(misled(detector, sight) for sight in seen)
+        ),
         "entropy": entropy,
     }
+
+
+def misled(detector: Detector, sight: Sight) -> bool:
+    """Whether what attacks optimise, `Detector.aggregate` of the frames' scores, is not what was reported."""
+    optimised = detector.aggregate(torch.from_numpy(sight.by_frame))
+    return not abs(float(optimised.mean()) - float(sight.confidence.mean())) <= SAME_MEAN
 
 
 def false_alarms(found: Sequence[Detections], boxes: Tensor) -> NDArray[np.int64]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from attacks.eot import EOT, reported
 from bench.detection import Detector, PatchThreat, Predictions
+from bench.detection.approach import score
 from bench.detection.boxes import overlap
 from bench.detection.closed_loop import Drive, drive
 from bench.detection.enforcer import PatchEnforcer
@@ -28,7 +29,7 @@ from envs.camera.environment import ApproachEnv
 from envs.camera.poses import approach
 from envs.camera.street.layout import sign_x
 from envs.camera.world import StopSignApproach
-from tests.framework.toy_camera import RedDetector, RedScenes, RedStreet, RedVictim
+from tests.framework.toy_camera import RED_AXES, RedDetector, RedScenes, RedStreet, RedVictim
 
 SCORES = st.lists(st.floats(0, 1), min_size=1, max_size=12)
 FAR = TemporalFusion(focal=1e5, vanishing_x=16.0, vanishing_y=16.0)
@@ -125,6 +126,30 @@ def test_attacks_optimise_what_is_scored(red: list[float]) -> None:
     tracked = torch.from_numpy(seen.confidence) > 0
     assert torch.allclose(torch.from_numpy(seen.confidence)[tracked], wanted[tracked], atol=1e-5)
     assert wanted[~tracked].max() <= detector.aggregate(torch.zeros(1)) + 1e-6 if (~tracked).any() else True
+
+
+class Decoying(Fused):
+    """Lets attacks optimise other scores than are reported."""
+
+    def aggregate(self, scores: Tensor) -> Tensor:
+        return 1 - super().aggregate(scores)
+
+
+class Silent(RedDetector):
+    """Without a memory, too, attacks can be given something else."""
+
+    def aggregate(self, scores: Tensor) -> Tensor:
+        return scores * 0.1
+
+
+def inconsistent(detector: Detector) -> float:
+    scored = score(detector, RedStreet().approaches(RED_AXES.cell(lanes=3, density=1.0), range(3)), None, share=0.5)
+    return float(scored["inconsistent"].max())
+
+
+def test_a_detector_that_reports_otherwise_than_attacks_optimise_is_flagged() -> None:
+    assert inconsistent(Decoying(RedDetector(), FAR)) == inconsistent(Silent()) == 1.0
+    assert inconsistent(fused()) == inconsistent(RedDetector()) == 0.0
 
 
 def test_eot_reaches_through_the_frames_of_an_approach() -> None:
