@@ -19,6 +19,8 @@ from bench.errors import UserError
 from bench.plugins.contracts import Facts
 from bench.run.config import component, run_config
 from bench.victims import zoo
+from bench.victims.detectors.examples import Example
+from bench.victims.detectors.rcnn import RCNN, RCNNNetwork
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
 from bench.victims.detectors.yolov5 import YOLOv5
 from defenses.advtrain_detection import DetectorAdversarialTraining
@@ -73,6 +75,49 @@ def test_training_depends_on_the_seed_and_the_control_is_never_attacked(victim: 
     assert any(text.startswith("patch 2, ") for text in told)
     assert not any(text.startswith("patch") for text in untold)
     assert not torch.equal(one.state_dict()["model.24.m.0.weight"], control.state_dict()["model.24.m.0.weight"])
+
+
+@pytest.mark.slow
+def test_a_detector_that_is_not_aligned_learns_from_what_it_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    victim, shown, own = RCNN(), [], RCNN.loss
+
+    def watched(self: RCNN, network: RCNNNetwork, example: Example) -> Tensor:
+        shown.append(example)
+        return own(self, network, example)
+
+    monkeypatch.setattr(RCNN, "loss", watched)
+    for decoys in (0.0, 1.0):
+        defense = DetectorAdversarialTraining(rounds=1, updates=3, batch=4, skip=1.0, decoys=decoys)
+        made = defense.train(victim, StopSignApproach(), seed=0, progress=lambda share, text: None)
+        assert not torch.equal(
+            made.network.state_dict()["second.name.bias"], made.start.state_dict()["second.name.bias"]
+        )
+    sign = victim.load(0, FACTS).index(STOP_SIGN)
+    real, false = (
+        [int((label == sign).sum()) for one in part for label in one.labels] for part in (shown[:3], shown[3:])
+    )
+    assert sum(real) > len(real) // 2
+    assert sum(false) == 0 < sum(len(label) for one in shown[3:] for label in one.labels)
+
+
+class NotAligned(RedDetector):
+    """Has no loss of its own either."""
+
+    aligned = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class NotAlignedVictim(DetectorVictim):
+    """The victim of `NotAligned`."""
+
+    def load(self, seed: int, facts: Facts) -> Detector:
+        return NotAligned()
+
+
+def test_a_detector_that_is_not_aligned_and_has_no_loss_is_refused() -> None:
+    defense = DetectorAdversarialTraining(**QUICK)
+    with pytest.raises(UserError, match="NotAlignedVictim has no loss for adversarial training"):
+        defense.train(NotAlignedVictim(), RedStreet(), seed=0, progress=lambda share, text: None)
 
 
 class Coloured(RedDetector):
