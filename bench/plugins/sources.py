@@ -43,7 +43,7 @@ def tracks_of(target: str) -> list[str]:
                 case ast.AnnAssign(target=ast.Name(id="track"), value=ast.Constant(value=str(track))):
                     found.add(track)
         for base in classes[name].bases:
-            match base:
+            match base.value if isinstance(base, ast.Subscript) else base:
                 case ast.Name(id=parent_class):
                     waiting.append((module, parent_class))
                 case ast.Attribute(value=ast.Name(id=parent), attr=parent_class):

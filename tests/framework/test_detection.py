@@ -98,6 +98,7 @@ def test_the_track_of_a_component_is_read_from_its_source() -> None:
     assert tracks_of("toy_camera_plugin:Paint") == ["detection"]
     assert tracks_of("bench.victims.drivers.dqn:DQN") == ["driving"]
     assert tracks_of("attacks.none:NoAttack") == ["any"]
+    assert tracks_of("bench.victims.detectors.fcos:FCOS") == ["detection"], "through a generic base class"
     assert tracks_of("nowhere:Nothing") == []
     assert {"none", "paint", "blank"} <= set(names("attack", "detection"))
 
