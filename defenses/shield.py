@@ -130,8 +130,7 @@ class Shielded(Filter):
         keeps = torch.cat((safe[..., :1], safe[..., 1:] & ~needless), -1)
         changes = (change >= 0) & margins.changeable
         none = ~keeps.any(-1, keepdim=True) & ~changes.any(-1, keepdim=True)
-        slower = torch.tensor([False, False, True], device=safe.device)
-        hard = torch.cat((keeps | (none & slower), changes), -1).to(stay)
+        hard = torch.cat((keeps | (none & margins.most), changes), -1).to(stay)
         soft = torch.cat((stay, change), -1).div(SOFTNESS).sigmoid()
         ordered = hard + soft - soft.detach()
         return ordered[..., self.reckoning.order]

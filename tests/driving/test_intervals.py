@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
@@ -142,12 +142,13 @@ def test_the_gradients_of_rooms_and_speeds_are_those_of_finite_differences(seed:
     width = torch.rand(low.shape, generator=generator)
     speed = 20 + 8 * torch.rand(count, generator=generator)
     ego = Ego(y=4 * one, heading=0 * one, speed=speed, target_lane=one, target_speed=speed, edge=2 * one)
-    weights = [torch.randn(shape, generator=generator) for shape in ((count, 2, 3, 3), (count, 3), (count, 9))]
+    weights = [torch.randn(shape, generator=generator) for shape in ((count, 6, 3, 3), (count, 3, 3), (count, 9))]
+    slowing = 5 * torch.rand(count, 3, generator=generator)
 
     def weighed(low: Tensor, speed: Tensor) -> Tensor:
         """[count] a weighted sum of all rooms and speeds."""
         moving, cars = ego._replace(speed=speed), Cars(torch.ones(count, others, dtype=torch.bool), low, low + width)
-        found = (*judge.rooms(moving, cars, speed[:, None].expand(-1, 3)), judge.rooms.speeds(moving, cars))
+        found = (*judge.rooms(moving, cars, speed[:, None].expand(-1, 3), slowing), judge.rooms.speeds(moving, cars))
         return torch.stack([(w * each).flatten(1).sum(1) for w, each in zip(weights, found, strict=True)]).sum(0)
 
     step, direction = 1e-2, torch.randn(low.shape, generator=generator) * torch.tensor([1.0, 0.0, 1.0, 0.0])
@@ -194,22 +195,57 @@ def test_no_leader_that_brakes_as_assumed_is_hit(seed: int, rate: float) -> None
     assert once.float().mean() > 0.5
 
 
-@settings(max_examples=20, deadline=None)
-@given(speed=st.sampled_from([15.0, 20.0, 25.0, 30.0]), closing=st.floats(-6, 4))
-def test_the_least_room_behind_allows_for_braking_within_a_lane_change(speed: float, closing: float) -> None:
-    """The ego changes lanes and slows down at once; the car behind brakes as soon as the ego has moved a metre."""
+@settings(max_examples=40, deadline=None)
+@given(
+    speed=st.sampled_from([15.0, 18.0, 20.0, 23.0, 25.0, 30.0]),
+    closing=st.floats(-6, 4),
+    aim=st.sampled_from([-10.0, -5.0, 0.0, 5.0]),
+    ahead=st.sampled_from([5.6, 8.0, 15.0, 60.0]),
+)
+def test_no_car_behind_is_hit_after_a_lane_change_into_the_least_room(
+    speed: float, closing: float, aim: float, ahead: float
+) -> None:
+    """Of the safe actions the slowest is taken each time; the car behind brakes as soon as the ego has moved a metre.
+
+    A car ahead on the lane that is left, as fast as the ego, tempts it to brake.
+    """
     moves, period, one = reckoning(FACTS, "discrete"), 1 / FACTS.decision_hz, torch.ones(1)
     judge = Judge(moves, period, Caution(braking=0.5, seconds=2.0, distance=0.4))
-    ego = Ego(y=0 * one, heading=0 * one, speed=speed * one, target_lane=0 * one, target_speed=speed * one, edge=one)
-    far = torch.tensor([[[-100.0, 4.0, speed + closing, 0.0]]])
-    gap = 100 - float(judge(ego, Cars(torch.ones(1, 1, dtype=torch.bool), far, far)).change[0, 1])
-    behind = speed + closing
-    for action in ("LANE_RIGHT", "SLOWER", *["IDLE"] * 40):
-        gap, seen = gap + (float(ego.speed) - behind) * period, float(ego.y) > 1
-        behind = max(behind - REAR_BRAKING * period * seen, 0.0)
-        after = moves.after(ego, torch.tensor([FACTS.actions.index(action)]))
+    low, high = moves.kinematics.target_speeds[0], moves.kinematics.target_speeds[-1]
+    target = min(max(round((speed + aim) / 5) * 5.0, low), high) * one
+    ego = Ego(y=0 * one, heading=0 * one, speed=speed * one, target_lane=0 * one, target_speed=target, edge=one)
+    behind, lead = speed + closing, speed
+
+    def cars(gap: float, front: float) -> Cars:
+        both = torch.tensor([[[-gap, 4.0, behind, 0.0], [front, 0.0, lead, 0.0]]])
+        return Cars(torch.ones(1, 2, dtype=torch.bool), both, both)
+
+    room = float(judge(ego, cars(100, ahead)).change[0, 1])
+    gap = 100 - float(judge(ego, cars(100, 200)).change[0, 1])
+    assume(room >= 0)
+    action = FACTS.actions.index("LANE_RIGHT")
+    for _ in range(40):
+        gap, ahead = gap + (float(ego.speed) - behind) * period, ahead + (lead - float(ego.speed)) * period
+        behind = max(behind - REAR_BRAKING * period * (float(ego.y) > 1), 0.0)
+        after = moves.after(ego, torch.tensor([action]))
         ego = Ego(*(after[name] for name in Ego._fields))
         assert gap > 5.0
+        margins = judge(ego, cars(gap, ahead))
+        safe = (margins.stay[0] >= 0).nonzero().flatten().tolist()
+        chosen = safe[-1] if safe else int(margins.most[0].int().argmax())
+        action = FACTS.actions.index(("FASTER", "IDLE", "SLOWER")[chosen])
+
+
+@pytest.mark.parametrize("other", [0.0, 4.0])
+def test_a_lane_that_may_not_exist_is_tried_only_where_idling_is_safe(other: float) -> None:
+    """LANE_RIGHT is in vain on the rightmost lane. A car further to the right shows that there is a lane."""
+    moves, one = reckoning(FACTS, "discrete"), torch.ones(1)
+    judge = Judge(moves, 1 / FACTS.decision_hz, Caution(braking=0.5, seconds=2.0, distance=0.4))
+    ego = Ego(y=0 * one, heading=0 * one, speed=28 * one, target_lane=0 * one, target_speed=25 * one, edge=64 * one)
+    cars = torch.tensor([[[10.0, 0.0, 20.0, 0.0], [90.0, other, 25.0, 0.0]]])
+    margins = judge(ego, Cars(torch.ones(1, 2, dtype=torch.bool), cars, cars))
+    assert float(margins.stay[0, 1]) < 0
+    assert (float(margins.change[0, 1]) >= 0) == (other > 0)
 
 
 @pytest.mark.parametrize("free", [True, False])

@@ -47,6 +47,8 @@ class CorridorJudge:
         self.reckoning, self.band = reckoning, band
         limit = reckoning.kinematics.acceleration_limit
         self.gained = limit * period
+        speeds = reckoning.kinematics.target_speeds
+        self.slowing = speeds[1] - speeds[0]
         following = FollowingDistance(reckoning.kinematics, period, caution.seconds, braking=limit)
         self.rooms = Rooms(reckoning, period, caution, following, steady=LEVELS // 2)
 
@@ -81,8 +83,9 @@ class CorridorJudge:
     def _rooms(self, ego: Ego, cars: Cars) -> tuple[Tensor, Tensor]:
         """Room to the cars ahead on the left, own and right lane for each acceleration, [..., 3, LEVELS]; behind, [..., 2]."""
         levels = torch.linspace(-1, 1, LEVELS).to(ego.speed) * self.gained
-        front, rear = self.rooms(ego, cars, (ego.speed.unsqueeze(-1) + levels).clamp(min=0))
-        return front[..., 0, :, :], rear[..., [0, 2]]
+        own = (ego.speed.unsqueeze(-1) + levels).clamp(min=0)
+        front, rear = self.rooms(ego, cars, own, torch.full_like(own, self.slowing))
+        return front[..., 0, :, :], rear[..., [0, 2], 0]
 
     def _accelerations(self, ego: Ego, room: Tensor) -> tuple[Tensor, Tensor]:
         """The lowest and the highest acceleration that is left, [...] in [-1, 1], from the room [..., LEVELS]."""

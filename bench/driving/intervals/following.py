@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.driving.intervals.kernels import FASTEST, HARDEST, LEVELS_PER_UNIT, STEP
 from bench.driving.kinematics import Kinematics
 
 LASTING_S = 8.0
+"""Seconds after which two cars have the same speed."""
+
+
+class Case(NamedTuple):
+    """A case in which a following distance is wanted.
+
+    Args:
+        within: seconds that count.
+        held: seconds for which the ego keeps its speed before it brakes.
+    """
+
+    within: float = LASTING_S
+    held: float = 0.0
 
 
 class FollowingDistance:
@@ -23,7 +39,7 @@ class FollowingDistance:
         kinematics: kinematics of the ego.
         period: seconds per decision.
         seconds: how long the leader brakes.
-        within: seconds that count, for each of the results; None for all until the speeds are the same.
+        cases: what each of the results is for.
         braking: the ego's own deceleration in m/s2, for continuous actions; None for repeated SLOWER.
     """
 
@@ -33,31 +49,32 @@ class FollowingDistance:
         period: float,
         seconds: float,
         *,
-        within: tuple[float | None, ...] = (None,),
+        cases: tuple[Case, ...] = (Case(),),
         braking: float | None = None,
     ) -> None:
         speeds = torch.arange(0.0, FASTEST + STEP, STEP, dtype=torch.float64)
         rates = torch.arange(HARDEST * LEVELS_PER_UNIT + 1.0, dtype=torch.float64) / LEVELS_PER_UNIT
         dt = period / kinematics.frames
-        rate, own, other = torch.meshgrid(rates, speeds, speeds, indexing="ij")
-        table, lost, target = torch.zeros_like(own), torch.zeros_like(own), own
-        # The leader has braked for one decision when the ego begins to.
-        other = (other - rate * min(period, seconds)).clamp(min=0)
-        ends = [round((counted or LASTING_S) / dt) for counted in within]
-        tables = {}
-        for frame in range(max(ends)):
-            if frame % kinematics.frames == 0:
-                target = slower(own, kinematics.target_speeds)
-            lost = lost + (own - other) * dt
-            table = torch.maximum(table, lost)
-            change = kinematics.speed_gain * (target - own) if braking is None else torch.full_like(own, -braking)
-            own = (own + change * dt).clamp(min=0)
-            if period + frame * dt < seconds - 1e-9:
-                other = (other - rate * dt).clamp(min=0)
-            if frame + 1 in ends:
-                tables[frame + 1] = table.float().flatten().numpy()
+
+        def table(case: Case) -> NDArray[np.float32]:
+            rate, own, other = torch.meshgrid(rates, speeds, speeds, indexing="ij")
+            most, lost, target = torch.zeros_like(own), torch.zeros_like(own), own
+            # The leader has braked for one decision when the ego begins to.
+            other = (other - rate * min(period, seconds)).clamp(min=0)
+            for frame in range(round(case.within / dt)):
+                holds = frame * dt < case.held - 1e-9
+                if not holds and frame % kinematics.frames == 0:
+                    target = slower(own, kinematics.target_speeds)
+                lost = lost + (own - other) * dt
+                most = torch.maximum(most, lost)
+                braked = kinematics.speed_gain * (target - own) if braking is None else torch.full_like(own, -braking)
+                own = own if holds else (own + braked * dt).clamp(min=0)
+                if period + frame * dt < seconds - 1e-9:
+                    other = (other - rate * dt).clamp(min=0)
+            return most.float().flatten().numpy()
+
         self.side = len(speeds)
-        self.tables = np.stack([tables[end] for end in ends])
+        self.tables = np.stack([table(case) for case in cases])
 
 
 def slower(speed: Tensor, target_speeds: tuple[float, ...]) -> Tensor:

@@ -46,8 +46,7 @@ class Rules(NamedTuple):
         acceleration, jam_distance, time_gap, free_share: of the car-following model, `bench.driving.kinematics.CarFollowing`.
         scale: the divisor in its desired gap.
         steady: number of the option that keeps the speed.
-        slowing: by how much the ego may have to slow down while it changes lanes.
-        delay: time constant in s with which it does so.
+        delay: time constant in s with which the ego slows down.
     """
 
     period: float
@@ -61,7 +60,6 @@ class Rules(NamedTuple):
     free_share: float
     scale: float
     steady: int
-    slowing: float
     delay: float
 
 
@@ -117,16 +115,16 @@ def _overlap(left: float, right: float, middle: float, width: float) -> bool:
 
 
 @inner
-def _lost(closing: float, rules: Rules) -> tuple[float, float]:
+def _lost(closing: float, slowing: float, rules: Rules) -> tuple[float, float]:
     """What the ego loses in m to a car that comes nearer at `closing` m/s from behind, at least 0, and its slope in `closing`.
 
-    The ego slows down by d = `slowing` with the time constant T = `delay`; the car keeps its speed for s = `REAR_S`, then brakes
-    at a = `REAR_BRAKING`. With c = d + closing they are equally fast at about t = s + c / a; by then the ego has lost
+    The ego slows down by d = `slowing` m/s with the time constant T = `delay`; the car keeps its speed for s = `REAR_S`, then
+    brakes at a = `REAR_BRAKING`. With c = d + closing they are equally fast at about t = s + c / a; by then the ego has lost
     c s + c^2 / 2a - d T (1 - exp(-t / T)).
     """
-    faster = rules.slowing + max(closing, 0.0)
-    left = rules.slowing * np.exp(-(REAR_S + faster / REAR_BRAKING) / rules.delay)
-    lost = faster * (REAR_S + faster / (2 * REAR_BRAKING)) - rules.delay * (rules.slowing - left)
+    faster = slowing + max(closing, 0.0)
+    left = slowing * np.exp(-(REAR_S + faster / REAR_BRAKING) / rules.delay)
+    lost = faster * (REAR_S + faster / (2 * REAR_BRAKING)) - rules.delay * (slowing - left)
     return max(lost, 0.0), (REAR_S + (faster - left) / REAR_BRAKING if closing > 0 and lost > 0 else 0.0)
 
 
@@ -138,6 +136,7 @@ def rooms(
     along: Floats,
     lane: Floats,
     own: Floats,
+    slowing: Floats,
     tables: Floats,
     side: int,
     rules: Rules,
@@ -155,11 +154,12 @@ def rooms(
         along: the ego's speed along the road, [N].
         lane: middle of the ego's target lane, in m, [N].
         own: the ego's speed after each option, [N, O].
+        slowing: by how much the ego slows down after that, in m/s, at least 0, [N, O].
         tables: following distances [T, levels * side * side].
         side: number of speeds in a table.
         rules: see `Rules`.
         front, front_car: room [N, T, 3, O] from -`FREE` to `FREE`, and the car that limits it or `NOBODY`.
-        rear, rear_car: the same of the cars behind for the steady option, [N, 3].
+        rear, rear_car: the same of the cars behind, [N, 3, O].
         level: how hard each car ahead brakes, [N, C]; needed for the gradient.
     """
     options = own.shape[1]
@@ -186,17 +186,18 @@ def rooms(
                                 front[n, table, beside, option] = room
                                 front_car[n, table, beside, option] = car
             else:
-                lost = _lost(high[n, car, 2] - own[n, rules.steady], rules)[0]
-                room = -high[n, car, 0] - rules.length - lost
-                for beside in range(3):
-                    middle = nearest + beside * rules.lane_width
-                    if _overlap(left, right, middle, rules.width) and room < rear[n, beside]:
-                        rear[n, beside], rear_car[n, beside] = room, car
-        for beside in range(3):
-            if rear[n, beside] < -FREE:
-                rear[n, beside], rear_car[n, beside] = -FREE, NOBODY
-            for table in range(len(tables)):
+                closing = high[n, car, 2] - own[n, rules.steady]
                 for option in range(options):
+                    room = -high[n, car, 0] - rules.length - _lost(closing, slowing[n, option], rules)[0]
+                    for beside in range(3):
+                        middle = nearest + beside * rules.lane_width
+                        if _overlap(left, right, middle, rules.width) and room < rear[n, beside, option]:
+                            rear[n, beside, option], rear_car[n, beside, option] = room, car
+        for beside in range(3):
+            for option in range(options):
+                if rear[n, beside, option] < -FREE:
+                    rear[n, beside, option], rear_car[n, beside, option] = -FREE, NOBODY
+                for table in range(len(tables)):
                     if front[n, table, beside, option] < -FREE:
                         front[n, table, beside, option], front_car[n, table, beside, option] = -FREE, NOBODY
 
@@ -207,6 +208,7 @@ def rooms_backward(
     high: Floats,
     along: Floats,
     own: Floats,
+    slowing: Floats,
     tables: Floats,
     side: int,
     rules: Rules,
@@ -223,7 +225,7 @@ def rooms_backward(
     """The gradients in the bounds and the ego's speeds, added to `by_low`, `by_high`, `by_along` and `by_own`.
 
     Args:
-        low, high, along, own, tables, side, rules, front_car, rear_car, level: as in `rooms`.
+        low, high, along, own, slowing, tables, side, rules, front_car, rear_car, level: as in `rooms`.
         by_front, by_rear: gradients in the rooms.
         by_low, by_high, by_along, by_own: zeros in the shape of the inputs.
     """
@@ -241,12 +243,14 @@ def rooms_backward(
                         by_low[n, car, 2] += slope * (rules.period - in_leader)
                     by_along[n] -= slope * rules.period
                     by_own[n, option] -= slope * in_own
-            car, slope = rear_car[n, beside], by_rear[n, beside]
-            if car != NOBODY and slope != 0:
-                by_high[n, car, 0] -= slope
-                change = slope * _lost(high[n, car, 2] - own[n, rules.steady], rules)[1]
-                by_high[n, car, 2] -= change
-                by_own[n, rules.steady] += change
+            for option in range(own.shape[1]):
+                car, slope = rear_car[n, beside, option], by_rear[n, beside, option]
+                if car != NOBODY and slope != 0:
+                    by_high[n, car, 0] -= slope
+                    closing = high[n, car, 2] - own[n, rules.steady]
+                    change = slope * _lost(closing, slowing[n, option], rules)[1]
+                    by_high[n, car, 2] -= change
+                    by_own[n, rules.steady] += change
 
 
 @entry_point

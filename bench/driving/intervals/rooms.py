@@ -16,9 +16,6 @@ from bench.driving.intervals.boxes import Boxes
 from bench.driving.intervals.ego import DeadReckoning, Ego
 from bench.driving.intervals.following import FollowingDistance
 
-CROSSING_S = 0.8
-"""Time in which the ego leaves a lane."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Caution:
@@ -83,24 +80,24 @@ class Rooms:
             free_share=model.free_share,
             scale=model.scale,
             steady=steady,
-            slowing=car.target_speeds[1] - car.target_speeds[0],
             delay=1 / car.speed_gain,
         )
 
-    def __call__(self, ego: Ego, cars: Cars, own: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, ego: Ego, cars: Cars, own: Tensor, slowing: Tensor) -> tuple[Tensor, Tensor]:
         """The least room in m, from -`FREE` to `FREE`, on the lanes to the left, own and right.
 
         Args:
             ego: the ego's motion.
             cars: the other cars.
             own: the ego's speed after each option, [..., O].
+            slowing: by how much the ego slows down after that while a car behind reacts, in m/s, at least 0, [..., O].
 
         Returns:
-            To the cars ahead, [..., T, 3, O], one for each table of following distances; and to the cars behind, [..., 3].
+            To the cars ahead, [..., T, 3, O], one for each table of following distances; and to the cars behind, [..., 3, O].
         """
         along = ego.speed * ego.heading.cos()
         lane = self.rules.lane_width * ego.target_lane
-        front, rear = _Rooms.apply(cars.low, cars.high, along, own, cars.present, lane, self)
+        front, rear = _Rooms.apply(cars.low, cars.high, along, own, slowing.detach(), cars.present, lane, self)
         return front, rear
 
     def speeds(self, ego: Ego, cars: Cars) -> Tensor:
@@ -125,13 +122,21 @@ def met(low: Tensor, high: Tensor, known: Tensor, tracks: tuple[Tensor, Tensor, 
 class _Rooms(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, low: Tensor, high: Tensor, along: Tensor, own: Tensor, present: Tensor, lane: Tensor, of: Rooms
+        ctx: Any,
+        low: Tensor,
+        high: Tensor,
+        along: Tensor,
+        own: Tensor,
+        slowing: Tensor,
+        present: Tensor,
+        lane: Tensor,
+        of: Rooms,
     ) -> tuple[Tensor, Tensor]:
         shape, options, tables = along.shape, own.shape[-1], len(of.following.tables)
         flat = _flat(low, 2), _flat(high, 2), _flat(along, 0), _flat(own, 1)
-        count, cars = flat[0].shape[:2]
+        slower, (count, cars) = _flat(slowing, 1), flat[0].shape[:2]
         front = np.empty((count, tables, 3, options), np.float32)
-        rear = np.empty((count, 3), np.float32)
+        rear = np.empty((count, 3, options), np.float32)
         found = np.empty(front.shape, np.int8), np.empty(rear.shape, np.int8), np.zeros((count, cars), np.int8)
         kernels.rooms(
             flat[0],
@@ -140,6 +145,7 @@ class _Rooms(torch.autograd.Function):
             flat[2],
             _flat(lane, 0),
             flat[3],
+            slower,
             of.following.tables,
             of.following.side,
             of.rules,
@@ -149,7 +155,7 @@ class _Rooms(torch.autograd.Function):
             found[1],
             found[2],
         )
-        ctx.of, ctx.flat, ctx.found = of, flat, found
+        ctx.of, ctx.flat, ctx.slower, ctx.found = of, flat, slower, found
         ctx.shapes, ctx.like = [each.shape for each in (low, high, along, own)], low.new_empty(0)
         return _shaped(front, shape, low), _shaped(rear, shape, low)
 
@@ -159,16 +165,17 @@ class _Rooms(torch.autograd.Function):
         gradients = [np.zeros_like(each) for each in ctx.flat]
         kernels.rooms_backward(
             *ctx.flat,
+            ctx.slower,
             ctx.of.following.tables,
             ctx.of.following.side,
             ctx.of.rules,
             *ctx.found,
             _flat(by_front, 3),
-            _flat(by_rear, 1),
+            _flat(by_rear, 2),
             *gradients,
         )
         back = [torch.from_numpy(each).to(ctx.like).reshape(to) for each, to in zip(gradients, ctx.shapes, strict=True)]
-        return *back, None, None, None
+        return *back, None, None, None, None
 
 
 class _Speeds(torch.autograd.Function):

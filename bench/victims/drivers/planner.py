@@ -27,8 +27,8 @@ SLOWEST = 20.0
 """The speed in m/s at which the progress begins."""
 PER_METRE, TIE_BREAK = 0.02, 1e-4
 """Value of a metre of margin where nothing is safe, and elsewhere."""
-ORDER_SAFE, ORDER_UNSAFE = (0.0, -0.02, -0.04), (-0.04, -0.02, 0.0)
-"""Small differences in value that order FASTER, IDLE and SLOWER."""
+ORDER = (0.0, -0.02, -0.04)
+"""Small differences in value that order FASTER, IDLE and SLOWER; where nothing is safe, of the margin, the other way round."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,9 +84,9 @@ class IntervalPlanner(IntervalPolicy):
         cars = cars_of(ego, boxes)
         found = self.judge(ego, cars)
         left, own, right = self._worth(ego, self.judge.rooms.speeds(ego, cars)).unbind(-1)
-        orders = torch.tensor([ORDER_SAFE, ORDER_UNSAFE]).to(own)
-        safe = own.unsqueeze(-1) + orders[0] + TIE_BREAK * found.stay
-        stay = torch.where(found.stay < 0, UNSAFE + orders[1] + PER_METRE * found.stay, safe)
+        order = torch.tensor(ORDER).to(own)
+        safe = own.unsqueeze(-1) + order + TIE_BREAK * found.stay
+        stay = torch.where(found.stay < 0, UNSAFE + PER_METRE * (found.stay - order), safe)
         change = found.worth_changing
         side = torch.stack([left, right], -1) - self.rules.gain + TIE_BREAK * change
         side = torch.where(change < 0, FORBIDDEN + PER_METRE * change, side)
