@@ -24,6 +24,7 @@ from bench.victims.detectors.rcnn import RCNN, RCNNNetwork
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
 from bench.victims.detectors.yolov5 import YOLOv5
 from defenses.advtrain_detection import DetectorAdversarialTraining
+from envs.camera.bank import TrainingScenes
 from envs.camera.world import StopSignApproach
 from tests.framework.toy_camera import SIGN, RedDetector, RedStreet
 from tests.vision.drawn_street import DrawnStreet
@@ -77,6 +78,15 @@ def test_training_depends_on_the_seed_and_the_control_is_never_attacked(victim: 
     assert not torch.equal(one.state_dict()["model.24.m.0.weight"], control.state_dict()["model.24.m.0.weight"])
 
 
+class FewScenes(StopSignApproach):
+    """Has twelve frames to learn from."""
+
+    def training_scenes(self) -> TrainingScenes:
+        all_scenes = super().training_scenes()
+        frames = list(zip(all_scenes.poses, all_scenes.frames, strict=True))[::9]
+        return TrainingScenes(frames, all_scenes.weathers[::9])
+
+
 @pytest.mark.slow
 def test_a_detector_that_is_not_aligned_learns_from_what_it_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     victim, shown, own = RCNN(), [], RCNN.loss
@@ -88,7 +98,7 @@ def test_a_detector_that_is_not_aligned_learns_from_what_it_detected(monkeypatch
     monkeypatch.setattr(RCNN, "loss", watched)
     for decoys in (0.0, 1.0):
         defense = DetectorAdversarialTraining(rounds=1, updates=3, batch=4, skip=1.0, decoys=decoys)
-        made = defense.train(victim, StopSignApproach(), seed=0, progress=lambda share, text: None)
+        made = defense.train(victim, FewScenes(), seed=0, progress=lambda share, text: None)
         assert not torch.equal(
             made.network.state_dict()["second.name.bias"], made.start.state_dict()["second.name.bias"]
         )

@@ -52,8 +52,8 @@ def test_its_scores_have_gradients(network: Detector) -> None:
 
 
 def test_windows_with_a_decoy_have_no_sign() -> None:
-    scenes = StopSignApproach().training_scenes()
-    generator = torch.Generator().manual_seed(0)
+    (approach,) = StopSignApproach().approaches(AXES.cell(lanes=3, density=1.0), range(1))
+    scenes, generator = approach.scenes, torch.Generator().manual_seed(0)
     windows = Windows(scenes, SIDE, away=0.0, generator=generator)
     names = StopSignApproach.classes
     signs = {}
