@@ -316,7 +316,16 @@ def verify(
 
 
 @app.command()
-def report(words: Words = None) -> None:
+def report(
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME] [out=…] [html=…]",
+            help="Name of a report (run, leaderboard or thesis; without one run), a results folder, a page to write.",
+            autocompletion=completed,
+        ),
+    ] = None,
+) -> None:
     """Print a report on all records of a results folder.
 
     For instance: bench report thesis out=results
