@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 from leaderboard.comparisons.comparison import Comparison, parameters
 
@@ -41,7 +41,8 @@ def defended(one: Comparison, shown: dict[str, Varying] | None = None) -> str:
 def labels(comparisons: Sequence[Comparison], column: str) -> dict[tuple[object, object], str]:
     """A label for each component of a kind, by name and parameters as in the records.
 
-    It is the name with the parameters in which components of this name differ, without those that most episodes have.
+    It is the name with the parameters in which components of this name differ, without those that most episodes have. Where
+    that would be the same for two components, it has the parameters in which these differ.
 
     Args:
         comparisons: all that need labels.
@@ -54,13 +55,22 @@ def labels(comparisons: Sequence[Comparison], column: str) -> dict[tuple[object,
             counter = episodes.setdefault((one.identity[column], name), Counter())
             counter[repr(value)] += one.own.table.num_rows
     usual = {key: value for key, counts in episodes.items() for value, n in counts.items() if 2 * n > counts.total()}
-    found = {}
-    for one in comparisons:
-        name, params = one.identity[column], one.identity[f"{column}_params"]
+
+    def label(key: tuple[object, object], names: Container[str], always: Container[str] = ()) -> str:
         words = [
-            f"{key}={value}"
-            for key, value in parameters(params).items()
-            if key in names.get(name, ()) and value != "" and usual.get((name, key)) != repr(value)
+            f"{name}={value}"
+            for name, value in parameters(key[1]).items()
+            if name in names and value != "" and (name in always or usual.get((key[0], name)) != repr(value))
         ]
-        found[name, params] = " ".join([str(name), *words])
+        return " ".join([str(key[0]), *words])
+
+    keys = {(one.identity[column], one.identity[f"{column}_params"]) for one in comparisons}
+    found = {key: label(key, names.get(key[0], ())) for key in keys}
+    for shared in (text for text, count in Counter(found.values()).items() if count > 1):
+        alike = [key for key in keys if found[key] == shared]
+        sets = [parameters(params) for _, params in alike]
+        # A parameter that is not known of all, because some records are older, tells nothing.
+        common = set.intersection(*map(set, sets))
+        differing = {name for name in common if len({repr(each[name]) for each in sets}) > 1}
+        found |= {key: label(key, names.get(key[0], ()), differing) for key in alike}
     return found

@@ -112,6 +112,12 @@ def test_a_label_leaves_out_what_is_empty() -> None:
     assert set(found.values()) == {"dqn", "dqn behind=shield", "dqn behind=tracker"}
 
 
+def test_two_components_have_two_labels_even_if_the_rarer_one_has_an_empty_parameter() -> None:
+    usual, rare = drive(victim_params={"behind": "shield"}), drive(victim_params={"behind": ""})
+    found = labels(read_tracks({"driving": pa.concat_tables([usual, rare.slice(0, rare.num_rows // 2)])}), "victim")
+    assert set(found.values()) == {"dqn", "dqn behind=shield"}
+
+
 def test_a_parameter_is_shown_only_where_components_of_the_same_name_differ_in_it() -> None:
     driven = [
         drive(victim=name, victim_params={"hidden": hidden}) for name, hidden in (("dqn", 1), ("ppo", 2), ("ppo", 3))
