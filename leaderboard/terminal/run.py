@@ -81,9 +81,7 @@ def _below(comparisons: Sequence[Comparison]) -> Iterator[Text]:
         yield Text(f"{about[0]}{others}: {remark}", style="yellow")
     if len(notes) > NOTES:
         yield Text(f"{counted(len(notes) - NOTES, 'more note')}: --cells", style="yellow")
-    yield Text(
-        "`bench show FOLDER --cells` shows every cell and parameter; `bench help TERM` explains a column.", style="dim"
-    )
+    yield Text("`bench show FOLDER --cells` shows more; `bench help TERM` explains a column.", style="dim")
 
 
 def _short_threat(one: Comparison) -> str:
