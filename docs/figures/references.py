@@ -109,7 +109,9 @@ def _records(victim: str | None = None) -> pa.Table:
 def _scores() -> dict[str, tuple[float, float]]:
     """Reward as a share of the maximum, and safe progress, of each driver; mean over scenarios and training seeds."""
     found: dict[str, tuple[float, float]] = {}
-    groups = _records().group_by(["victim", "victim_params"], use_threads=False)
+    records = _records()
+    records = records.filter(pc.is_in(records["victim"], pa.array(["blind", "ddpg", "dqn", "idm", "random"])))
+    groups = records.group_by(["victim", "victim_params"], use_threads=False)
     means = groups.aggregate([("return", "mean"), ("safe_progress", "mean")])
     for row in means.to_pylist():
         params = json.loads(row["victim_params"])
