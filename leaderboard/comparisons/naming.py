@@ -56,21 +56,24 @@ def labels(comparisons: Sequence[Comparison], column: str) -> dict[tuple[object,
             counter[repr(value)] += one.own.table.num_rows
     usual = {key: value for key, counts in episodes.items() for value, n in counts.items() if 2 * n > counts.total()}
 
-    def label(key: tuple[object, object], names: Container[str], always: Container[str] = ()) -> str:
+    def label(key: tuple[object, object], always: Container[str] = ()) -> str:
+        component_name, params = key
         words = [
             f"{name}={value}"
-            for name, value in parameters(key[1]).items()
-            if name in names and value != "" and (name in always or usual.get((key[0], name)) != repr(value))
+            for name, value in parameters(params).items()
+            if name in names.get(component_name, ())
+            and value != ""
+            and (name in always or usual.get((component_name, name)) != repr(value))
         ]
-        return " ".join([str(key[0]), *words])
+        return " ".join([str(component_name), *words])
 
     keys = {(one.identity[column], one.identity[f"{column}_params"]) for one in comparisons}
-    found = {key: label(key, names.get(key[0], ())) for key in keys}
+    found = {key: label(key) for key in keys}
     for shared in (text for text, count in Counter(found.values()).items() if count > 1):
         alike = [key for key in keys if found[key] == shared]
         sets = [parameters(params) for _, params in alike]
         # A parameter that is not known of all, because some records are older, tells nothing.
         common = set.intersection(*map(set, sets))
         differing = {name for name in common if len({repr(each[name]) for each in sets}) > 1}
-        found |= {key: label(key, names.get(key[0], ()), differing) for key in alike}
+        found |= {key: label(key, differing) for key in alike}
     return found
