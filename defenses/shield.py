@@ -88,8 +88,7 @@ class Filter(IntervalPolicy):
 
     def edge(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Tensor:
         """The highest lane [...] that is known to exist: the ego was in it, or a car surely was."""
-        place = torch.where(boxes.present[..., 1:], boxes.low[..., 1:, 1] + ego.y.unsqueeze(-1), 0.0).amax(-1)
-        lane = (place / self.reckoning.kinematics.lane_width).round()
+        lane = cars_of(ego, boxes).rightmost(self.reckoning.kinematics.lane_width)
         return torch.maximum(torch.maximum(lane, ego.target_lane), state["edge"])
 
 

@@ -142,13 +142,13 @@ def test_the_gradients_of_rooms_and_speeds_are_those_of_finite_differences(seed:
     width = torch.rand(low.shape, generator=generator)
     speed = 20 + 8 * torch.rand(count, generator=generator)
     ego = Ego(y=4 * one, heading=0 * one, speed=speed, target_lane=one, target_speed=speed, edge=2 * one)
-    weights = [torch.randn(shape, generator=generator) for shape in ((count, 6, 3, 3), (count, 3, 3), (count, 9))]
-    slowing = 5 * torch.rand(count, 3, generator=generator)
+    weights = [torch.randn(shape, generator=generator) for shape in ((count, 6, 3, 4), (count, 3, 4), (count, 9))]
+    slowing = 5 * torch.rand(count, 4, generator=generator)
 
     def weighed(low: Tensor, speed: Tensor) -> Tensor:
         """[count] a weighted sum of all rooms and speeds."""
         moving, cars = ego._replace(speed=speed), Cars(torch.ones(count, others, dtype=torch.bool), low, low + width)
-        found = (*judge.rooms(moving, cars, speed[:, None].expand(-1, 3), slowing), judge.rooms.speeds(moving, cars))
+        found = (*judge.rooms(moving, cars, speed[:, None].expand(-1, 4), slowing), judge.rooms.speeds(moving, cars))
         return torch.stack([(w * each).flatten(1).sum(1) for w, each in zip(weights, found, strict=True)]).sum(0)
 
     step, direction = 1e-2, torch.randn(low.shape, generator=generator) * torch.tensor([1.0, 0.0, 1.0, 0.0])
