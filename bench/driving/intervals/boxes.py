@@ -11,7 +11,6 @@ from torch import Tensor
 from bench.driving.features import Features
 from bench.driving.threat import Norm
 
-
 ALONG = ("x", "vx")
 """The features along the road."""
 
