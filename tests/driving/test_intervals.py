@@ -167,6 +167,22 @@ def test_the_gradients_of_rooms_and_speeds_are_those_of_finite_differences(seed:
     assert float(((ahead - back) / (2 * step) - slope).abs().median()) < 0.02 * float(slope.abs().mean())
 
 
+def test_margins_use_no_room_that_is_not_computed() -> None:
+    count, others, generator = 256, 6, torch.Generator().manual_seed(0)
+    judge = Judge(reckoning(FACTS, "discrete"), 1 / FACTS.decision_hz, Caution(braking=0.5, seconds=2.0, distance=0.4))
+    low = torch.rand(count, others, 4, generator=generator) * torch.tensor([80.0, 8.0, 10.0, 2.0])
+    low = low + torch.tensor([-30.0, 0.0, 15.0, -1.0])
+    speed, aim = (15 + 15 * torch.rand(count, generator=generator) for _ in range(2))
+    off, one = 8 * torch.rand(count, generator=generator), torch.ones(count)
+    ego = Ego(y=off, heading=0 * one, speed=speed, target_lane=one, target_speed=aim, edge=2 * one)
+    cars = Cars(torch.ones(count, others, dtype=torch.bool), low, low + 1)
+    some = judge(ego, cars)
+    assert not judge.rooms.asked.all()
+    judge.rooms.asked[:] = True
+    for name, value in judge(ego, cars)._asdict().items():
+        torch.testing.assert_close(getattr(some, name), value, rtol=0, atol=0, msg=name)
+
+
 @settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 10_000), rate=st.sampled_from([1.25, 4.0]))
 def test_no_leader_that_brakes_as_assumed_is_hit(seed: int, rate: float) -> None:
