@@ -30,7 +30,9 @@ def print_report(words: Sequence[str], console: Console) -> None:
     name = names[0] if names else "leaderboard" if "html" in values else "run"
     published = "out" not in values and not out.exists() and name != "run"
     if "out" not in values and (published or out.exists()):
-        console.print("published records (there is no folder results)" if published else "records of the folder results")
+        console.print(
+            "published records (there is no folder results)" if published else "records of the folder results"
+        )
     if "html" in values:
         page = registry.resolve(PAGES, name, "page")
         page(None if published else out, Path(values["html"]).expanduser(), console)
