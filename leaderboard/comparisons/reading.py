@@ -86,7 +86,7 @@ def read_tracks(records: Mapping[str, pa.Table]) -> list[Comparison]:
 
 
 def comparable(records: pa.Table, of: Track) -> pa.Table:
-    """The records without the older ones, scored by a stand-in for the metric, of defended victims that have newer ones on a grid."""
+    """The records without older ones, scored by a stand-in for the metric, of defended victims that have newer ones on a grid."""
     if of.scored_with not in records.column_names:
         return records
     newer = np.flatnonzero(records[of.scored_with].is_valid().to_numpy())
