@@ -123,7 +123,7 @@ def clean(pair: Comparison) -> pa.Table:
 
 
 def undisturbed(pair: Comparison) -> float:
-    """Confidence without a patch."""
+    """Stop score without a patch."""
     assert pair.clean_score
     return pair.clean_score.estimate
 
