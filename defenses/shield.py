@@ -38,6 +38,7 @@ class Shield(DrivingDefense):
     Args:
         assumed_budget: budget of the perturbation set that it assumes.
         assumed_norm: kind of this set.
+        assumed_noise: by how much the sensor may be wrong about other cars along the road besides, in m and m/s.
         band: margin of FASTER in m from which on slower actions are masked.
         braking: least deceleration that is assumed of a car ahead, in m/s2; it is higher behind a queue.
         braking_s: how long a car ahead is assumed to brake, in s.
@@ -46,6 +47,7 @@ class Shield(DrivingDefense):
 
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"
+    assumed_noise: NotNegative = 0.05
     band: NotNegative = 0.0
     braking: NotNegative = 0.5
     braking_s: NotNegative = 2.0
@@ -62,7 +64,9 @@ class Filter(IntervalPolicy):
     """A policy behind a filter. Its state is the reckoned ego, the highest lane that was seen, and the inner policy's state."""
 
     def __init__(self, settings: Shield, policy: Policy, facts: DrivingFacts) -> None:
-        super().__init__(facts, policy.action_type, settings.assumed_norm, settings.assumed_budget)
+        super().__init__(
+            facts, policy.action_type, settings.assumed_norm, settings.assumed_budget, settings.assumed_noise
+        )
         self.policy, self.band = policy, settings.band
         self.driver, self.weights_sha256 = policy.driver, policy.weights_sha256
         self.caution = Caution(braking=settings.braking, seconds=settings.braking_s, distance=settings.distance)
@@ -88,8 +92,7 @@ class Filter(IntervalPolicy):
 
     def edge(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Tensor:
         """The highest lane [...] that is known to exist: the ego was in it, or a car surely was."""
-        place = torch.where(boxes.present[..., 1:], boxes.low[..., 1:, 1] + ego.y.unsqueeze(-1), 0.0).amax(-1)
-        lane = (place / self.reckoning.kinematics.lane_width).round()
+        lane = cars_of(ego, boxes).rightmost(self.reckoning.kinematics.lane_width)
         return torch.maximum(torch.maximum(lane, ego.target_lane), state["edge"])
 
 

@@ -15,6 +15,7 @@ from bench.driving.intervals.boxes import Assumed, Boxes
 from bench.driving.intervals.policy import IntervalPolicy, corrected, reckoning, with_inner
 from bench.driving.intervals.tracks import narrowed, predicted
 from bench.driving.threat import Norm
+from bench.plugins.ranges import NotNegative
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,10 +30,12 @@ class Tracker(DrivingDefense):
     Args:
         assumed_budget: budget of the perturbation set that it assumes.
         assumed_norm: kind of this set.
+        assumed_noise: by how much the sensor may be wrong about other cars along the road besides, in m and m/s.
     """
 
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"
+    assumed_noise: NotNegative = 0.1
 
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
         return Tracked(self, victim.load(seed, facts), facts).eval()
@@ -43,7 +46,7 @@ class Tracked(PolicyWrapper):
 
     def __init__(self, settings: Tracker, policy: Policy, facts: DrivingFacts) -> None:
         super().__init__(policy)
-        self.assumed = Assumed(facts.features, settings.assumed_norm, settings.assumed_budget)
+        self.assumed = Assumed(facts.features, settings.assumed_norm, settings.assumed_budget, settings.assumed_noise)
         self.period = 1 / facts.decision_hz
         self.reckoning = reckoning(facts, policy.action_type)
 

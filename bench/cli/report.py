@@ -27,11 +27,13 @@ def print_report(words: Sequence[str], console: Console) -> None:
     """
     names, values = split(words, KEYS, names=1)
     out = Path(values.get("out", "results")).expanduser()
-    no_folder = "out" not in values and not out.exists()
+    name = names[0] if names else "leaderboard" if "html" in values else "run"
+    published = "out" not in values and not out.exists() and name != "run"
+    if "out" not in values and (published or out.exists()):
+        console.print("published records (there is no folder results)" if published else "records of the folder results")
     if "html" in values:
-        page = registry.resolve(PAGES, names[0] if names else "leaderboard", "page")
-        page(None if no_folder else out, Path(values["html"]).expanduser(), console)
+        page = registry.resolve(PAGES, name, "page")
+        page(None if published else out, Path(values["html"]).expanduser(), console)
         return
-    name = names[0] if names else "run"
     function = registry.resolve(registry.REPORTS, name, "report")
-    function({} if name != "run" and no_folder else reading.read_all(out), console)
+    function({} if published else reading.read_all(out), console)

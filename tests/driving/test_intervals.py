@@ -77,14 +77,21 @@ def driven(world: HighwayWorld, policy: Policy, attack: Any, **values: Any) -> d
 
 @pytest.mark.parametrize("norm", ["relative", "linf"])
 @settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 10_000), budget=st.sampled_from([0.0, 0.05, 0.1, 0.3]))
-def test_the_boxes_of_any_shown_observation_hold_the_truth(norm: Norm, seed: int, budget: float) -> None:
-    truth = observations(4, seed).clamp(-1, 1)
+@given(
+    seed=st.integers(0, 10_000), budget=st.sampled_from([0.0, 0.05, 0.1, 0.3]), noise=st.sampled_from([0.0, 0.1, 0.5])
+)
+def test_the_boxes_of_any_shown_observation_hold_the_truth(norm: Norm, seed: int, budget: float, noise: float) -> None:
+    truth, generator = observations(4, seed).clamp(-1, 1), torch.Generator().manual_seed(seed)
     threat = ObservationThreat(norm=norm, budget=budget)
-    radius = threat.radius(truth, FACTS.features)
-    share = torch.rand(truth.shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
-    shown = (truth + share.sign() * share.abs().sqrt() * radius).clamp(-1, 1)
-    boxes = Assumed(FACTS.features, norm, budget).boxes(shown)
+    # The sensor is wrong about the other cars' x and vx; what it measures is then perturbed.
+    off = noise * (2 * torch.rand(truth.shape, generator=generator) - 1)
+    off[..., 0, :] = off[..., [0, 2, 4]] = 0.0
+    off[..., 1:] /= FACTS.features.half_range()
+    measured = (truth + off).clamp(-1, 1)
+    share = torch.rand(truth.shape, generator=generator) * 2 - 1
+    radius = threat.radius(measured, FACTS.features)
+    shown = (measured + share.sign() * share.abs().sqrt() * radius).clamp(-1, 1)
+    boxes = Assumed(FACTS.features, norm, budget, noise).boxes(shown)
     physical = truth[..., 1:] * FACTS.features.half_range()
     present = boxes.present.unsqueeze(-1)
     assert bool(((boxes.low <= physical + 1e-4) & (physical <= boxes.high + 1e-4) | ~present).all())
@@ -142,13 +149,13 @@ def test_the_gradients_of_rooms_and_speeds_are_those_of_finite_differences(seed:
     width = torch.rand(low.shape, generator=generator)
     speed = 20 + 8 * torch.rand(count, generator=generator)
     ego = Ego(y=4 * one, heading=0 * one, speed=speed, target_lane=one, target_speed=speed, edge=2 * one)
-    weights = [torch.randn(shape, generator=generator) for shape in ((count, 6, 3, 3), (count, 3, 3), (count, 9))]
-    slowing = 5 * torch.rand(count, 3, generator=generator)
+    weights = [torch.randn(shape, generator=generator) for shape in ((count, 6, 3, 4), (count, 3, 4), (count, 9))]
+    slowing = 5 * torch.rand(count, 4, generator=generator)
 
     def weighed(low: Tensor, speed: Tensor) -> Tensor:
         """[count] a weighted sum of all rooms and speeds."""
         moving, cars = ego._replace(speed=speed), Cars(torch.ones(count, others, dtype=torch.bool), low, low + width)
-        found = (*judge.rooms(moving, cars, speed[:, None].expand(-1, 3), slowing), judge.rooms.speeds(moving, cars))
+        found = (*judge.rooms(moving, cars, speed[:, None].expand(-1, 4), slowing), judge.rooms.speeds(moving, cars))
         return torch.stack([(w * each).flatten(1).sum(1) for w, each in zip(weights, found, strict=True)]).sum(0)
 
     step, direction = 1e-2, torch.randn(low.shape, generator=generator) * torch.tensor([1.0, 0.0, 1.0, 0.0])
@@ -158,6 +165,22 @@ def test_the_gradients_of_rooms_and_speeds_are_those_of_finite_differences(seed:
     ahead, back = weighed(low + step * direction, speed + step), weighed(low - step * direction, speed - step)
     # Where another car becomes the nearest one within the step, there is no slope.
     assert float(((ahead - back) / (2 * step) - slope).abs().median()) < 0.02 * float(slope.abs().mean())
+
+
+def test_margins_use_no_room_that_is_not_computed() -> None:
+    count, others, generator = 256, 6, torch.Generator().manual_seed(0)
+    judge = Judge(reckoning(FACTS, "discrete"), 1 / FACTS.decision_hz, Caution(braking=0.5, seconds=2.0, distance=0.4))
+    low = torch.rand(count, others, 4, generator=generator) * torch.tensor([80.0, 8.0, 10.0, 2.0])
+    low = low + torch.tensor([-30.0, 0.0, 15.0, -1.0])
+    speed, aim = (15 + 15 * torch.rand(count, generator=generator) for _ in range(2))
+    off, one = 8 * torch.rand(count, generator=generator), torch.ones(count)
+    ego = Ego(y=off, heading=0 * one, speed=speed, target_lane=one, target_speed=aim, edge=2 * one)
+    cars = Cars(torch.ones(count, others, dtype=torch.bool), low, low + 1)
+    some = judge(ego, cars)
+    assert not judge.rooms.asked.all()
+    judge.rooms.asked[:] = True
+    for name, value in judge(ego, cars)._asdict().items():
+        torch.testing.assert_close(getattr(some, name), value, rtol=0, atol=0, msg=name)
 
 
 @settings(max_examples=4, deadline=None)

@@ -149,6 +149,15 @@ def test_report_prints_a_report_by_name(bench: Bench, tmp_path: Path) -> None:
     assert_one_line(bench("report", f"out={tmp_path / 'none'}"), "there are no records")
 
 
+def test_a_report_without_a_folder_says_which_records_it_shows(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert bench("report", "leaderboard").out.startswith("published records")
+    bench("run", *TOY, "executor=serial", "record=0", "out=results")
+    assert bench("report").out.startswith("records of the folder results")
+
+
 def test_training_saves_to_the_zoo_and_says_how_long_it_took(bench: Bench, tmp_path: Path) -> None:
     said = bench("train", "victim=toy", "world=toy", "seeds=0,1", f"out={tmp_path}")
     assert said.code == 0

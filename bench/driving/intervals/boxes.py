@@ -11,6 +11,9 @@ from torch import Tensor
 from bench.driving.features import Features
 from bench.driving.threat import Norm
 
+ALONG = ("x", "vx")
+"""The features along the road."""
+
 
 class Boxes(NamedTuple):
     """What is known about every row of an observation, in physical units.
@@ -33,17 +36,21 @@ class Assumed:
         features: names, ranges and floors of the measured features.
         norm: kind of the set, as in `bench.driving.ObservationThreat`.
         budget: its size.
+        noise: by how much the sensor may besides be wrong about where along the road another car is, and how fast, in m and
+            m/s, at least 0.
     """
 
     features: Features
     norm: Norm
     budget: float
+    noise: float = 0.0
 
     def boxes(self, shown: Tensor) -> Boxes:
         """The true values from which the set leads to the shown ones: the inverse of `ObservationThreat.radius`.
 
         With the norm `relative` a shown z stands for true values in [min(z - f, z / (1 +- b)), max(z + f, z / (1 -+ b))], where
-        b is the budget and f the floor, and + or - is chosen by the sign of z.
+        b is the budget and f the floor, and + or - is chosen by the sign of z. Boxes of other cars are wider by the noise at
+        both ends; the ego's own row is measured without any.
 
         Args:
             shown: the observation that the policy received, [..., V, F], on the normalised scale.
@@ -60,6 +67,9 @@ class Assumed:
             larger, smaller = value / max(1 - self.budget, 1e-3), value / (1 + self.budget)
             low = torch.minimum(value - floor, torch.minimum(larger, smaller))
             high = torch.maximum(value + floor, torch.maximum(larger, smaller))
+        noise = torch.tensor([self.noise if name in ALONG else 0.0 for name in features.names]).to(value)
+        noise = noise * (torch.arange(value.shape[-2]) > 0).to(value).unsqueeze(-1)
+        low, high = low - noise, high + noise
         end = half * (1 - 1e-5)
         low = torch.where(low - centre <= -end, -torch.inf, low)
         high = torch.where(high - centre >= end, torch.inf, high)

@@ -50,7 +50,7 @@ class CorridorJudge:
         speeds = reckoning.kinematics.target_speeds
         self.slowing = speeds[1] - speeds[0]
         following = FollowingDistance(reckoning.kinematics, period, caution.seconds, braking=limit)
-        self.rooms = Rooms(reckoning, period, caution, following, steady=LEVELS // 2)
+        self.rooms = Rooms(reckoning, period, caution, following, steady=LEVELS // 2, asked=(range(LEVELS),))
 
     def __call__(self, ego: Ego, cars: Cars, edge: Tensor) -> Corridor:
         """The corridor [...].

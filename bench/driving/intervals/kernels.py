@@ -139,6 +139,7 @@ def rooms(
     slowing: Floats,
     tables: Floats,
     side: int,
+    asked: Flags,
     rules: Rules,
     front: Floats,
     front_car: Numbers,
@@ -157,6 +158,7 @@ def rooms(
         slowing: by how much the ego slows down after that, in m/s, at least 0, [N, O].
         tables: following distances [T, levels * side * side].
         side: number of speeds in a table.
+        asked: the pairs of table and option whose room is computed, [T, O].
         rules: see `Rules`.
         front, front_car: room [N, T, 3, O] from -`FREE` to `FREE`, and the car that limits it or `NOBODY`.
         rear, rear_car: the same of the cars behind, [N, 3, O].
@@ -179,6 +181,8 @@ def rooms(
                 level[n, car] = _level(low[n], high[n], present[n], car, rules)
                 for table in range(len(tables)):
                     for option in range(options):
+                        if not asked[table, option]:
+                            continue
                         room = gap - used(tables[table], side, own[n, option], leader, level[n, car])[0]
                         for beside in range(3):
                             middle = nearest + beside * rules.lane_width

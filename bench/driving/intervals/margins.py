@@ -20,6 +20,8 @@ SETTLED_M, SETTLED_RAD = 0.5, 0.1
 """The ego is in its target lane if it is this close to the middle and to its direction."""
 KEEPS, CHANGES = 1, 3
 """Numbers of options: IDLE, and a lane change without braking, after FASTER, IDLE and SLOWER."""
+STAYS = range(CHANGES)
+"""The options FASTER, IDLE and SLOWER."""
 
 
 class Margins(NamedTuple):
@@ -58,8 +60,8 @@ class Margins(NamedTuple):
 
     @property
     def changeable(self) -> Tensor:
-        """bool [..., 2]: from a lane the ego may go to both sides, and from between two back, if the new one is not safe."""
-        back = torch.stack([self.straddled < 0, self.straddled > 0], -1) & (self.stay[..., 2:] < 0)
+        """bool [..., 2]: from a lane the ego may go to both sides, and from between two back, if nothing else is safe."""
+        back = torch.stack([self.straddled < 0, self.straddled > 0], -1) & (self.stay < 0).all(-1, keepdim=True)
         return self.settled.unsqueeze(-1) | back
 
 
@@ -74,12 +76,14 @@ class Judge:
 
     def __init__(self, reckoning: DeadReckoning, period: float, caution: Caution) -> None:
         self.reckoning = reckoning
-        leaving = (Case(within=CLEARING_S * (PARTS - part) / PARTS) for part in range(PARTS))
-        changing = Case(held=CLEARING_S), Case(within=CLEARING_S, held=CLEARING_S)
-        following = FollowingDistance(
-            reckoning.kinematics, period, caution.seconds, cases=(Case(), *changing, *leaving)
-        )
-        self.rooms = Rooms(reckoning, period, caution, following, steady=KEEPS)
+        asked = {
+            Case(): STAYS,
+            Case(held=CLEARING_S): [CHANGES],
+            Case(within=CLEARING_S, held=CLEARING_S): [KEEPS],
+            **{Case(within=CLEARING_S * (PARTS - part) / PARTS): STAYS for part in range(PARTS)},
+        }
+        following = FollowingDistance(reckoning.kinematics, period, caution.seconds, cases=tuple(asked))
+        self.rooms = Rooms(reckoning, period, caution, following, steady=KEEPS, asked=tuple(asked.values()))
 
     def __call__(self, ego: Ego, cars: Cars) -> Margins:
         rooms, rear = self.rooms(ego, cars, *self._options(ego))
@@ -139,9 +143,7 @@ class Judge:
 
     def _right_exists(self, ego: Ego, cars: Cars) -> Tensor:
         """bool [...], whether it is known that there is a lane on the right: the edge is known, or a car is surely there."""
-        rightmost = torch.where(cars.present, cars.low[..., 1], 0.0).amax(-1)
-        beyond = rightmost > (ego.target_lane + 0.5) * self.reckoning.kinematics.lane_width
-        return beyond | (ego.edge < UNKNOWN_EDGE)
+        return (cars.rightmost(self.reckoning.kinematics.lane_width) > ego.target_lane) | (ego.edge < UNKNOWN_EDGE)
 
 
 def _spared(front: Tensor, rear: Tensor) -> Tensor:

@@ -27,15 +27,18 @@ class IntervalPolicy(Policy):
         facts: facts of the world.
         action_type: kind of the actions.
         norm, budget: the perturbation set that it assumes.
+        noise: the error of the sensor that it assumes, in m and m/s.
 
     Raises:
         UserError: if the world does not offer what intervals need.
     """
 
-    def __init__(self, facts: DrivingFacts, action_type: ActionType, norm: Norm, budget: float) -> None:
+    def __init__(
+        self, facts: DrivingFacts, action_type: ActionType, norm: Norm, budget: float, noise: float = 0.0
+    ) -> None:
         super().__init__()
         self.action_type = action_type
-        self.assumed = Assumed(facts.features, norm, budget)
+        self.assumed = Assumed(facts.features, norm, budget, noise)
         self.period = 1 / facts.decision_hz
         self.reckoning = reckoning(facts, action_type)
 

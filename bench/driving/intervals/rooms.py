@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -44,6 +45,10 @@ class Cars(NamedTuple):
     low: Tensor
     high: Tensor
 
+    def rightmost(self, lane_width: float) -> Tensor:
+        """The number of the rightmost lane [...] that a car is surely in; 0 without a car."""
+        return torch.where(self.present, self.low[..., 1] / lane_width, 0.0).amax(-1).round()
+
 
 def cars_of(ego: Ego, boxes: Boxes) -> Cars:
     along, across = ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
@@ -60,12 +65,23 @@ class Rooms:
         caution: what is assumed of other cars.
         following: following distances.
         steady: number of the option that keeps the speed.
+        asked: for each table of following distances the options whose room is computed; that of others is `FREE`.
     """
 
     def __init__(
-        self, reckoning: DeadReckoning, period: float, caution: Caution, following: FollowingDistance, steady: int
+        self,
+        reckoning: DeadReckoning,
+        period: float,
+        caution: Caution,
+        following: FollowingDistance,
+        *,
+        steady: int,
+        asked: tuple[Sequence[int], ...],
     ) -> None:
         car = reckoning.kinematics
+        self.asked = np.zeros((len(asked), 1 + max(option for options in asked for option in options)), np.bool_)
+        for table, options in enumerate(asked):
+            self.asked[table, list(options)] = True
         model = car.following
         self.following, self.top = following, car.target_speeds[-1]
         self.rules = kernels.Rules(
@@ -148,6 +164,7 @@ class _Rooms(torch.autograd.Function):
             slower,
             of.following.tables,
             of.following.side,
+            of.asked,
             of.rules,
             front,
             found[0],

@@ -41,6 +41,7 @@ class Planner(DrivingVictim):
     Args:
         assumed_budget: budget of the perturbation set that it assumes.
         assumed_norm: kind of this set.
+        assumed_noise: by how much the sensor may be wrong about other cars along the road besides, in m and m/s.
         braking: least deceleration that is assumed of a car ahead, in m/s2; it is higher where another car is close ahead of it.
         braking_s: how long a car ahead is assumed to brake, in s.
         distance: room between two cars that is always kept, in m.
@@ -51,6 +52,7 @@ class Planner(DrivingVictim):
 
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"
+    assumed_noise: NotNegative = 0.05
     braking: NotNegative = 0.5
     braking_s: NotNegative = 2.0
     distance: NotNegative = 0.4
@@ -70,7 +72,7 @@ class IntervalPlanner(IntervalPolicy):
     """The policy. Its scores are the progress that an action is worth, with a gradient to every shown value that matters."""
 
     def __init__(self, rules: Planner, facts: DrivingFacts) -> None:
-        super().__init__(facts, "discrete", rules.assumed_norm, rules.assumed_budget)
+        super().__init__(facts, "discrete", rules.assumed_norm, rules.assumed_budget, rules.assumed_noise)
         self.rules = rules
         caution = Caution(braking=rules.braking, seconds=rules.braking_s, distance=rules.distance)
         self.judge = Judge(self.reckoning, self.period, caution)
