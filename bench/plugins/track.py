@@ -157,6 +157,8 @@ class Track(ABC):
     """Further columns, which may be null, for the flags of a leaderboard."""
     of_older: ClassVar[Mapping[str, str]] = {}
     """For probes that may not be null: the measurement that stands for them in records from before they were measured."""
+    scored_with: ClassVar[str] = ""
+    """A probe that is null in records with a stand-in for the metric (`of_older`): they are not comparable with newer ones."""
     norms: ClassVar[tuple[str, ...]] = ()
     """The norms of its threat models; records with another one are refused. Empty: any name."""
     facts_of_v1: ClassVar[Mapping[str, object]] = {}

@@ -181,6 +181,7 @@ class DetectionTrack(Track):
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
     probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP)
     of_older: ClassVar[Mapping[str, str]] = {"stop_score": "confidence_mean"}
+    scored_with: ClassVar[str] = "decoy_confidence"
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")
     metric: ClassVar[str] = "stop_score"
     metric_title: ClassVar[str] = "stop score"

@@ -52,7 +52,7 @@ def none() -> Figure:
     }
     colours = (style.BLUE, style.GREY, style.GREY, style.RED)
     detection.bar_label(detection.bar(list(measured), list(measured.values()), color=colours), fmt="%.2f", fontsize=10)
-    detection.set(ylabel="confidence", xlabel="patch", ylim=(0, 1))
+    detection.set(ylabel="stop score", xlabel="patch", ylim=(0, 1))
     detection.set_title("yolov3_tiny", fontsize=10.5)
     return made
 
@@ -130,7 +130,7 @@ def advtrain_detection() -> Figure:
     """Confidence during the approach, undefended and hardened, from the published records."""
     pairs = {"undefended": patched("eot"), "hardened": patched("eot", "advtrain_detection")}
     left = {name: pair.score.estimate for name, pair in pairs.items()}
-    title = f"advtrain: confidence under eot {left['undefended']:.2f} undefended,\n{left['hardened']:.2f} hardened"
+    title = f"advtrain: stop score under eot {left['undefended']:.2f} undefended,\n{left['hardened']:.2f} hardened"
     made = style.figure(4.0, title)
     for axes, (name, pair) in zip(made.subplots(1, 2, sharey=True), pairs.items(), strict=True):
         curve(axes, clean(pair), style.BLUE, "no patch")

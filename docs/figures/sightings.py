@@ -24,7 +24,7 @@ from envs.camera.axes import APPROACH_V1, AXES
 from envs.camera.world import StopSignApproach
 from leaderboard.comparisons.comparison import Comparison, parameters
 from leaderboard.comparisons.pairing import beside
-from leaderboard.comparisons.reading import read_comparisons
+from leaderboard.comparisons.reading import comparable, read_comparisons
 from leaderboard.published import published
 
 LANES, DENSITY = 3, 1.0
@@ -113,7 +113,7 @@ def patched(attack: str, defense: str = "none") -> Comparison:
 @cache
 def _comparisons() -> list[Comparison]:
     own = track("detection")
-    return read_comparisons(published(own), own)
+    return read_comparisons(comparable(published(own), own), own)
 
 
 def clean(pair: Comparison) -> pa.Table:
@@ -123,7 +123,7 @@ def clean(pair: Comparison) -> pa.Table:
 
 
 def undisturbed(pair: Comparison) -> float:
-    """Confidence without a patch."""
+    """Stop score without a patch."""
     assert pair.clean_score
     return pair.clean_score.estimate
 

@@ -58,10 +58,10 @@ def grey_patch() -> Figure:
 
 
 def _begun(attack: str, height: float, ratios: tuple[float, ...]) -> tuple[Figure, list[SubFigure]]:
-    """A figure whose title gives the confidence without and with the patch, and its subfigures."""
+    """A figure whose title gives the stop score without and with the patch, and its subfigures."""
     pair = patched(attack)
     before, after = undisturbed(pair), pair.score.estimate
-    made = style.figure(height, f"{attack}: confidence {before:.2f} without, {after:.2f} with it")
+    made = style.figure(height, f"{attack}: stop score {before:.2f} without, {after:.2f} with it")
     return made, list(made.subfigures(len(ratios), 1, height_ratios=ratios, squeeze=False)[:, 0])
 
 

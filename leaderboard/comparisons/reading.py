@@ -85,6 +85,17 @@ def read_tracks(records: Mapping[str, pa.Table]) -> list[Comparison]:
     return [one for one in found if one.is_attacked or not one.is_baseline]
 
 
+def comparable(records: pa.Table, of: Track) -> pa.Table:
+    """The records without older ones, scored by a stand-in for the metric, of defended victims that have newer ones on a grid."""
+    if of.scored_with not in records.column_names:
+        return records
+    newer = np.flatnonzero(records[of.scored_with].is_valid().to_numpy())
+    codes = codes_of(records, CONTROL)
+    keep = ~np.isin(codes, codes[newer])
+    keep[newer] = True
+    return records.filter(pa.array(keep))
+
+
 def _rank(one: Comparison) -> tuple[object, ...]:
     """By world, victim and defence (`none` first); then the strongest attack first, baselines last."""
     text = {name: str(value) for name, value in one.identity.items()}

@@ -11,11 +11,11 @@ import pyarrow as pa
 
 from bench.plugins import registry
 from bench.plugins.contracts import Access
-from bench.plugins.track import Track
+from bench.plugins.track import Track, track
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Interval
 from leaderboard.comparisons.comparison import THREAT, Comparison
-from leaderboard.comparisons.reading import read_tracks
+from leaderboard.comparisons.reading import comparable, read_tracks
 from leaderboard.ranking.flags import Flag, Subject, flags
 from leaderboard.ranking.worst import Panel, Worst, margin
 
@@ -187,6 +187,6 @@ def _baselines(attacks: Sequence[Comparison]) -> dict[str, Episodes]:
 
 
 def read_boards(records: Mapping[str, pa.Table]) -> tuple[list[Board], list[Comparison]]:
-    """The leaderboards that records make, by track, and all that was driven."""
-    comparisons = read_tracks(records)
+    """The leaderboards that records make, by track, and all that was driven and can be compared."""
+    comparisons = read_tracks({name: comparable(table, track(name)) for name, table in records.items()})
     return boards(comparisons), comparisons

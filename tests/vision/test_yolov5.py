@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from bench.detection import STOP_SIGN
-from bench.detection.boxes import confidence
+from bench.detection.approach import score
+from bench.detection.boxes import confidence, overlap
 from bench.errors import UserError
 from bench.victims import zoo
 from bench.victims.detectors import yolov5_file
-from bench.victims.detectors.yolov5 import MULTIPLES, Size, YOLOv5, YOLOv5Network
+from bench.victims.detectors.examples import Example
+from bench.victims.detectors.yolov5 import MULTIPLES, Size, YOLOv5, YOLOv5Network, sign_of
 from envs.camera.axes import AXES
 from envs.camera.world import StopSignApproach
 from tests.vision.drawn_street import DrawnStreet
@@ -89,6 +91,22 @@ def test_a_recipe_out_of_range_is_named(bad: dict[str, float]) -> None:
         YOLOv5(**bad)
 
 
+def test_caution_counts_the_surest_stop_sign_that_is_not_there() -> None:
+    torch.manual_seed(0)
+    network = YOLOv5Network("n", ("stop sign", "car")).eval()
+    box = torch.tensor([[8.0, 8.0, 40.0, 40.0]])
+    signs = Example(torch.rand(2, 3, 64, 64), [box, box], [torch.tensor([0]), torch.tensor([1])])
+    boxes, there = sign_of(signs, 0)
+    assert there.tolist() == [True, False]
+    assert boxes.tolist() == [box[0].tolist(), [0.0] * 4]
+    with torch.no_grad():
+        plain, cautious = (YOLOv5(caution=weight).loss(network, signs) for weight in (0.0, 3.0))
+        scores = network(signs.pictures).scores_of(0)
+        away = overlap(network(signs.pictures).boxes[0], box) == 0
+    surest = torch.stack([scores[0][away].max(), scores[1].max()])
+    torch.testing.assert_close(cautious - plain, -3 * (1 - surest).log().mean())
+
+
 @pytest.mark.slow
 def test_the_shipped_detector_finds_held_out_signs() -> None:
     detector, world = YOLOv5().load(0, FACTS), StopSignApproach()
@@ -98,3 +116,12 @@ def test_the_shipped_detector_finds_held_out_signs() -> None:
         seen = confidence(predictions, detector.index(STOP_SIGN), approach.scenes.boxes)
         assert seen.mean() > 0.6
         assert (seen[5:] > 0.5).all()
+
+
+@pytest.mark.slow
+def test_the_shipped_detector_takes_no_decoy_for_a_stop_sign() -> None:
+    world = StopSignApproach()
+    approaches = world.approaches(AXES.cell(lanes=3, density=1.0), range(3))
+    measured = score(YOLOv5().load(0, FACTS), approaches, None, share=0.5)
+    assert measured["false_stops"].mean() < 0.05
+    assert measured["average_precision"].mean() >= 0.85

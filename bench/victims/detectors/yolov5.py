@@ -10,20 +10,20 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
-from bench.detection import CameraWorld, Detector, Predictions
+from bench.detection import STOP_SIGN, CameraWorld, Detector, Predictions
 from bench.errors import UserError
 from bench.plugins.contracts import Facts, Progress, Trained
-from bench.plugins.ranges import Count, Share
+from bench.plugins.ranges import Count, NotNegative
 from bench.victims import zoo
 from bench.victims.detectors import coco, yolo, yolov5_file
 from bench.victims.detectors.examples import Example
 from bench.victims.detectors.learner import Learner
-from bench.victims.detectors.loss import supervised
+from bench.victims.detectors.loss import mistaken, supervised
 
 Size = Literal["n", "s", "m", "l", "x"]
 MULTIPLES: dict[Size, tuple[float, float]] = {
@@ -201,15 +201,17 @@ class YOLOv5(Learner[YOLOv5Network]):
         window: side of a window in pixels, a multiple of 32.
         away: share of the windows at uniformly random places; the others are near the sign.
         decoys: share of the windows with a decoy in the place of the stop sign.
+        caution: weight of the surest stop sign that is not there, in decoys and elsewhere.
         learning_rate: maximum learning rate of AdamW.
         trained_in: non-default parameters of the training world; set by `bench train`.
     """
 
+    training: ClassVar[int] = 2
+
     size: Size = "n"
     path: str = ""
-    updates: Count = 1200
-    away: Share = 0.3
-    decoys: Share = 0.0
+    updates: Count = 1600
+    caution: NotNegative = 2.0
 
     def zoo_name(self) -> str:
         return f"yolov5{self.size}"
@@ -248,4 +250,14 @@ class YOLOv5(Learner[YOLOv5Network]):
         return network
 
     def loss(self, network: YOLOv5Network, example: Example) -> Tensor:
-        return supervised(network(example.pictures), example.boxes, example.labels)
+        predictions = network(example.pictures)
+        label = network.index(STOP_SIGN)
+        wrong = mistaken(predictions, label, *sign_of(example, label)).mean()
+        return supervised(predictions, example.boxes, example.labels) + self.caution * wrong
+
+
+def sign_of(example: Example, label: int) -> tuple[Tensor, Tensor]:
+    """The box [N, 4] of the stop sign in each window, zeros where there is none, and whether there is one, bool [N]."""
+    found = [box[kind == label][:1] for box, kind in zip(example.boxes, example.labels, strict=True)]
+    there = torch.tensor([len(box) > 0 for box in found])
+    return torch.stack([box[0] if len(box) else torch.zeros(4) for box in found]), there
