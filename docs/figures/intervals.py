@@ -15,6 +15,7 @@ from attacks.noise import Noise
 from bench.driving import ObservationThreat, Policy
 from bench.driving.enforcer import Enforcer
 from bench.driving.intervals.margins import Margins
+from bench.driving.intervals.rooms import cars_of
 from bench.driving.victim import CountedPolicy
 from bench.victims.drivers.dqn import DQN
 from bench.victims.drivers.planner import IntervalPlanner, Planner
@@ -67,7 +68,7 @@ def shield() -> Figure:
     boxes = policy.assumed.boxes(flat)
     with torch.no_grad():
         ego = policy.reckoning.now(boxes, policy.reckoning.unknown(torch.arange(len(flat))))
-        found: Margins = policy.judge(ego, boxes)
+        found: Margins = policy.judge(ego, cars_of(ego, boxes))
     for place, (axes, name) in enumerate(zip(made.subplots(1, 2, sharey=True), ("FASTER", "SLOWER"), strict=True)):
         margin = found.stay[:, 2 * place].view(len(CLOSING), len(DISTANCE)).clamp(-30, 30)
         drawn = _map(axes, margin, f"margin of {name} (m)", "PuOr", (-30, 30))
