@@ -29,13 +29,14 @@ def print_report(words: Sequence[str], console: Console) -> None:
     out = Path(values.get("out", "results")).expanduser()
     name = names[0] if names else "leaderboard" if "html" in values else "run"
     published = "out" not in values and not out.exists() and name != "run"
-    if "out" not in values and (published or out.exists()):
-        console.print(
-            "published records (there is no folder results)" if published else "records of the folder results"
-        )
+    source = "published records (there is no folder results)" if published else f"records of the folder {out}"
     if "html" in values:
         page = registry.resolve(PAGES, name, "page")
         page(None if published else out, Path(values["html"]).expanduser(), console)
+        console.print(source)
         return
     function = registry.resolve(registry.REPORTS, name, "report")
-    function({} if published else reading.read_all(out), console)
+    records = {} if published else reading.read_all(out)
+    if "out" not in values:
+        console.print(source)
+    function(records, console)

@@ -22,6 +22,8 @@ from leaderboard.comparisons.reading import SCENARIO, groups, read_comparisons
 from leaderboard.published import published
 
 ATTACK, WORLD, DETECTOR = "eot", "camera", "yolov3_tiny"
+FAMILY = ("yolov3_tiny", "yolov5")
+"""The published detectors that stand beside the YOLOv5 of the thesis."""
 CONTROLS = (*REFERENCE_PATCHES, NO_ATTACK)
 WEATHERS = {"sun": "clear", "rain": "rain"}
 """The thesis' and ours."""
@@ -228,15 +230,17 @@ def is_of(row: str, identity: Mapping[str, object]) -> bool:
 
 
 def _detectors(tables: Iterable[pa.Table]) -> list[Detector]:
-    """Of every victim what most of its records share: the user's where there are any, else the published ones."""
+    """Of every victim what most of its records share: all of the user's, then those of the family that are published."""
     found: dict[str, Detector] = {}
-    for table in tables:
+    for place, table in enumerate(tables):
         rows: Counter[Detector] = Counter()
         columns = ("victim", "victim_params", "world_params", "attack_params")
         for identity, some in groups(table, columns, pc.equal(table["attack"], ATTACK)):
             victim, victim_params, world_params, attack = (str(identity[name]) for name in columns)
             rows[Detector(victim, victim_params, world_params, _crafting(attack))] += some.num_rows
         for detector, _ in rows.most_common():
+            if place > 0 and detector.victim not in FAMILY:
+                continue
             found.setdefault(detector.victim, detector)
     if not found:
         victim, world, attack = _standard("victim", DETECTOR), _standard("world", WORLD), _standard("attack", ATTACK)

@@ -9,7 +9,7 @@ from torch import Tensor
 from bench.driving import Policy
 from bench.driving.intervals.boxes import Assumed
 from bench.errors import UserError
-from bench.plugins.pair import choose
+from bench.plugins.options import configured, parameter_words
 from defenses.pessimist_q import Believing, PessimistQ
 from envs.highway.world import HighwayWorld
 from tests.attacks.victims import observations, victim
@@ -81,7 +81,9 @@ def test_a_victim_with_continuous_actions_is_refused() -> None:
 
 
 def test_a_tracker_in_front_narrows_the_belief() -> None:
-    chain = choose("defense", "tracker+pessimist_q").component.load(Given(policy=victim("discrete")), 0, FACTS)
+    chain = configured("defense", "tracker+pessimist_q", parameter_words("tracker.assumed_noise=0")).component.load(
+        Given(policy=victim("discrete")), 0, FACTS
+    )
     alone = believing(victim("discrete"))
     shown = observations(4, 3)
     state = chain.advance(shown, torch.full((4,), SLOW), chain.initial(torch.arange(4)))
