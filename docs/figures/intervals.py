@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
+from matplotlib import colormaps
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -61,7 +62,7 @@ def _decisions(title: str, policies: Mapping[str, Policy]) -> Figure:
 
 def shield() -> Figure:
     """The margin of FASTER and of SLOWER by distance and closing speed."""
-    made = style.figure(4.3, "shield: where FASTER is allowed, and where only SLOWER is left")
+    made = style.figure(4.3, "shield: where FASTER and SLOWER are safe")
     policy = Planner().load(0, FACTS)
     assert isinstance(policy, IntervalPlanner)
     flat = _observations(BLOCKED).flatten(0, 1)
@@ -71,7 +72,7 @@ def shield() -> Figure:
         found: Margins = policy.judge(ego, cars_of(ego, boxes))
     for place, (axes, name) in enumerate(zip(made.subplots(1, 2, sharey=True), ("FASTER", "SLOWER"), strict=True)):
         margin = found.stay[:, 2 * place].view(len(CLOSING), len(DISTANCE)).clamp(-30, 30)
-        drawn = _map(axes, margin, f"margin of {name} (m)", "PuOr", (-30, 30))
+        drawn = _map(axes, margin, f"margin of {name} (m)", colormaps["PuOr"].resampled(12), (-30, 30))
         axes.contour(DISTANCE, CLOSING, margin, levels=[0.0], colors=style.INK, linewidths=1.2)
         made.colorbar(drawn, ax=axes, location="bottom", aspect=16)
     made.axes[0].set_ylabel("closing speed (m/s), own: 25")

@@ -14,14 +14,14 @@ from docs.figures import style
 from leaderboard.published import published
 from leaderboard.ranking.boards import Board, Row, read_boards
 
-MEASURES = {"driving": "safe progress", "detection": "confidence in the stop sign"}
+MEASURES = {"driving": "safe progress", "detection": "stop score"}
 MARKS = {
     "no attack": ("o", 7, style.TRUE),
     "strongest": ("o", 7, style.SHOWN),
     "best blind policy": ("|", 13, style.INK),
 }
 FLAGGED = 0.4
-"""Opacity of a flagged row."""
+"""Opacity of a flagged row among others."""
 
 
 def standard() -> Figure:
@@ -41,8 +41,9 @@ def standard() -> Figure:
 
 def _draw(axes: Axes, board: Board) -> None:
     names = blended_transform_factory(axes.transAxes, axes.transData)
+    all_flagged = all(row.flagged for row in board.rows)
     for place, row in enumerate(board.rows):
-        opacity = FLAGGED if row.flagged else 1
+        opacity = FLAGGED if row.flagged and not all_flagged else 1
         worst = row.worst.score
         if row.worst.clean:
             axes.plot([worst.estimate, row.worst.clean.estimate], [place, place], color=style.FAINT, lw=5, zorder=1)
@@ -51,11 +52,20 @@ def _draw(axes: Axes, board: Board) -> None:
         if np.isfinite(row.worst.rival).all():
             blind = share_interval(row.worst.rival[None]).estimate
             axes.plot(blind, place, "|", color=style.INK, ms=13, mew=1.8)
-        axes.text(-0.02, place, _name(row), transform=names, ha="right", va="center", alpha=max(opacity, 0.65))
+        axes.text(
+            -0.02,
+            place,
+            _name(row, said=all_flagged),
+            transform=names,
+            ha="right",
+            va="center",
+            alpha=max(opacity, 0.65),
+        )
     axes.set(xlim=(0, 1), ylim=(len(board.rows) - 0.5, -0.5), yticks=[], xlabel=MEASURES[board.track.name])
     axes.spines["left"].set_visible(False)
     norm, budget, *_ = board.threat
-    axes.set_title(f"{board.track.name}, {norm} {budget:g}", fontsize=10.5)
+    flagged = ", all rows flagged" if all_flagged else ""
+    axes.set_title(f"{board.track.name}, {norm} {budget:g}{flagged}", fontsize=10.5)
 
 
 def _point(axes: Axes, found: Interval, place: int, colour: str, opacity: float) -> None:
@@ -63,7 +73,8 @@ def _point(axes: Axes, found: Interval, place: int, colour: str, opacity: float)
     axes.plot(found.estimate, place, "o", color=colour, ms=7, alpha=opacity, mec="none", clip_on=False)
 
 
-def _name(row: Row) -> str:
+def _name(row: Row, *, said: bool) -> str:
+    """Victim and defence; and that the row is flagged, if that is not said of all."""
     victim, defense = (str(row.identity[name]) for name in ("victim", "defense"))
     plain = victim if defense == "none" else f"{victim} + {defense.removesuffix('_detection')}"
-    return f"{plain} (flagged)" if row.flagged else plain
+    return f"{plain} (flagged)" if row.flagged and not said else plain

@@ -140,7 +140,9 @@ class Source:
     def __init__(self, records: pa.Table, shipped: pa.Table | None = None) -> None:
         ours = (pc.field("world") == WORLD) & (pc.field("defense") == "none")
         self.track = ByConfidence()
-        tables = (records, published(track(DetectionTrack.name)) if shipped is None else shipped)
+        if shipped is None:
+            shipped = published(track(DetectionTrack.name)).filter(pc.is_in(pc.field("victim"), pa.array(FAMILY)))
+        tables = (records, shipped)
         self.tables = [table.select(COLUMNS).filter(ours) for table in tables]
         self.detectors = _detectors(self.tables)
         self.missing: dict[Detector, set[str]] = {}
@@ -230,17 +232,15 @@ def is_of(row: str, identity: Mapping[str, object]) -> bool:
 
 
 def _detectors(tables: Iterable[pa.Table]) -> list[Detector]:
-    """Of every victim what most of its records share: all of the user's, then those of the family that are published."""
+    """Of every victim what most of its records share: the user's where there are any, else the published ones."""
     found: dict[str, Detector] = {}
-    for place, table in enumerate(tables):
+    for table in tables:
         rows: Counter[Detector] = Counter()
         columns = ("victim", "victim_params", "world_params", "attack_params")
         for identity, some in groups(table, columns, pc.equal(table["attack"], ATTACK)):
             victim, victim_params, world_params, attack = (str(identity[name]) for name in columns)
             rows[Detector(victim, victim_params, world_params, _crafting(attack))] += some.num_rows
         for detector, _ in rows.most_common():
-            if place > 0 and detector.victim not in FAMILY:
-                continue
             found.setdefault(detector.victim, detector)
     if not found:
         victim, world, attack = _standard("victim", DETECTOR), _standard("world", WORLD), _standard("attack", ATTACK)

@@ -135,7 +135,7 @@ def detector(victim: str, defense: str) -> None:
     # A backward pass may add in another order.
     here, there = (one["frame_confidence"] for one in found)
     np.testing.assert_allclose(here, there, atol=0.01)
-    assert here.max() > 0.05
+    assert here.max() > 0.2
 
 
 CASES: dict[str, Callable[[], None]] = {
@@ -150,7 +150,7 @@ DRIVERS = (
     ("dqn", "frame_stack", "pgd"),
     ("random", "none", "none"),
 )
-DETECTORS = (("yolov5", "jpeg"),)
+DETECTORS = (("rcnn", "jpeg"),)
 
 
 if __name__ == "__main__":
