@@ -21,19 +21,22 @@ from envs.camera.camera import Camera
 from envs.camera.develop import MIDDLE_GREY
 from envs.camera.poses import Pose
 from envs.camera.street.layout import LOCATIONS
-from envs.weather import WEATHERS
+from envs.weather import Weather
 
 Array = NDArray[np.float64]
-Effect = Callable[[Tensor, Sequence[Pose]], Tensor]
+Effect = Callable[[Tensor, Sequence[Pose], Sequence[Weather]], Tensor]
 
 GLASS_M, SLOPE_DEG = 0.06, 30.0
 """Distance of the windscreen to the camera, and its angle to the horizontal."""
 APERTURE_M = 0.0017
 """Diameter of the aperture: F/2 at the focal length of the camera of KITTI (721 pixels of 4.65 micrometres)."""
 WIPE_S = 3.0
-"""Longest time since the last wipe: 20 cycles a minute, the slowest setting of a wiper that FMVSS 104 (S4.1.1) allows."""
-RAIN_MM_H, SMALLEST_MM, LARGEST_MM = WEATHERS["rain"].precipitation_mm_h, 1.0, 6.0
-"""Rain rate, and diameters of the falling drops that are drawn; smaller ones are narrower than the aperture."""
+"""Time between two wipes: 20 cycles a minute, the slowest setting of a wiper that FMVSS 104 (S4.1.1) allows."""
+SHOWER_MM_H = 7.6
+"""Rate of the rain whose last drops are on the glass where it does not rain: the upper end of moderate rain (AMS, Glossary of
+Meteorology, "Rain")."""
+SMALLEST_MM, LARGEST_MM = 0.5, 6.0
+"""Diameters of the falling drops that are drawn: those of rain; smaller ones are drizzle (the same)."""
 CONTACT_DEG, WATER = 40.0, 1.33
 """Contact angle of water on glass, and its refractive index."""
 RUN = (1.0, 1.6)
@@ -48,8 +51,11 @@ EXPOSURE_S, SAMPLES = 1 / 30, 9
 """Exposure time of the blurred frames: all of it at 30 images a second, as in twilight; and instants of it that are averaged."""
 
 
-def drops(light: Tensor, poses: Sequence[Pose]) -> Tensor:
+def drops(light: Tensor, poses: Sequence[Pose], weathers: Sequence[Weather]) -> Tensor:
     """Drops on the windscreen: each refracts the street, shrunk and upside down, and is out of focus.
+
+    There are as many as fall between two wipes at the rain rate of the weather, or after a shower (`SHOWER_MM_H`) where it does
+    not rain.
 
     As Halimeh and Roser (2009, "Raindrop detection on car windshields using geometric-photometric environment construction and
     intensity-based correlation"), drops are spherical caps on a sloped glass, and light is refracted by Snell's law. The camera
@@ -58,8 +64,10 @@ def drops(light: Tensor, poses: Sequence[Pose]) -> Tensor:
     Args:
         light: linear light [N, 3, H, W], H and W multiples of 32.
         poses: of the N frames.
+        weathers: of the N frames.
     """
-    sheets = [_sheet(pose) for pose in poses]
+    rates = [weather.precipitation_mm_h or SHOWER_MM_H for weather in weathers]
+    sheets = [_sheet(pose, rate) for pose, rate in zip(poses, rates, strict=True)]
     covered, sources = (torch.stack(parts) for parts in zip(*sheets, strict=True))
     shown = grid_sample(avg_pool2d(light, BLURRED), sources, padding_mode="border", align_corners=False)
     layers = _defocused(torch.cat((covered, covered * shown), 1))
@@ -67,7 +75,7 @@ def drops(light: Tensor, poses: Sequence[Pose]) -> Tensor:
     return light * (1 - covered) + shown
 
 
-def glare(light: Tensor, poses: Sequence[Pose]) -> Tensor:
+def glare(light: Tensor, poses: Sequence[Pose], weathers: Sequence[Weather]) -> Tensor:
     """Veiling glare of a low sun above the image: 10 E / theta^2 is added (Stiles and Holladay; Vos 1984; CIE 146:2002).
 
     E is the illuminance in lx, theta the angle to the sun in degrees, the veil a luminance in cd/m2.
@@ -75,11 +83,12 @@ def glare(light: Tensor, poses: Sequence[Pose]) -> Tensor:
     Args:
         light: linear light [N, 3, H, W].
         poses: of the N frames; frames of a place have the sun in the same direction.
+        weathers: not used.
     """
     return light + torch.stack([_veil(pose) for pose in poses])
 
 
-def blur(light: Tensor, poses: Sequence[Pose]) -> Tensor:
+def blur(light: Tensor, poses: Sequence[Pose], weathers: Sequence[Weather]) -> Tensor:
     """Motion blur of the drive: the mean over the exposure, in which the image grows around the focus of expansion.
 
     The whole street is taken to be as far away as the sign, so the blur is right on the sign, too strong behind it and too weak
@@ -88,6 +97,7 @@ def blur(light: Tensor, poses: Sequence[Pose]) -> Tensor:
     Args:
         light: linear light [N, 3, H, W].
         poses: of the N frames.
+        weathers: not used.
     """
     height, width = light.shape[2:]
     size = torch.tensor([width, height])
@@ -107,10 +117,10 @@ EFFECTS: Mapping[str, Effect] = MappingProxyType({"drops": drops, "glare": glare
 
 
 @lru_cache(maxsize=128)
-def _sheet(pose: Pose) -> tuple[Tensor, Tensor]:
+def _sheet(pose: Pose, rate_mm_h: float) -> tuple[Tensor, Tensor]:
     """The drops of a frame at one in `STEP` pixels: where they are [1, h, w], and which places they show [h, w, 2]."""
     camera = pose.camera
-    middles, halves = _drawn(pose)
+    middles, halves = _drawn(pose, rate_mm_h)
     columns, rows = (torch.arange(STEP / 2, side, STEP) for side in (camera.width, camera.height))
     here = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
     # A drop far outside of the image, so that there is one.
@@ -128,20 +138,20 @@ def _sheet(pose: Pose) -> tuple[Tensor, Tensor]:
     return covered[None], 2 * place / torch.tensor([camera.width, camera.height]) - 1
 
 
-def _drawn(pose: Pose) -> tuple[Array, Array]:
-    """Middles [K, 2] and half axes [K, 2] in pixels of the drops that fell on the windscreen since the last wipe.
+def _drawn(pose: Pose, rate_mm_h: float) -> tuple[Array, Array]:
+    """Middles [K, 2] and half axes [K, 2] in pixels of the drops that are on the windscreen just before the next wipe.
 
     Falling drops have the sizes of Marshall and Palmer (1948) and the speeds of Atlas et al. (1973), as in
     `envs.camera.weather.streaks`. Each becomes a spherical cap of the same volume.
     """
     camera, rng = pose.camera, np.random.default_rng([pose.seed, 1])
-    per_mm = 4.1 * RAIN_MM_H**-0.21
+    per_mm = 4.1 * rate_mm_h**-0.21
     in_air = 8000 / per_mm * np.exp(-per_mm * SMALLEST_MM)
     fall = 9.65 - 10.3 * np.exp(-0.6 * (SMALLEST_MM + 1 / per_mm))
     area = camera.width * camera.height * (GLASS_M / camera.focal) ** 2
     # By the area that the camera sees, which is that of the glass times the sine of its slope.
     rate = in_air * (SPEED_MPS + fall / np.tan(np.deg2rad(SLOPE_DEG))) * area
-    count = rng.poisson(rate * rng.uniform(0, WIPE_S))
+    count = rng.poisson(rate * WIPE_S)
     diameter = np.minimum(SMALLEST_MM + rng.exponential(1 / per_mm, count), LARGEST_MM)
     sine, cosine = np.sin(np.deg2rad(CONTACT_DEG)), np.cos(np.deg2rad(CONTACT_DEG))
     base = diameter * np.cbrt(sine**3 / (2 * (2 - 3 * cosine + cosine**3)))

@@ -18,6 +18,7 @@ from envs.camera.lens import EFFECTS
 from envs.camera.poses import Pose
 from envs.camera.windscreen_axes import AXES, LENSES, WINDSCREEN_V1
 from envs.camera.world import StopSignApproach
+from envs.weather import WEATHERS
 
 
 class WindscreenScenes(Scenes):
@@ -57,8 +58,9 @@ class WindscreenScenes(Scenes):
             places = [place for place, number in enumerate(numbers) if self.lenses[number] == lens]
             if places:
                 poses = [self.street.poses[numbers[place]] for place in places]
+                weathers = [WEATHERS[self.street.weathers[numbers[place]]] for place in places]
                 chosen = torch.tensor(places)
-                light = effect(develop.light_of(pictures[chosen]), poses)
+                light = effect(develop.light_of(pictures[chosen]), poses, weathers)
                 pictures = pictures.index_copy(0, chosen, develop.tone(light))
         return self.street.with_noise(pictures, frames)
 

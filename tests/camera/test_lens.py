@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -16,10 +17,12 @@ from envs.camera.lens import EFFECTS
 from envs.camera.windscreen import Windscreen, WindscreenScenes
 from envs.camera.windscreen_axes import AXES, LENSES, WINDSCREEN_V1
 from envs.camera.world import StopSignApproach
+from envs.weather import WEATHERS
 from tests.camera.scenes import scenes
 
 POSES = poses.approach("sun-behind-ego", 3, 1.0, "sun")
 FRAMES = torch.tensor([0, 9])
+CLEAR, RAIN = WEATHERS["clear"], WEATHERS["rain"]
 STREET = scenes()
 
 
@@ -33,29 +36,31 @@ def through(name: str) -> WindscreenScenes:
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_an_effect_is_affine_in_light_and_all_but_glare_are_linear(name: str) -> None:
-    effect, ends = EFFECTS[name], [POSES[0], POSES[9]]
+    def effect(light: Tensor) -> Tensor:
+        return EFFECTS[name](light, [POSES[0], POSES[9]], [CLEAR, RAIN])
+
     first, second, dark = light(0), light(1), torch.zeros(2, 3, 384, 1248)
-    mixed = effect(0.3 * first + 0.5 * second, ends)
-    expected = 0.3 * effect(first, ends) + 0.5 * effect(second, ends) + 0.2 * effect(dark, ends)
+    mixed = effect(0.3 * first + 0.5 * second)
+    expected = 0.3 * effect(first) + 0.5 * effect(second) + 0.2 * effect(dark)
     torch.testing.assert_close(mixed, expected, atol=1e-5, rtol=0)
-    assert bool(effect(dark, ends).any()) == (name == "glare")
+    assert bool(effect(dark).any()) == (name == "glare")
 
 
 @pytest.mark.parametrize("name", ["drops", "blur"])
 def test_even_light_stays_as_it_is_away_from_the_border(name: str) -> None:
     even = torch.full((1, 3, 384, 1248), 0.4)
-    seen = EFFECTS[name](even, [POSES[5]])[..., 20:-20, 20:-20]
+    seen = EFFECTS[name](even, [POSES[5]], [CLEAR])[..., 20:-20, 20:-20]
     torch.testing.assert_close(seen, even[..., 20:-20, 20:-20], atol=1e-5, rtol=0)
 
 
 def test_a_drop_shows_the_street_upside_down_and_spares_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     pose, half = POSES[1], 40.0
     alone = torch.tensor([[624.0, 192.0]]).double().numpy(), torch.tensor([[half, half]]).double().numpy()
-    monkeypatch.setattr(lens, "_drawn", lambda pose: alone)
+    monkeypatch.setattr(lens, "_drawn", lambda pose, rate: alone)
     lens._sheet.cache_clear()
     sky_over_road = torch.zeros(1, 3, 384, 1248)
     sky_over_road[..., :192, :] = 1
-    seen = lens.drops(sky_over_road, [pose])[0, 0]
+    seen = lens.drops(sky_over_road, [pose], [CLEAR])[0, 0]
     lens._sheet.cache_clear()
     assert float(seen[192 - 20, 624]) < 0.3
     assert float(seen[192 + 20, 624]) > 0.7
@@ -63,15 +68,25 @@ def test_a_drop_shows_the_street_upside_down_and_spares_the_rest(monkeypatch: py
 
 
 def test_drops_are_those_of_the_pose_and_as_many_as_fall_between_two_wipes() -> None:
-    numbers = [len(lens._drawn(pose)[0]) for pose in poses.scored()]
-    assert [len(lens._drawn(pose)[0]) for pose in poses.scored()[:5]] == numbers[:5]
+    numbers = [len(lens._drawn(pose, 25.0)[0]) for pose in poses.scored()]
+    assert [len(lens._drawn(pose, 25.0)[0]) for pose in poses.scored()[:5]] == numbers[:5]
     assert len(set(numbers)) > 20
-    assert 40 < sum(numbers) / len(numbers) < 55
+    assert 210 < sum(numbers) / len(numbers) < 240
+
+
+def test_rain_leaves_more_and_larger_drops_than_a_shower_that_has_passed() -> None:
+    even = torch.zeros(len(POSES), 3, 384, 1248)
+    even[..., :192, :] = 1
+    changed = [(lens.drops(even, POSES, [weather] * len(POSES)) - even).abs().mean() for weather in (CLEAR, RAIN)]
+    assert changed[1] > 1.5 * changed[0] > 0
+    widths = [np.concatenate([lens._drawn(pose, rate)[1][:, 0] for pose in POSES]) for rate in (lens.SHOWER_MM_H, 25.0)]
+    assert len(widths[1]) > 1.5 * len(widths[0])
+    assert widths[1].mean() > widths[0].mean()
 
 
 def test_motion_blur_spares_the_focus_of_expansion_and_grows_towards_the_sign() -> None:
     stripes = (torch.arange(1248) % 8 < 4).float().expand(1, 3, 384, 1248)
-    contrast = lens.blur(stripes, [POSES[9]])[0, 0, 200].unfold(0, 8, 8).std(1)
+    contrast = lens.blur(stripes, [POSES[9]], [CLEAR])[0, 0, 200].unfold(0, 8, 8).std(1)
     middle = round(float(lens._expansion(POSES[9].camera)[0])) // 8
     assert float(contrast[middle]) > 2 * float(contrast[middle + 28])
 
@@ -83,7 +98,7 @@ def test_a_nearer_sun_adds_more_veil() -> None:
 
 
 def test_a_clean_lens_shows_the_frames_of_the_world_camera_bit_for_bit() -> None:
-    values = {"lanes": 3, "density": 1.0, "weather": "rain"}
+    values: dict[str, int | float | str] = {"lanes": 3, "density": 1.0, "weather": "rain"}
     (clean,) = Windscreen().approaches(AXES.cell(**values), range(1))
     (camera,) = StopSignApproach().approaches(StopSignApproach.axes.cell(**values), range(1))
     patch = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
