@@ -68,8 +68,9 @@ def test_a_drop_shows_the_street_upside_down_and_spares_the_rest(monkeypatch: py
 
 
 def test_drops_are_those_of_the_pose_and_as_many_as_fall_between_two_wipes() -> None:
-    numbers = [len(lens._drawn(pose, 25.0)[0]) for pose in poses.scored()]
-    assert [len(lens._drawn(pose, 25.0)[0]) for pose in poses.scored()[:5]] == numbers[:5]
+    rate = RAIN.precipitation_mm_h
+    numbers = [len(lens._drawn(pose, rate)[0]) for pose in poses.scored()]
+    assert [len(lens._drawn(pose, rate)[0]) for pose in poses.scored()[:5]] == numbers[:5]
     assert len(set(numbers)) > 20
     assert 210 < sum(numbers) / len(numbers) < 240
 
@@ -79,7 +80,8 @@ def test_rain_leaves_more_and_larger_drops_than_a_shower_that_has_passed() -> No
     even[..., :192, :] = 1
     changed = [(lens.drops(even, POSES, [weather] * len(POSES)) - even).abs().mean() for weather in (CLEAR, RAIN)]
     assert changed[1] > 1.5 * changed[0] > 0
-    widths = [np.concatenate([lens._drawn(pose, rate)[1][:, 0] for pose in POSES]) for rate in (lens.SHOWER_MM_H, 25.0)]
+    rates = (lens.SHOWER_MM_H, RAIN.precipitation_mm_h)
+    widths = [np.concatenate([lens._drawn(pose, rate)[1][:, 0] for pose in POSES]) for rate in rates]
     assert len(widths[1]) > 1.5 * len(widths[0])
     assert widths[1].mean() > widths[0].mean()
 
