@@ -40,7 +40,7 @@ AWAY = 0.2
 SEEN = 0.5
 """A sign with a smaller visible share is not a target."""
 SURE = 0.4
-"""The teacher's detections above this score are labels, where predictions cannot be compared one by one."""
+"""The teacher's detections above this score are labels of the detector's own loss."""
 DECAY = 0.98
 """Of the average of the weights, which is that of about the last 50 updates: a longer one would be close to the start."""
 IN_THE_LOOP = (
@@ -58,8 +58,8 @@ class DetectorAdversarialTraining(DetectorDefense):
     with one of the newest patches on each sign. With probability `skip` a sign has no patch. If the world has decoys, a share of
     the windows has one in the place of the sign. The loss asks the detector to find the sign despite the patch, to find none in
     decoys and elsewhere, and otherwise to keep its original predictions on the same window without a patch. The only label is the
-    sign's box. Predictions of a detector that is not `aligned` cannot be compared one by one: what it detected in the window
-    without a patch are then the labels of its own loss. `skip=1` is the control: the same training without patches.
+    sign's box. A detector that was trained here (a `Learner`) keeps its own loss instead: what it detected in the window without
+    a patch are the labels. `skip=1` is the control: the same training without patches.
 
     Tensors with more than `largest` values stay as they are, and the zoo stores only those that changed.
 
@@ -75,8 +75,8 @@ class DetectorAdversarialTraining(DetectorDefense):
         batch: windows per update.
         window: side of a window in pixels, a multiple of the detector's stride.
         learning_rate: maximum learning rate of AdamW.
-        fidelity: weight of keeping the original predictions, relative to finding the sign.
-        caution: weight of finding no sign in decoys and elsewhere, relative to finding the sign.
+        fidelity: weight of keeping the original predictions, or of the detector's own loss, relative to finding the sign.
+        caution: weight of finding no sign in decoys and elsewhere, relative to finding the sign; times `Learner.care`.
         largest: number of values of the largest tensors that are trained.
         trained: training seed of the zoo's detector; the seeds of a run are patch seeds.
         trained_in: non-default parameters of the training world; set by `bench train`.
@@ -154,7 +154,8 @@ class _Hardening:
         progress: Progress,
     ) -> None:
         self.recipe, self.attack, self.scenes, self.progress = recipe, attack, scenes, progress
-        self.victim = victim
+        self.learner = victim if isinstance(victim, Learner) else None
+        self.caution = recipe.caution * (self.learner.care if self.learner else 1.0)
         self.teacher, self.detector = detector, copy.deepcopy(detector)
         self._train_weights()
         if not any(weight.requires_grad for weight in self.detector.parameters()):
@@ -180,13 +181,12 @@ class _Hardening:
         visible = signs & inside & (self.scenes.visible[views.frames] >= SEEN)
         found = (missed(current, self.label, boxes) * visible).mean()
         cautious = mistaken(current, self.label, boxes, signs).mean()
-        if self.teacher.aligned:
+        if self.learner:
+            faithful = self.learner.loss(self.detector, self._taught(shown, original, signs))
+        else:
             # What the teacher says of decoys is no example.
             faithful = (unlike(current, original) * signs).mean()
-        else:
-            assert isinstance(self.victim, Learner)
-            faithful = self.victim.loss(self.detector, self._taught(shown, original, signs))
-        return found + self.recipe.caution * cautious + self.recipe.fidelity * faithful
+        return found + self.caution * cautious + self.recipe.fidelity * faithful
 
     def _taught(self, shown: Tensor, original: Predictions, signs: Tensor) -> Example:
         """The windows with the teacher's detections, but no stop signs where decoys are."""

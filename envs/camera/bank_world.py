@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
 
 from platformdirs import user_cache_path
 
 from bench.detection import CameraWorld
+from bench.errors import UserError
 from bench.plugins.contracts import Progress
 from envs.camera import bank
+from envs.camera.bank import BankScenes
 from envs.camera.objects import NAMES
 from envs.camera.poses import Pose
 
@@ -39,6 +42,27 @@ class BankWorld(CameraWorld):
         """Folder of the frames."""
         return Path(self.bank).expanduser() if self.bank else bank.SHIPPED
 
+    def on_road(self, location: str, lanes: int, density: float, weather: str) -> BankScenes:
+        """The frames of the approach at a place, farthest first.
+
+        Args:
+            location: name of the place.
+            lanes, density: the road.
+            weather: name of the weather.
+
+        Raises:
+            UserError: if the bank has no such frames.
+        """
+        frames = [
+            (pose, frame)
+            for pose, frame in _read(self.folder, location, weather)
+            if (pose.lanes, pose.density) == (lanes, density)
+        ]
+        if not frames:
+            road = f"{lanes} lanes at density {density:g}"
+            raise UserError(f"no frames of {location} with {road} in {self.folder}; `bench render` makes them")
+        return BankScenes(frames, [weather] * len(frames))
+
     @abstractmethod
     def every_pose(self) -> tuple[Pose, ...]:
         """Every pose that it shows."""
@@ -57,3 +81,8 @@ class BankWorld(CameraWorld):
 
         kept = user_cache_path("cavbench") / "street"
         return rendering.make(self.every_pose(), kept=kept, out=out or self.folder, progress=progress)
+
+
+@lru_cache(maxsize=4)
+def _read(folder: Path, location: str, weather: str) -> list[tuple[Pose, bank.Frame]]:
+    return bank.read(folder, location, weather)

@@ -21,8 +21,8 @@ from envs.camera.street.render import Traced
 from envs.camera.weather import air
 from envs.weather import Weather
 
-QUALITY, CLOSED_LOOP_QUALITY = 85, 60
-"""WebP quality of the image, lower on the road that has many frames; the sign's crop is stored separately."""
+QUALITY, LOWER_QUALITY = 85, 60
+"""WebP quality of the image, lower on the closed loop and at the places with one road; the sign's crop is stored separately."""
 GAMMA = 2.2
 """The light of the crop is stored in 8 bits as (value / largest) ** (1 / GAMMA)."""
 
@@ -54,7 +54,8 @@ def frame(traced: Traced, pose: Pose, weather: Weather) -> Frame:
     light = traced.black * between.transmitted + between.added
     factor = develop.exposure(light)
     picture = develop.tone(torch.from_numpy(light * factor)).numpy()
-    quality = CLOSED_LOOP_QUALITY if LOCATIONS[pose.location].closed_loop else QUALITY
+    place = LOCATIONS[pose.location]
+    quality = LOWER_QUALITY if place.closed_loop or place.one_road else QUALITY
     done, webp = cv2.imencode(
         ".webp", np.rint(255 * picture[..., ::-1]).astype(np.uint8), [cv2.IMWRITE_WEBP_QUALITY, quality]
     )

@@ -20,14 +20,14 @@ LANES = [int(lanes) for lanes in AXES["lanes"].choices]
 DENSITIES = [float(density) for density in AXES["density"].choices]
 TRAINING_VIEWS = 12
 """Number of views of each training place under each lighting."""
-TRAINING_LIGHTINGS: tuple[Lighting, ...] = ("sun", "overcast")
+DAYLIGHT: tuple[Lighting, ...] = ("sun", "overcast")
 """The lightings of the weathers in the standard grid."""
 LEAST_VISIBLE = 0.6
 """Approximate share of the sign that a training view shows at least."""
 CLOSED_LOOP_LANES, CLOSED_LOOP_DENSITY = 3, 1.0
 CLOSED_LOOP_DISTANCES = tuple(float(distance) for distance in np.arange(30.0, 7.9, -0.5))
 """Distances of the frames of the closed loop to the sign, in m."""
-CLOSED_LOOP_LIGHTINGS: tuple[Lighting, ...] = ("sun", "overcast")
+ONE_ROAD_LANES, ONE_ROAD_DENSITY = 4, 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,13 +96,25 @@ def scored() -> tuple[Pose, ...]:
 
 
 @cache
+def one_road() -> tuple[Pose, ...]:
+    """Every pose of the places that are rendered on one road."""
+    return tuple(
+        pose
+        for location in LOCATIONS.values()
+        if location.one_road
+        for lighting in DAYLIGHT
+        for pose in approach(location.name, ONE_ROAD_LANES, ONE_ROAD_DENSITY, lighting)
+    )
+
+
+@cache
 def closed_loop() -> tuple[Pose, ...]:
     """Every pose of the road that is driven in closed loop, farthest first under each lighting."""
     return tuple(
         pose
         for location in LOCATIONS.values()
         if location.closed_loop
-        for lighting in CLOSED_LOOP_LIGHTINGS
+        for lighting in DAYLIGHT
         for pose in approach(location.name, CLOSED_LOOP_LANES, CLOSED_LOOP_DENSITY, lighting, CLOSED_LOOP_DISTANCES)
     )
 
@@ -111,7 +123,7 @@ def closed_loop() -> tuple[Pose, ...]:
 def training() -> tuple[Pose, ...]:
     """Views of the training places, at random distances, slightly off the middle and the direction of the lane."""
     poses: list[Pose] = []
-    for number, lighting in enumerate(TRAINING_LIGHTINGS):
+    for number, lighting in enumerate(DAYLIGHT):
         for location in LOCATIONS.values():
             rng = np.random.default_rng([location.seed, number])
             wanted = len(poses) + TRAINING_VIEWS * location.training

@@ -24,7 +24,7 @@ from envs.camera.street.light import Light, light, lighting
 from envs.camera.street.render import Traced, load, trace, variant, works
 from envs.weather import WEATHERS
 
-VERSION = 2
+VERSION = 3
 """Version of the traced scene; raise it when the street or its light change."""
 
 

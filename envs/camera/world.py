@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import ClassVar
 
 from bench.detection import Approach
-from bench.errors import UserError
 from bench.scenarios import Axes, Cell
 from envs.camera import bank, poses
 from envs.camera.axes import APPROACH_V1, AXES
@@ -41,26 +40,13 @@ class StopSignApproach(BankWorld):
 
     def scenes(self, cell: Cell, seed: int) -> BankScenes:
         """The frames of the approach of a seed, farthest first."""
-        location = self._place(seed)
-        frames = [
-            (pose, frame)
-            for pose, frame in _read(self.folder, location, cell.weather)
-            if (pose.lanes, pose.density) == (cell.lanes, cell.density)
-        ]
-        if not frames:
-            raise UserError(f"no frames of {location} with {cell} in {self.folder}; `bench render` makes them")
-        return BankScenes(frames, [cell.weather] * len(frames))
+        return self.on_road(self._place(seed), int(cell.lanes), float(cell.density), str(cell.weather))
 
     def _place(self, seed: int) -> str:
         return self.locations[seed % len(self.locations)]
 
     def every_pose(self) -> tuple[Pose, ...]:
         return (*poses.training(), *poses.scored())
-
-
-@lru_cache(maxsize=4)
-def _read(folder: Path, location: str, weather: str) -> list[tuple[poses.Pose, bank.Frame]]:
-    return bank.read(folder, location, weather)
 
 
 @lru_cache(maxsize=1)

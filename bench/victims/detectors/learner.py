@@ -58,6 +58,11 @@ class Learner(DetectorVictim, Generic[Network]):
         if self.window < STRIDE or self.window % STRIDE:
             raise ValueError(f"window must be a multiple of {STRIDE}, got {self.window}")
 
+    @property
+    def care(self) -> float:
+        """How much more adversarial training weighs a stop sign that is not there, so that it keeps what this training taught."""
+        return 1.0
+
     @abstractmethod
     def begun(self, names: tuple[str, ...]) -> Network:
         """The network with random weights, for these classes."""

@@ -244,6 +244,10 @@ class YOLOv5(Learner[YOLOv5Network]):
             raise UserError("victim.path names a detector that is trained already; leave it out to train one")
         return super().train(world, seed=seed, progress=progress)
 
+    @property
+    def care(self) -> float:
+        return 1 + self.caution
+
     def begun(self, names: tuple[str, ...]) -> YOLOv5Network:
         network = YOLOv5Network(self.size, names)
         network.expect_little()

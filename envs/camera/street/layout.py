@@ -50,6 +50,7 @@ class Location:
         sun_azimuth_deg: clockwise from the driving direction; at 180 the sun is behind the ego and shines on the sign.
         seed: seed of everything at this place.
         training: whether attacks and defences may use it; scores come from the other places.
+        one_road: whether it is rendered on one road only, for the world `places`.
         closed_loop: whether a car drives there in closed loop. Then the traffic obeys the sign: it waits at the line, so a frame
             depends on the place of the car only.
     """
@@ -59,12 +60,13 @@ class Location:
     sun_azimuth_deg: float
     seed: int
     training: bool = False
+    one_road: bool = False
     closed_loop: bool = False
 
     @property
     def scored(self) -> bool:
         """Whether it is a place of the world `camera` that scores come from."""
-        return not (self.training or self.closed_loop)
+        return not (self.training or self.one_road or self.closed_loop)
 
 
 LOCATIONS: dict[str, Location] = {
@@ -76,6 +78,13 @@ LOCATIONS: dict[str, Location] = {
         Location(name="training-1", surrounding="town", sun_azimuth_deg=150.0, seed=11, training=True),
         Location(name="training-2", surrounding="avenue", sun_azimuth_deg=285.0, seed=12, training=True),
         Location(name="training-3", surrounding="outskirts", sun_azimuth_deg=40.0, seed=13, training=True),
+        Location(name="avenue-80", surrounding="avenue", sun_azimuth_deg=80.0, seed=31, one_road=True),
+        Location(name="avenue-330", surrounding="avenue", sun_azimuth_deg=330.0, seed=32, one_road=True),
+        Location(name="town-30", surrounding="town", sun_azimuth_deg=30.0, seed=33, one_road=True),
+        Location(name="town-120", surrounding="town", sun_azimuth_deg=120.0, seed=34, one_road=True),
+        Location(name="town-200", surrounding="town", sun_azimuth_deg=200.0, seed=35, one_road=True),
+        Location(name="outskirts-140", surrounding="outskirts", sun_azimuth_deg=140.0, seed=36, one_road=True),
+        Location(name="outskirts-240", surrounding="outskirts", sun_azimuth_deg=240.0, seed=37, one_road=True),
         Location(name="crossing", surrounding="outskirts", sun_azimuth_deg=215.0, seed=21, closed_loop=True),
     )
 }

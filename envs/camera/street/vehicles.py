@@ -119,7 +119,7 @@ def vehicle(model: Model, paint: tuple[float, float, float], *, lights: bool = F
     rear = min(station[0] for station in shape.body) - 0.015
     low, high = (0.7, 0.88) if shape.cabin and model != "lorry" else (0.75, 1.15)
     wide = shape.body[0][3]
-    lamps = join([_panel(side * wide - 0.17 * side, side * wide, low, high, rear) for side in (-1, 1)])
+    lamps = join([_panel(x, x + 0.17, low, high, rear) for x in (-wide, wide - 0.17)])
     parts.append((lamps, m.TAIL_LIGHT_LIT if lights else m.TAIL_LIGHT))
     parts.append((_panel(-0.26, 0.26, 0.55, 0.66, rear), m.PLATE))
     return parts
