@@ -62,6 +62,9 @@ STYLE = {
 LONG_NUMBER = re.compile(r"(?<=[\s\"])-?\d+\.\d{2,}(?=[\s\"])")
 """A coordinate in an SVG file. One decimal is enough: a tenth of a point."""
 
+SAME_COMMAND = re.compile(r"(?:[LM] [-\d. ]+(?:\nL [-\d. ]+)+|Q [-\d. ]+(?:\nQ [-\d. ]+)+)")
+"""Lines of a path in an SVG file, one after the other, or curves: the letter is needed once."""
+
 
 def figure(height: float, title: str) -> Figure:
     """An empty figure of `height` inches with a title."""
@@ -82,11 +85,16 @@ def save(made: Figure, path: Path) -> None:
         drawn = io.StringIO()
         made.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
         text = LONG_NUMBER.sub(lambda number: f"{float(number[0]):.1f}", drawn.getvalue())
-        path.write_text(re.sub(r"\s*\n\s*", "\n", text))
+        path.write_text(SAME_COMMAND.sub(_joined, re.sub(r"\s*\n\s*", "\n", text)))
         return
     drawn = io.BytesIO()
     made.savefig(drawn, format="png", dpi=PNG_DPI)
     Image.open(drawn).convert("RGB").quantize(PNG_COLOURS).save(path, optimize=True)
+
+
+def _joined(commands: re.Match[str]) -> str:
+    first, *others = commands[0].split("\n")
+    return " ".join([first, *(command[2:] for command in others)])
 
 
 mpl.rcParams.update(STYLE)
