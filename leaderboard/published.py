@@ -26,6 +26,8 @@ from bench.records.schema import schema
 
 SERIES = ("pair", "training_seed", "grid")
 """The columns that records are renewed by."""
+MEASURED = frozenset({"return", "distance_m", "min_ttc_s", "mean_speed", "linf", "l2", "linf_m", "linf_mps"})
+"""Columns of numbers that hardly repeat: they are stored byte by byte without a dictionary, a sixth smaller."""
 
 
 def published(track: Track) -> pa.Table:
@@ -65,7 +67,16 @@ def publish(folder: Path, file: Path, *, add: bool = False) -> int:
             raise UserError(f"{folder} has records of the track {name}, {file} has others")
         records = added(reading.upgraded(file), records)
     with whole(file) as made:
-        pq.write_table(records, made, compression="zstd", compression_level=19)
+        apart = [name for name in records.column_names if name in MEASURED]
+        others = [name for name in records.column_names if name not in MEASURED]
+        pq.write_table(
+            records,
+            made,
+            compression="zstd",
+            compression_level=19,
+            use_byte_stream_split=apart,
+            use_dictionary=others,
+        )
     return int(records.num_rows)
 
 

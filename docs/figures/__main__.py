@@ -59,6 +59,7 @@ FIGURES = {
     "world_highway.svg": "highway:world",
     "world_camera.png": "camera:world",
     "world_crossing.png": "crossing:world",
+    "world_places.png": "camera:places",
     "world_windscreen.png": "camera:windscreen",
     "decoys.png": "camera:decoys",
     "leaderboard.svg": "leaderboard:standard",

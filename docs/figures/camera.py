@@ -6,10 +6,13 @@ from copy import copy
 
 import torch
 from matplotlib.figure import Figure
+from torch import Tensor
 
+from bench.detection import Approach
 from docs.figures import style
 from docs.figures.sightings import DENSITY, FRAME, LANES, approaches, picture, show
 from envs.camera.faces import DECOYS
+from envs.camera.places import StopSignPlaces
 from envs.camera.windscreen import Windscreen
 from envs.camera.windscreen_axes import AXES, LENSES
 from envs.weather import WEATHERS
@@ -27,14 +30,30 @@ def world() -> Figure:
     panels = made.subplots(len(WEATHERS), len(places))
     for row, weather in zip(panels, WEATHERS, strict=True):
         for axes, approach in zip(row, approaches(weather), strict=True):
-            left, top, right, bottom = approach.scenes.boxes[FRAME].tolist()
-            height, width = approach.scenes.size
-            x = round(min(max((left + right - WINDOW[0]) / 2, 0), width - WINDOW[0]))
-            y = round(min(max((top + bottom - WINDOW[1]) / 2, 0), height - WINDOW[1]))
-            show(axes, picture(approach, FRAME)[:, y : y + WINDOW[1], x : x + WINDOW[0]])
+            show(axes, _around_the_sign(approach))
         row[0].set_ylabel(weather)
     for axes, place in zip(panels[0], places, strict=True):
         axes.set_title(place.replace("-", " "), fontsize=10.5)
+    return made
+
+
+def _around_the_sign(approach: Approach) -> Tensor:
+    """`FRAME` of an approach, cut to `WINDOW` around the sign."""
+    left, top, right, bottom = approach.scenes.boxes[FRAME].tolist()
+    height, width = approach.scenes.size
+    x = round(min(max((left + right - WINDOW[0]) / 2, 0), width - WINDOW[0]))
+    y = round(min(max((top + bottom - WINDOW[1]) / 2, 0), height - WINDOW[1]))
+    return picture(approach, FRAME)[:, y : y + WINDOW[1], x : x + WINDOW[0]]
+
+
+def places() -> Figure:
+    """One frame of each of the ten places, in clear weather."""
+    world = StopSignPlaces()
+    found = world.approaches(world.axes.cell(weather="clear"), range(len(world.locations)))
+    made = style.figure(2.2, f"places: {len(found)} places, one road")
+    for axes, approach in zip(made.subplots(2, len(found) // 2).flat, found, strict=True):
+        show(axes, _around_the_sign(approach))
+        axes.set_title(approach.location.replace("-", " "), fontsize=9)
     return made
 
 
