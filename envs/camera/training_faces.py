@@ -15,6 +15,8 @@ Colour = tuple[int, int, int]
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
 OUTLINES = ("octagon",) * 7 + ("disc", "triangle", "diamond", "rectangle", "nothing")
 """Drawn with equal probability."""
+RED_RIMS = 0.35
+"""Share of the plates with a red rim, as many signs have. A stop sign with a patch has one, too, but a wider one."""
 _NAME = "training "
 _SIDE = sign.TEXELS
 _FULL = 255
@@ -30,7 +32,8 @@ def drawn(name: str) -> tuple[Image, Image]:
     """The face of a training decoy: colours sRGB [S, S, 3], and where its plate is [S, S], 0 to 255."""
     chance, outline = _begun(name)
     cover = np.zeros((_SIDE, _SIDE), np.uint8) if outline == "nothing" else _polygon(outline, 1.0)
-    picture = np.full((_SIDE, _SIDE, 3), _colour(chance), np.uint8)
+    rim = _red(chance) if chance.random() < RED_RIMS else _colour(chance)
+    picture = np.full((_SIDE, _SIDE, 3), rim, np.uint8)
     inner = _polygon(outline, chance.uniform(0.75, 0.97)) if outline != "nothing" else cover
     picture[inner > 0] = _ground(chance)
     for _ in range(int(chance.integers(1, 4))):
@@ -70,8 +73,17 @@ def _colour(chance: np.random.Generator) -> Colour:
             return (235, 235, 230)
         case "black":
             return (14, 14, 14)
-    hsv = np.array([[[chance.integers(180), chance.integers(90, 256), chance.integers(70, 250)]]], np.uint8)
-    red, green, blue = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0].tolist()
+    return _rgb(int(chance.integers(180)), int(chance.integers(90, 256)), int(chance.integers(70, 250)))
+
+
+def _red(chance: np.random.Generator) -> Colour:
+    """A red of traffic signs, new or faded."""
+    return _rgb(int(chance.integers(-6, 7)) % 180, int(chance.integers(170, 256)), int(chance.integers(110, 240)))
+
+
+def _rgb(hue: int, saturation: int, value: int) -> Colour:
+    """A colour; `hue` is in units of two degrees."""
+    red, green, blue = cv2.cvtColor(np.array([[[hue, saturation, value]]], np.uint8), cv2.COLOR_HSV2RGB)[0, 0].tolist()
     return red, green, blue
 
 
