@@ -1,0 +1,137 @@
+"""A judge of windows: it says whether a window shows a stop sign, and never looks at the middle of the window."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import conv2d, interpolate, max_pool2d, pad
+
+CELL, STEP = 4, 2
+"""Side of a cell in pixels, and the distance between two windows."""
+ACROSS, HIDDEN = 10, 6
+"""Cells across a window, and across its cover in the middle."""
+WINDOW, COVER, SIGN = CELL * ACROSS, CELL * HIDDEN, 32
+"""Side of a window, of its cover and of the sign in its middle, in pixels."""
+WIDTHS = (24, 16, 32, 32)
+"""Channels of the two layers of a cell and of the two layers of a window."""
+FINEST, COARSER, LEVELS = 0.92, 1.2, 8
+"""Pixels of the image for a pixel of the finest level, the ratio of two levels, and their number: signs of 29 to 106 pixels."""
+BESIDE, GREY = 8, 0.5
+"""A level is continued by this many pixels of this colour on each side, for signs at the edge of the image."""
+BLOCK = 4
+"""Of a block of 4 x 4 windows, the best is reported."""
+
+
+class Judge(nn.Module):
+    """Log-odds that a window shows a stop sign, for all windows of images at once.
+
+    A window is a grid of 10 x 10 cells of 4 x 4 pixels. Each cell is described on its own, and the descriptions of the 64 cells on
+    the rim, two cells wide, are joined. The weights of the 36 cells in the middle are 0: whatever is there, the answer is the
+    same. No layer mixes neighbouring cells before, as in BagNets (Brendel and Bethge 2019), on which PatchGuard is built.
+
+    Images [N, 3, H, W] in [0, 1] become log-odds [N, 1, (H - 40) // 2 + 1, (W - 40) // 2 + 1]. It has 54,321 weights.
+    """
+
+    rim: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        first, second, joined, last = WIDTHS
+        self.cells = nn.Sequential(
+            nn.Conv2d(3, first, CELL, stride=STEP, bias=False),
+            nn.BatchNorm2d(first),
+            nn.ReLU(),
+            nn.Conv2d(first, second, 1, bias=False),
+            nn.BatchNorm2d(second),
+            nn.ReLU(),
+        )
+        self.joined = nn.Parameter(nn.init.kaiming_uniform_(torch.empty(joined, second, ACROSS, ACROSS)))
+        self.last = nn.Sequential(
+            nn.BatchNorm2d(joined), nn.ReLU(), nn.Conv2d(joined, last, 1), nn.ReLU(), nn.Conv2d(last, 1, 1)
+        )
+        middle = slice((ACROSS - HIDDEN) // 2, (ACROSS + HIDDEN) // 2)
+        rim = torch.ones(ACROSS, ACROSS)
+        rim[middle, middle] = 0
+        self.register_buffer("rim", rim, persistent=False)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        odds: Tensor = self.last(conv2d(self.cells(pictures), self.joined * self.rim, dilation=CELL // STEP))
+        return odds
+
+
+@dataclass(frozen=True)
+class Level:
+    """The windows of one size in images [N, 3, H, W]; h x w of them.
+
+    Args:
+        pictures: [N, 3, h', w'], the images in this size, continued by `BESIDE` pixels.
+        scale: width and height of a pixel of this size, in pixels of the image.
+    """
+
+    pictures: Tensor
+    scale: tuple[float, float]
+
+    @property
+    def middles(self) -> Tensor:
+        """[h, w, 2] x and y of the middle of each window, in pixels of the image."""
+        rows, columns = (
+            (torch.arange((side - WINDOW) // STEP + 1, device=self.pictures.device) * STEP + WINDOW / 2 - BESIDE) * scale
+            for side, scale in zip(self.pictures.shape[2:], reversed(self.scale), strict=True)
+        )
+        return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
+
+    @property
+    def boxes(self) -> Tensor:
+        """[h, w, 4] where the sign of each window is, in pixels of the image."""
+        return self._around(SIGN / 2)
+
+    @property
+    def covers(self) -> Tensor:
+        """[h, w, 4] boxes of the image whose pixels have no influence on the answer for each window.
+
+        Shrinking an image mixes neighbouring pixels: one of the cells' pixels depends on what is up to half of its width beside it.
+        """
+        return self._around(COVER / 2 - 0.5)
+
+    def _around(self, half: float) -> Tensor:
+        middles, size = self.middles, half * self.pictures.new_tensor(self.scale)
+        return torch.cat([middles - size, middles + size], -1)
+
+
+def levels(pictures: Tensor) -> Iterator[Level]:
+    """The windows of images [N, 3, H, W] sRGB in [0, 1], finest first; without the sizes that have no window."""
+    height, width = pictures.shape[2:]
+    for number in range(LEVELS):
+        scale = FINEST * COARSER**number
+        size = round(height / scale), round(width / scale)
+        if min(size) + 2 * BESIDE >= WINDOW:
+            small = interpolate(pictures, size, mode="bilinear", antialias=True)
+            yield Level(pad(small, (BESIDE,) * 4, value=GREY), (width / size[1], height / size[0]))
+
+
+def best_of_blocks(odds: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
+    """The best window of each block: log-odds [N, B], and its box [N, B, 4].
+
+    Args:
+        odds: [N, 1, h, w].
+        boxes: [h, w, 4].
+    """
+    best, which = max_pool2d(odds, BLOCK, ceil_mode=True, return_indices=True)
+    return best.flatten(1), boxes.flatten(0, 1)[which.flatten(1)]
+
+
+def bound(odds: Tensor, usable: Tensor, found: Tensor) -> Tensor:
+    """[N] log-odds which a block reports at least, whatever the windows show that are not usable; -inf if none is.
+
+    Args:
+        odds: [N, 1, h, w].
+        usable: bool [N, h, w], windows whose answer is certain.
+        found: bool [N, h, w], windows at the place of the sign. A block counts only if all of its windows are: any of
+            them may be its best.
+    """
+    certain = odds[:, 0].masked_fill(~usable, -torch.inf)
+    elsewhere = max_pool2d((~found).float()[:, None], BLOCK, ceil_mode=True)[:, 0] > 0
+    return max_pool2d(certain[:, None], BLOCK, ceil_mode=True)[:, 0].masked_fill(elsewhere, -torch.inf).amax((1, 2))
