@@ -28,8 +28,8 @@ BLOCK = 4
 class Judge(nn.Module):
     """Log-odds that a window shows a stop sign, for all windows of images at once.
 
-    A window is a grid of 10 x 10 cells of 4 x 4 pixels. Each cell is described on its own, and the descriptions of the 64 cells on
-    the rim, two cells wide, are joined. The weights of the 36 cells in the middle are 0: whatever is there, the answer is the
+    A window is a grid of 10 x 10 cells of 4 x 4 pixels. Each cell is described on its own, and the descriptions of the 64 cells
+    on the rim, two cells wide, are joined. The weights of the 36 cells in the middle are 0: whatever is there, the answer is the
     same. No layer mixes neighbouring cells before, as in BagNets (Brendel and Bethge 2019), on which PatchGuard is built.
 
     Images [N, 3, H, W] in [0, 1] become log-odds [N, 1, (H - 40) // 2 + 1, (W - 40) // 2 + 1]. It has 54,321 weights.
@@ -78,7 +78,8 @@ class Level:
     def middles(self) -> Tensor:
         """[h, w, 2] x and y of the middle of each window, in pixels of the image."""
         rows, columns = (
-            (torch.arange((side - WINDOW) // STEP + 1, device=self.pictures.device) * STEP + WINDOW / 2 - BESIDE) * scale
+            (torch.arange((side - WINDOW) // STEP + 1, device=self.pictures.device) * STEP + WINDOW / 2 - BESIDE)
+            * scale
             for side, scale in zip(self.pictures.shape[2:], reversed(self.scale), strict=True)
         )
         return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
@@ -86,19 +87,21 @@ class Level:
     @property
     def boxes(self) -> Tensor:
         """[h, w, 4] where the sign of each window is, in pixels of the image."""
-        return self._around(SIGN / 2)
+        return self._around(*(SIGN / 2 * scale for scale in self.scale))
 
     @property
     def covers(self) -> Tensor:
-        """[h, w, 4] boxes of the image whose pixels have no influence on the answer for each window.
+        """[h, w, 4] boxes of the image; the pixels that lie wholly inside have no influence on the answer for the window.
 
-        Shrinking an image mixes neighbouring pixels: one of the cells' pixels depends on what is up to half of its width beside it.
+        A pixel of a level is a mean over the pixels of the image whose middles are nearer to its own than its width, and than 1.
+        So those on the rim depend on a little of what is beside them.
         """
-        return self._around(COVER / 2 - 0.5)
+        return self._around(*(COVER / 2 * scale - (max(scale, 1) - scale / 2 - 0.5) for scale in self.scale))
 
-    def _around(self, half: float) -> Tensor:
-        middles, size = self.middles, half * self.pictures.new_tensor(self.scale)
-        return torch.cat([middles - size, middles + size], -1)
+    def _around(self, across: float, down: float) -> Tensor:
+        middles = self.middles
+        half = middles.new_tensor([across, down])
+        return torch.cat([middles - half, middles + half], -1)
 
 
 def levels(pictures: Tensor) -> Iterator[Level]:

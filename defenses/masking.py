@@ -8,7 +8,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from bench.detection import STOP_SIGN, CameraWorld, Detector, DetectorDefense, DetectorVictim, Predictions, Scenes, Wrapped
+from bench.detection import (
+    STOP_SIGN,
+    CameraWorld,
+    Detector,
+    DetectorDefense,
+    DetectorVictim,
+    Predictions,
+    Scenes,
+    Wrapped,
+)
 from bench.detection.boxes import overlap
 from bench.detection.sight import SAME_IOU
 from bench.plugins.contracts import Facts, Progress, Trained
