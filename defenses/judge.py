@@ -11,28 +11,33 @@ from torch.nn.functional import conv2d, interpolate, max_pool2d, pad
 
 CELL, STEP = 4, 2
 """Side of a cell in pixels, and the distance between two windows."""
-ACROSS, HIDDEN = 10, 6
+ACROSS, HIDDEN = 12, 6
 """Cells across a window, and across its cover in the middle."""
-WINDOW, COVER, SIGN = CELL * ACROSS, CELL * HIDDEN, 32
+WINDOW, COVER, SIGN = CELL * ACROSS, CELL * HIDDEN, 36
 """Side of a window, of its cover and of the sign in its middle, in pixels."""
-WIDTHS = (24, 16, 32, 32)
-"""Channels of the two layers of a cell and of the two layers of a window."""
-FINEST, COARSER, LEVELS = 0.92, 1.2, 8
-"""Pixels of the image for a pixel of the finest level, the ratio of two levels, and their number: signs of 29 to 106 pixels."""
+WIDTHS, FEW = (24, 16, 48, 32), 4
+"""Channels of the two layers of a cell and of the two layers of a window, and those of a cell at a glance."""
+FINEST, COARSER, LEVELS = 0.8, 1.13, 12
+"""Pixels of the image for a pixel of the finest level, the ratio of two levels, and their number: signs of 29 to 110 pixels."""
 BESIDE, GREY = 8, 0.5
 """A level is continued by this many pixels of this colour on each side, for signs at the edge of the image."""
 BLOCK = 4
 """Of a block of 4 x 4 windows, the best is reported."""
+UNLIKELY, NEVER = 0.0, -8.0
+"""Windows with lower log-odds at a glance are not looked at again, and get the second log-odds."""
+AT_ONCE = 8192
+"""Windows that are looked at in one go, to save memory."""
 
 
 class Judge(nn.Module):
     """Log-odds that a window shows a stop sign, for all windows of images at once.
 
-    A window is a grid of 10 x 10 cells of 4 x 4 pixels. Each cell is described on its own, and the descriptions of the 64 cells
-    on the rim, two cells wide, are joined. The weights of the 36 cells in the middle are 0: whatever is there, the answer is the
+    A window is a grid of 12 x 12 cells of 4 x 4 pixels. Each cell is described on its own, and the descriptions of the 108 cells
+    on the rim, three cells wide, are joined. The 36 cells in the middle have no weights: whatever is there, the answer is the
     same. No layer mixes neighbouring cells before, as in BagNets (Brendel and Bethge 2019), on which PatchGuard is built.
 
-    Images [N, 3, H, W] in [0, 1] become log-odds [N, 1, (H - 40) // 2 + 1, (W - 40) // 2 + 1]. It has 54,321 weights.
+    To save time there are two answers, both from the rim alone: a linear one for all windows, and a better one for those that
+    may show a sign. It has 86,758 weights.
     """
 
     rim: Tensor
@@ -48,18 +53,45 @@ class Judge(nn.Module):
             nn.BatchNorm2d(second),
             nn.ReLU(),
         )
-        self.joined = nn.Parameter(nn.init.kaiming_uniform_(torch.empty(joined, second, ACROSS, ACROSS)))
+        middle = slice((ACROSS - HIDDEN) // 2, (ACROSS + HIDDEN) // 2)
+        rim = torch.ones(ACROSS, ACROSS, dtype=torch.bool)
+        rim[middle, middle] = False
+        self.register_buffer("rim", rim, persistent=False)
+        self.few = nn.Conv2d(second, FEW, 1)
+        self.glance = nn.Linear(FEW * int(rim.sum()), 1)
+        self.joined = nn.Linear(second * int(rim.sum()), joined, bias=False)
         self.last = nn.Sequential(
             nn.BatchNorm2d(joined), nn.ReLU(), nn.Conv2d(joined, last, 1), nn.ReLU(), nn.Conv2d(last, 1, 1)
         )
-        middle = slice((ACROSS - HIDDEN) // 2, (ACROSS + HIDDEN) // 2)
-        rim = torch.ones(ACROSS, ACROSS)
-        rim[middle, middle] = 0
-        self.register_buffer("rim", rim, persistent=False)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        odds: Tensor = self.last(conv2d(self.cells(pictures), self.joined * self.rim, dilation=CELL // STEP))
-        return odds
+        """Log-odds [N, 1, h, w] of images [N, 3, H, W] in [0, 1]; h is (H - 48) // 2 + 1, and w likewise."""
+        cells = self.cells(pictures)
+        likely = self._everywhere(self.few(cells), self.glance) > UNLIKELY
+        odds = torch.full_like(likely, NEVER, dtype=pictures.dtype)
+        found = torch.cat([self._at(cells, places) for places in likely[:, 0].nonzero().split(AT_ONCE)])
+        return odds.masked_scatter(likely, found)
+
+    def both(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+        """The log-odds at a glance, and the better ones for all windows, [N, 1, h, w] each: for the training."""
+        cells = self.cells(pictures)
+        return self._everywhere(self.few(cells), self.glance), self.last(self._everywhere(cells, self.joined))
+
+    def _everywhere(self, cells: Tensor, layer: nn.Linear) -> Tensor:
+        """A layer on the rim of every window: a convolution whose kernel is 0 in the middle."""
+        outputs, channels = layer.out_features, cells.shape[1]
+        kernel = cells.new_zeros(outputs, channels, ACROSS, ACROSS)
+        kernel[:, :, self.rim] = layer.weight.view(outputs, channels, -1)
+        return conv2d(cells, kernel, layer.bias, dilation=CELL // STEP)
+
+    def _at(self, cells: Tensor, places: Tensor) -> Tensor:
+        """The better log-odds [M] of windows at places [M, 3]: image, row and column."""
+        image, row, column = (each[:, None] for each in places.unbind(1))
+        down, across = self.rim.nonzero().mul(CELL // STEP).unbind(1)
+        rims = cells.permute(0, 2, 3, 1)[image, row + down, column + across]
+        joined = self.joined(rims.transpose(1, 2).flatten(1))
+        odds: Tensor = self.last(joined[:, :, None, None])
+        return odds.flatten()
 
 
 @dataclass(frozen=True)

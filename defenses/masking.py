@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import binary_cross_entropy_with_logits
+from torch.nn.functional import softplus
 
 from bench.detection import (
     STOP_SIGN,
@@ -25,22 +25,41 @@ from bench.plugins.ranges import Count, Natural, Positive
 from bench.victims import zoo
 from bench.victims.detectors.training import descend
 from bench.victims.detectors.windows import Views, Windows, kept
-from defenses.judge import COARSER, COVER, FINEST, LEVELS, SIGN, STEP, WINDOW, Judge, best_of_blocks, bound, levels
+from defenses.judge import (
+    COARSER,
+    COVER,
+    FINEST,
+    LEVELS,
+    NEVER,
+    SIGN,
+    STEP,
+    WINDOW,
+    Judge,
+    best_of_blocks,
+    bound,
+    levels,
+)
 
 SIDE = 96
-"""Side in pixels of a training picture, which has 29 x 29 windows."""
-OTHERS, AWAY = 0.4, 0.35
-"""Share of the training pictures that show a decoy, and share of those at random places."""
-FACES = 8
-"""Sets of decoys that are drawn for the training."""
-SIZES = (26.0, 38.0)
-"""A window is one of a sign if that is this wide in it, in pixels."""
+"""Side in pixels of a training picture, which has 25 x 25 windows."""
+OTHERS, AWAY, MISTAKEN = 0.45, 0.35, 0.7
+"""Share of the training pictures that show a decoy, share of those away from the sign, and share of these at a mistake."""
+RED = 0.5
+"""Share of the decoys that get the hue of the sign."""
+ROUNDS, LOOKED_AT, MISTAKES = 8, 54, 4
+"""How often decoys are drawn and mistakes are looked for, in how many frames, and how many of each frame are remembered."""
+LARGEST = 40.5
+"""A window is not one of a sign that is wider in it than this, in pixels."""
+SLACK = 2.5
+"""Nor of one that it could be this much nearer to: its cover must hide the patch, and not much more."""
 MARGIN = 1.5
 """A patch changes pixels up to this far beyond its edge, in pixels of the image."""
 PATCH = 0.5
 """Side of a patch as a share of the sign's side: in training, a window must cover it."""
 HARDEST = 16
 """Of the windows without a sign in a training picture, this many count: those that look most like one."""
+SEEN_AT_A_GLANCE = 20.0
+"""Weight of a window with a sign among the windows without one, for the answer at a glance: no sign may be lost there."""
 DECAY = 0.995
 """Of the average of the weights, per update."""
 
@@ -105,7 +124,7 @@ class Masking(DetectorDefense):
         trained_in: non-default parameters of the training world; set by `bench train`.
     """
 
-    updates: Count = 2000
+    updates: Count = 1400
     batch: Count = 32
     learning_rate: Positive = 4e-3
     trained: Natural = 0
@@ -152,24 +171,48 @@ class _Examples:
         self.generator = torch.Generator().manual_seed(seed)
         self.windows = Windows(scenes, SIDE, away=AWAY, generator=self.generator)
         self.decoys: Tensor | None = None
+        self.mistakes = torch.zeros(0, 4)
 
     def loss(self, update: int) -> Tensor:
-        """Cross-entropy: mean over the windows of a sign, plus mean over the hardest windows without one, of each picture."""
+        """Cross-entropy: mean over the windows of a sign, plus mean over the hardest windows without one, of each picture.
+
+        The answer at a glance has the same loss, with other weights.
+        """
         self._redrawn(update)
         shown, views, signs = self._drawn()
-        odds = self.judge(shown)[:, 0]
         wanted, other = self._labels(views, signs)
-        missed = binary_cross_entropy_with_logits(odds, torch.ones_like(odds), reduction="none")
-        hardest = odds.masked_fill(~other, -torch.inf).flatten(1).topk(HARDEST).values
-        with_sign = wanted.flatten(1).any(1)
-        shares = wanted / wanted.sum((1, 2), keepdim=True).clamp(min=1)
-        return (missed * shares).sum() / with_sign.sum().clamp(min=1) + nn.functional.softplus(hardest).mean()
+        shares = wanted / wanted.sum((1, 2), keepdim=True).clamp(min=1) / wanted.flatten(1).any(1).sum().clamp(min=1)
+        losses = []
+        for odds, weight in zip(self.judge.both(shown), (SEEN_AT_A_GLANCE, 1.0), strict=True):
+            hardest = odds[:, 0].masked_fill(~other, -torch.inf).flatten(1).topk(HARDEST).values
+            losses.append(weight * (softplus(-odds[:, 0]) * shares).sum() + softplus(hardest).mean())
+        return sum(losses[1:], losses[0])
 
     def _redrawn(self, update: int) -> None:
-        """Draw the next set of decoys when it is time."""
-        number, each = divmod(update, max(1, self.recipe.updates // FACES))
-        if self.scenes.decoys and each == 0:
+        """Draw the next set of decoys when it is time, and look for mistakes."""
+        number, since = divmod(update, max(1, self.recipe.updates // ROUNDS))
+        if since:
+            return
+        if self.scenes.decoys:
             self.decoys = kept(self.scenes, self.scenes.redrawn(number).render_decoys)
+        if number:
+            self.judge.eval()
+            frames = torch.randperm(len(self.scenes), generator=self.generator)[:LOOKED_AT]
+            found = [self._mistaken(frame) for frame in frames.tolist()]
+            self.mistakes = torch.cat([self.mistakes, *found])
+            self.judge.train()
+
+    @torch.no_grad()
+    def _mistaken(self, frame: int) -> Tensor:
+        """The windows of a frame without a sign that look most like one: frame, middle and size of a pixel, [MISTAKES, 4]."""
+        picture = (self.windows.pictures if self.decoys is None else self.decoys)[frame, None] / 255
+        found = [best_of_blocks(self.judge(level.pictures), level.boxes) for level in levels(picture)]
+        odds, boxes = (torch.cat(parts, 1)[0] for parts in zip(*found, strict=True))
+        if self.decoys is None:
+            odds = odds.masked_fill(overlap(boxes, self.scenes.boxes[frame]) > 0, NEVER)
+        worst = boxes[odds.topk(MISTAKES).indices]
+        middles, scale = (worst[:, :2] + worst[:, 2:]) / 2, (worst[:, 2:] - worst[:, :2]).mean(1, keepdim=True) / SIGN
+        return torch.cat([torch.full((MISTAKES, 1), frame), middles, scale], 1)
 
     def _drawn(self) -> tuple[Tensor, Views, Tensor]:
         """Pictures [N, 3, SIDE, SIDE] with their places, and which show the frame with its sign, bool [N]."""
@@ -180,34 +223,67 @@ class _Examples:
         if self.decoys is not None:
             signs = self._uniform(count) >= OTHERS
             others = self.windows.cut(views, self.decoys[views.frames])
+            others = torch.where(
+                self._uniform(count, 1, 1, 1) < RED, self._reddened(others, shown, self._true(views)), others
+            )
             shown = torch.where(signs[:, None, None, None], shown, others)
         (shown,) = self.windows.lit(shown)
         return shown, views, signs
 
+    def _reddened(self, others: Tensor, shown: Tensor, boxes: Tensor) -> Tensor:
+        """Pictures of decoys whose mean hue, in the boxes [N, 4] of the signs, is that of the sign in the other pictures.
+
+        Hues are turned in the plane of the two differences of colour of YIQ, the television standard NTSC.
+        """
+        place = torch.arange(SIDE) + 0.5
+        across, down = ((place >= boxes[:, axis, None]) & (place <= boxes[:, axis + 2, None]) for axis in (0, 1))
+        inside = (down[:, :, None] & across[:, None, :])[:, None]
+        yiq = torch.tensor([[0.299, 0.587, 0.114], [0.5959, -0.2746, -0.3213], [0.2115, -0.5227, 0.3112]])
+        angles = []
+        for pictures in (shown, others):
+            mean = (pictures * inside).sum((2, 3)) @ yiq.T
+            angles.append(torch.atan2(mean[:, 2], mean[:, 1]))
+        turn = angles[0] - angles[1]
+        cos, sin, zero = turn.cos(), turn.sin(), torch.zeros_like(turn)
+        turned = torch.stack([zero + 1, zero, zero, zero, cos, -sin, zero, sin, cos], 1).view(-1, 3, 3)
+        change = torch.linalg.inv(yiq) @ turned @ yiq
+        return torch.where(inside, torch.einsum("nij,njhw->nihw", change, others).clamp(0, 1), others)
+
     def _views(self, count: int) -> Views:
-        """Squares around the sign in which it is about as wide as in a window; some at random places, in a random size."""
+        """Squares around the sign in which it is about as wide as in a window; others at mistakes or random places."""
         frames = torch.randint(len(self.scenes), (count,), generator=self.generator)
         box, limit = self.scenes.boxes[frames], torch.tensor(self.scenes.size[::-1])
-        wide = (box[:, 2:] - box[:, :2]).amax(1)
-        near = SIDE / SIGN * wide * self._between(0.8, 1.25, count)
-        far = SIDE * self._between(FINEST, FINEST * COARSER ** (LEVELS - 1), count)
+        sides = SIDE / SIGN * (box[:, 2:] - box[:, :2]).amax(1) * self._between(0.9, 1.12, count)
+        middle = (box[:, :2] + box[:, 2:]) / 2 + (self._uniform(count, 2) - 0.5) * 0.5 * sides[:, None]
         away = self._uniform(count) < AWAY
-        sides = torch.where(away, far, near).clamp(max=float(limit.min())).round()
-        middle = (box[:, :2] + box[:, 2:]) / 2 + (self._uniform(count, 2) - 0.5) * 0.6 * sides[:, None]
+        sides = torch.where(away, SIDE * self._between(FINEST, FINEST * COARSER ** (LEVELS - 1), count), sides)
         middle = torch.where(away[:, None], self._uniform(count, 2) * limit, middle)
+        if len(self.mistakes):
+            chosen = self.mistakes[torch.randint(len(self.mistakes), (count,), generator=self.generator)]
+            again = away & (self._uniform(count) < MISTAKEN)
+            frames = torch.where(again, chosen[:, 0].long(), frames)
+            sides = torch.where(again, SIDE * chosen[:, 3] * self._between(0.9, 1.1, count), sides)
+            beside = (self._uniform(count, 2) - 0.5) * 0.3 * sides[:, None]
+            middle = torch.where(again[:, None], chosen[:, 1:3] + beside, middle)
+        sides = sides.clamp(max=float(limit.min())).round()
         corners = (middle - sides[:, None] / 2).round().clamp(min=0).minimum(limit - sides[:, None])
         return Views(frames, corners, sides)
+
+    def _true(self, views: Views) -> Tensor:
+        """[N, 4] boxes of the signs in the training pictures."""
+        return views.boxes(self.scenes.boxes[views.frames], SIDE)
 
     def _labels(self, views: Views, signs: Tensor) -> tuple[Tensor, Tensor]:
         """Which windows [N, h, w] are those of a sign, and which are of none; the others do not count."""
         place = (torch.arange((SIDE - WINDOW) // STEP + 1) * STEP + WINDOW / 2).float()
         middles = torch.stack(torch.meshgrid(place, place, indexing="xy"), -1)
         own = torch.cat([middles - SIGN / 2, middles + SIGN / 2], -1)
-        true = views.boxes(self.scenes.boxes[views.frames], SIDE)[:, None, None]
+        true = self._true(views)[:, None, None]
         wide = (true[..., 2:] - true[..., :2]).amax(-1)
         beside = (middles - (true[..., :2] + true[..., 2:]) / 2).abs().amax(-1)
-        needed = PATCH / 2 * wide + 0.5 + MARGIN * (SIDE / views.sides)[:, None, None]
-        fits = (beside + needed <= COVER / 2) & (wide >= SIZES[0]) & (wide <= SIZES[1])
+        needed = PATCH / 2 * wide + MARGIN * (SIDE / views.sides)[:, None, None]
+        slack = COVER / 2 - beside - needed
+        fits = (slack >= 0) & (slack <= SLACK) & (wide <= LARGEST)
         there = signs[:, None, None]
         return fits & there, (overlap(own, true) < SAME_IOU) | ~there
 
