@@ -41,8 +41,8 @@ from defenses.judge import (
 )
 
 MIDDLE = 4.0
-"""Log-odds of the judge with a score of one half. In the training frames 19 of 20 signs have certified log-odds above 10.0, and 19
-of 20 decoys that it was not trained with have log-odds below -2.1: this lies in the middle."""
+"""Log-odds of the judge with a score of one half. In the training frames 19 of 20 signs have certified log-odds above 10.0,
+and 19 of 20 decoys that it was not trained with have log-odds below -2.1: this lies in the middle."""
 
 SIDE = 96
 """Side in pixels of a training picture, which has 25 x 25 windows."""
