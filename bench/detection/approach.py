@@ -15,11 +15,11 @@ from bench.detection import stopping
 from bench.detection.boxes import confidence, overlap
 from bench.detection.closed_loop import Drives
 from bench.detection.detector import STOP_SIGN, Detections, Detector
-from bench.detection.discrimination import discrimination, if_visible
+from bench.detection.discrimination import certified, discrimination, if_visible
 from bench.detection.patch import Patch
 from bench.detection.printing import non_printability
 from bench.detection.scenes import Approach, Scenes
-from bench.detection.sight import SAME_IOU, Sight, look, look_at_decoys
+from bench.detection.sight import SAME_IOU, Sight, certain, look, look_at_decoys
 from bench.trust.streams import Stream
 
 Columns = dict[str, NDArray[np.generic]]
@@ -89,6 +89,8 @@ def score(
     with torch.no_grad():
         looks = [look(detector, one, texels, share) for one in scenes]
         others = [look_at_decoys(detector, one) for one in scenes]
+        # Without an attack there is no patch that something is certain under.
+        least = [certain(detector, one, share) if share else None for one in scenes]
         seen = [looks[number] for number in of_approach]
         if trace:
             for place in trace.episodes:
@@ -107,7 +109,12 @@ def score(
         "non_printability": np.nan if texels is None else float(non_printability(texels)),
         **probed(detector, approaches, seen, texels, share, entropy),
     }
-    of_scenes = {**measured(looks, scenes), **discrimination(looks, others, scenes), **if_visible(looks, scenes)}
+    of_scenes = {
+        **measured(looks, scenes),
+        **discrimination(looks, others, scenes),
+        **certified(least, looks, others),
+        **if_visible(looks, scenes),
+    }
     return {
         "seed": np.array([approach.seed for approach in approaches], np.int64),
         "location": np.array([approach.location for approach in approaches]),

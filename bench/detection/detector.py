@@ -119,6 +119,21 @@ class Detector(nn.Module, ABC):
         """
         return scores
 
+    def certified(self, pictures: Tensor, boxes: Tensor, reach: Tensor) -> Tensor | None:
+        """A lower bound of what is reported on a stop sign, whatever a patch shows; None for a detector without a certificate.
+
+        It bounds the confidence (`bench.detection.boxes.confidence`), which is taken before non-maximum suppression.
+
+        Args:
+            pictures: float [N, 3, H, W], images without a patch, sRGB in [0, 1].
+            boxes: [N, 4], the true box of the sign in each.
+            reach: [N, 4], a box in each; pixels outside of it are not changed.
+
+        Returns:
+            [N] in [0, 1]; 0 where nothing is certain.
+        """
+        return None
+
     def index(self, name: str) -> int:
         """The label of a class.
 
@@ -129,7 +144,7 @@ class Detector(nn.Module, ABC):
 
 
 class Wrapped(Detector):
-    """A detector around another one, with its classes and its memory.
+    """A detector around another one, with its classes and its memory, but without its certificate.
 
     Args:
         inner: the other one.

@@ -11,6 +11,10 @@ from bench.detection import stopping
 from bench.detection.precision import VISIBLE, precision_of_approach
 from bench.detection.scenes import Scenes
 from bench.detection.sight import Sight
+from bench.errors import UserError
+
+ROUNDING = 1e-3
+"""A confidence may be this much below its certificate: sums in another order."""
 
 
 def discrimination(
@@ -45,6 +49,33 @@ def _of_approach(seen: Sight, decoys: Sight | None, scenes: Scenes) -> dict[str,
         "false_stops": float(np.mean([len(one.scores) for one in decoys.found])),
         "octagons": float(taken.mean()) if len(taken) else np.nan,
     }
+
+
+def certified(
+    least: Sequence[NDArray[np.float32] | None], seen: Sequence[Sight], decoys: Sequence[Sight | None]
+) -> dict[str, NDArray[np.generic]]:
+    """`stop_score` of A approaches with the certified confidence in the sign, [A]; NaN without a certificate.
+
+    No patch lowers the confidence below the certificate, and decoys carry none, so `stop_score` is at least this.
+
+    Args:
+        least: the certified confidence in each frame; None without a certificate.
+        seen: the output with the sign, which may have a patch.
+        decoys: the output with decoys; None where the world has none.
+
+    Raises:
+        UserError: if the confidence is below the certificate in a frame.
+    """
+    found = []
+    for certain, sight, other in zip(least, seen, decoys, strict=True):
+        if certain is None:
+            found.append(np.nan)
+            continue
+        if (short := float((certain - sight.confidence).max())) > ROUNDING:
+            raise UserError(f"the certificate is false: the confidence in a frame is {short:.3f} below it")
+        of_decoys = 0.0 if other is None else float(other.confidence.mean(dtype=np.float64))
+        found.append(max(0.0, float(certain.mean(dtype=np.float64)) - of_decoys))
+    return {"certified": np.array(found)}
 
 
 def if_visible(seen: Sequence[Sight], scenes: Sequence[Scenes]) -> dict[str, NDArray[np.generic]]:

@@ -29,6 +29,10 @@ class Placed(Wrapped):
         found = self.inner(pictures.to(self._there))
         return Predictions(found.boxes.to(CPU), found.objectness.to(CPU), found.classes.to(CPU))
 
+    def certified(self, pictures: Tensor, boxes: Tensor, reach: Tensor) -> Tensor | None:
+        least = self.inner.certified(*(part.to(self._there) for part in (pictures, boxes, reach)))
+        return None if least is None else least.to(CPU)
+
 
 def placed(detector: Detector, device: str) -> Detector:
     """The detector on a device; itself on the processor."""

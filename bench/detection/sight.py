@@ -84,6 +84,23 @@ def look_at_decoys(detector: Detector, scenes: Scenes) -> Sight | None:
     return _sight(detector, scenes, scenes.render_decoys) if scenes.decoys else None
 
 
+def certain(detector: Detector, scenes: Scenes, share: float) -> NDArray[np.float32] | None:
+    """[F] what the detector reports at least of the sign in each frame, whatever is on the patch; None without a certificate.
+
+    Args:
+        detector: the (defended) victim.
+        scenes: F frames.
+        share: side of the patch as a share of the sign's side.
+    """
+    reach, parts = scenes.reach(share), []
+    for frames in torch.arange(len(scenes)).split(BATCH):
+        part = detector.certified(scenes.render(frames, None, share), scenes.boxes[frames], reach[frames])
+        if part is None:
+            return None
+        parts.append(part.numpy())
+    return np.concatenate(parts)
+
+
 def _sight(detector: Detector, scenes: Scenes, render: Callable[[Tensor], Tensor]) -> Sight:
     moved = -torch.diff(scenes.distance, prepend=scenes.distance[:1])
     parts, state = [], detector.initial()

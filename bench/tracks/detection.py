@@ -133,6 +133,17 @@ PRINTED: tuple[pa.Field, ...] = (
     field("seen_instead", TEXT, "the class of most of these frames; empty if there is none", nullable=True),
 )
 """What was printed, and what is seen of the sign where it can be seen; null in older records."""
+CERTIFIED: tuple[pa.Field, ...] = (
+    field(
+        "certified",
+        FLOAT,
+        "stop_score at least, whatever the patch shows: with the certified confidence instead of confidence_mean; null without a "
+        "certificate or an attack",
+        "0 to 1",
+        nullable=True,
+    ),
+)
+"""What the defence promises; null in older records."""
 
 CLOSED_LOOP: tuple[pa.Field, ...] = (
     field(
@@ -179,7 +190,7 @@ class DetectionTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("patch",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP, *CERTIFIED)
     of_older: ClassVar[Mapping[str, str]] = {"stop_score": "confidence_mean"}
     scored_with: ClassVar[str] = "decoy_confidence"
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyarrow as pa
 import pytest
 from full_house import SEEN
-from synthetic import drive, probed
+from synthetic import approach, drive, probed
 
 from bench.statistics.certificate import certificate
 from leaderboard.comparisons.reading import read_tracks
@@ -30,3 +30,19 @@ def test_a_row_certifies_what_its_clean_score_and_its_noise_allow(shift: float) 
     assert worst.clean is not None
     assert worst.certified == pytest.approx(certificate(worst.clean, shift))
     assert 0.0 <= worst.certified <= worst.clean.low + 1e-9
+
+
+def detector(bound: float | None) -> Row:
+    """A row of a detector under `eot`, whose records promise this; the clean run promises nothing."""
+    tables = [approach(0.9), approach(0.6, attack="eot"), approach(0.7, attack="grey_patch")]
+    if bound is not None:
+        tables[1:] = [probed(one, certified=bound) for one in tables[1:]]
+    (found,) = boards(read_tracks({"detection": pa.concat_tables(tables)}))[0].rows
+    return found
+
+
+def test_a_detector_certifies_what_its_records_say() -> None:
+    assert detector(None).worst.certified is None
+    worst = detector(0.25).worst
+    assert worst.certified == pytest.approx(0.25)
+    assert worst.certified <= worst.score.estimate
