@@ -38,6 +38,7 @@ FIGURES = {
     "defense_median.png": "filters:median",
     "defense_jpeg.png": "filters:jpeg",
     "defense_segmenter.png": "filters:segmenter",
+    "defense_masking.png": "filters:masking",
     "defense_temporal.png": "frames:temporal",
     "victim_dqn.svg": "decisions:dqn",
     "victim_ddpg.svg": "decisions:ddpg",

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from bench.detection.stopping import THRESHOLD
+from defenses.judge import COVER, GREY, SIGN
 from defenses.segmenter import Completed
 from defenses.smoothing import Guarded
 from docs.figures import style
 from docs.figures.patches import STRONGER, texels_of
 from docs.figures.sightings import FRAME, approaches, crop, detector, frame_axes, picture, said, show, sight
+from envs.camera.faces import DECOYS
 
 NEAR = 8
 """Index of the frame in the figure of `segmenter`, in which the patch that knows of it avoids the marks."""
@@ -48,6 +52,31 @@ def segmenter() -> Figure:
             axes.imshow(avg_pool2d(crop(part, approach, NEAR), 3).permute(1, 2, 0).numpy(), interpolation="nearest")
             axes.set_xlabel(f"{title}: {said(guarded.inner, part, approach, NEAR):.2f}" if part is seen else title)
             style.bare(axes)
+    return made
+
+
+def masking() -> Figure:
+    """What the judge sees of the sign with and without a patch, and of a decoy with a red ring."""
+    guarded, approach = detector(defense="masking"), approaches()[0]
+    scenes = copy(approach.scenes)
+    scenes.decoys = tuple(each for each in DECOYS if each.name == "fifty") * len(scenes)
+    patch = torch.rand(3, 100, 100, generator=torch.Generator().manual_seed(0))
+    shown = {
+        "stop sign": picture(approach, NEAR),
+        "with a patch": picture(approach, NEAR, patch),
+        "the decoy fifty": scenes.render_decoys(torch.tensor([NEAR]))[0],
+    }
+    made = style.figure(1.7, "masking: the middle is hidden from the judge")
+    left, top, right, bottom = scenes.boxes[NEAR].tolist()
+    x, y, half = (left + right) / 2, (top + bottom) / 2, (right - left) * COVER / SIGN / 2
+    rows, columns = slice(round(y - half), round(y + half)), slice(round(x - half), round(x + half))
+    for part, (name, each) in zip(made.subfigures(1, len(shown)), shown.items(), strict=True):
+        covered = each.clone()
+        covered[:, rows, columns] = GREY
+        for axes, one in zip(part.subplots(1, 2), (each, covered), strict=True):
+            axes.imshow(avg_pool2d(crop(one, approach, NEAR), 3).permute(1, 2, 0).numpy(), interpolation="nearest")
+            style.bare(axes)
+        part.suptitle(f"{name}: {said(guarded, each, approach, NEAR):.2f}", fontsize=10)
     return made
 
 
