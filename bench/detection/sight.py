@@ -92,6 +92,8 @@ def certain(detector: Detector, scenes: Scenes, share: float) -> NDArray[np.floa
         scenes: F frames.
         share: side of the patch as a share of the sign's side.
     """
+    if type(detector).certified is Detector.certified:
+        return None  # No frame is rendered for a detector without a certificate.
     reach, parts = scenes.reach(share), []
     for frames in torch.arange(len(scenes)).split(BATCH):
         part = detector.certified(scenes.render(frames, None, share), scenes.boxes[frames], reach[frames])
