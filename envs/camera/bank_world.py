@@ -42,6 +42,10 @@ class BankWorld(CameraWorld):
         """Folder of the frames."""
         return Path(self.bank).expanduser() if self.bank else bank.SHIPPED
 
+    def place(self, seed: int) -> str:
+        """Name of the place that a scenario seed is driven at."""
+        return self.locations[seed % len(self.locations)]
+
     def on_road(self, location: str, lanes: int, density: float, weather: str) -> BankScenes:
         """The frames of the approach at a place, farthest first.
 

@@ -38,7 +38,7 @@ class StopSignPlaces(BankWorld):
     def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
         found = []
         for seed in seeds:
-            place = self.locations[seed % len(self.locations)]
+            place = self.place(seed)
             scenes = self.on_road(place, poses.ONE_ROAD_LANES, poses.ONE_ROAD_DENSITY, str(cell.weather))
             found.append(Approach(seed=seed, location=place, scenes=scenes))
         return found

@@ -88,7 +88,7 @@ class Windscreen(BankWorld):
         for seed in seeds:
             street = self._street.scenes(cell, seed)
             scenes = WindscreenScenes(street, [cell.lens] * len(street))
-            found.append(Approach(seed=seed, location=self.locations[seed % len(self.locations)], scenes=scenes))
+            found.append(Approach(seed=seed, location=self.place(seed), scenes=scenes))
         return found
 
     @property

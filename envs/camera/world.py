@@ -36,14 +36,11 @@ class StopSignApproach(BankWorld):
         return _training(self.folder)
 
     def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
-        return [Approach(seed=seed, location=self._place(seed), scenes=self.scenes(cell, seed)) for seed in seeds]
+        return [Approach(seed=seed, location=self.place(seed), scenes=self.scenes(cell, seed)) for seed in seeds]
 
     def scenes(self, cell: Cell, seed: int) -> BankScenes:
         """The frames of the approach of a seed, farthest first."""
-        return self.on_road(self._place(seed), int(cell.lanes), float(cell.density), str(cell.weather))
-
-    def _place(self, seed: int) -> str:
-        return self.locations[seed % len(self.locations)]
+        return self.on_road(self.place(seed), int(cell.lanes), float(cell.density), str(cell.weather))
 
     def every_pose(self) -> tuple[Pose, ...]:
         return (*poses.training(), *poses.scored())
