@@ -22,8 +22,8 @@ from bench.victims import zoo
 from bench.victims.detectors.examples import Example
 from bench.victims.detectors.rcnn import RCNN, RCNNNetwork
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
-from bench.victims.detectors.yolov5 import YOLOv5
-from defenses.advtrain_detection import DetectorAdversarialTraining
+from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
+from defenses.advtrain_detection import DetectorAdversarialTraining, _Hardening
 from envs.camera.bank import TrainingScenes
 from envs.camera.world import StopSignApproach
 from tests.framework.toy_camera import SIGN, RedDetector, RedStreet
@@ -108,6 +108,27 @@ def test_a_detector_that_is_not_aligned_learns_from_what_it_detected(monkeypatch
     )
     assert sum(real) > len(real) // 2
     assert sum(false) == 0 < sum(len(label) for one in shown[3:] for label in one.labels)
+
+
+@pytest.mark.parametrize("of_victim", [0.0, 3.0])
+def test_an_aligned_detector_that_was_trained_here_keeps_its_own_loss_too(
+    of_victim: float, victim: YOLOv5, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown, weights, own = [], [], YOLOv5.loss
+
+    def watched(self: YOLOv5, network: YOLOv5Network, example: Example) -> Tensor:
+        shown.append(example)
+        return own(self, network, example)
+
+    def begun(self: _Hardening, number: int) -> None:
+        weights.append(self.caution)
+
+    monkeypatch.setattr(YOLOv5, "loss", watched)
+    monkeypatch.setattr(_Hardening, "_begin", begun)
+    assert victim.load(0, FACTS).aligned
+    trained(replace(victim, caution=of_victim), rounds=1, updates=3, skip=1.0, caution=2.0)
+    assert len(shown) == 3
+    assert weights == [2.0 * (1 + of_victim)]
 
 
 class NotAligned(RedDetector):
