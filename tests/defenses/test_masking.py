@@ -26,6 +26,7 @@ from bench.errors import UserError
 from bench.victims import zoo
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
 from bench.victims.detectors.yolov5 import YOLOv5
+from defenses import masking
 from defenses.jpeg import JPEG
 from defenses.judge import (
     ACROSS,
@@ -163,14 +164,15 @@ def test_the_detectors_own_predictions_are_kept_and_small_images_have_no_window(
     assert Masked(inner, untrained()).certified(tiny, torch.zeros(1, 4), torch.zeros(1, 4)).tolist() == [0]  # type: ignore[union-attr]
 
 
-def patches(detector: Masked) -> dict[str, Tensor]:
-    """Patches of all kinds, among them one that was optimised against the defended detector."""
+@cache
+def patches() -> dict[str, Tensor]:
+    """Patches of all kinds, among them one that was optimised against the shipped judge."""
     board = torch.zeros(3, 16, 16)
     board[:, ::2, ::2] = board[:, 1::2, 1::2] = 1
     attack = EOT(steps=4, batch=2, window=160, texels=32, loss="log_odds", learning_rate=0.3)
     threat = PatchThreat(budget=SHARE)
     training = StopSignApproach().training_scenes()
-    made = craft(attack, detector, training, threat, attack_seed=0, progress=lambda share, text: None).texels
+    made = craft(attack, shipped(), training, threat, attack_seed=0, progress=lambda share, text: None).texels
     assert made is not None
     red = torch.tensor([0.68, 0.08, 0.12])[:, None, None].expand(3, 16, 16)
     return {
@@ -189,7 +191,7 @@ def test_no_patch_lowers_the_confidence_below_the_certificate(weather: str) -> N
     least = certain(shipped(), frames, SHARE)
     assert least is not None
     assert least.mean() > 0.3
-    for texels in patches(shipped()).values():
+    for texels in patches().values():
         assert (look(shipped(), frames, texels, SHARE).confidence >= least - 1e-4).all()
 
 
@@ -207,7 +209,7 @@ def test_no_random_patch_changes_what_is_certain(seed: int, texels: int, frame: 
 
 def test_a_larger_patch_has_no_certificate() -> None:
     frames = scenes()
-    for share, most in ((0.5, 1.0), (0.8, 0.02), (1.0, 0.001)):
+    for share, most in ((0.8, 0.02), (1.0, 0.001)):
         least = certain(shipped(), frames, share)
         assert least is not None
         assert least.mean() <= most
@@ -280,6 +282,7 @@ def test_it_trains_the_judge_only_and_the_zoo_finds_it(
     victim: YOLOv5, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
+    monkeypatch.setattr(masking, "LOOKED_AT", 6)
     made = QUICK.train(victim, DrawnStreet(), seed=0, progress=lambda share, text: None)
     recipe = zoo.Recipe.of(victim, QUICK)
     path = zoo.save(made.network, recipe, seed=0, world=DrawnStreet(), card=made.card, start=made.start)
@@ -289,7 +292,8 @@ def test_it_trains_the_judge_only_and_the_zoo_finds_it(
     assert torch.allclose(again(shown).scores, made.network(shown).scores, rtol=0.02, atol=1e-3)
 
 
-def test_all_victims_get_the_same_judge(victim: YOLOv5) -> None:
+def test_all_victims_get_the_same_judge(victim: YOLOv5, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(masking, "LOOKED_AT", 6)
     made = [QUICK.train(one, DrawnStreet(), seed=1, progress=lambda share, text: None) for one in (victim, RedVictim())]
     one, other = (list(each.network.judge.parameters()) for each in made)  # type: ignore[union-attr]
     assert all(map(torch.equal, one, other))
