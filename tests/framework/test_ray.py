@@ -32,7 +32,7 @@ def cluster(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
     root = Path(__file__).parents[2]
     os.environ |= {"PYTHONPATH": import_path(toy_folder, root), "RAY_USAGE_STATS_ENABLED": "0", "OMP_NUM_THREADS": "1"}
     # Ray's workers are niced by 15, and beside another test would hardly run.
-    os.environ["RAY_worker_niceness"] = "0"
+    os.environ |= {"RAY_worker_niceness": "0"}
     made = Cluster()
     try:
         for name in ("head", "other"):
