@@ -1,11 +1,11 @@
-"""How much of the way to perfect information a better choice of actions could win `planner` at most.
+"""How much of the way to perfect information `planner` wins if it knows the future, within the same margins.
 
     python benchmarks/safe_foresight.py [--lanes 3 4 5] [--density 1 2] [--episodes 16] [--assumed-budget 0 0.1]
 
 Tuning seeds, clear weather, no attack. `rules` is `planner`. `foresight` knows the future: in every frame it rolls 64 plans of
 4 s in copies of the simulator, as `oracle_planner` does, but takes only actions that `planner` holds to be safe; where none is,
-it does what `planner` does. What it leaves to `oracle_planner` is the price of the margins, not of the choice. With 64 plans a
-frame it is a lower bound of the best choice.
+it does what `planner` does. A better choice of plans than 64 random ones, and one that counts with the margins of later frames,
+would score more: this is a lower bound of what the margins allow.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def driven(cell: Cell, episodes: int, budget: float, foresight: bool) -> tuple[f
         found = policy.judge(ego, cars_of(ego, boxes))
         change = (found.change >= 0) & found.changeable
         safe = torch.cat((found.stay >= 0, change), -1)[..., policy.reckoning.order]
-        action = policy.scores(shown, state).argmax(-1).numpy()
+        action = policy.weighed(shown, boxes, state).argmax(-1).numpy()
         if foresight:
             action = seer.actions(step, safe.numpy(), action)
         state = policy.advance(shown, torch.from_numpy(action), state)
