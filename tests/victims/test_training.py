@@ -31,7 +31,7 @@ from defenses.advtrain import AdversarialTraining, AttackInLoop
 
 SHORT = {"decisions": 160, "copies": 1, "hidden": 8, "batch": 16, "memory": 2000, "checkpoints": 1}
 VICTIMS = [DQN(**SHORT), DDPG(**SHORT)]
-LEARNERS = [*VICTIMS, PPO(**SHORT), SAC(**SHORT)]
+LEARNERS = [*VICTIMS, PPO(**SHORT, fine_rollout=16), SAC(**SHORT)]
 NAMES = ["dqn", "ddpg", "ppo", "sac"]
 
 
@@ -77,6 +77,27 @@ def test_returns_end_where_the_episode_ends(world: DrivingWorld) -> None:
     assert bool((over | ~short).all())
     assert bool((seen["next", "reward"].squeeze(-1)[crashed] < -1).all())
     assert bool((seen["next", "reward"].squeeze(-1)[~crashed] >= 0).all())
+
+
+def test_in_the_second_phase_of_ppo_the_critic_learns_first_and_a_crash_costs_more(world: DrivingWorld) -> None:
+    victim = PPO(**SHORT, fine_rollout=CHUNK, fine_batch=16, settling=2, tau=1.0)
+    phase = victim.phases(TrainingHooks())[1]
+    env = world.make(roads(world, 1), action_type="discrete")
+    env.set_seed(0)
+    learner = victim.learner(env, TrainingHooks())
+    learner.enter(phase)
+    assert learner.progress(TensorDict({"progress": 1.0, "crashed": True, "offroad": False})) == 1 - 360
+    practice = Practice(env, learner, phase, crash_penalty=40.0, memory=2000, batch=16)
+    moved = []
+    for _ in range(3):
+        before = [[weight.clone() for weight in part.parameters()] for part in (learner.policy, learner.critic)]
+        practice.drive(CHUNK, 0.5)
+        learner.learn(1e-3, 0.5)
+        after = [list(part.parameters()) for part in (learner.policy, learner.critic)]
+        moved.append(
+            [any((a != b).any() for a, b in zip(*pair, strict=True)) for pair in zip(before, after, strict=True)]
+        )
+    assert moved == [[False, True], [False, True], [True, True]]
 
 
 @pytest.mark.parametrize("skip", [0.0, 0.5, 1.0])

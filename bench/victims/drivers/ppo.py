@@ -16,7 +16,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from bench.driving import ActionType, Policy, TrainingHooks
-from bench.plugins.ranges import Count, Positive, Share
+from bench.plugins.ranges import Count, Natural, NotNegative, Positive, Share
 from bench.victims.drivers.learner import CHUNK, Learner, Phase
 from bench.victims.drivers.logits import Logits
 from bench.victims.drivers.networks import QPolicy, StateValue
@@ -30,36 +30,53 @@ class PPO(LearningDriver):
 
     TorchRL's ClipPPOLoss with generalised advantages (Schulman et al. 2016). The policy drives greedily: the scores that an
     attack sees are the logits, and the most likely action is taken. It learns from its latest experience only, so `n_step`,
-    `memory`, `tau` and `updates` have no meaning for it.
+    `memory` and `updates` have no meaning for it. `tau` is the rate at which the averaged weights, with which it drives, follow.
 
-    From scratch it has no phase of single frames: the policy that holds decisions for `repeat` frames scores as well if it is
-    asked at every frame. `fine` is the share of the training, at its end, over which the checkpoints are spread. Behind a defence
+    Its second phase, from scratch, decides at every frame and takes few careful steps: a crash is rare and comes seconds after
+    the decision that led to it, so it costs more, and each update learns from more experience. For the first `settling` rounds of
+    updates of this phase the critic alone learns. With a trained start the updates are those of the first phase. Behind a defence
     it explores more than at the end of the training without one (`BEHIND`).
 
     Args:
-        rollout: decisions on every road between two rounds of updates.
+        rollout: decisions on every road between two rounds of updates, in the first phase.
         epochs: how often each decision is learned from.
+        fine_rollout, fine_batch, fine_epochs: the same in the second phase, and its transitions per update.
+        fine_gamma, fine_trace: discount and lambda of the second phase per `repeat` frames.
+        fine_penalty: cost of a crash in the second phase, in frames of perfect driving.
+        fine_rate: learning rate of the second phase; that of the critic is `critic_speed` times as high.
+        settling: rounds of updates at its beginning in which the policy stays.
         clip: epsilon, the largest change of an action's probability ratio that is rewarded.
-        trace: lambda of the advantages per decision of the first phase; lambda^(1/repeat) in the second.
+        trace: lambda of the advantages per decision of the first phase.
         entropy: initial weight of the entropy bonus.
         final_entropy: its weight from `explore_until` on; it falls exponentially until then.
         explore_until: share of the training until which the reward for the rightmost lane grows, with the square of the share,
-            to its full weight. With this reward from the start, the policy drives in the rightmost lane before it can pass, and
-            never leaves it.
+            to its full weight; the second phase has the full weight. With this reward from the start, the policy drives in the
+            rightmost lane before it can pass, and never leaves it.
     """
 
     algorithm = "ppo"
     policy_type = QPolicy
 
-    decisions: Count = 36_000
+    decisions: Count = 43_200
     rollout: Annotated[int, Interval(ge=8)] = 16
     epochs: Count = 3
     learning_rate: float = 7e-4
+    fine: Share = 0.5
+    fine_rollout: Annotated[int, Interval(ge=8)] = 256
+    fine_batch: Count = 4608
+    fine_gamma: Share = 0.98
+    fine_trace: Share = 0.92
+    fine_epochs: Count = 4
+    fine_rate: Positive = 2e-4
+    fine_penalty: NotNegative = 400.0
+    critic_speed: Positive = 5.0
+    settling: Natural = 4
+    tau: Share = 0.01
     clip: Annotated[float, Interval(gt=0, lt=1)] = 0.2
     trace: Share = 0.85
     entropy: Positive = 0.5
     final_entropy: Positive = 0.02
-    explore_until: Annotated[float, Interval(gt=0, le=1)] = 0.8
+    explore_until: Annotated[float, Interval(gt=0, le=1)] = 0.65
     behind_decisions: Count = 8_000
 
     @property
@@ -67,10 +84,8 @@ class PPO(LearningDriver):
         return "discrete"
 
     def phases(self, hooks: TrainingHooks) -> list[Phase]:
-        phases = super().phases(hooks)
-        if hooks.start is not None:
-            return phases
-        return [replace(phases[0], decisions=sum(phase.decisions for phase in phases))]
+        first, *second = super().phases(hooks)
+        return [first, *(replace(phase, gamma=self.fine_gamma ** (1 / self.repeat)) for phase in second)]
 
     def learner(self, env: EnvBase, hooks: TrainingHooks) -> Learner:
         return _ProximalLearner(self, env, hooks)
@@ -124,18 +139,32 @@ class _ProximalLearner(Learner):
             critic_coeff=1.0,
             reduction="none",
         )
-        self.adam = torch.optim.Adam(self.loss.parameters(), recipe.learning_rate, eps=1e-5)
+        self.mean: QPolicy = copy.deepcopy(self.policy)
+        self.fine, self.settling = False, 0
+        self._start()
+
+    def _start(self) -> None:
+        parts = [{"params": list(part.parameters())} for part in (self.policy, self.critic)]
+        self.adam = torch.optim.Adam(parts, self.recipe.learning_rate, eps=1e-5)
 
     def enter(self, phase: Phase) -> None:
-        self.repeat = phase.repeat
-        trace = self.recipe.trace ** (phase.repeat / self.recipe.repeat)
+        recipe = self.recipe
+        self.repeat, self.fine = phase.repeat, phase.repeat == 1 and self.hooks.start is None
+        self.rollout, self.epochs, self.batch = recipe.rollout, recipe.epochs, recipe.batch
+        self.final = recipe.final_entropy
+        if self.fine:
+            self.rollout, self.epochs, self.batch = recipe.fine_rollout, recipe.fine_epochs, recipe.fine_batch
+            self.explored, self.settling, self.final = 1.0, recipe.settling, self.final * phase.exploration
+            self._start()
+        trace = (recipe.fine_trace if self.fine else recipe.trace) ** (phase.repeat / recipe.repeat)
         self.advantage = GAE(gamma=phase.gamma, lmbda=trace, value_network=self.critic)
         self.chunks = []
 
     def progress(self, info: TensorDictBase) -> Tensor:
         """`progress`, whose part for the rightmost lane grows until `explore_until`."""
         if self.explored >= 1:
-            return super().progress(info)
+            harder = self.recipe.fine_penalty - self.recipe.crash_penalty if self.fine else 0.0
+            return super().progress(info) - harder * (info["crashed"] | info["offroad"]).float()
         low, high = SPEEDS
         fast = SPEED * self.repeat * ((info["speed"] - low) / (high - low)).clamp(0, 1)
         return fast + self.explored**2 * (super().progress(info) - fast)
@@ -145,27 +174,36 @@ class _ProximalLearner(Learner):
 
     def learn(self, rate: float, share: float) -> None:
         recipe = self.recipe
-        if len(self.chunks) * CHUNK < recipe.rollout:
+        if len(self.chunks) * CHUNK < self.rollout:
             return
-        self.explored = min(1.0, self.first + (1 - self.first) * share / recipe.explore_until)
-        self.loss.entropy_coeff.fill_(recipe.entropy * (recipe.final_entropy / recipe.entropy) ** self.explored)
+        if not self.fine:
+            self.explored = min(1.0, self.first + (1 - self.first) * share / recipe.explore_until)
+        self.loss.entropy_coeff.fill_(recipe.entropy * (self.final / recipe.entropy) ** self.explored)
         whole, self.chunks = torch.cat(self.chunks, -1), []
         with torch.no_grad():
             flat = self.advantage(whole).exclude("next").reshape(-1)
         advantage = flat["advantage"]
         flat.set("advantage", (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6))
         flat.set("truth", flat["observation"])
-        for _ in range(recipe.epochs):
-            for rows in torch.randperm(len(flat)).split(recipe.batch):
+        for _ in range(self.epochs):
+            for rows in torch.randperm(len(flat)).split(self.batch):
                 self.update(flat[rows], rate)
+        self.settling -= 1
 
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
-        self.adam.param_groups[0]["lr"] = learning_rate
+        policy, critic = self.adam.param_groups
+        policy["lr"] = critic["lr"] = learning_rate
+        if self.fine:
+            share = self.recipe.fine_rate / self.recipe.learning_rate
+            policy["lr"] = learning_rate * share if self.settling <= 0 else 0.0
+            critic["lr"] = learning_rate * share * self.recipe.critic_speed
         self.adam.zero_grad()
         self.hooks.loss(self.policy, sample, self._surrogate).mean().backward()
         for network in (self.policy, self.critic):
             torch.nn.utils.clip_grad_norm_(network.parameters(), 0.5)
         self.adam.step()
+        for mean, own in zip(self.mean.parameters(), self.policy.parameters(), strict=True):
+            mean.data.lerp_(own.data, self.recipe.tau)
 
     def _surrogate(self, sample: TensorDictBase) -> Tensor:
         parts = self.loss(sample)
@@ -176,4 +214,4 @@ class _ProximalLearner(Learner):
         """Nothing: its exploration is its own uncertainty."""
 
     def averaged(self) -> Policy:
-        return copy.deepcopy(self.policy)
+        return copy.deepcopy(self.mean)
