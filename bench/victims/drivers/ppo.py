@@ -43,7 +43,8 @@ class PPO(LearningDriver):
         fine_rollout, fine_batch, fine_epochs: the same in the second phase, and its transitions per update.
         fine_gamma, fine_trace: discount and lambda of the second phase per `repeat` frames.
         fine_penalty: cost of a crash in the second phase, in frames of perfect driving.
-        fine_rate: learning rate of the second phase; that of the critic is `critic_speed` times as high.
+        fine_rate: learning rate of the policy in the second phase.
+        critic_speed: learning rate of the critic there, as a multiple of `fine_rate`.
         settling: rounds of updates at its beginning in which the policy stays.
         clip: epsilon, the largest change of an action's probability ratio that is rewarded.
         trace: lambda of the advantages per decision of the first phase.
