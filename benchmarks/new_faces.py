@@ -10,7 +10,7 @@ word STOP: what an honest detector should say of these is open, since a patch ma
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection import Scenes
+from bench.detection import Detector, Scenes
 from bench.detection.colour import linear
 from bench.detection.sight import look_at_decoys
 from bench.plugins import registry
@@ -143,13 +143,13 @@ FACES: dict[str, Callable[[], tuple[Image, Image]]] = {
 
 
 class Carrying(BankScenes):
-    """Scenes with one face in the place of all their decoys."""
+    """The frames of other scenes, with one face in the place of all decoys."""
 
-    def __init__(self, scenes: Scenes, name: str) -> None:
+    face: Face
+
+    def __init__(self, scenes: Scenes) -> None:
         assert isinstance(scenes, BankScenes)
         super().__init__(list(zip(scenes.poses, scenes.frames, strict=True)), scenes.weathers)
-        picture, cover = (torch.from_numpy(part).float() / 255 for part in FACES[name]())
-        self.face = Face(linear(picture.permute(2, 0, 1)), cover[None])
 
     def developed_decoys(self, frames: Tensor) -> Tensor:
         return torch.stack([self._plate(number).carrying(self.face) for number in frames.tolist()])
@@ -165,33 +165,50 @@ def main() -> None:
     asked = parser.parse_args()
     settle()
     cells = [WORLD.axes.cell(lanes=n, density=1.0, weather=weather) for n in asked.lanes for weather in asked.weathers]
-    approaches = [one.scenes for cell in cells for one in WORLD.approaches(cell, range(len(WORLD.locations)))]
+    approaches = [Carrying(one.scenes) for cell in cells for one in WORLD.approaches(cell, range(len(WORLD.locations)))]
+    faces = {name: painted(draw) for name, draw in FACES.items()}
     if asked.picture:
-        cv2.imwrite(str(asked.picture), pictured(approaches[0]))
-    print(f"{'':<34}" + "".join(f"{name:>18}" for name in FACES))
+        cv2.imwrite(str(asked.picture), pictured(approaches[0], list(faces.values())))
+    print(f"{'':<34}" + "".join(f"{name:>18}" for name in faces))
     for victim in asked.victims:
         for defense in asked.defenses:
-            seen = registry.load("victim", victim)()
-            detector = registry.load("defense", defense)().load(seen, 0, WORLD.facts)
+            undefended = registry.load("victim", victim)()
+            detector = registry.load("defense", defense)().load(undefended, 0, WORLD.facts)
             print(f"{victim + ', ' + defense:<34}", end="", flush=True)
-            for name in FACES:
-                with torch.no_grad():
-                    sights = [look_at_decoys(detector, Carrying(scenes, name)) for scenes in approaches]
-                sure = np.mean([one.confidence.mean() for one in sights if one])
-                stops = np.mean([len(found.boxes) for one in sights if one for found in one.found])
-                print(f"{f'{sure:.2f} ({stops:.2f})':>18}", flush=True, end="")
+            for face in faces.values():
+                sure, stops = said(detector, approaches, face)
+                print(f"{f'{sure:.2f} ({stops:.2f})':>18}", end="", flush=True)
             print()
 
 
-def pictured(scenes: Scenes) -> NDArray[np.uint8]:
+def painted(draw: Callable[[], tuple[Image, Image]]) -> Face:
+    picture, cover = (torch.from_numpy(part).float() / 255 for part in draw())
+    return Face(linear(picture.permute(2, 0, 1)), cover[None])
+
+
+def said(detector: Detector, approaches: Sequence[Carrying], face: Face) -> tuple[float, float]:
+    """The mean confidence at the place of the sign, and the false stops a frame, if all signs have a face."""
+    confidences, stops = [], []
+    for scenes in approaches:
+        scenes.face = face
+        with torch.no_grad():
+            seen = look_at_decoys(detector, scenes)
+        assert seen is not None
+        confidences.extend(seen.confidence)
+        stops.extend(len(found.boxes) for found in seen.found)
+    return float(np.mean(confidences)), float(np.mean(stops))
+
+
+def pictured(scenes: Carrying, faces: Sequence[Face]) -> NDArray[np.uint8]:
     """The surroundings of the sign in a frame with each face, side by side, BGR."""
     number = len(scenes) // 2
     x0, y0, x1, y1 = scenes.boxes[number].round().long().tolist()
-    wide = x1 - x0
+    margin = (x1 - x0) // 2
     shown = []
-    for name in FACES:
-        image = Carrying(scenes, name).render_decoys(torch.tensor([number]))[0]
-        part = image[:, y0 - wide // 2 : y1 + wide // 2, x0 - wide // 2 : x1 + wide // 2]
+    for face in faces:
+        scenes.face = face
+        image = scenes.render_decoys(torch.tensor([number]))[0]
+        part = image[:, y0 - margin : y1 + margin, x0 - margin : x1 + margin]
         shown.append((255 * part.permute(1, 2, 0)).byte().numpy()[..., ::-1])
     return np.concatenate(shown, 1).repeat(3, 0).repeat(3, 1)
 

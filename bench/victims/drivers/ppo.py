@@ -34,22 +34,26 @@ class PPO(LearningDriver):
 
     Its second phase, from scratch, decides at every frame and takes few careful steps: a crash is rare and comes seconds after
     the decision that led to it, so it costs more, and each update learns from more experience. For the first `settling` rounds of
-    updates of this phase the critic alone learns. With a trained start the updates are those of the first phase. Behind a defence
-    it explores more than at the end of the training without one (`BEHIND`).
+    updates of this phase the critic alone learns. A phase of fewer than `fine_rollout` decisions learns nothing. With a trained
+    start the updates are those of the first phase. Behind a defence it explores more than at the end of the training without one
+    (`BEHIND`).
 
     Args:
         rollout: decisions on every road between two rounds of updates, in the first phase.
         epochs: how often each decision is learned from.
-        fine_rollout, fine_batch, fine_epochs: the same in the second phase, and its transitions per update.
+        fine_rollout: decisions on every road between two rounds of updates, in the second phase.
+        fine_batch: transitions per update in the second phase.
+        fine_epochs: how often each decision of the second phase is learned from.
         fine_gamma, fine_trace: discount and lambda of the second phase per `repeat` frames.
         fine_penalty: cost of a crash in the second phase, in frames of perfect driving.
         fine_rate: learning rate of the policy in the second phase.
         critic_speed: learning rate of the critic there, as a multiple of `fine_rate`.
-        settling: rounds of updates at its beginning in which the policy stays.
+        settling: rounds of updates at the beginning of the second phase in which the critic alone learns.
         clip: epsilon, the largest change of an action's probability ratio that is rewarded.
         trace: lambda of the advantages per decision of the first phase.
         entropy: initial weight of the entropy bonus.
-        final_entropy: its weight from `explore_until` on; it falls exponentially until then.
+        final_entropy: its weight from `explore_until` on; it falls exponentially until then. In the second phase the
+            weight is always this divided by `repeat`.
         explore_until: share of the training until which the reward for the rightmost lane grows, with the square of the share,
             to its full weight; the second phase has the full weight. With this reward from the start, the policy drives in the
             rightmost lane before it can pass, and never leaves it.
