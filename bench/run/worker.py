@@ -63,7 +63,7 @@ class Worker:
     """
 
     def __init__(self, limits: Limits) -> None:
-        own = context(__name__, *_framework())
+        own = context(__name__, *work_modules())
         self.limits = limits
         self.busy = self.ready = self.spent = False
         self.heard, self.printed = True, b""
@@ -200,10 +200,10 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
         os.dup2(output.fileno(), stream)
     output.close()
     settle()
-    for module in _framework():
+    for module in work_modules():
         importlib.import_module(module)
     # Before any plug-in is imported.
-    framework = Snapshot()
+    before = Snapshot()
     settings = _settings()
     connection.send_bytes(pickle.dumps(READY))
 
@@ -220,7 +220,7 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
             if os.getpgrp() == own:
                 os.killpg(0, signal.SIGKILL)
             return
-        outcome = _carried_out(content, tell, framework)
+        outcome = _carried_out(content, tell, before)
         if isinstance(outcome, Outcome) and _settings() != settings:
             outcome = replace(outcome, last=True)
         connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
@@ -239,7 +239,7 @@ def _settings() -> tuple[object, ...]:
 
 
 @cache
-def _framework() -> tuple[str, ...]:
+def work_modules() -> tuple[str, ...]:
     """The modules that do the work of the built-in tracks."""
     names = [
         name for name, claims in registry.entries(registry.TRACKS).items() if claims[0].distribution == registry.OWN
@@ -247,11 +247,11 @@ def _framework() -> tuple[str, ...]:
     return tuple(module for name in names for module in (track(name).work, track(name).preparation) if module)
 
 
-def _carried_out(content: bytes, tell: Tell, framework: Snapshot) -> Outcome | Failure:
+def _carried_out(content: bytes, tell: Tell, before: Snapshot) -> Outcome | Failure:
     try:
         with contained():
             task: Task = pickle.loads(content)
     # Unpickling imports the plug-ins.
     except Exception as error:
         return Failure(why=f"failed: a worker cannot load it: {reason(error)}")
-    return attempt(task, tell, framework)
+    return attempt(task, tell, before)

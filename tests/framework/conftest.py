@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import runpy
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +16,8 @@ import pytest
 
 from bench.cli import main as cli
 from bench.plugins import registry
+from bench.run import worker
+from bench.run.process import context
 from tests.framework.distributions import install_toy
 
 BENCH = (sys.executable, "-m", "bench")
@@ -93,3 +97,30 @@ def ran(folder: Path, *words: str) -> Said:
     process = started(folder, *words)
     out, err = process.communicate(timeout=300)
     return Said(process.returncode, out, err)
+
+
+def forked(folders: Iterable[Path], *words: str) -> Said:
+    """Run the command line to its end, with the plug-ins of `folders`, in a process that is forked with the imports done."""
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "COLUMNS": "160"}
+    made = context(worker.__name__, *worker.work_modules())
+    with tempfile.TemporaryDirectory() as outputs:
+        files = (Path(outputs, "out"), Path(outputs, "err"))
+        process = made.Process(target=_command, args=(words, environment, import_path(*folders), Path.cwd(), files))  # type: ignore[attr-defined]
+        process.start()
+        process.join(timeout=300)
+        assert process.exitcode is not None, f"bench {' '.join(words)} did not end"
+        out, err = (file.read_text() for file in files)
+    return Said(process.exitcode, out, err)
+
+
+def _command(
+    words: Sequence[str], environment: Mapping[str, str], paths: str, folder: Path, files: Sequence[Path]
+) -> None:
+    os.environ.clear()
+    os.environ.update(environment | {"PYTHONPATH": paths})
+    os.chdir(folder)
+    sys.path[:0] = paths.split(os.pathsep)
+    for stream, file in enumerate(files, start=1):
+        os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT), stream)
+    sys.argv[:] = ["bench", *words]
+    runpy.run_module("bench", run_name="__main__")

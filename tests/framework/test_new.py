@@ -14,7 +14,7 @@ import pytest
 from bench.conformance import scaffold
 from bench.plugins.track import track
 from bench.records import reading
-from tests.framework.conftest import Said, import_path, ran
+from tests.framework.conftest import Said, forked, import_path
 from tests.framework.distributions import install, pip_install
 from tests.framework.test_cli import assert_one_line
 from tests.framework.test_third_track import POINTS as LISTENING
@@ -108,13 +108,13 @@ def test_every_package_passes_its_own_tests(written: list[Path], installed: Path
 
 @pytest.mark.slow
 def test_an_installed_package_is_listed_checked_and_scored_in_workers(installed: Path, tmp_path: Path) -> None:
-    (line,) = [line for line in ran(installed, "list").out.splitlines() if "my_attack_driving" in line]
+    (line,) = [line for line in forked((installed,), "list").out.splitlines() if "my_attack_driving" in line]
     assert line.split()[:2] == ["my_attack_driving", "driving"]
-    checked = ran(installed, "check", "my_attack_driving", "attack.strength=2")
+    checked = forked((installed,), "check", "my_attack_driving", "attack.strength=2")
     assert checked.code == 0, checked.out
     assert "0 to fix" in checked.out
     words = ("attack=my_attack_driving", "attack.strength=2", "lanes=3,4", "density=1", "weather=clear", "episodes=2")
-    said = ran(installed, "run", *words, "seeds=0", "workers=2", "reference=false", "record=0", f"out={tmp_path}")
+    said = forked((installed,), "run", *words, "seeds=0", "workers=2", "reference=false", "record=0", f"out={tmp_path}")
     assert said.code == 0, said.err
     rows = [
         row
@@ -134,7 +134,7 @@ def test_the_first_run_of_a_package_works_as_printed(installed: Path, tmp_path: 
     _, command, *words = scaffold.first_run(kind, name, on).split()
     quicker = ["seeds=0", "reference=false", "record=0", "executor=serial"]
     quicker += ["world.max_steps=30"] if on == "driving" else ["episodes=1"]
-    said = ran(installed, command, *words, *quicker, f"out={tmp_path}")
+    said = forked((installed,), command, *words, *quicker, f"out={tmp_path}")
     assert said.code == 0, said.err
     rows = reading.read(tmp_path, track=track(on)).to_pylist()
     assert name in {row[kind] for row in rows}

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from bench.plugins.track import track
 from bench.records import reading
-from tests.framework.conftest import BENCH, import_path
+from tests.framework.conftest import forked
 from tests.framework.distributions import pip_install
 
 PAGE = Path(__file__).parents[2] / "docs" / "plugins.md"
@@ -36,9 +35,6 @@ def blocks() -> list[tuple[str, str, str]]:
 def test_the_commands_of_the_page_work_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     site, package = tmp_path / "site", tmp_path / "cavbench-my-attack"
-    # The effect of `pip install -e`, beside the environment of the tests: the package's own files are found first.
-    monkeypatch.setenv("PYTHONPATH", import_path(package, site))
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
     for language, block, file in blocks():
         match language:
@@ -76,6 +72,6 @@ def typed(line: str, package: Path, site: Path) -> None:
         pip_install(site, package)
         return
     assert program == "bench"
-    command = [*BENCH, *words, *(SMALLER if words[0] == "run" else ())]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert ended.returncode == 0, f"{line}: {ended.stdout}{ended.stderr}"
+    # The effect of `pip install -e`, beside the environment of the tests: the package's own files are found first.
+    said = forked((package, site), *words, *(SMALLER if words[0] == "run" else ()))
+    assert said.code == 0, f"{line}: {said.out}{said.err}"
