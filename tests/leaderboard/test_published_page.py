@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 
@@ -14,26 +15,53 @@ import pytest
 from rich.console import Console
 
 import leaderboard
-from leaderboard.page.write import write
 from leaderboard.terminal.ranking import leaderboard_report
 
 MADE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d\+00:00)?")
 NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
 
 
+SCRIPT = (
+    "import sys; from io import StringIO; from pathlib import Path; from rich.console import Console\n"
+    "from bench.plugins.track import track; from leaderboard.published import published\n"
+    "from leaderboard.page.write import write; from leaderboard.terminal.run import run_report\n"
+    "if __name__ == '__main__':\n"
+    "    write(None, Path(sys.argv[1]), Console(quiet=True))\n"
+    "    records = published(track('detection'))\n"
+    "    run_report({'detection': records.slice(0, 54)}, Console(file=StringIO()))\n"
+    "    print('torch' in sys.modules)\n"
+)
+"""Writes the page and a table of a run, and prints whether torch was imported."""
+
+
+@dataclass(frozen=True)
+class Remade:
+    """The page that `SCRIPT` wrote in a process of its own, and what it printed."""
+
+    page: Path
+    said: tuple[str, str]
+
+
 @pytest.fixture(scope="module")
-def remade(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    page = tmp_path_factory.mktemp("remade") / "index.html"
-    write(None, page, Console(quiet=True))
-    return page
+def remade(tmp_path_factory: pytest.TempPathFactory) -> Remade:
+    folder = tmp_path_factory.mktemp("remade")
+    (folder / "report.py").write_text(SCRIPT)
+    done = subprocess.run(
+        [sys.executable, "report.py", "index.html"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(Path(leaderboard.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+    )
+    return Remade(folder / "index.html", (done.stdout, done.stderr))
 
 
-def test_the_films_of_the_published_rows_lie_beside_the_page(remade: Path) -> None:
-    made = json.loads(remade.with_suffix(".json").read_text())
+def test_the_films_of_the_published_rows_lie_beside_the_page(remade: Remade) -> None:
+    made = json.loads(remade.page.with_suffix(".json").read_text())
     clips = {row["clip"] for board in made["boards"] for row in board["rows"] if row["clip"]}
     assert len(clips) >= 4
     for clip in clips:
-        assert 10_000 < (remade.parent / clip).stat().st_size < 300_000
+        assert 10_000 < (remade.page.parent / clip).stat().st_size < 300_000
 
 
 def test_without_records_the_leaderboard_on_the_terminal_is_the_published_one() -> None:
@@ -44,34 +72,16 @@ def test_without_records_the_leaderboard_on_the_terminal_is_the_published_one() 
     assert re.search(r"1 +advtrain +dqn +0\.\d\d", said)
 
 
-def test_reports_import_no_torch(tmp_path: Path) -> None:
+def test_reports_import_no_torch(remade: Remade) -> None:
     """It takes seconds; records say all that a report needs."""
-    script = (
-        "import sys; from io import StringIO; from pathlib import Path; from rich.console import Console\n"
-        "from bench.plugins.track import track; from leaderboard.published import published\n"
-        "from leaderboard.page.write import write; from leaderboard.terminal.run import run_report\n"
-        "if __name__ == '__main__':\n"
-        "    write(None, Path(sys.argv[1]), Console(quiet=True))\n"
-        "    records = published(track('detection'))\n"
-        "    run_report({'detection': records.slice(0, 54)}, Console(file=StringIO()))\n"
-        "    print('torch' in sys.modules)\n"
-    )
-    (tmp_path / "report.py").write_text(script)
-    done = subprocess.run(
-        [sys.executable, "report.py", "page.html"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(leaderboard.__file__).parents[1])},
-        capture_output=True,
-        text=True,
-    )
-    assert (done.stdout, done.stderr) == ("False\n", "")
+    assert remade.said == ("False\n", "")
 
 
 @pytest.mark.parametrize("ending", ["html", "json", "csv"])
-def test_the_published_leaderboard_is_up_to_date(ending: str, remade: Path) -> None:
+def test_the_published_leaderboard_is_up_to_date(ending: str, remade: Remade) -> None:
     published, now = (
         MADE.sub("", folder.joinpath(f"index.{ending}").read_text())
-        for folder in (Path(leaderboard.__file__).parent, remade.parent)
+        for folder in (Path(leaderboard.__file__).parent, remade.page.parent)
     )
     remake = "bench report html=leaderboard/index.html makes it anew"
     assert NUMBER.split(now) == NUMBER.split(published), remake
