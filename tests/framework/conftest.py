@@ -21,6 +21,8 @@ from bench.run.process import context
 from tests.framework.distributions import install_toy
 
 BENCH = (sys.executable, "-m", "bench")
+SETTINGS = {"OMP_NUM_THREADS": "1", "COLUMNS": "160"}
+"""Of the environment of a command in a process of its own."""
 
 
 @pytest.fixture(scope="session")
@@ -81,7 +83,7 @@ def import_path(*folders: Path) -> str:
 
 def started(folder: Path, *words: str) -> subprocess.Popen[str]:
     """Start the command line in a new process, with the plug-ins of `folder`."""
-    environment = os.environ | {"PYTHONPATH": import_path(folder), "OMP_NUM_THREADS": "1", "COLUMNS": "160"}
+    environment = os.environ | SETTINGS | {"PYTHONPATH": import_path(folder)}
 
     def hear() -> None:
         """Accept Ctrl-C, which a shell's background job, such as these tests, and its children ignore."""
@@ -101,14 +103,16 @@ def ran(folder: Path, *words: str) -> Said:
 
 def forked(folders: Iterable[Path], *words: str) -> Said:
     """Run the command line to its end, with the plug-ins of `folders`, in a process that is forked with the imports done."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "COLUMNS": "160"}
+    environment = os.environ | SETTINGS
     made = context(worker.__name__, *worker.work_modules())
     with tempfile.TemporaryDirectory() as outputs:
         files = (Path(outputs, "out"), Path(outputs, "err"))
         process = made.Process(target=_command, args=(words, environment, import_path(*folders), Path.cwd(), files))  # type: ignore[attr-defined]
         process.start()
         process.join(timeout=300)
-        assert process.exitcode is not None, f"bench {' '.join(words)} did not end"
+        if process.exitcode is None:
+            process.kill()
+            pytest.fail(f"bench {' '.join(words)} did not end")
         out, err = (file.read_text() for file in files)
     return Said(process.exitcode, out, err)
 
