@@ -58,19 +58,29 @@ class Entry:
         return f"{self.distribution} {self.version}"
 
 
-@cache
 def entries(group: str) -> dict[str, tuple[Entry, ...]]:
     """All names of an entry-point group, sorted, with their entries: more than one entry is a clash."""
-    found: dict[str, set[Entry]] = {}
+    return installed().get(group, {})
+
+
+@cache
+def installed() -> dict[str, dict[str, tuple[Entry, ...]]]:
+    """The entries of all groups of cavbench, by group and name, sorted; every installed distribution is read, once."""
+    found: dict[str, dict[str, set[Entry]]] = {}
     # Each question for a name or a version reads the whole metadata of a distribution.
     shipping: dict[int, tuple[str, str]] = {}
-    for point in metadata.entry_points(group=group):
+    points = metadata.entry_points()
+    own = [group for group in points.groups if group.startswith(f"{OWN}.")]
+    for point in (point for group in own for point in points.select(group=group)):
         if point.dist and id(point.dist) not in shipping:
             shipping[id(point.dist)] = point.dist.name, point.dist.version
         distribution, version = shipping.get(id(point.dist), ("unknown", "unknown"))
         entry = Entry(name=point.name, target=point.value, distribution=distribution, version=version)
-        found.setdefault(point.name, set()).add(entry)
-    return {name: tuple(sorted(found[name], key=lambda entry: entry.shipped_by)) for name in sorted(found)}
+        found.setdefault(point.group, {}).setdefault(point.name, set()).add(entry)
+    return {
+        group: {name: tuple(sorted(of[name], key=lambda entry: entry.shipped_by)) for name in sorted(of)}
+        for group, of in found.items()
+    }
 
 
 def names(kind: Kind) -> list[str]:

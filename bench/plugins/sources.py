@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib.util
 import re
+from dataclasses import dataclass
 from functools import cache
 
 from bench.plugins import registry
@@ -28,7 +29,7 @@ def tracks_of(target: str) -> list[str]:
     They are the values of `track: ... = "..."` in the bodies of the class and its bases, where these can be followed by name.
     """
     module, _, name = target.partition(":")
-    waiting, seen, found = [(module, name)], set(), set()
+    waiting, seen, found = [(module, name)], set(), set[str]()
     while waiting:
         module, name = place = waiting.pop()
         if place in seen:
@@ -38,16 +39,10 @@ def tracks_of(target: str) -> list[str]:
         if name not in classes:
             waiting += [imported[name]] if name in imported else []
             continue
-        for node in classes[name].body:
-            match node:
-                case ast.AnnAssign(target=ast.Name(id="track"), value=ast.Constant(value=str(track))):
-                    found.add(track)
-        for base in classes[name].bases:
-            match base.value if isinstance(base, ast.Subscript) else base:
-                case ast.Name(id=parent_class):
-                    waiting.append((module, parent_class))
-                case ast.Attribute(value=ast.Name(id=parent), attr=parent_class):
-                    waiting.append((".".join(filter(None, imported.get(parent, (parent, "")))), parent_class))
+        found |= classes[name].tracks
+        for parent, parent_class in classes[name].bases:
+            origin = ".".join(filter(None, imported.get(parent, (parent, "")))) if parent else module
+            waiting.append((origin, parent_class))
     return sorted(found)
 
 
@@ -57,7 +52,7 @@ def summary(target: str) -> str:
     classes, imported = _top_level(module)
     if name not in classes:
         return summary(":".join(imported[name])) if name in imported and imported[name] != (module, name) else ""
-    text = " ".join((ast.get_docstring(classes[name]) or "").partition("\n\n")[0].split())
+    text = " ".join(classes[name].docstring.partition("\n\n")[0].split())
     # The end of a sentence is no full stop within brackets or of an abbreviation, which a small letter or a number follows.
     for end in re.finditer(r"\.(?=\s+[A-Z`]|$)", text):
         if text.count("(", 0, end.start()) == text.count(")", 0, end.start()):
@@ -65,14 +60,38 @@ def summary(target: str) -> str:
     return text
 
 
+@dataclass(frozen=True)
+class _Class:
+    """What is read of a class: its docstring, tracks, and bases as (module or alias, name); "" is the class's own module."""
+
+    docstring: str
+    tracks: frozenset[str]
+    bases: tuple[tuple[str, str], ...]
+
+    @classmethod
+    def read(cls, node: ast.ClassDef) -> _Class:
+        tracks, bases = set(), []
+        for line in node.body:
+            match line:
+                case ast.AnnAssign(target=ast.Name(id="track"), value=ast.Constant(value=str(track))):
+                    tracks.add(track)
+        for base in node.bases:
+            match base.value if isinstance(base, ast.Subscript) else base:
+                case ast.Name(id=name):
+                    bases.append(("", name))
+                case ast.Attribute(value=ast.Name(id=parent), attr=name):
+                    bases.append((parent, name))
+        return cls(ast.get_docstring(node) or "", frozenset(tracks), tuple(bases))
+
+
 @cache
-def _top_level(module: str) -> tuple[dict[str, ast.ClassDef], dict[str, tuple[str, str]]]:
+def _top_level(module: str) -> tuple[dict[str, _Class], dict[str, tuple[str, str]]]:
     """The classes of a module, and the origin (module, name) of each name that it imports."""
     path = file_of(module)
     if path is None or path.suffix != ".py":
         return {}, {}
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    classes: dict[str, ast.ClassDef] = {}
+    classes: dict[str, _Class] = {}
     imported: dict[str, tuple[str, str]] = {}
     try:
         body = ast.parse(path.read_bytes()).body
@@ -81,7 +100,7 @@ def _top_level(module: str) -> tuple[dict[str, ast.ClassDef], dict[str, tuple[st
     for node in body:
         match node:
             case ast.ClassDef():
-                classes[node.name] = node
+                classes[node.name] = _Class.read(node)
             case ast.Import():
                 imported |= {alias.asname or alias.name: (alias.name, "") for alias in node.names}
             case ast.ImportFrom():

@@ -109,7 +109,7 @@ def cartpole(plugins: Path) -> Iterator[Any]:
         "cavbench.grids": {"cartpole-v1": "cartpole:CARTPOLE_V1"},
     }
     install(plugins, "cartpole", points, {"cartpole": code})
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
     import cartpole  # type: ignore[import-not-found]
 
     yield cartpole

@@ -31,10 +31,10 @@ def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("site")
     install_toy(folder)
     sys.path.insert(0, str(folder))
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
     yield folder
     sys.path.remove(str(folder))
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
 
 
 @pytest.fixture
@@ -43,9 +43,9 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = tmp_path / "plugins"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
     yield folder
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def test_a_defence_that_knows_the_public_scenarios_is_caught_and_the_honest_vict
         {"cavbench.defenses": {"knows": "knowing_plugin:Knows"}},
         {"knowing_plugin": KNOWING.read_text()},
     )
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
     out = tmp_path / "results"
     said = bench("audit", *ROW, f"out={out}", "salt=7")
     assert said.code == 1, said.err

@@ -26,7 +26,7 @@ def rows(plugins: Path, bench: Callable[..., Said], tmp_path: Path) -> dict[str,
     code = Path(__file__).with_name("bad_defenses.py").read_text()
     points = {"cavbench.defenses": {name: f"bad_defenses_plugin:{name.capitalize()}" for name in (*BAD, "dicing")}}
     install(plugins, "cavbench-bad", points, {"bad_defenses_plugin": code})
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
     out = tmp_path / "results"
     said = bench("run", "attack=pgd,zo,noise", f"defense=none,dicing,{','.join(BAD)}", *WORDS, f"out={out}")
     assert said.code == 0, said.err

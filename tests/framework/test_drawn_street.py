@@ -39,7 +39,7 @@ def test_a_patch_hides_a_sign_from_yolo_and_fog_alone_does_less(
         "cavbench.grids": {"drawn-v1": "tests.vision.drawn_street:DRAWN_V1"},
     }
     install(plugins, "drawn", points, {})
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
     attack = ("attack=paint,blank", "attack.texels=32", "attack.steps=15")
     said = bench("run", *attack, *WORDS, "weather=clear,fog", "workers=2", f"out={tmp_path}")
     assert said.code == 0, said.err

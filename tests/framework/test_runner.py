@@ -250,7 +250,7 @@ class Poison(DrivingAttack):
         return observation
 """
     install(plugins, "cavbench-poison", {"cavbench.attacks": {"poison": "poison:Poison"}}, {"poison": code}, "2.1")
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
     out = tmp_path / "results"
     words = (
         "attack=poison",

@@ -32,7 +32,7 @@ def third_track(plugins: Path) -> Iterator[None]:
         POINTS,
         {"listening_plugin": Path(__file__).with_name("toy_track.py").read_text()},
     )
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
     track.cache_clear()
     yield
     track.cache_clear()

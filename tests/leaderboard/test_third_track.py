@@ -53,7 +53,7 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def _forget() -> None:
-    registry.entries.cache_clear()
+    registry.installed.cache_clear()
     track.cache_clear()
 
 
