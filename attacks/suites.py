@@ -9,3 +9,4 @@ from bench.plugins.suites import Suite
 STANDARD_1 = Suite.read(Path(__file__).with_name("standard-1.toml"))
 STANDARD_2 = Suite.read(Path(__file__).with_name("standard-2.toml"))
 STANDARD_DETECTION_1 = Suite.read(Path(__file__).with_name("standard-detection-1.toml"))
+STANDARD_DETECTION_2 = Suite.read(Path(__file__).with_name("standard-detection-2.toml"))

@@ -13,8 +13,10 @@ Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
-OUTLINES = ("octagon",) * 7 + ("disc", "triangle", "diamond", "rectangle", "nothing")
+OUTLINES = ("octagon",) * 6 + ("disc",) * 4 + ("triangle",) * 2 + ("diamond", "rectangle", "nothing")
 """Drawn with equal probability."""
+RED_GROUNDS = 0.35
+"""Share of the other outlines that are red inside, as a no-entry sign is. A red octagon may be a stop sign with a patch."""
 RED_RIMS = 0.35
 """Share of the plates with a red rim, as many signs have. A stop sign with a patch has one, too, but a wider one."""
 _NAME = "training "
@@ -35,7 +37,8 @@ def drawn(name: str) -> tuple[Image, Image]:
     rim = _red(chance) if chance.random() < RED_RIMS else _colour(chance)
     picture = np.full((_SIDE, _SIDE, 3), rim, np.uint8)
     inner = _polygon(outline, chance.uniform(0.75, 0.97)) if outline != "nothing" else cover
-    picture[inner > 0] = _ground(chance)
+    red = outline != "octagon" and chance.random() < RED_GROUNDS
+    picture[inner > 0] = _red(chance) if red else _ground(chance)
     for _ in range(int(chance.integers(1, 4))):
         painting = (_word, _word, _shape, _bars, _blocks)
         painting[int(chance.integers(len(painting)))](picture, chance)
@@ -88,7 +91,7 @@ def _rgb(hue: int, saturation: int, value: int) -> Colour:
 
 
 def _ground(chance: np.random.Generator) -> Colour:
-    """A colour that is not the red of a stop sign: with a patch on it, a red octagon may be one."""
+    """A colour that is not the red of a stop sign."""
     while True:
         red, green, blue = colour = _colour(chance)
         if red < 1.8 * max(green, blue):

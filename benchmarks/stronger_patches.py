@@ -1,0 +1,93 @@
+"""Measures what a detector keeps under other variants of the last `eot` of the standard suite.
+
+    python benchmarks/stronger_patches.py [--victim yolov5] [--defense advtrain_detection] [--only NAME ...] [--device cuda]
+
+Each line is one patch, crafted on the training places and shown in the approaches of four cells (three and four lanes, clear and
+rain): the mean confidence at the sign, the lowest mean of an approach, and the images that the attack asked about. A variant
+that leaves less than the first line says that the suite is too weak for this detector. Takes 1 to 20 minutes a line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from attacks.eot import EOT
+from bench.detection import PatchThreat
+from bench.detection.enforcer import PatchEnforcer
+from bench.detection.placed import placed
+from bench.detection.sight import look
+from bench.plugins import registry, suites
+from bench.run.process import settle
+from envs.camera.world import StopSignApproach
+
+WORLD = StopSignApproach()
+SHIFTED = {"scale": 0.0, "rotation": 0.0}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "suite": {},
+    "1000 steps": {"steps": 1000},
+    "batch 16": {"batch": 16},
+    "batch 16, 1000 steps": {"batch": 16, "steps": 1000},
+    "small steps": {"learning_rate": 0.05},
+    "medium steps": {"learning_rate": 0.2},
+    "shifts only": SHIFTED,
+    "shifts only, small steps": SHIFTED | {"learning_rate": 0.05},
+    "shifts only, 1000 steps": SHIFTED | {"steps": 1000},
+    "shifts only, batch 16": SHIFTED | {"batch": 16},
+    "shifts only, batch 16, 1000 steps": SHIFTED | {"batch": 16, "steps": 1000},
+    "all transformations": {
+        "perspective": 0.15,
+        "brightness": 0.2,
+        "contrast": 0.2,
+        "saturation": 0.2,
+        "hue": 0.05,
+        "noise": 0.02,
+    },
+    "probability": {"loss": "probability"},
+    "window 320": {"window": 320},
+    "50 texels": {"texels": 50},
+    "no total variation": {"tv": 0.0},
+}
+"""Parameters that differ from those of the suite's last `eot`, with one start each."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--victim", default="yolov5")
+    parser.add_argument("--defense", default="advtrain_detection")
+    parser.add_argument("--only", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cpu")
+    asked = parser.parse_args()
+    settle()
+    defense = registry.load("defense", asked.defense)()
+    detector = placed(defense.load(registry.load("victim", asked.victim)(), 0, WORLD.facts), asked.device)
+    cells = [WORLD.axes.cell(lanes=n, density=1.0, weather=weather) for n in (3, 4) for weather in ("clear", "rain")]
+    approaches = [one.scenes for cell in cells for one in WORLD.approaches(cell, range(len(WORLD.locations)))]
+    print(f"{asked.victim}, {asked.defense}, seed {asked.seed:<12}{'confidence':>30}{'lowest':>8}{'images':>8}{'s':>6}")
+    for name in asked.only:
+        begun = time.perf_counter()
+        attack = replace(strongest(), restarts=1, **VARIANTS[name])
+        generator = torch.Generator().manual_seed(asked.seed)
+        torch.manual_seed(asked.seed)
+        enforcer = PatchEnforcer(detector, PatchThreat(), attack.access, generator)
+        patch = attack.craft(enforcer.oracle, WORLD.training_scenes(), lambda share, text: None)
+        with torch.no_grad():
+            means = [float(look(detector, one, patch, PatchThreat().budget).confidence.mean()) for one in approaches]
+        seconds = time.perf_counter() - begun
+        mean = sum(means) / len(means)
+        print(f"{name:<48}{mean:>16.2f}{min(means):>8.2f}{enforcer.spent:>8}{seconds:>6.0f}", flush=True)
+
+
+def strongest() -> EOT:
+    """The last `eot` of the newest suite of the track."""
+    *_, last = (one.chosen.component for one in suites.suite("standard-detection").members if one.attack == "eot")
+    return last
+
+
+if __name__ == "__main__":
+    main()
