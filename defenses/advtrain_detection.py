@@ -47,7 +47,7 @@ IN_THE_LOOP = (
     "steps=150 batch=6 window=160 learning_rate=0.5 loss=log_odds tv=0.05 rotation=0 scale=0 perspective=0 "
     "brightness=0 contrast=0 saturation=0 hue=0 noise=0"
 )
-"""Shifts only, in large steps: with small ones the patch is weak before they end."""
+"""Shifts only, in large steps: with small ones the patch is still weak after the last step."""
 
 
 @dataclass(frozen=True, kw_only=True)
