@@ -99,6 +99,7 @@ def patched(attack: str, defense: str = "none") -> Comparison:
         "defense": defense,
         "victim": "yolov3_tiny",
         "threat_budget": SHARE,
+        "grid": APPROACH_V1.name,
     }
     # Older records lack parameters that came later.
     defaults = parameters(choose("attack", attack).params).items()
