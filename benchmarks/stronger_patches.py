@@ -72,7 +72,7 @@ def main() -> None:
     print(f"{title:<48}{'confidence':>16}{'lowest':>8}{'images':>8}{'s':>6}")
     threat, training = PatchThreat(), WORLD.training_scenes()
     for name in asked.only:
-        attack = replace(strongest(), restarts=1, **VARIANTS[name])
+        attack = replace(last_of_suite(), restarts=1, **VARIANTS[name])
         made = craft(attack, detector, training, threat, attack_seed=asked.seed, progress=lambda share, text: None)
         with torch.no_grad():
             means = [float(look(detector, one, made.texels, threat.budget).confidence.mean()) for one in approaches]
@@ -80,7 +80,7 @@ def main() -> None:
         print(f"{name:<48}{mean:>16.2f}{min(means):>8.2f}{made.queries:>8}{made.seconds:>6.0f}", flush=True)
 
 
-def strongest() -> EOT:
+def last_of_suite() -> EOT:
     """The last `eot` of the newest suite of the track."""
     *_, last = (one.chosen.component for one in suites.suite("standard-detection").members if one.attack == "eot")
     return last

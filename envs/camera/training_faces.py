@@ -16,7 +16,7 @@ LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
 OUTLINES = ("octagon",) * 6 + ("disc",) * 4 + ("triangle",) * 2 + ("diamond", "rectangle", "nothing")
 """Drawn with equal probability."""
 RED_GROUNDS = 0.35
-"""Share of the plates that are no octagons that are red inside, as a no-entry sign is. A red octagon may be a stop sign."""
+"""Of the plates that are no octagons, this share is red inside, as a no-entry sign is. A red octagon may be a stop sign."""
 RED_RIMS = 0.35
 """Share of the plates with a red rim, as many signs have. A stop sign with a patch has one, too, but a wider one."""
 _NAME = "training "
