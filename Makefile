@@ -3,11 +3,11 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-BROWSERS := chromium chromium-browser google-chrome
+HAS_BROWSER := (for name in chromium chromium-browser google-chrome; do command -v $$name >/dev/null && exit 0; done; exit 1)
 RUN_STAMP := $(VENV)/installed-to-run
 DEV_STAMP := $(VENV)/installed-to-develop
 
-.PHONY: run test lint docs bench soak wheel-check install install-dev browser clean
+.PHONY: run test lint docs bench soak wheel-check install install-dev browser debian-browser clean
 
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
@@ -49,12 +49,13 @@ $(DEV_STAMP): $(RUN_STAMP)
 
 # The browser for the tests of the leaderboard's page: one on the PATH, else Debian's (as root), else Playwright's own.
 # Without a browser these tests are skipped, and say why.
-browser: install-dev
-	@for name in $(BROWSERS); do command -v $$name >/dev/null && exit 0; done; \
-	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
-		apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium && exit 0; \
-	fi; \
-	$(BIN)/python -m playwright install chromium || echo "no browser: the tests of the page will be skipped"
+browser: debian-browser install-dev
+	@$(HAS_BROWSER) || $(BIN)/python -m playwright install chromium || echo "no browser: the tests of the page will be skipped"
+
+# Needs no environment, so it is installed beside it (`make --jobs`).
+debian-browser:
+	@$(HAS_BROWSER) || [ "$$(id -u)" != 0 ] || ! command -v apt-get >/dev/null || \
+		{ apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium; } || true
 
 clean:
 	rm -rf $(VENV) build dist docs/_build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -56,15 +56,15 @@ class DetectorAdversarialTraining(DetectorDefense):
 
     In each round a patch is crafted against the current detector; then the detector is trained on windows of the training scenes
     with one of the newest patches on each sign. With probability `skip` a sign has no patch. If the world has decoys, a share of
-    the windows has one in the place of the sign. The loss asks the detector to find the sign despite the patch, to find none in
-    decoys and elsewhere, and otherwise to keep its original predictions on the same window without a patch. The only label is the
-    sign's box. A detector that was trained here (a `Learner`) keeps its own loss instead: what it detected in the window without
-    a patch are the labels. `skip=1` is the control: the same training without patches.
+    the windows has one in the place of the sign, with a patch as often as the signs. The loss asks the detector to find the sign
+    despite the patch, to find none in decoys and elsewhere, and otherwise to keep its original predictions on the same window
+    without a patch. The only label is the sign's box. A detector that was trained here (a `Learner`) keeps its own loss instead:
+    what it detected in the window without a patch are the labels. `skip=1` is the control: the same training without patches.
 
     Tensors with more than `largest` values stay as they are, and the zoo stores only those that changed.
 
     Args:
-        skip: probability that a sign has no patch, in [0, 1].
+        skip: probability that a sign or a decoy has no patch, in [0, 1].
         decoys: share of the windows that have a decoy in the place of the sign, in [0, 1].
         attack: any registered patch attack.
         attack_params: its parameters, as on the command line but separated by spaces.
@@ -82,7 +82,7 @@ class DetectorAdversarialTraining(DetectorDefense):
         trained_in: non-default parameters of the training world; set by `bench train`.
     """
 
-    training: ClassVar[int] = 3
+    training: ClassVar[int] = 4
 
     skip: Share = 0.3
     decoys: Share = 0.4
@@ -90,7 +90,7 @@ class DetectorAdversarialTraining(DetectorDefense):
     attack_params: str = IN_THE_LOOP
     budget: Annotated[float, Interval(gt=0, le=1)] = 0.5
     rounds: Count = 20
-    updates: Count = 30
+    updates: Count = 80
     shown: Count = 8
     batch: Count = 8
     window: Count = 224
@@ -236,8 +236,8 @@ class _Hardening:
         return signs, plain
 
     def _patched(self, views: Views, plain: Tensor, signs: Tensor) -> Tensor:
-        """The windows, with patches on the signs except where skipped."""
-        attacked = signs & (torch.rand(len(plain), generator=self.generator) >= self.recipe.skip)
+        """The windows, with patches on the signs and the decoys except where skipped."""
+        attacked = torch.rand(len(plain), generator=self.generator) >= self.recipe.skip
         if not attacked.any():
             return plain
         which = torch.randint(len(self.patches), (len(plain),), generator=self.generator)
@@ -245,7 +245,17 @@ class _Hardening:
         one = views[attacked]
         patches = torch.stack([self.patches[number] for number in which[attacked]])
         with torch.no_grad():
-            pictures = self.scenes.render(one.frames, patches, self.recipe.budget)
+            signed = self.windows.cut(one, self.scenes.render(one.frames, patches, self.recipe.budget))
         shown = plain.clone()
-        shown[attacked] = self.windows.cut(one, pictures)
+        # A patch looks the same on the face of a decoy: only its pixels are taken.
+        taken = signs[attacked, None, None] | self._on_patch(one)
+        shown[attacked] = torch.where(taken[:, None], signed, plain[attacked])
         return shown
+
+    def _on_patch(self, views: Views) -> Tensor:
+        """The pixels of the windows that a patch covers, bool [N, window, window]."""
+        boxes = views.boxes(self.scenes.boxes[views.frames], self.recipe.window)
+        middle, half = (boxes[:, :2] + boxes[:, 2:]) / 2, self.recipe.budget * (boxes[:, 2:] - boxes[:, :2]) / 2
+        pixels = torch.arange(self.recipe.window) + 0.5
+        across, down = ((pixels - middle[:, axis, None]).abs() <= half[:, axis, None] for axis in (0, 1))
+        return down[:, :, None] & across[:, None]

@@ -17,8 +17,11 @@ OUTLINES = ("octagon",) * 6 + ("disc",) * 4 + ("triangle",) * 2 + ("diamond", "r
 """Drawn with equal probability."""
 RED_GROUNDS = 0.35
 """Of the plates that are no octagons, this share is red inside, as a no-entry sign is. A red octagon may be a stop sign."""
+WHITE_MARKS = 0.6
+"""Of the marks on a red ground, this share is white, as on traffic signs."""
 RED_RIMS = 0.35
 """Share of the plates with a red rim, as many signs have. A stop sign with a patch has one, too, but a wider one."""
+WHITE: Colour = (235, 235, 230)
 _NAME = "training "
 _SIDE = sign.TEXELS
 _FULL = 255
@@ -40,8 +43,9 @@ def drawn(name: str) -> tuple[Image, Image]:
     red = outline != "octagon" and chance.random() < RED_GROUNDS
     picture[inner > 0] = _red(chance) if red else _ground(chance)
     for _ in range(int(chance.integers(1, 4))):
+        colour = WHITE if red and chance.random() < WHITE_MARKS else _colour(chance)
         painting = (_word, _word, _shape, _bars, _blocks)
-        painting[int(chance.integers(len(painting)))](picture, chance)
+        painting[int(chance.integers(len(painting)))](picture, chance, colour)
     return picture, cover
 
 
@@ -73,7 +77,7 @@ def _colour(chance: np.random.Generator) -> Colour:
     """White, black, or any hue."""
     match chance.choice(["white", "black", "hue"], p=[0.2, 0.1, 0.7]):
         case "white":
-            return (235, 235, 230)
+            return WHITE
         case "black":
             return (14, 14, 14)
     return _rgb(int(chance.integers(180)), int(chance.integers(90, 256)), int(chance.integers(70, 250)))
@@ -98,7 +102,7 @@ def _ground(chance: np.random.Generator) -> Colour:
             return colour
 
 
-def _word(picture: Image, chance: np.random.Generator) -> None:
+def _word(picture: Image, chance: np.random.Generator, colour: Colour) -> None:
     """A word of up to six letters or digits."""
     text = "".join(chance.choice(list(LETTERS), size=int(chance.integers(1, 7))))
     font = int(chance.choice([cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_TRIPLEX]))
@@ -107,30 +111,30 @@ def _word(picture: Image, chance: np.random.Generator) -> None:
     (wide, high), _ = cv2.getTextSize(text, font, 1.0, 1)
     scale = min(share / wide, 0.4 * _SIDE / high)
     x, y = _SIDE / 2 - scale * wide / 2, _SIDE * chance.uniform(0.35, 0.65) + scale * high / 2
-    cv2.putText(picture, text, (round(x), round(y)), font, scale, _colour(chance), thick, cv2.LINE_AA)
+    cv2.putText(picture, text, (round(x), round(y)), font, scale, colour, thick, cv2.LINE_AA)
 
 
-def _shape(picture: Image, chance: np.random.Generator) -> None:
+def _shape(picture: Image, chance: np.random.Generator, colour: Colour) -> None:
     """A disc, a ring, a triangle, a diamond or a rectangle."""
     name = str(chance.choice(["octagon", "disc", "triangle", "diamond", "rectangle"]))
     size = chance.uniform(0.3, 0.9)
     mask = _polygon(name, size) > 0
     if chance.random() < 0.5:
         mask &= _polygon(name, size * chance.uniform(0.5, 0.85)) == 0
-    picture[mask] = _colour(chance)
+    picture[mask] = colour
 
 
-def _bars(picture: Image, chance: np.random.Generator) -> None:
+def _bars(picture: Image, chance: np.random.Generator, colour: Colour) -> None:
     """Stripes across, down or aslant."""
     rows, columns = np.mgrid[:_SIDE, :_SIDE] / _SIDE
     angle = chance.choice([0.0, 0.25, 0.5, 0.75]) * np.pi
     along = np.cos(angle) * rows + np.sin(angle) * columns
     low = chance.uniform(-0.2, 0.9)
-    picture[(along > low) & (along < low + chance.uniform(0.08, 0.3))] = _colour(chance)
+    picture[(along > low) & (along < low + chance.uniform(0.08, 0.3))] = colour
 
 
-def _blocks(picture: Image, chance: np.random.Generator) -> None:
-    """A square of random blocks in the middle, fine or coarse, as patches of attacks are."""
+def _blocks(picture: Image, chance: np.random.Generator, colour: Colour) -> None:
+    """A square of random blocks in the middle, fine or coarse, as patches of attacks are; of all colours."""
     cells, side = int(2 ** chance.uniform(1, 6)), int(chance.uniform(0.3, 0.6) * _SIDE)
     colours = chance.integers(0, 256, (cells, cells, 3), np.uint8)
     first = (_SIDE - side) // 2

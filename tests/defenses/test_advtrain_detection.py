@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from attacks.eot import EOT
+from attacks.noise_patch import NoisePatch
 from bench.detection import STOP_SIGN, Detector, DetectorVictim, PatchThreat, Predictions
 from bench.detection.boxes import confidence
 from bench.detection.enforcer import PatchEnforcer
@@ -108,6 +109,32 @@ def test_a_detector_that_is_not_aligned_learns_from_what_it_detected(monkeypatch
     )
     assert sum(real) > len(real) // 2
     assert sum(false) == 0 < sum(len(label) for one in shown[3:] for label in one.labels)
+
+
+@pytest.mark.parametrize("decoys", [0.0, 1.0])
+def test_decoys_carry_the_patches_that_signs_carry(decoys: float, victim: YOLOv5) -> None:
+    scenes = FewScenes().training_scenes()
+    recipe = DetectorAdversarialTraining(skip=0.0, decoys=decoys, window=64)
+    start = victim.load(0, FACTS)
+    hardening = _Hardening(recipe, NoisePatch(), victim, start, scenes, seed=0, progress=lambda share, text: None)
+    hardening._begin(0)
+    views = hardening.windows.draw(16)
+    signs, plain = hardening._plain(views)
+    shown = hardening._patched(views, plain, signs)
+    signed = hardening.windows.cut(views, scenes.render(views.frames, hardening.patches[0][None], recipe.budget))
+    assert signs.all() == (not decoys)
+    if not decoys:
+        torch.testing.assert_close(shown, signed)
+        return
+    boxes = views.boxes(scenes.reach(recipe.budget)[views.frames], recipe.window).int().tolist()
+    seen = 0
+    for after, before, like, (left, top, right, bottom) in zip(shown, plain, signed, boxes, strict=True):
+        changed = (after != before).any(0)
+        torch.testing.assert_close(after[:, changed], like[:, changed])
+        seen += int(changed.sum())
+        changed[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = False
+        assert not changed.any()
+    assert seen > 1000
 
 
 @pytest.mark.parametrize("of_victim", [0.0, 3.0])
