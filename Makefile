@@ -52,7 +52,7 @@ $(DEV_STAMP): $(RUN_STAMP)
 browser: debian-browser install-dev
 	@$(HAS_BROWSER) || $(BIN)/python -m playwright install chromium || echo "no browser: the tests of the page will be skipped"
 
-# Needs no environment, so it is installed beside it (`make --jobs`).
+# It needs nothing of the environment, so with `make --jobs` both are installed at the same time.
 debian-browser:
 	@$(HAS_BROWSER) || [ "$$(id -u)" != 0 ] || ! command -v apt-get >/dev/null || \
 		{ apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium; } || true
