@@ -22,7 +22,7 @@ from tests.framework.distributions import install
 
 KNOWING = Path(__file__).with_name("knowing.py")
 ROW = (
-    *("attack=pgd", "attack.restarts=1", "attack.steps=5", "victim=dqn", "defense=none,knows"),
+    *("attack=pgd", "attack.restarts=1", "attack.steps=5", "victim=dqn", "defense=none,knows", "world.max_steps=150"),
     *(
         "lanes=3",
         "density=1",

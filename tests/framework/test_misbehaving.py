@@ -31,7 +31,7 @@ DEEDS = {
     "generator exit": "GeneratorExit",
     "os exit": "it ended its worker process (exit code 0)",
     "segfault": "it ended its worker process (SIGSEGV)",
-    "hang": "it took longer than unit_timeout=15 seconds",
+    "hang": "it took longer than unit_timeout=10 seconds",
     "leak": "it used",
     "memory error": "MemoryError",
     "nan": "Rogue.perturb returned numbers that are NaN or infinite",
@@ -67,7 +67,7 @@ def swept(site: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Said, P
     out = tmp_path_factory.mktemp("swept")
     deeds = ",".join([f"'{deed}'" for deed in (*HARMLESS, *DEEDS)])
     attacks = ",".join(["rogue", "noise", *ON_IMPORT])
-    limits = ("unit_timeout=15", "unit_memory=1.5", "threat.queries=2")
+    limits = ("unit_timeout=10", "unit_memory=1.5", "threat.queries=2")
     words = (f"attack={attacks}", f"attack.deed={deeds}", "victim=toy", "workers=2", *limits, *CELL)
     return ran(site, "run", *words, f"out={out}"), out
 
@@ -163,14 +163,14 @@ def test_a_victim_that_cannot_answer_is_named_and_drives_nothing(site: Path, tmp
 @pytest.mark.slow
 def test_one_process_alone_survives_what_can_be_survived(site: Path, tmp_path: Path) -> None:
     deeds = "none,'system exit',interrupt,unprintable,hang,'patch torch'"
-    words = (f"attack.deed={deeds}", "victim=toy", *CELL, "executor=serial", "unit_timeout=15", f"out={tmp_path}")
+    words = (f"attack.deed={deeds}", "victim=toy", *CELL, "executor=serial", "unit_timeout=10", f"out={tmp_path}")
     said = ran(site, "run", "attack=rogue", *words)
     assert said.code == 2
     for why in (
         "SystemExit: 0",
         "KeyboardInterrupt",
         "failed: UnprintableError",
-        "unit_timeout=15",
+        "unit_timeout=10",
         "torch.Tensor.tanh was replaced",
     ):
         assert why in said.err

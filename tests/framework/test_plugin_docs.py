@@ -15,7 +15,7 @@ from tests.framework.conftest import forked
 from tests.framework.distributions import pip_install
 
 PAGE = Path(__file__).parents[2] / "docs" / "plugins.md"
-SMALLER = ("seeds=0", "reference=false", "record=0", "world.max_steps=30", "executor=serial")
+SMALLER = ("seeds=0", "reference=false", "record=0", "world.max_steps=15", "executor=serial")
 """Options added to the runs of the page, to make them quick."""
 TABLES = re.compile(r"# What makes it a plug-in.*?(?=\n\[tool\.pytest)", re.DOTALL)
 """Matches the entry points and modules in the pyproject.toml that `bench new` writes."""

@@ -45,19 +45,19 @@ FAST = {
     "rain": case(4, 1, ANY, 23, steps=25, weather="rain"),
 }
 SLOW = {
-    "3 lanes": case(3, 1, SOMETIMES, 1_000_000, 1_000_001, steps=250),
-    "4 lanes": case(4, 1, SOMETIMES, 1_000_002, steps=250),
-    "5 lanes": case(5, 1, discrete(0, 2, 4, every=5), 5, steps=250),
-    "3 lanes, density 2": case(3, 2, ANY, 1, 2, steps=150),
-    "4 lanes, density 2": case(4, 2, ANY, 3, 4, steps=150),
+    "3 lanes": case(3, 1, SOMETIMES, 1_000_001, steps=250),
+    "4 lanes": case(4, 1, SOMETIMES, 1_000_002, steps=200),
+    "5 lanes": case(5, 1, discrete(0, 2, 4, every=5), 5, steps=200),
+    "3 lanes, density 2": case(3, 2, ANY, 1, steps=150),
+    "4 lanes, density 2": case(4, 2, ANY, 4, steps=150),
     "5 lanes, density 2, 50 vehicles": case(5, 2, IDLE, 6, steps=150, vehicles=50),
-    "full speed": case(3, 2, discrete(3), 7, 8, 9, steps=150),
-    "thesis' target speeds": case(3, 1.5, ANY, 10, 11, steps=150, **THESIS),
+    "full speed": case(3, 2, discrete(3), 8, 9, steps=150),
+    "thesis' target speeds": case(3, 1.5, ANY, 10, steps=150, **THESIS),
     "continuous": case(3, 1, continuous(0.02), 12, 13, steps=150, **DRIVE),
     "continuous, off the road": case(5, 2, continuous(1.0, every=7), 14, 15, steps=100, **DRIVE),
-    "idm driver": case(4, 1, IDLE, 16, 17, steps=200, driver="idm"),
+    "idm driver": case(4, 1, IDLE, 16, steps=200, driver="idm"),
     "idm driver, density 2": case(3, 2, IDLE, 18, steps=200, driver="idm"),
-    "1 Hz decisions": case(3, 1, ANY, 19, 20, steps=30, policy_frequency=1),
+    "1 Hz decisions": case(3, 1, ANY, 19, steps=30, policy_frequency=1),
     "5 Hz physics": case(3, 1, ANY, 21, steps=100, policy_frequency=5, simulation_frequency=5, ego_spacing=1.5),
     "plain reward": case(
         3, 1, ANY, 24, steps=100, normalize_reward=False, offroad_terminal=False, collision_reward=-5.0
@@ -114,7 +114,7 @@ def test_any_world_is_bit_equal_for_a_few_steps(world: Case) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(random_cases())
 def test_any_of_many_worlds_is_bit_equal_for_a_few_steps(world: Case) -> None:
     assert not differences(compare(world))
