@@ -57,6 +57,33 @@ class Sighting:
 
 
 @dataclass(frozen=True)
+class Unpatched:
+    """The detector's output on A approaches that is the same whatever patch is on the sign.
+
+    Args:
+        scenes: the S distinct scenes of the approaches; each frame is looked at once.
+        of_approach: [A] the number of each approach's scenes.
+        decoys: [S] the output on the decoys; None for a world without decoys.
+        least: [S] what is certain under every patch; None without a certificate or a patch.
+    """
+
+    scenes: Sequence[Scenes]
+    of_approach: NDArray[np.int64]
+    decoys: Sequence[Sight | None]
+    least: Sequence[NDArray[np.float32] | None]
+
+    @classmethod
+    def of(cls, detector: Detector, approaches: Sequence[Approach], share: float) -> Unpatched:
+        """Run the detector; `share` is the side of patches as a share of the sign's side."""
+        scenes, of_approach = _distinct([approach.scenes for approach in approaches])
+        with torch.no_grad():
+            decoys = [look_at_decoys(detector, one) for one in scenes]
+            # Without an attack there is no patch that something is certain under.
+            least = [certain(detector, one, share) if share else None for one in scenes]
+        return cls(scenes, of_approach, decoys, least)
+
+
+@dataclass(frozen=True)
 class Trace:
     """Some approaches of a unit, for recordings: `episodes` are indices into its seeds, `sightings` has one item for each."""
 
@@ -72,6 +99,7 @@ def score(
     share: float,
     entropy: int = 0,
     trace: Trace | None = None,
+    unpatched: Unpatched | None = None,
 ) -> Columns:
     """Run a detector on every frame of A approaches and return the measurements, [A] each.
 
@@ -82,15 +110,13 @@ def score(
         share: side of the patch as a share of the sign's side.
         entropy: seed of the frame that is probed; no measurement depends on it.
         trace: collects the detector's output on its episodes.
+        unpatched: the output without the patch on the same approaches, if it is known; it is the same for all patches.
     """
     texels = patch.texels if patch else None
-    # Approaches may share their scenes; each frame is looked at once.
-    scenes, of_approach = _distinct([approach.scenes for approach in approaches])
+    known = unpatched or Unpatched.of(detector, approaches, share)
+    scenes, of_approach = known.scenes, known.of_approach
     with torch.no_grad():
         looks = [look(detector, one, texels, share) for one in scenes]
-        others = [look_at_decoys(detector, one) for one in scenes]
-        # Without an attack there is no patch that something is certain under.
-        least = [certain(detector, one, share) if share else None for one in scenes]
         seen = [looks[number] for number in of_approach]
         if trace:
             for place in trace.episodes:
@@ -111,8 +137,8 @@ def score(
     }
     of_scenes = {
         **measured(looks, scenes),
-        **discrimination(looks, others, scenes),
-        **certified(least, looks, others),
+        **discrimination(looks, known.decoys, scenes),
+        **certified(known.least, looks, known.decoys),
         **if_visible(looks, scenes),
     }
     return {

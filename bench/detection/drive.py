@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,13 +23,15 @@ from bench.detection import (
     stopping,
     threat,
 )
-from bench.detection.approach import Sighting, Trace, check_approaches, score
+from bench.detection.approach import Sighting, Trace, Unpatched, check_approaches, score
 from bench.detection.closed_loop import Drive, Drives
 from bench.detection.contracts import CameraWorld
 from bench.detection.detector import Detector
 from bench.detection.patch import Patch
 from bench.detection.placed import placed
+from bench.detection.scenes import Approach
 from bench.errors import UserError
+from bench.plugins.progress import share_done
 from bench.plugins.track import Driven, Job
 from bench.trust.seal import Seal
 from bench.trust.streams import Stream
@@ -60,20 +62,72 @@ def drive(job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
         artefact: content of the patch file; None if there is no patch.
         traced: scenario seeds of the approaches to record.
     """
-    pair, world = job.pair, job.pair.world.component
+    (driven,) = _carried_out([job], {job.artefact: artefact} if artefact else {}, traced)
+    return driven
+
+
+def drive_jointly(jobs: Sequence[Job], artefacts: Mapping[str, bytes]) -> Sequence[Driven] | None:
+    """Run jobs that differ in their attacks alone: what does not depend on the patch is done once for all.
+
+    Args:
+        jobs: the jobs.
+        artefacts: contents of the patch files, by `Job.artefact`.
+
+    Returns:
+        None if one of them fails.
+    """
+    try:
+        return _carried_out(jobs, artefacts)
+    # Whatever went wrong is found again, and named, where the jobs are carried out one by one.
+    except Exception:
+        return None
+
+
+def _carried_out(jobs: Sequence[Job], artefacts: Mapping[str, bytes], traced: Sequence[int] = ()) -> list[Driven]:
+    """The measurements of each job; `traced` approaches are recorded of the only one."""
+    first = jobs[0]
+    found: list[Driven] = []
+    pair, world = first.pair, first.pair.world.component
     assert isinstance(world, CameraWorld)
-    patch = _patch(artefact, job.artefact) if artefact else None
+    patches = [_patch(artefacts[job.artefact], job.artefact) if job.artefact in artefacts else None for job in jobs]
     SEAL.check()
-    with Stream("load", job.attack_seed).in_use():
-        detector = placed(pair.load(job.training_seed), job.device)
-        approaches = world.approaches(job.cell, job.seeds)
-        check_approaches(approaches, job.seeds, type(world).__name__)
-        trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
-        with Watch(detector, "detector", "defense", listens=False):
-            columns = score(detector, approaches, patch, share=pair.threat.budget, entropy=job.entropy, trace=trace)
-            sightings = trace.sightings if trace else []
-            driven, sightings = _driven(job, detector, patch.texels if patch else None, sightings)
+    with Stream("load", first.attack_seed).in_use():
+        detector = placed(pair.load(first.training_seed), first.device)
+        approaches = world.approaches(first.cell, first.seeds)
+        check_approaches(approaches, first.seeds, type(world).__name__)
+    with Watch(detector, "detector", "defense", listens=False):
+        with Stream("unpatched", first.attack_seed).in_use():
+            unpatched = Unpatched.of(detector, approaches, pair.threat.budget)
+        for job, patch in zip(jobs, patches, strict=True):
+            share_done(len(found) / len(jobs))
+            # A random detector draws the same whatever patches it saw before.
+            with Stream("look", job.attack_seed).in_use():
+                found.append(_scored(job, detector, approaches, patch, unpatched, traced))
     SEAL.check()
+    return found
+
+
+def _scored(
+    job: Job,
+    detector: Detector,
+    approaches: Sequence[Approach],
+    patch: Patch | None,
+    unpatched: Unpatched,
+    traced: Sequence[int],
+) -> Driven:
+    """The measurements of a job under its patch."""
+    trace = Trace([job.seeds.index(seed) for seed in traced]) if traced else None
+    columns = score(
+        detector,
+        approaches,
+        patch,
+        share=job.pair.threat.budget,
+        entropy=job.entropy,
+        trace=trace,
+        unpatched=unpatched,
+    )
+    sightings = trace.sightings if trace else []
+    driven, sightings = _driven(job, detector, patch.texels if patch else None, sightings)
     made = {"patch": np.array([job.artefact] * len(approaches))}
     columns |= closed_loop.measured(driven, len(approaches)) | made
     return Driven(columns, dict(zip(traced, sightings, strict=True)))

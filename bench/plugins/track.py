@@ -7,7 +7,7 @@ knows a track by name. Importing a track's module must be quick: put imports of 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -261,12 +261,16 @@ class Track(ABC):
             traced: scenario seeds of the episodes to record.
         """
 
-    def joint(self, pair: Pair) -> bool:
-        """Whether jobs of this pair in several cells may be given to `drive_jointly`."""
-        return False
+    def alike(self, job: Job) -> Hashable | None:
+        """What jobs have in common that may be given to `drive_jointly`; None for a job that is carried out alone."""
+        return None
 
-    def drive_jointly(self, jobs: Sequence[Job]) -> Sequence[Driven] | None:
-        """Carry out jobs of one pair and training seed in one batch, which is faster, with the results that each has alone.
+    def drive_jointly(self, jobs: Sequence[Job], artefacts: Mapping[str, bytes]) -> Sequence[Driven] | None:
+        """Carry out jobs that are alike in one batch, which is faster, with the results that each has alone.
+
+        Args:
+            jobs: the jobs.
+            artefacts: the results of `prepare`, by `Job.artefact`.
 
         Returns:
             None if they must be carried out one by one.

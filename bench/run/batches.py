@@ -1,4 +1,4 @@
-"""Puts units together that are driven in one batch, which shares what takes as long for one episode as for a hundred."""
+"""Puts units together that are driven in one batch: it shares what is the same for all, or takes as long for one as for many."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Works = Sequence[Preparation | Unit]
 
 
 def batches(works: Works, recorded: Collection[str], workers: int) -> list[Works]:
-    """The works in batches of units of the same pair and training seed; alone, what cannot be driven together.
+    """The works in batches of units that are alike (`Track.alike`); alone, what cannot be driven together.
 
     Args:
         works: in the order in which they should begin.
@@ -24,9 +24,9 @@ def batches(works: Works, recorded: Collection[str], workers: int) -> list[Works
     """
     alike: dict[object, list[Preparation | Unit]] = {}
     for place, work in enumerate(works):
-        single = isinstance(work, Preparation) or work.preparation is not None or work.fingerprint in recorded
-        key = place if single or not work.track.joint(work.pair) else (work.pair.id, work.training_seed, work.seeds)
-        alike.setdefault(key, []).append(work)
+        single = isinstance(work, Preparation) or work.fingerprint in recorded
+        key = None if single else work.track.alike(work.job)
+        alike.setdefault(place if key is None else key, []).append(work)
     most = max(1, len(works) // (TASKS * workers))
     found: list[Works] = []
     for group in alike.values():

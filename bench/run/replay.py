@@ -94,7 +94,7 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     unit, before = _unit(out, record)
     task = Task(
         work=unit,
-        artefact=_artefact(out, unit, record),
+        artefacts=_artefacts(out, unit, record),
         recorded=[record["seed"]],
         entropy=record.get("entropy"),
     )
@@ -153,7 +153,7 @@ def repeat(out: Path, record: Mapping[str, Any]) -> Repeated:
         UserError: if a component, the weights or the artefact is missing.
     """
     unit, before = _unit(out, record)
-    task = Task(work=unit, artefact=_artefact(out, unit, record), entropy=record.get("entropy"))
+    task = Task(work=unit, artefacts=_artefacts(out, unit, record), entropy=record.get("entropy"))
     after = _carried_out(task).records
     assert after is not None
     return Repeated(unit, before, after, _changed(unit, record, after), _differences(unit, before, after))
@@ -176,7 +176,7 @@ def film(out: Path, record: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
     settle()
     driven = unit.track.drive(
         dataclasses.replace(unit.job, entropy=record.get("entropy") or 0),
-        _artefact(out, unit, record),
+        _artefacts(out, unit, record).get(unit.artefact),
         [record["seed"]],
     )
     made = unit.track.film(unit.job, driven.traces[record["seed"]], {**unit.constants(0.0), "seed": record["seed"]})
@@ -184,9 +184,10 @@ def film(out: Path, record: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
     return made, _differences(unit, before, after)
 
 
-def _artefact(out: Path, unit: Unit, record: Mapping[str, Any]) -> bytes | None:
+def _artefacts(out: Path, unit: Unit, record: Mapping[str, Any]) -> dict[str, bytes]:
+    """What was prepared for a unit when the record was made, by the fingerprint that it has now."""
     noun, folder = unit.track.artefact or ("", "")
-    return artefacts.read(out / folder / f"{record[noun]}.safetensors") if record.get(noun) else None
+    return {unit.artefact: artefacts.read(out / folder / f"{record[noun]}.safetensors")} if record.get(noun) else {}
 
 
 def _differences(unit: Unit, before: pa.Table, after: pa.Table) -> tuple[str, ...]:

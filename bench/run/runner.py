@@ -155,16 +155,24 @@ class _Driving:
         return self.finished
 
     def _tasks(self, together: Iterable[Sequence[Preparation | Unit]]) -> Iterator[Task]:
-        """The tasks of batches, without those of a pair that was given up, and without those whose preparation failed."""
-        for work, *others in together:
-            if self.failures.given_up(work.pair):
-                self.failures.leave(work.pair, 1 + len(others))
-            elif isinstance(work, Preparation):
-                yield Task(work=work)
-            elif work.preparation is None or artefacts.path_of(self.out, work.preparation).exists():
-                artefact = self._read(artefacts.path_of(self.out, work.preparation)) if work.preparation else None
-                units = [other for other in others if isinstance(other, Unit)]
-                yield Task(work=work, artefact=artefact, recorded=self.recorded.get(work.fingerprint, ()), others=units)
+        """The tasks of batches, without the units of a pair that was given up, and without those whose preparation failed."""
+        for batch in together:
+            units: list[Unit] = []
+            prepared: dict[str, bytes] = {}
+            for work in batch:
+                if self.failures.given_up(work.pair):
+                    self.failures.leave(work.pair, 1)
+                elif isinstance(work, Preparation):
+                    yield Task(work=work)
+                elif work.preparation is None:
+                    units.append(work)
+                elif (path := artefacts.path_of(self.out, work.preparation)).exists():
+                    units.append(work)
+                    prepared[work.artefact] = self._read(path)
+            if units:
+                first, *others = units
+                recorded = self.recorded.get(first.fingerprint, ())
+                yield Task(work=first, artefacts=prepared, recorded=recorded, others=others)
 
     def _end(self, some: Iterable[Finished]) -> None:
         """Write the outcomes of tasks that finished at about the same time, then tell the watcher."""

@@ -44,21 +44,21 @@ class Task:
 
     Args:
         work: the unit, preparation or loading.
-        artefact: content of the file of the unit's preparation; None if it has none.
+        artefacts: contents of the files of the units' preparations, by `Work.artefact`.
         recorded: scenario seeds of the episodes to record.
         entropy: seed of the probes of a replay; None draws one, which nobody can foresee.
         others: units to drive in the same batch (`bench.run.batches`).
     """
 
     work: Unit | Preparation | Loading
-    artefact: bytes | None = None
+    artefacts: Mapping[str, bytes] = field(default_factory=dict)
     recorded: Sequence[int] = ()
     entropy: int | None = None
     others: Sequence[Unit] = ()
 
     def parts(self) -> list[Task]:
         """A task for each unit of a batch; none if it is not a batch."""
-        return [Task(work=unit) for unit in (self.work, *self.others)] if self.others else []
+        return [replace(self, work=unit, others=()) for unit in (self.work, *self.others)] if self.others else []
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +156,7 @@ def _in_one_batch(task: Task, tell: Tell) -> list[Outcome]:
     units = (task.work, *task.others)
     start, entropy = time.perf_counter(), secrets.randbits(62)
     with _heard(units, tell):
-        driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units])
+        driven = units[0].track.drive_jointly([replace(unit.job, entropy=entropy) for unit in units], task.artefacts)
     if driven is None:
         return []
     per_episode = (time.perf_counter() - start) / sum(len(unit.seeds) for unit in units)
@@ -207,7 +207,8 @@ def _performed(task: Task, tell: Tell) -> Outcome:
 def _driven(unit: Unit, task: Task) -> Outcome:
     start = time.perf_counter()
     entropy = secrets.randbits(62) if task.entropy is None else task.entropy
-    driven = unit.track.drive(replace(unit.job, entropy=entropy), task.artefact, task.recorded)
+    artefact = task.artefacts.get(unit.artefact)
+    driven = unit.track.drive(replace(unit.job, entropy=entropy), artefact, task.recorded)
     wall_s = time.perf_counter() - start
     constants = unit.constants(wall_s)
     try:

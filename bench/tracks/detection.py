@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -291,6 +291,16 @@ class DetectionTrack(Track):
         from bench.detection.drive import drive
 
         return drive(job, artefact, traced)
+
+    def alike(self, job: Job) -> Hashable | None:
+        attacked = ("attack", "attack_params")
+        apart = tuple(value for name, value in job.pair.identity.items() if name not in attacked)
+        return (apart, job.training_seed, job.attack_seed, tuple(job.cell.items()), job.seeds, job.device)
+
+    def drive_jointly(self, jobs: Sequence[Job], artefacts: Mapping[str, bytes]) -> Sequence[Driven] | None:
+        from bench.detection.drive import drive_jointly
+
+        return drive_jointly(jobs, artefacts)
 
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         from bench.recording.detection import save

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -212,12 +212,12 @@ class DrivingTrack(Track):
 
         return drive(job, traced)
 
-    def joint(self, pair: Pair) -> bool:
+    def alike(self, job: Job) -> Hashable | None:
         from bench.driving.drive import joint
 
-        return joint(pair)
+        return (job.pair.id, job.training_seed, job.seeds) if joint(job.pair) else None
 
-    def drive_jointly(self, jobs: Sequence[Job]) -> Sequence[Driven] | None:
+    def drive_jointly(self, jobs: Sequence[Job], artefacts: Mapping[str, bytes]) -> Sequence[Driven] | None:
         from bench.driving.drive import drive_jointly
 
         return drive_jointly(jobs)
