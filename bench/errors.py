@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import unicodedata
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 LONGEST = 60
 """A value of a user in a message is cut to so many characters."""
@@ -43,6 +44,15 @@ class UnfinishedError(UserError):
 
 class EscapeError(Exception):
     """Foreign code raised what ends a process: its message is the type and the first line of that."""
+
+
+@contextmanager
+def in_one_line() -> Iterator[None]:
+    """For scripts: a UserError within the block ends the process with one line and exit code 1, without a traceback."""
+    try:
+        yield
+    except UserError as error:
+        raise SystemExit(f"error: {message(error)}") from None
 
 
 def reason(error: BaseException) -> str:

@@ -22,6 +22,7 @@ from attacks.zo import ZOSignSGD
 from bench.driving import DrivingAttack, ObservationThreat, Policy
 from bench.driving.attacker import Attacker
 from bench.driving.victim import CountedPolicy
+from bench.errors import in_one_line
 from bench.run.process import settle
 from bench.scenarios import SeedBlock
 from bench.victims.drivers.networks import QPolicy
@@ -120,5 +121,5 @@ def _timed(work: Callable[[], object]) -> float:
 
 
 if __name__ == "__main__":
-    with torch.no_grad():
+    with in_one_line(), torch.no_grad():
         main()

@@ -18,6 +18,7 @@ import torch
 from bench.detection import Detector
 from bench.detection.discrimination import discrimination
 from bench.detection.sight import look, look_at_decoys
+from bench.errors import in_one_line
 from bench.plugins import registry
 from bench.run.process import settle
 from envs.camera import training_faces
@@ -69,4 +70,5 @@ def with_training_faces(approaches: list[BankScenes]) -> list[BankScenes]:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

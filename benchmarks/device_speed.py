@@ -20,6 +20,7 @@ import torch
 from bench.detection.crafting import prepare
 from bench.detection.drive import drive as score
 from bench.driving.drive import drive
+from bench.errors import in_one_line
 from bench.plugins.pair import Chosen, Pair, choose
 from bench.plugins.track import Job
 from bench.run.process import settle
@@ -84,4 +85,5 @@ def _seconds(work: Callable[[], object]) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

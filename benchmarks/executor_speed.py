@@ -26,6 +26,7 @@ from pathlib import Path
 import psutil
 import pyarrow as pa
 
+from bench.errors import in_one_line
 from bench.plugins.framework import Snapshot
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import track
@@ -176,4 +177,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with in_one_line():
+        sys.exit(main())

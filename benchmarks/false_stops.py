@@ -17,6 +17,7 @@ from torch import Tensor
 from bench.detection import Objects
 from bench.detection.boxes import overlap
 from bench.detection.sight import look_at_decoys
+from bench.errors import in_one_line
 from bench.plugins import registry
 from bench.run.process import settle
 from envs.camera.bank import BankScenes
@@ -60,4 +61,5 @@ def place(box: Tensor, scenes: BankScenes, frame: int) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

@@ -22,6 +22,7 @@ from torch import Tensor
 from bench.detection import Detector, Scenes
 from bench.detection.colour import linear
 from bench.detection.sight import look_at_decoys
+from bench.errors import in_one_line
 from bench.plugins import registry
 from bench.run.process import settle
 from envs.camera import sign
@@ -214,4 +215,5 @@ def pictured(scenes: Carrying, faces: Sequence[Face]) -> NDArray[np.uint8]:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

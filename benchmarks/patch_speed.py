@@ -20,7 +20,7 @@ from attacks.eot import EOT
 from bench.detection import STOP_SIGN, Detector, PatchThreat, Scenes
 from bench.detection.approach import look
 from bench.detection.enforcer import PatchEnforcer
-from bench.errors import UserError
+from bench.errors import in_one_line
 from bench.run.process import settle
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
 from envs.camera.axes import APPROACH_V1
@@ -39,11 +39,8 @@ def main() -> None:
     settle()
     torch.manual_seed(0)
     world, detector = StopSignApproach(bank=arguments.bank), YOLOv3Tiny().load(0, StopSignApproach().facts)
-    try:
-        craft(detector, world.training_scenes(), arguments.rounds, arguments.steps)
-        score(detector, world, arguments.rounds)
-    except UserError as error:
-        raise SystemExit(str(error)) from None
+    craft(detector, world.training_scenes(), arguments.rounds, arguments.steps)
+    score(detector, world, arguments.rounds)
 
 
 def craft(detector: Detector, scenes: Scenes, rounds: int, steps: int) -> None:
@@ -113,4 +110,5 @@ def seconds(work: Callable[[], object]) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

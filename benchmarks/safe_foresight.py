@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from bench.driving.intervals.rooms import cars_of
 from bench.driving.metrics import safe_progress
+from bench.errors import in_one_line
 from bench.run.process import settle
 from bench.scenarios import Cell, SeedBlock
 from bench.victims.drivers.planner import IntervalPlanner, Planner
@@ -115,4 +116,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

@@ -21,6 +21,7 @@ from bench.detection import PatchThreat
 from bench.detection.crafting import craft
 from bench.detection.placed import placed
 from bench.detection.sight import look
+from bench.errors import in_one_line
 from bench.plugins import registry, suites
 from bench.run.process import settle
 from envs.camera.world import StopSignApproach
@@ -87,4 +88,5 @@ def last_of_suite() -> EOT:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

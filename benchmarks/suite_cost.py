@@ -13,6 +13,7 @@ import torch
 
 from bench.driving import ObservationThreat
 from bench.driving.drive import drive
+from bench.errors import in_one_line
 from bench.plugins.pair import Pair, choose
 from bench.plugins.suites import suite
 from bench.plugins.track import Job
@@ -49,4 +50,5 @@ def _job(pair: Pair, cell: object, seeds: range) -> Job:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "standard", int(sys.argv[2]) if len(sys.argv) > 2 else 20)
+    with in_one_line():
+        main(sys.argv[1] if len(sys.argv) > 1 else "standard", int(sys.argv[2]) if len(sys.argv) > 2 else 20)

@@ -27,6 +27,7 @@ from bench.detection.crafting import craft
 from bench.detection.discrimination import discrimination
 from bench.detection.patch import Patch
 from bench.detection.sight import look, look_at_decoys
+from bench.errors import in_one_line
 from bench.plugins import registry
 from bench.run.process import settle
 from defenses.temporal import TemporalFusion
@@ -117,4 +118,5 @@ def _driven(detector: Detector, weather: str, patch: Patch | None) -> list[float
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

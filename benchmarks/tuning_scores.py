@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from bench.driving.drive import drive
+from bench.errors import in_one_line
 from bench.run.config import run_config
 from bench.run.process import settle
 from bench.run.unit import Unit
@@ -40,4 +41,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

@@ -16,6 +16,7 @@ from attacks.eot import EOT
 from bench.detection import PatchThreat
 from bench.detection.approach import score
 from bench.detection.crafting import craft
+from bench.errors import in_one_line
 from bench.plugins import registry
 from bench.run.process import settle
 from envs.camera.world import StopSignApproach
@@ -56,4 +57,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()

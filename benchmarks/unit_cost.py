@@ -22,6 +22,7 @@ from torch import Tensor
 
 from bench.driving import Policy
 from bench.driving.drive import drive, drive_jointly
+from bench.errors import in_one_line
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Driven, Job
 from bench.run.batches import EPISODES
@@ -129,4 +130,5 @@ def _seconds(work: Callable[[], object]) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    with in_one_line():
+        main()
