@@ -143,7 +143,10 @@ class Masking(DetectorDefense):
 
     def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
         recipe = zoo.Recipe.of(victim, self)
-        return zoo.load(recipe, self.trained, lambda **_: _around(victim.load(seed, facts), Judge()))
+        judge = Judge()
+        network = zoo.load(recipe, self.trained, lambda **_: _around(victim.load(seed, facts), judge))
+        judge.freeze()
+        return network
 
     def train(self, victim: DetectorVictim, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
         """Train the judge of training seed `seed`. The victim plays no part: all get the same judge."""
