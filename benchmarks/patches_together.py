@@ -33,16 +33,10 @@ def main() -> None:
     asked = parser.parse_args()
     settle()
     jobs, artefacts = work(asked.victim, asked.defense, asked.patches)
-    alone, together = zip(
-        *(
-            (
-                seconds(lambda: [drive(job, artefacts[job.artefact], ()) for job in jobs]),
-                seconds(lambda: drive_jointly(jobs, artefacts)),
-            )
-            for _ in range(asked.rounds)
-        ),
-        strict=True,
-    )
+    alone, together = [], []
+    for _ in range(asked.rounds):
+        alone.append(seconds(lambda: [drive(job, artefacts[job.artefact], ()) for job in jobs]))
+        together.append(seconds(lambda: drive_jointly(jobs, artefacts)))
     ratio = statistics.median(one / other for one, other in zip(alone, together, strict=True))
     print(
         f"{asked.patches} patches, {asked.defense} + {asked.victim}: alone {statistics.median(alone):.1f} s, "
