@@ -8,7 +8,7 @@ import importlib.util
 import json
 import os
 import platform
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, is_dataclass
 from functools import cache
 from importlib import metadata
@@ -33,6 +33,10 @@ BESIDE_THE_RESULT = frozenset(
     ]
 )
 """Packages and modules of `bench` that choose, store or show results: editing them outdates no record."""
+
+
+STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)
+"""What can hold an import statement: expressions, most of a file, cannot."""
 
 
 def canonical(value: Any) -> str:
@@ -111,21 +115,24 @@ def file_of(module: str) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
-def _imports(module: str, path: Path) -> Iterator[str]:
+@cache
+def _imports(module: str, path: Path) -> tuple[str, ...]:
     """Every name in the import statements of a module, whether it names a module or not."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    found: list[str] = []
     waiting: list[ast.AST] = [ast.parse(path.read_bytes())]
     while waiting:
         node = waiting.pop()
         # What types alone need is never executed.
         for_types = isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-        waiting += node.orelse if for_types and isinstance(node, ast.If) else ast.iter_child_nodes(node)
+        inside = node.orelse if for_types and isinstance(node, ast.If) else ast.iter_child_nodes(node)
+        waiting += [child for child in inside if isinstance(child, STATEMENTS)]
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
-            yield base
-            yield from (f"{base}.{alias.name}" for alias in node.names)
+            found += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return tuple(found)
 
 
 def state_digest(network: Any) -> str:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import Field, field, fields, is_dataclass, make_dataclass
 from enum import Enum
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -263,7 +263,6 @@ def _setting_names(setting: Field[Any]) -> list[str]:
 
 
 def _parsed(words: Sequence[str]) -> list[Override]:
-    parser = OverridesParser.create()
     overrides = []
     for word in words:
         key, equals, value = word.partition("=")
@@ -276,16 +275,27 @@ def _parsed(words: Sequence[str]) -> list[Override]:
         if len(value) > LONGEST_VALUE or NESTED.search(value):
             raise UserError(f"cannot read {short(word)!r}: a value is one word, or a list a,b,c of them")
         try:
-            (override,) = parser.parse_overrides([word])
+            override = _override(word)
         except HydraException:
             # The value is outside of hydra's grammar: quote it as plain text.
             escaped = value.replace("\\", "\\\\").replace('"', '\\"')
             try:
-                (override,) = parser.parse_overrides([f'{key}="{escaped}"'])
+                override = _override(f'{key}="{escaped}"')
             except HydraException as error:
                 raise UserError(f"cannot read {short(word)!r}") from error
         overrides.append(override)
     return overrides
+
+
+@lru_cache(maxsize=1000)
+def _override(word: str) -> Override:
+    """One option in hydra's grammar, which takes a millisecond to read; a run reads its own several times.
+
+    Raises:
+        HydraException: if it is outside of the grammar.
+    """
+    (override,) = OverridesParser.create().parse_overrides([word])
+    return override
 
 
 def _elements(override: Override) -> tuple[str, ...]:
@@ -336,7 +346,7 @@ def _composed(config: DictConfig, overrides: list[str], schema: type[Any]) -> Di
         UserError: if one of them has another type than its field.
     """
     try:
-        for override in OverridesParser.create().parse_overrides(overrides):
+        for override in map(_override, overrides):
             OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
         OmegaConf.resolve(config)
         return config

@@ -278,25 +278,22 @@ def test_the_certificate_is_a_column_and_a_false_one_ends_the_run() -> None:
         run(Promising(0.95))
 
 
-def test_it_trains_the_judge_only_and_the_zoo_finds_it(
+def test_it_trains_the_judge_only_the_zoo_finds_it_and_all_victims_get_the_same_one(
     victim: YOLOv5, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path / "zoo"))
     monkeypatch.setattr(masking, "LOOKED_AT", 6)
-    made = QUICK.train(victim, DrawnStreet(), seed=0, progress=lambda share, text: None)
+    made, other = (
+        QUICK.train(one, DrawnStreet(), seed=0, progress=lambda share, text: None) for one in (victim, RedVictim())
+    )
     recipe = zoo.Recipe.of(victim, QUICK)
     path = zoo.save(made.network, recipe, seed=0, world=DrawnStreet(), card=made.card, start=made.start)
     assert all(name.startswith("judge.") for name in load_file(path))
     shown = random(1, 3, 64, 64)
     again = QUICK.load(victim, 7, FACTS)
     assert torch.allclose(again(shown).scores, made.network(shown).scores, rtol=0.02, atol=1e-3)
-
-
-def test_all_victims_get_the_same_judge(victim: YOLOv5, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(masking, "LOOKED_AT", 6)
-    made = [QUICK.train(one, DrawnStreet(), seed=1, progress=lambda share, text: None) for one in (victim, RedVictim())]
-    one, other = (list(each.network.judge.parameters()) for each in made)  # type: ignore[union-attr]
-    assert all(map(torch.equal, one, other))
+    judges = [each.network.judge.parameters() for each in (made, other)]  # type: ignore[union-attr]
+    assert all(map(torch.equal, *judges))
 
 
 def test_impossible_options_are_refused() -> None:

@@ -202,13 +202,19 @@ def test_the_report_reads_published_records(monkeypatch: pytest.MonkeyPatch) -> 
     assert "†" in report().split("Table 4.2")[1]
 
 
-def test_a_trade_off_over_seeds_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def nothing_published(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(policy_records, "published", lambda track: schema(track).empty_table())
+
+
+@pytest.mark.usefixtures("nothing_published")
+def test_a_trade_off_over_seeds_is_found() -> None:
     text = report(*skip_sweep({0.0: 0.2, 0.3: 0.4, 0.5: 0.6, 1.0: 0.9}, {0.0: 0.6, 0.3: 0.45, 0.5: 0.3, 1.0: 0.1}))
     assert "DQN: does the trade-off exist? Yes." in text
     assert "DDPG: does the trade-off exist? It cannot be said" in text
 
 
+@pytest.mark.usefixtures("nothing_published")
 def test_no_trade_off_is_claimed_from_noise_or_from_two_seeds() -> None:
     same = {0.0: 0.5, 0.3: 0.5, 0.5: 0.5, 1.0: 0.5}
     assert "does the trade-off exist? Not shown." in report(*skip_sweep(same, same))
