@@ -36,7 +36,7 @@ BESIDE_THE_RESULT = frozenset(
 
 
 STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)
-"""What can hold an import statement: expressions, most of a file, cannot."""
+"""The nodes of a syntax tree that can hold an import. Most nodes of a file are expressions, which cannot."""
 
 
 def canonical(value: Any) -> str:

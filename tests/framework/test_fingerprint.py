@@ -81,6 +81,7 @@ def test_the_digest_covers_a_component_and_its_imports(tmp_path: Path, monkeypat
     def digest() -> str:
         fingerprint.code_digest.cache_clear()
         fingerprint._code.cache_clear()
+        fingerprint._imports.cache_clear()
         return fingerprint.code_digest(("some_plugin.attack",))
 
     before = digest()
@@ -100,6 +101,7 @@ def test_comments_docstrings_and_layout_outdate_no_record(tmp_path: Path, monkey
         module.write_text(text)
         fingerprint.code_digest.cache_clear()
         fingerprint._code.cache_clear()
+        fingerprint._imports.cache_clear()
         return fingerprint.code_digest(("lone_plugin",))
 
     before = digest("def f(x):\n    return x + 1\n")
