@@ -34,7 +34,7 @@ def test_a_suite_expands_to_the_members_meant_for_the_victim(victim: str, action
 def test_each_track_has_its_standard() -> None:
     config = run_config(["attack=standard", "victim=yolov5", "weather=clear", "lanes=3", "density=1", "seeds=0"])
     assert [pair.attack for pair in config.pairs] == [
-        one.chosen for one in suites.suite("standard-detection-2").members
+        one.chosen for one in suites.suite("standard-detection-3").members
     ]
     assert {pair.threat.access for pair in config.pairs} == {"gradients"}
 
