@@ -28,6 +28,8 @@ SERIES = ("pair", "training_seed", "grid")
 """The columns that records are renewed by."""
 MEASURED = frozenset({"return", "distance_m", "min_ttc_s", "mean_speed", "linf", "l2", "linf_m", "linf_mps"})
 """Columns of numbers that hardly repeat: they are stored byte by byte without a dictionary, a sixth smaller."""
+TIMES = ("attack_ms", "crafting_s", "wall_s")
+"""Columns of measured times. They are published with three significant digits: more are noise, and a twentieth of a file."""
 
 
 def published(track: Track) -> pa.Table:
@@ -66,6 +68,7 @@ def publish(folder: Path, file: Path, *, add: bool = False) -> int:
         if check(file)[0].name != name:
             raise UserError(f"{folder} has records of the track {name}, {file} has others")
         records = added(reading.upgraded(file), records)
+    records = with_rounded_times(records)
     with whole(file) as made:
         apart = [name for name in records.column_names if name in MEASURED]
         others = [name for name in records.column_names if name not in MEASURED]
@@ -78,6 +81,15 @@ def publish(folder: Path, file: Path, *, add: bool = False) -> int:
             use_dictionary=others,
         )
     return int(records.num_rows)
+
+
+def with_rounded_times(records: pa.Table) -> pa.Table:
+    """The records with their times as they are published."""
+    for name in set(TIMES) & set(records.column_names):
+        times = [None if one is None else float(f"{one:.3g}") for one in records[name].to_pylist()]
+        place = records.column_names.index(name)
+        records = records.set_column(place, records.schema.field(name), [times])
+    return records
 
 
 def added(old: pa.Table, new: pa.Table) -> pa.Table:

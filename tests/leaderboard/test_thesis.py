@@ -23,7 +23,7 @@ from bench.plugins.track import Track, track, tracks
 from bench.records import store as results
 from bench.records.schema import schema
 from bench.run.config import run_config
-from leaderboard.published import publish, published
+from leaderboard.published import publish, published, with_rounded_times
 from leaderboard.thesis import policy_records
 from leaderboard.thesis.numbers import printed
 from leaderboard.thesis.policy_records import Source, Wanted
@@ -150,6 +150,15 @@ def test_what_is_published_is_what_was_recorded(tmp_path: Path, name: str, recor
     shipped = pq.read_table(tmp_path / "published.parquet")
     assert shipped.schema.equals(schema(track(name)))
     assert sorted(shipped[score].to_pylist()) == sorted(recorded[score].to_pylist())
+
+
+def test_times_are_published_with_three_digits() -> None:
+    times = {"wall_s": [1.23456, None], "attack_ms": [1234.5, 0.0], "safe_progress": [0.123456, 1.0]}
+    assert with_rounded_times(pa.table(times)).to_pydict() == {
+        "wall_s": [1.23, None],
+        "attack_ms": [1230.0, 0.0],
+        "safe_progress": [0.123456, 1.0],
+    }
 
 
 def scores_of(records: pa.Table, run: int) -> list[float]:
