@@ -4,9 +4,9 @@
 
 Each line is one patch, crafted on the training places and shown in the approaches of four cells (three and four lanes, clear and
 rain): the mean confidence at the sign, the lowest mean of an approach, and the images that the attack asked about. `suite`,
-`shifts only` and `shifts only, batch 6, small steps` are the longer `eot` of the suite with one start instead of three: a variant that
-leaves less than all of them hints that the suite is too weak for this detector. Starts differ by 0.1 and more (`--seed`). Takes 1 to 50
-minutes a line.
+`shifts only` and `shifts only, batch 6, small steps` are the longer `eot` of the suite with one start instead of three: a variant
+that leaves less than all of them hints that the suite is too weak for this detector. Starts differ by 0.1 and more (`--seed`).
+Takes 1 to 50 minutes a line.
 """
 
 from __future__ import annotations
