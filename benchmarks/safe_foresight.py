@@ -25,8 +25,7 @@ from bench.scenarios import Cell, SeedBlock
 from bench.victims.drivers.planner import IntervalPlanner, Planner
 from envs.highway.ego import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from envs.highway.engine import Flag, HighwayEngine, Number
-from envs.highway.forecast import roll_batch
-from envs.highway.oracle import FAILURE, LIBRARY, PLANS, OraclePlanner
+from envs.highway.oracle import LIBRARY, PLANS, OraclePlanner
 from envs.highway.world import HighwayWorld
 
 WORLD = HighwayWorld()
@@ -37,8 +36,8 @@ class Foresight:
     """Chooses the actions of an engine's episodes among those that are safe on intervals, by their simulated future."""
 
     def __init__(self, engine: HighwayEngine) -> None:
-        oracle = OraclePlanner(engine)
-        self.engine, self.library, self.plan = engine, oracle.library, oracle.plan
+        self.oracle = OraclePlanner(engine)
+        self.plan = self.oracle.plan
 
     def actions(self, step: int, safe: NDArray[np.bool_], otherwise: NDArray[np.int64]) -> NDArray[np.int64]:
         """The actions [B] in this step.
@@ -48,20 +47,14 @@ class Foresight:
             safe: bool [B, A], the actions that may be taken.
             otherwise: [B] what is done where there is none.
         """
-        engine, length = self.engine, self.plan.shape[1]
-        tried = self.library[(step * PLANS + np.arange(PLANS)) % LIBRARY][None].repeat(len(safe), 0)
+        tried = self.oracle.library[(step * PLANS + np.arange(PLANS)) % LIBRARY][None].repeat(len(safe), 0)
         if step:
             tried[:, 0] = np.roll(self.plan, -1, axis=1)
             tried[:, 0, -1] = IDLE
         for place, action in enumerate((FASTER, IDLE, SLOWER, LANE_LEFT, LANE_RIGHT), start=1):
             tried[:, place] = FASTER if action in (LANE_LEFT, LANE_RIGHT) else action
             tried[:, place, 0] = action
-        failed, cars = np.zeros(tried.shape[:2], np.int64), engine.vehicles.copy()
-        crashed, progress = np.zeros(failed.shape, np.bool_), np.zeros(failed.shape, np.float32)
-        counts, controls = np.full(len(cars), cars.shape[1], np.int64), np.zeros((*tried.shape, 2))
-        lanes = engine.episodes["lanes"].astype(np.int64)
-        roll_batch(cars, counts, tried, controls, lanes, engine.parameters, failed, crashed, progress)
-        worth = progress - np.where(failed < length, FAILURE - failed, 0.0)
+        worth = self.oracle.worth(np.arange(len(tried)), tried)
         worth = np.where(np.take_along_axis(safe, tried[:, :, 0], 1), worth, FORBIDDEN)
         self.plan = tried[np.arange(len(tried)), worth.argmax(1)]
         return np.where(worth.max(1) > FORBIDDEN, self.plan[:, 0], otherwise)

@@ -56,6 +56,10 @@ class OraclePlanner:
         tried[:, 0] = np.where(begun, rest, IDLE)
         for place, action in enumerate((FASTER, IDLE, SLOWER), start=1):
             tried[:, place] = action
+        self.plan[rows] = tried[np.arange(len(rows)), self.worth(rows, tried).argmax(1)]
+
+    def worth(self, rows: NDArray[np.int64], tried: NDArray[np.int64]) -> NDArray[np.floating]:
+        """[R, P] how far plans [R, P, length] would bring the episodes `rows` [R], less the cost of a failure."""
         cars = np.ascontiguousarray(self.engine.vehicles[rows])
         failed = np.zeros(tried.shape[:2], np.int64)
         crashed, progress = np.zeros(failed.shape, np.bool_), np.zeros(failed.shape, np.float32)
@@ -63,8 +67,7 @@ class OraclePlanner:
         controls = np.zeros((*tried.shape, 2))
         lanes = self.engine.episodes["lanes"][rows].astype(np.int64)
         roll_batch(cars, counts, tried, controls, lanes, self.engine.parameters, failed, crashed, progress)
-        worth = progress - np.where(failed < self.length, FAILURE - failed, 0.0)
-        self.plan[rows] = tried[np.arange(len(rows)), worth.argmax(1)]
+        return progress - np.where(failed < self.length, FAILURE - failed, 0.0)
 
 
 def _library(length: int, segment: int) -> NDArray[np.int64]:
