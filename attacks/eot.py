@@ -11,18 +11,15 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from attacks.views import Views, log_odds
 from bench.detection import PatchAttack, PatchOracle, Predictions, Scenes
 from bench.detection.printing import non_printability
 from bench.detection.threat import Texels
 from bench.plugins.contracts import Access, Progress
 from bench.plugins.ranges import Count, NotNegative, Positive
 
-SEEN = 0.5
-"""Frames in which a smaller share of the sign is visible are not used."""
 REPORT_EVERY = 5
 """Steps between two progress reports."""
-SUREST = 1e-6
-"""Scores closer to 0 or 1 than this have the log-odds of this."""
 JUDGED = 0.2
 """Share of the steps, the last ones, whose mean loss says which start is the best."""
 
@@ -107,12 +104,10 @@ class EOT(PatchAttack):
         """A patch [3, P, P] from a random start, and its mean loss in the last steps; infinite if the queries ended before."""
         from attacks.transformations import Transformations
 
-        seen = (scenes.visible >= SEEN).nonzero().squeeze(1)
         patch = torch.rand(1, 3, self.texels, self.texels, generator=oracle.generator).requires_grad_(True)
         adam = torch.optim.Adam([patch], lr=self.learning_rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.steps, self.learning_rate / 20)
-        size = min(self.window, scenes.size[0]), min(self.window, scenes.size[1])
-        reach = scenes.reach(oracle.threat.budget)
+        views = Views(oracle, scenes, window=self.window, translation=self.translation)
         transform = Transformations(
             rotation=self.rotation,
             scale=self.scale,
@@ -125,16 +120,14 @@ class EOT(PatchAttack):
         )
         losses = []
         for step in range(min(self.steps, oracle.remaining // self.batch)):
-            frames = seen[torch.randint(len(seen), (self.batch,), generator=oracle.generator)]
-            corners = self._corners(scenes.boxes[frames], scenes.size, oracle.generator)
-            windows = scenes.windows(frames, patch, oracle.threat.budget, corners, size)
-            predictions = oracle.differentiable(transform(windows, reach[frames] - corners.repeat(1, 2)))
-            scores = reported(oracle, predictions.scores_of(oracle.label).amax(-1), scenes.distance[frames])
+            views.draw(self.batch)
+            predictions = oracle.differentiable(transform(views.shown(patch), views.reach))
+            scores = views.reported(views.highest(predictions))
             found, variation = scores.mean(), total_variation(patch)
             oracle.report(patch[0], found=found, total_variation=variation)
             loss = self._loss(scores) + self.tv * variation
             if self.target:
-                places = transform.carried(scenes.boxes[frames] - corners.repeat(1, 2))
+                places = transform.carried(views.boxes)
                 loss = loss - self._loss(seen_at(places, predictions, oracle.index(self.target)))
             if self.nps:
                 loss = loss + self.nps * non_printability(patch)
@@ -154,21 +147,7 @@ class EOT(PatchAttack):
         """The loss of scores [N] in [0, 1]."""
         if self.loss == "probability":
             return scores.mean()
-        return scores.clamp(SUREST, 1 - SUREST).logit().mean()
-
-    def _corners(self, boxes: Tensor, picture: tuple[int, int], generator: torch.Generator) -> Tensor:
-        """int64 [N, 2] column and row of the first pixel of windows around the signs, shifted by up to `translation`."""
-        limit = torch.tensor([picture[1], picture[0]])
-        side = limit.clamp(max=self.window)
-        shift = (torch.rand(len(boxes), 2, generator=generator) * 2 - 1) * self.translation * self.window
-        middle = (boxes[:, :2] + boxes[:, 2:]) / 2 + shift
-        return torch.minimum((middle - side / 2).round().long().clamp(min=0), limit - side)
-
-
-def reported(oracle: PatchOracle, scores: Tensor, distance: Tensor) -> Tensor:
-    """[N] what the detector reports of scores [N] of views with the same patch, as if they were an approach, farthest first."""
-    order = distance.argsort(descending=True)
-    return oracle.aggregate(scores[order])[order.argsort()]
+        return log_odds(scores).mean()
 
 
 def seen_at(boxes: Tensor, predictions: Predictions, label: int) -> Tensor:

@@ -28,9 +28,19 @@ MOMENTS = 5
 
 
 def eot() -> Figure:
+    """A patch by gradients."""
+    return _crafted("eot")
+
+
+def square_patch() -> Figure:
+    """A patch by random search."""
+    return _crafted("square_patch")
+
+
+def _crafted(attack: str) -> Figure:
     """The patch at several crafting steps, the sign with it, and the confidence."""
-    made, (crafted, below) = _begun("eot", 6.4, (1.15, 3.6))
-    evolution = patch_of("eot").evolution
+    made, (crafted, below) = _begun(attack, 6.4, (1.15, 3.6))
+    evolution = patch_of(attack).evolution
     assert evolution is not None
     chosen = torch.linspace(0, len(evolution.steps) - 1, MOMENTS).round().long()
     crafted.suptitle(
@@ -39,7 +49,7 @@ def eot() -> Figure:
     for axes, place in zip(crafted.subplots(1, MOMENTS), chosen, strict=True):
         show(axes, evolution.texels[place] / 255)
         axes.set_title(f"step {int(evolution.steps[place])}: {float(evolution.losses['found'][place]):.2f}", fontsize=9)
-    _seen(below, "eot")
+    _seen(below, attack)
     return made
 
 

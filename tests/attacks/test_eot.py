@@ -13,6 +13,7 @@ from torch import Tensor
 from attacks.eot import EOT, total_variation
 from attacks.grey_patch import GreyPatch
 from attacks.noise_patch import NoisePatch
+from attacks.views import corners
 from bench.detection import Detector, PatchOracle, PatchThreat, Predictions, Scenes
 from bench.detection.boxes import confidence
 from bench.detection.enforcer import PatchEnforcer
@@ -146,7 +147,7 @@ def test_it_stops_at_the_query_budget() -> None:
 def test_the_window_contains_the_sign(x: float, y: float, side: float, translation: float, seed: int) -> None:
     box = torch.tensor([[x, y, min(x + side, 1248), min(y + side, 384)]])
     generator = torch.Generator().manual_seed(seed)
-    (corner,) = EOT(translation=translation)._corners(box, (384, 1248), generator)
+    (corner,) = corners(box, (384, 1248), 320, translation, generator)
     assert 0 <= corner[0] <= box[0, 0]
     assert 0 <= corner[1] <= box[0, 1]
     assert box[0, 2] <= corner[0] + 320 <= 1248

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from attacks.eot import EOT, reported
+from attacks.eot import EOT
+from attacks.views import reported
 from bench.detection import Detector, PatchThreat, Predictions
 from bench.detection.approach import score
 from bench.detection.boxes import overlap

@@ -13,8 +13,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from attacks.square_patch import SquarePatch
 from bench.conformance import complaints
-from bench.detection import Detector
+from bench.detection import Detector, PatchThreat
+from bench.detection.crafting import craft
+from bench.detection.sight import look
 from bench.errors import UserError
 from bench.plugins.pair import choose
 from bench.run.config import component, run_config
@@ -23,6 +26,7 @@ from bench.victims.detectors.layout import Layout, layout_of, split
 from bench.victims.files.torch_operations import operation
 from bench.victims.files.trial import RefusedError
 from envs.camera.world import StopSignApproach
+from tests.framework.toy_camera import RedScenes
 
 FACTS = StopSignApproach().facts
 NAMES = "car+stop sign"
@@ -222,8 +226,22 @@ def test_a_gradient_attack_on_an_onnx_detector_is_refused_before_any_work() -> N
         run_config(["attack=eot", "victim=detector", "victim.path=nowhere.onnx"])
     run_config(["attack=noise_patch", "victim=detector", "victim.path=nowhere.onnx"])
     run_config(["attack=eot", "victim=detector", "victim.path=nowhere.pt2"])
+    run_config(["attack=square_patch", "victim=detector", "victim.path=nowhere.onnx"])
     sent = pickle.loads(pickle.dumps(choose("victim", "detector", path="nowhere.onnx").component))
     assert (sent.answers, sent.libraries) == ("scores", ("onnxruntime",))
+
+
+def test_a_black_box_is_attacked_by_its_scores(black_box: str) -> None:
+    """Its scores rise with the mean of the image, so the best patch is black."""
+    detector, scenes = load(black_box), RedScenes(torch.linspace(30, 8, 5))
+    attack = SquarePatch(texels=8, steps=200, views=2, renew=100, window=32)
+    threat = PatchThreat(budget=0.9)
+    made = craft(attack, detector, scenes, threat, attack_seed=0, progress=lambda share, text: None)
+    assert (made.queries, made.gradients) == (2 * (200 + 2), 0)
+    assert made.texels is not None
+    grey, patched = (look(detector, scenes, one, 0.9).confidence.mean() for one in (made.texels * 0 + 0.5, made.texels))
+    assert patched < grey
+    assert made.texels.mean() < 0.3
 
 
 def made(

@@ -1,0 +1,80 @@
+"""Views of the training places for the crafting of patches: windows around the sign, at random shifts."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.detection import PatchOracle, Predictions, Scenes
+
+SEEN = 0.5
+"""Frames in which a smaller share of the sign is visible are not used."""
+SUREST = 1e-6
+"""Scores closer to 0 or 1 than this have the log-odds of this."""
+
+
+class Views:
+    """Random windows around the sign in scenes.
+
+    Args:
+        oracle: the attack's oracle, for its generator and threat model.
+        scenes: the scenes to craft on.
+        window: side in pixels of the square windows; smaller where the picture is.
+        translation: largest shift of the sign, as a share of the window.
+    """
+
+    def __init__(self, oracle: PatchOracle, scenes: Scenes, *, window: int, translation: float) -> None:
+        self._oracle, self._scenes, self._window, self._translation = oracle, scenes, window, translation
+        self._seen = (scenes.visible >= SEEN).nonzero().squeeze(1)
+        self._reach = scenes.reach(oracle.threat.budget)
+        self.size = min(window, scenes.size[0]), min(window, scenes.size[1])
+
+    def draw(self, number: int) -> None:
+        """Draw the frames and the places of the windows."""
+        generator, scenes = self._oracle.generator, self._scenes
+        self.frames = self._seen[torch.randint(len(self._seen), (number,), generator=generator)]
+        self.corners = corners(scenes.boxes[self.frames], scenes.size, self._window, self._translation, generator)
+
+    def shown(self, patches: Tensor) -> Tensor:
+        """Windows [N, 3, h, w] with patches [N, 3, P, P], or with the same patch [1, 3, P, P] in all."""
+        return self._scenes.windows(self.frames, patches, self._oracle.threat.budget, self.corners, self.size)
+
+    @property
+    def boxes(self) -> Tensor:
+        """[N, 4] the sign's boxes in the windows."""
+        return self._scenes.boxes[self.frames] - self.corners.repeat(1, 2)
+
+    @property
+    def reach(self) -> Tensor:
+        """[N, 4] boxes around all pixels that a patch changes."""
+        return self._reach[self.frames] - self.corners.repeat(1, 2)
+
+    def highest(self, predictions: Predictions) -> Tensor:
+        """[N] the highest score of the sign in each view."""
+        return predictions.scores_of(self._oracle.label).amax(-1)
+
+    def reported(self, highest: Tensor) -> Tensor:
+        """[N] what the detector reports of these scores (`reported`)."""
+        return reported(self._oracle, highest, self._scenes.distance[self.frames])
+
+
+def corners(
+    boxes: Tensor, picture: tuple[int, int], window: int, translation: float, generator: torch.Generator
+) -> Tensor:
+    """int64 [N, 2] column and row of the first pixel of windows around signs [N, 4], shifted by a share of their side."""
+    limit = torch.tensor([picture[1], picture[0]])
+    side = limit.clamp(max=window)
+    shift = (torch.rand(len(boxes), 2, generator=generator) * 2 - 1) * translation * window
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2 + shift
+    return torch.minimum((middle - side / 2).round().long().clamp(min=0), limit - side)
+
+
+def reported(oracle: PatchOracle, scores: Tensor, distance: Tensor) -> Tensor:
+    """[N] what the detector reports of scores [N] of views with the same patch, as if they were an approach, farthest first."""
+    order = distance.argsort(descending=True)
+    return oracle.aggregate(scores[order])[order.argsort()]
+
+
+def log_odds(scores: Tensor) -> Tensor:
+    """The log-odds of scores in [0, 1]."""
+    return scores.clamp(SUREST, 1 - SUREST).logit()
