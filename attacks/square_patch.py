@@ -28,7 +28,7 @@ class SquarePatch(PatchAttack):
     Starts from random stripes. Each step paints a square of a random place and colour on the patch, each channel 0 or 1. It is
     kept if that lowers the sign's highest score: the mean of its log-odds over some views of the training places. The views are
     drawn again after some steps, so that the patch does not learn them by heart. It needs scores and no gradients: it attacks
-    black boxes, and tells whether a defence only hides its gradients.
+    black boxes, and tells whether a defence only hides its gradients. With norm `print` each colour is the nearest printable one.
 
     Args:
         texels: side of the patch in texels, from 8 to 512 (default 100).
@@ -58,7 +58,8 @@ class SquarePatch(PatchAttack):
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         views = Views(oracle, scenes, window=self.window, translation=self.translation)
-        patch = self._stripes(oracle.generator)
+        confine = oracle.threat.confine
+        patch = confine(self._stripes(oracle.generator))
         least = torch.inf, torch.inf
         for step in range(self.steps):
             fresh = step % self.renew == 0
@@ -67,7 +68,7 @@ class SquarePatch(PatchAttack):
             if fresh:
                 views.draw(self.views)
                 least = self._losses(oracle, views, patch)
-            tried = self._painted(patch, step / self.steps, oracle.generator)
+            tried = confine(self._painted(patch, step / self.steps, oracle.generator))
             losses = self._losses(oracle, views, tried)
             if losses < least:
                 patch, least = tried, losses

@@ -37,6 +37,14 @@ def test_each_channel_of_each_texel_is_0_or_1() -> None:
     assert set(patch.unique().tolist()) <= {0.0, 1.0}
 
 
+def test_printed_squares_are_printable() -> None:
+    threat = PatchThreat(norm="print")
+    enforcer = PatchEnforcer(RedDetector(), threat, QUICK.access, torch.Generator().manual_seed(0))
+    patch = QUICK.craft(enforcer.oracle, SCENES, lambda share, text: None)
+    assert torch.equal(threat.confine(patch), patch)
+    assert 0 < patch.min() < patch.max() < 1
+
+
 def test_it_needs_scores_only_and_asks_about_the_views_of_each_step() -> None:
     _, enforcer = crafted(QUICK)
     assert (enforcer.access, enforcer.backwards) == ("scores", 0)
