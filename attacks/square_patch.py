@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -72,9 +73,10 @@ class SquarePatch(PatchAttack):
             losses = self._losses(oracle, views, tried)
             if losses < least:
                 patch, least = tried, losses
-            oracle.report(patch, log_odds=least[0])
+            found = 1 / (1 + math.exp(-least[0]))
+            oracle.report(patch, found=found)
             if step % REPORT_EVERY == 0:
-                progress(step / self.steps, f"log-odds of a stop sign {least[0]:.1f}")
+                progress(step / self.steps, f"stop sign {found:.2f}")
         return patch
 
     def _losses(self, oracle: PatchOracle, views: Views, patch: Tensor) -> tuple[float, float]:

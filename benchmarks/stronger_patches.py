@@ -1,4 +1,4 @@
-"""Measures what a detector keeps under other variants of the last `eot` of the standard suite.
+"""Measures what a detector keeps under other variants of the last `eot` of `standard-detection-3`.
 
     python benchmarks/stronger_patches.py [--victim yolov5] [--defense advtrain_detection] [--only NAME ...] [--device cuda]
 
@@ -84,8 +84,8 @@ def main() -> None:
 
 
 def last_of_suite() -> EOT:
-    """The last `eot` of the newest suite of the track."""
-    *_, last = (one.chosen.component for one in suites.suite("standard-detection").members if one.attack == "eot")
+    """The last `eot` of the suite."""
+    *_, last = (one.chosen.component for one in suites.suite("standard-detection-3").members if one.attack == "eot")
     return last
 
 
