@@ -11,8 +11,9 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from attacks.views import Views, log_odds
+from attacks.views import Views
 from bench.detection import PatchAttack, PatchOracle, Predictions, Scenes
+from bench.detection.evidence import log_odds
 from bench.detection.printing import non_printability
 from bench.detection.threat import Texels
 from bench.plugins.contracts import Access, Progress

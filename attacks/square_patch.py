@@ -10,8 +10,9 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from attacks.views import Views, log_odds
+from attacks.views import Views
 from bench.detection import PatchAttack, PatchOracle, Scenes
+from bench.detection.evidence import log_odds
 from bench.detection.threat import Texels
 from bench.plugins.contracts import Access, Progress
 from bench.plugins.ranges import Count
@@ -29,7 +30,7 @@ class SquarePatch(PatchAttack):
     Starts from random stripes. Each step paints a square of a random place and colour on the patch, each channel 0 or 1. It is
     kept if that lowers the sign's highest score: the mean of its log-odds over some views of the training places. The views are
     drawn again after some steps, so that the patch does not learn them by heart. It needs scores and no gradients: it attacks
-    black boxes, and tells whether a defence only hides its gradients. With norm `print` each colour is the nearest printable one.
+    black boxes, and tells whether a defence only hides its gradients. With norm `print` its colours are made printable.
 
     Args:
         texels: side of the patch in texels, from 8 to 512 (default 100).
@@ -80,7 +81,7 @@ class SquarePatch(PatchAttack):
         return patch
 
     def _losses(self, oracle: PatchOracle, views: Views, patch: Tensor) -> tuple[float, float]:
-        """The mean log-odds of what the detector reports of the sign, and of single views: they decide where a memory is sure."""
+        """The mean log-odds of the sign as the detector reports it, and in each view by itself, which decides between equals."""
         highest = views.highest(oracle.predict(views.shown(patch[None])))
         return float(log_odds(views.reported(highest)).mean()), float(log_odds(highest).mean())
 

@@ -9,12 +9,10 @@ from bench.detection import PatchOracle, Predictions, Scenes
 
 SEEN = 0.5
 """Frames in which a smaller share of the sign is visible are not used."""
-SUREST = 1e-6
-"""Scores closer to 0 or 1 than this have the log-odds of this."""
 
 
 class Views:
-    """Random windows around the sign in scenes.
+    """Random windows around the sign in scenes; `draw` comes first.
 
     Args:
         oracle: the attack's oracle, for its generator and threat model.
@@ -27,27 +25,27 @@ class Views:
         self._oracle, self._scenes, self._window, self._translation = oracle, scenes, window, translation
         self._seen = (scenes.visible >= SEEN).nonzero().squeeze(1)
         self._reach = scenes.reach(oracle.threat.budget)
-        self.size = min(window, scenes.size[0]), min(window, scenes.size[1])
+        self._size = min(window, scenes.size[0]), min(window, scenes.size[1])
 
     def draw(self, number: int) -> None:
         """Draw the frames and the places of the windows."""
         generator, scenes = self._oracle.generator, self._scenes
-        self.frames = self._seen[torch.randint(len(self._seen), (number,), generator=generator)]
-        self.corners = corners(scenes.boxes[self.frames], scenes.size, self._window, self._translation, generator)
+        self._frames = self._seen[torch.randint(len(self._seen), (number,), generator=generator)]
+        self._corners = corners(scenes.boxes[self._frames], scenes.size, self._window, self._translation, generator)
 
     def shown(self, patches: Tensor) -> Tensor:
         """Windows [N, 3, h, w] with patches [N, 3, P, P], or with the same patch [1, 3, P, P] in all."""
-        return self._scenes.windows(self.frames, patches, self._oracle.threat.budget, self.corners, self.size)
+        return self._scenes.windows(self._frames, patches, self._oracle.threat.budget, self._corners, self._size)
 
     @property
     def boxes(self) -> Tensor:
         """[N, 4] the sign's boxes in the windows."""
-        return self._scenes.boxes[self.frames] - self.corners.repeat(1, 2)
+        return self._scenes.boxes[self._frames] - self._corners.repeat(1, 2)
 
     @property
     def reach(self) -> Tensor:
         """[N, 4] boxes around all pixels that a patch changes."""
-        return self._reach[self.frames] - self.corners.repeat(1, 2)
+        return self._reach[self._frames] - self._corners.repeat(1, 2)
 
     def highest(self, predictions: Predictions) -> Tensor:
         """[N] the highest score of the sign in each view."""
@@ -55,7 +53,7 @@ class Views:
 
     def reported(self, highest: Tensor) -> Tensor:
         """[N] what the detector reports of these scores (`reported`)."""
-        return reported(self._oracle, highest, self._scenes.distance[self.frames])
+        return reported(self._oracle, highest, self._scenes.distance[self._frames])
 
 
 def corners(
@@ -73,8 +71,3 @@ def reported(oracle: PatchOracle, scores: Tensor, distance: Tensor) -> Tensor:
     """[N] what the detector reports of scores [N] of views with the same patch, as if they were an approach, farthest first."""
     order = distance.argsort(descending=True)
     return oracle.aggregate(scores[order])[order.argsort()]
-
-
-def log_odds(scores: Tensor) -> Tensor:
-    """The log-odds of scores in [0, 1]."""
-    return scores.clamp(SUREST, 1 - SUREST).logit()

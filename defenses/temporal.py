@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bench.detection import STOP_SIGN, Detector, DetectorDefense, DetectorVictim, Predictions, Wrapped
 from bench.detection.boxes import detections, overlap
+from bench.detection.evidence import log_odds
 from bench.plugins.contracts import Facts
 from bench.plugins.ranges import NotNegative, Positive
 
@@ -19,8 +20,6 @@ SINGLE = 0.2
 """Score after one frame with the greatest evidence: below `bench.detection.stopping.THRESHOLD`, so one frame does not count."""
 HIGHEST = 0.97
 """Highest score of a track, with log-odds of 3.5: OctoMap's upper clamp (Hornung et al. 2013)."""
-SUREST = 1e-6
-"""Scores closer to 0 or 1 than this have the log-odds of this."""
 MATCH_IOU, MERGE_IOU = 0.3, 0.45
 """A prediction belongs to a track from this IoU with the track's place on; tracks with a greater IoU than the second are one."""
 LEAST_SCORE = 0.01
@@ -84,7 +83,7 @@ class Fused(Wrapped):
 
     def evidence(self, scores: Tensor) -> Tensor:
         """The evidence of scores in [0, 1], in log-odds; the gradient is that without clipping."""
-        odds = scores.clamp(SUREST, 1 - SUREST).logit() - math.log(self.recipe.neutral / (1 - self.recipe.neutral))
+        odds = log_odds(scores) - math.log(self.recipe.neutral / (1 - self.recipe.neutral))
         return straight_through(odds, -self.recipe.miss, self.recipe.hit)
 
     def added(self, odds: Tensor, evidence: Tensor) -> Tensor:

@@ -16,10 +16,10 @@ QUICK = SquarePatch(texels=16, steps=40, views=4, renew=10, window=32)
 
 
 def crafted(
-    attack: SquarePatch, seed: int = 0, queries: int = 20_000, detector: Detector | None = None
+    attack: SquarePatch, seed: int = 0, detector: Detector | None = None, threat: PatchThreat | None = None
 ) -> tuple[Tensor, PatchEnforcer]:
     generator = torch.Generator().manual_seed(seed)
-    enforcer = PatchEnforcer(detector or RedDetector(), PatchThreat(queries=queries), attack.access, generator)
+    enforcer = PatchEnforcer(detector or RedDetector(), threat or PatchThreat(), attack.access, generator)
     return attack.craft(enforcer.oracle, SCENES, lambda share, text: None), enforcer
 
 
@@ -39,8 +39,7 @@ def test_each_channel_of_each_texel_is_0_or_1() -> None:
 
 def test_printed_squares_are_printable() -> None:
     threat = PatchThreat(norm="print")
-    enforcer = PatchEnforcer(RedDetector(), threat, QUICK.access, torch.Generator().manual_seed(0))
-    patch = QUICK.craft(enforcer.oracle, SCENES, lambda share, text: None)
+    patch, _ = crafted(QUICK, threat=threat)
     assert torch.equal(threat.confine(patch), patch)
     assert 0 < patch.min() < patch.max() < 1
 
@@ -52,10 +51,10 @@ def test_it_needs_scores_only_and_asks_about_the_views_of_each_step() -> None:
 
 
 def test_it_stops_at_the_query_budget() -> None:
-    patch, enforcer = crafted(QUICK, queries=30)
+    patch, enforcer = crafted(QUICK, threat=PatchThreat(queries=30))
     assert enforcer.spent == 4 * (1 + 6)
-    assert torch.equal(patch, crafted(QUICK, queries=31)[0])
-    assert crafted(QUICK, queries=4)[1].spent == 0
+    assert torch.equal(patch, crafted(QUICK, threat=PatchThreat(queries=31))[0])
+    assert crafted(QUICK, threat=PatchThreat(queries=4))[1].spent == 0
 
 
 def test_the_patch_depends_on_the_seed_only() -> None:
