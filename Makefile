@@ -13,7 +13,7 @@ run: install
 	$(BIN)/bench run attack=zo defense=advtrain
 
 test: install-dev browser
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 3 --dist worksteal
 
 lint: install-dev
 	$(BIN)/ruff check .
