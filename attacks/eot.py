@@ -17,10 +17,14 @@ from bench.detection.evidence import log_odds
 from bench.detection.printing import non_printability
 from bench.detection.threat import Texels
 from bench.plugins.contracts import Access, Progress
-from bench.plugins.ranges import Count, NotNegative, Positive
+from bench.plugins.ranges import Count, NotNegative, Positive, Share
+
+Loss = Literal["probability", "log_odds"]
 
 REPORT_EVERY = 5
 """Steps between two progress reports."""
+CUT = 0.4
+"""Side of the square that `cutout` greys, as a share of the patch's side."""
 JUDGED = 0.2
 """Share of the steps, the last ones, whose mean loss says which start is the best."""
 
@@ -60,6 +64,8 @@ class EOT(PatchAttack):
         brightness, contrast, saturation: largest change, as a share (default 0.2 each).
         hue: largest rotation of the hue, as a share of the full circle, up to 0.5 (default 0.05).
         noise: standard deviation of Gaussian noise on the sRGB scale (default 0.02).
+        cutout: probability that a random square of the patch is grey in a view, so that no part of the patch is needed alone
+            (T-SEA, Huang et al. 2023, arXiv 2211.09773) (default 0).
 
     Queries: restarts * steps * batch images.
 
@@ -74,7 +80,7 @@ class EOT(PatchAttack):
     texels: Texels = 100
     steps: Count = 150
     restarts: Count = 1
-    loss: Literal["probability", "log_odds"] = "probability"
+    loss: Loss = "probability"
     batch: Count = 8
     learning_rate: Positive = 0.05
     tv: NotNegative = 0.1
@@ -89,6 +95,7 @@ class EOT(PatchAttack):
     saturation: Annotated[float, Interval(ge=0, lt=1)] = 0.2
     hue: Annotated[float, Interval(ge=0, le=0.5)] = 0.05
     noise: NotNegative = 0.02
+    cutout: Share = 0.0
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         found = [
@@ -122,7 +129,8 @@ class EOT(PatchAttack):
         losses = []
         for step in range(min(self.steps, oracle.remaining // self.batch)):
             views.draw(self.batch)
-            predictions = oracle.differentiable(transform(views.shown(patch), views.reach))
+            shown = cut_out(patch, self.batch, self.cutout, oracle.generator) if self.cutout else patch
+            predictions = oracle.differentiable(transform(views.shown(shown), views.reach))
             scores = views.reported(views.highest(predictions))
             found, variation = scores.mean(), total_variation(patch)
             oracle.report(patch[0], found=found, total_variation=variation)
@@ -156,6 +164,17 @@ def seen_at(boxes: Tensor, predictions: Predictions, label: int) -> Tensor:
     middle = (predictions.boxes[..., :2] + predictions.boxes[..., 2:]) / 2
     inside = ((middle >= boxes[:, None, :2]) & (middle <= boxes[:, None, 2:])).all(-1)
     return (predictions.scores_of(label) * inside).amax(-1)
+
+
+def cut_out(patch: Tensor, number: int, probability: float, generator: torch.Generator) -> Tensor:
+    """[N, 3, P, P] copies of a patch [1, 3, P, P], each with this probability with a random grey square."""
+    size = patch.shape[-1]
+    side = round(CUT * size)
+    begins = torch.randint(size - side + 1, (2, number, 1), generator=generator)
+    rows, columns = (torch.arange(size) >= begins) & (torch.arange(size) < begins + side)
+    chosen = torch.rand(number, 1, 1, generator=generator) < probability
+    cut = rows[:, :, None] & columns[:, None, :] & chosen
+    return torch.where(cut[:, None], 0.5, patch)
 
 
 def total_variation(patch: Tensor) -> Tensor:

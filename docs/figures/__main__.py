@@ -23,6 +23,7 @@ FIGURES = {
     "attack_art.svg": "attacks:art",
     "attack_eot.png": "sign_patches:eot",
     "attack_square_patch.png": "sign_patches:square_patch",
+    "attack_transfer.png": "sign_patches:transfer",
     "attack_noise_patch.png": "sign_patches:noise_patch",
     "attack_grey_patch.png": "sign_patches:grey_patch",
     "defense_none.svg": "hardening:none",

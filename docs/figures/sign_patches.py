@@ -37,6 +37,11 @@ def square_patch() -> Figure:
     return _crafted("square_patch")
 
 
+def transfer() -> Figure:
+    """A patch against other detectors."""
+    return _crafted("transfer")
+
+
 def _crafted(attack: str) -> Figure:
     """The patch at several crafting steps, the sign with it, and the confidence."""
     made, (crafted, below) = _begun(attack, 6.4, (1.15, 3.6))

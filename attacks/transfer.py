@@ -1,0 +1,100 @@
+"""A patch that is crafted against other detectors: the victim is never asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from attacks.eot import EOT, Loss
+from bench.detection import STOP_SIGN, Detector, DetectorVictim, PatchOracle, Predictions, Scenes
+from bench.errors import UserError
+from bench.plugins import registry
+from bench.plugins.contracts import Access, Facts, Progress
+from bench.plugins.ranges import Count, NotNegative, Share
+from bench.scenarios.axes import Axes
+
+BETWEEN = "+"
+"""Between the names of surrogates."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Transfer(EOT):
+    """A universal patch against several detectors (as T-SEA, Huang et al. 2023, arXiv 2211.09773), shown to one it never met.
+
+    `eot` on surrogates: detectors of the zoo, each as it is without a defence. They take turns, a step each, so that the loss is
+    in the mean that of all of them. The victim answers no question, so this is the attack of somebody who knows nothing about it.
+    If the victim is among its own surrogates, the attack is a white box on it. `cutout`, one of the tricks of T-SEA, keeps the
+    patch from relying on one small part; their ShakeDrop, which drops blocks inside of a network, is not here.
+
+    Args:
+        surrogates: names of detectors, joined by "+" (default yolov3_tiny+yolov5+fcos+rcnn).
+        steps: optimiser steps of all surrogates together, at least 1 (default 600).
+        loss: what is minimised: the mean of the score, or of its log-odds (default log_odds).
+        tv: weight of the total variation (default 0.05).
+        window: side in pixels of the square window around the sign (default 160).
+        cutout: probability that a random square of the patch is grey in a view (default 0.9, as in T-SEA).
+
+    The other parameters are those of `eot`.
+
+    Queries: none. The surrogates are asked about at most as many images as the threat model allows for the victim.
+
+    Example:
+        >>> from attacks.transfer import Transfer
+        >>> of_one = Transfer(surrogates="fcos")
+    """
+
+    access: ClassVar[Access] = "oblivious"
+
+    surrogates: str = "yolov3_tiny+yolov5+fcos+rcnn"
+    steps: Count = 600
+    loss: Loss = "log_odds"
+    tv: NotNegative = 0.05
+    window: Count = 160
+    cutout: Share = 0.9
+
+    def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
+        return super().craft(_InsteadOfTheVictim(self._detectors(), oracle), scenes, progress)
+
+    def _detectors(self) -> list[Detector]:
+        victims = [registry.load("victim", name)() for name in self.surrogates.split(BETWEEN)]
+        for victim in victims:
+            if not isinstance(victim, DetectorVictim):
+                raise UserError(f"attack.surrogates={self.surrogates}: {type(victim).__name__} is no detector")
+        # Networks draw random weights before they get those of their file; the patch shall not depend on how many.
+        with torch.random.fork_rng(devices=[]):
+            return [victim.load(0, Facts(axes=Axes(()))) for victim in victims]
+
+
+class _Turns:
+    """The surrogates' side of an oracle: each question goes to the next of them."""
+
+    def __init__(self, detectors: Sequence[Detector]) -> None:
+        self.detectors, self.turn, self.spent = detectors, 0, 0
+
+    def ask(self, pictures: Tensor, access: Access) -> Predictions:
+        detector = self.detectors[self.turn % len(self.detectors)]
+        self.turn, self.spent = self.turn + 1, self.spent + len(pictures)
+        predictions = detector(pictures)
+        of_sign = predictions.scores_of(detector.index(STOP_SIGN))
+        return Predictions(predictions.boxes, of_sign, torch.ones_like(of_sign)[..., None])
+
+    def aggregate(self, scores: Tensor) -> Tensor:
+        return scores
+
+
+class _InsteadOfTheVictim(PatchOracle):
+    """What `eot` asks instead of the victim's oracle; intermediate patches are reported to that one."""
+
+    def __init__(self, detectors: Sequence[Detector], victims: PatchOracle) -> None:
+        stride = max(detector.stride for detector in detectors)
+        super().__init__(
+            _Turns(detectors), victims.threat, victims.generator, label=0, stride=stride, names=(STOP_SIGN,)
+        )
+        self._victims = victims
+
+    def report(self, patch: Tensor, **losses: Tensor | float) -> None:
+        self._victims.report(patch, **losses)

@@ -1,0 +1,66 @@
+"""Scores detectors under patches that were crafted against other detectors, and against several at once (`transfer`).
+
+    python benchmarks/transfer_matrix.py [--detectors yolov3_tiny yolov5 fcos rcnn] [--hardened yolov3_tiny] [--steps 600]
+        [--cutout 0.9] [--lanes 3 4] [--weathers clear rain]
+
+Each row is a patch, each column a detector that sees it; hardened detectors have columns only. On the diagonal the attack is a
+white box. The last row is the universal patch, crafted against all. The score is the stop score, the mean over all approaches.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from attacks.transfer import BETWEEN, Transfer
+from bench.detection import DetectorDefense, DetectorVictim, PatchThreat
+from bench.detection.approach import score
+from bench.detection.crafting import craft
+from bench.errors import in_one_line
+from bench.plugins import registry
+from bench.run.process import settle
+from envs.camera.world import StopSignApproach
+
+WORLD = StopSignApproach()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--detectors", nargs="+", default=["yolov3_tiny", "yolov5", "fcos", "rcnn"])
+    parser.add_argument("--hardened", nargs="*", default=[], help="detectors that are scored hardened, too")
+    parser.add_argument("--steps", type=int, default=Transfer.steps)
+    parser.add_argument("--cutout", type=float, default=Transfer.cutout)
+    parser.add_argument("--lanes", nargs="+", type=int, default=[3, 4])
+    parser.add_argument("--weathers", nargs="+", default=["clear", "rain"])
+    asked = parser.parse_args()
+    settle()
+    threat, scenes = PatchThreat(), WORLD.training_scenes()
+    victims: dict[str, DetectorVictim] = {name: registry.load("victim", name)() for name in asked.detectors}
+    seeing = {name: victim.load(0, WORLD.facts) for name, victim in victims.items()}
+    defense: DetectorDefense = registry.load("defense", "advtrain_detection")()
+    for name in asked.hardened:
+        seeing[f"{name}+"] = defense.load(registry.load("victim", name)(), 0, WORLD.facts)
+    cells = [WORLD.axes.cell(lanes=n, density=1.0, weather=weather) for n in asked.lanes for weather in asked.weathers]
+    approaches = [each for cell in cells for each in WORLD.approaches(cell, range(len(WORLD.locations)))]
+    print(f"{'crafted against':<20}" + "".join(f"{name:>15}" for name in seeing) + "     (+ hardened)", flush=True)
+    universal = [BETWEEN.join(asked.detectors)] if len(asked.detectors) > 1 else []
+    for surrogates in ("nothing", *asked.detectors, *universal):
+        patch = None
+        if surrogates != "nothing":
+            attack = Transfer(surrogates=surrogates, steps=asked.steps, cutout=asked.cutout)
+            victim = next(iter(seeing.values()))
+            patch = craft(attack, victim, scenes, threat, attack_seed=0, progress=lambda share, text: None)
+        stops = [
+            np.mean(score(detector, approaches, patch, share=threat.budget)["stop_score"])
+            for detector in seeing.values()
+        ]
+        print(
+            f"{'all' if BETWEEN in surrogates else surrogates:<20}" + "".join(f"{stop:>15.2f}" for stop in stops),
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    with in_one_line():
+        main()

@@ -1,0 +1,81 @@
+"""The patch against other detectors: whom it asks, whom it hides the sign from, and how its parts are cut out."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from attacks.eot import CUT, EOT, cut_out
+from attacks.transfer import Transfer, _Turns
+from bench.detection import PatchThreat
+from bench.detection.crafting import craft
+from bench.errors import UserError
+from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
+from bench.victims.detectors.yolov5 import YOLOv5
+from tests.attacks.test_eot import SCENES
+from tests.conftest import FACTS
+from tests.framework.toy_camera import RedDetector
+from tests.vision.drawn_street import DrawnStreet
+
+
+def crafted(attack: Transfer, seed: int = 0) -> tuple[Tensor, int]:
+    made = craft(attack, RedDetector(), SCENES, PatchThreat(), attack_seed=seed, progress=lambda share, text: None)
+    assert made.texels is not None
+    return made.texels, made.queries
+
+
+def test_the_victim_is_never_asked_and_the_patch_depends_on_the_seed_only() -> None:
+    attack = Transfer(surrogates="yolov3_tiny", texels=16, steps=2, batch=2)
+    (first, queries), (again, _), (other, _) = (crafted(attack, seed) for seed in (0, 0, 1))
+    assert queries == 0
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_against_the_victim_itself_it_is_eot() -> None:
+    """The only difference is what the question costs."""
+    scenes, options = (
+        DrawnStreet().training_scenes(),
+        {"texels": 16, "steps": 3, "batch": 2, "window": 160, "cutout": 0.5},
+    )
+    attacks = Transfer(surrogates="yolov3_tiny", **options), EOT(loss="log_odds", tv=0.05, **options)
+    victim = YOLOv3Tiny().load(0, FACTS)
+    free, asked = (
+        craft(attack, victim, scenes, PatchThreat(), attack_seed=0, progress=lambda share, text: None)
+        for attack in attacks
+    )
+    assert torch.equal(free.texels, asked.texels)
+    assert (free.queries, asked.queries) == (0, 6)
+    assert free.evolution is not None
+
+
+def test_surrogates_take_turns_and_each_tells_of_the_stop_sign_only() -> None:
+    detectors = [YOLOv3Tiny().load(0, FACTS), YOLOv5().load(0, FACTS)]
+    turns, shown = _Turns(detectors), torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    for detector in (*detectors, *detectors):
+        told = turns.ask(shown, "gradients")
+        assert torch.equal(told.scores_of(0), detector(shown).scores_of(detector.index("stop sign")))
+    assert turns.spent == 8
+
+
+@pytest.mark.parametrize(
+    ("surrogates", "said"), [("yolov3_tiny+dqn", "DQN is no detector"), ("yolov9", "unknown victim 'yolov9'")]
+)
+def test_what_is_no_detector_is_refused_in_one_line(surrogates: str, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        crafted(Transfer(surrogates=surrogates))
+
+
+def test_a_cut_out_square_is_grey_and_the_rest_is_the_patch() -> None:
+    patch = torch.zeros(1, 3, 20, 20)
+    views = cut_out(patch, 50, 1.0, torch.Generator().manual_seed(0))
+    assert views.shape == (50, 3, 20, 20)
+    assert set(views.unique().tolist()) == {0.0, 0.5}
+    assert ((views == 0.5).sum((1, 2, 3)) == 3 * round(20 * CUT) ** 2).all()
+    assert len({tuple(view[0].nonzero()[0].tolist()) for view in views}) > 20
+    some = cut_out(patch, 400, 0.25, torch.Generator().manual_seed(0)).amax((1, 2, 3)) > 0
+    assert 0.15 < some.float().mean() < 0.35
+    leaf = torch.rand(1, 3, 20, 20).requires_grad_(True)
+    cut_out(leaf, 1, 1.0, torch.Generator().manual_seed(0)).sum().backward()
+    assert (leaf.grad == 0).sum() == 3 * round(20 * CUT) ** 2
