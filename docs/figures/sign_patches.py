@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from torch import Tensor
 
+from bench.detection.patch import Patch
 from docs.figures import style
 from docs.figures.patches import patch_of, texels_of
 from docs.figures.sightings import (
@@ -38,24 +40,33 @@ def square_patch() -> Figure:
 
 
 def transfer() -> Figure:
-    """A patch against other detectors."""
-    return _crafted("transfer")
+    """A patch against another detector."""
+    made = style.figure(4.4, "transfer: a patch against yolov5, shown to yolov3_tiny")
+    crafted, below = made.subfigures(2, 1, height_ratios=(1.15, 1.5))
+    patch = patch_of("transfer", surrogates="yolov5")
+    _moments(crafted, patch)
+    assert patch.texels is not None
+    _signs(below, patch.texels)
+    return made
 
 
 def _crafted(attack: str) -> Figure:
     """The patch at several crafting steps, the sign with it, and the confidence."""
     made, (crafted, below) = _begun(attack, 6.4, (1.15, 3.6))
-    evolution = patch_of(attack).evolution
-    assert evolution is not None
-    chosen = torch.linspace(0, len(evolution.steps) - 1, MOMENTS).round().long()
-    crafted.suptitle(
-        "as it comes about: step of the crafting, and score of a stop sign", x=0.01, ha="left", fontsize=10
-    )
-    for axes, place in zip(crafted.subplots(1, MOMENTS), chosen, strict=True):
-        show(axes, evolution.texels[place] / 255)
-        axes.set_title(f"step {int(evolution.steps[place])}: {float(evolution.losses['found'][place]):.2f}", fontsize=9)
+    _moments(crafted, patch_of(attack))
     _seen(below, attack)
     return made
+
+
+def _moments(part: SubFigure, patch: Patch) -> None:
+    """The patch at several crafting steps."""
+    evolution = patch.evolution
+    assert evolution is not None
+    chosen = torch.linspace(0, len(evolution.steps) - 1, MOMENTS).round().long()
+    part.suptitle("as it comes about: step of the crafting, and score of a stop sign", x=0.01, ha="left", fontsize=10)
+    for axes, place in zip(part.subplots(1, MOMENTS), chosen, strict=True):
+        show(axes, evolution.texels[place] / 255)
+        axes.set_title(f"step {int(evolution.steps[place])}: {float(evolution.losses['found'][place]):.2f}", fontsize=9)
 
 
 def noise_patch() -> Figure:
@@ -83,8 +94,14 @@ def _begun(attack: str, height: float, ratios: tuple[float, ...]) -> tuple[Figur
 def _seen(part: SubFigure, attack: str) -> None:
     """The patch, the sign without and with it, and the confidence."""
     pictures, curves = part.subfigures(2, 1, height_ratios=(1, 1.25))
-    approach, texels = approaches()[0], texels_of(attack)
-    patch, *signs = pictures.subplots(1, 3)
+    _signs(pictures, texels_of(attack))
+    _curves(curves.subplots(), attack)
+
+
+def _signs(part: SubFigure, texels: Tensor) -> None:
+    """The patch, and the sign without and with it."""
+    approach = approaches()[0]
+    patch, *signs = part.subplots(1, 3)
     patch.imshow(texels.permute(1, 2, 0).numpy(), interpolation="nearest")
     style.bare(patch)
     patch.set_title("the patch", fontsize=10)
@@ -92,7 +109,6 @@ def _seen(part: SubFigure, attack: str) -> None:
         shown = picture(approach, FRAME, worn)
         show(axes, crop(shown, approach, FRAME))
         axes.set_title(f"{name}: {said(detector(), shown, approach, FRAME):.2f}", fontsize=10)
-    _curves(curves.subplots(), attack)
 
 
 def _curves(axes: Axes, attack: str) -> None:
