@@ -12,9 +12,8 @@ DEV_STAMP := $(VENV)/installed-to-develop
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
 
-# Three processes on two cores: some tests wait for processes that they have started.
 test: install-dev browser
-	$(BIN)/python -m pytest -n 3 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: install-dev
 	$(BIN)/ruff check .

@@ -31,7 +31,7 @@ class Transfer(EOT):
     patch from relying on one small part; their ShakeDrop, which drops blocks inside of a network, is not here.
 
     Args:
-        surrogates: names of detectors, joined by "+" (default yolov3_tiny+yolov5+fcos+rcnn).
+        surrogates: names of detectors, joined by "+" (default yolov5+fcos).
         steps: optimiser steps of all surrogates together, at least 1 (default 600).
         loss: what is minimised: the mean of the score, or of its log-odds (default log_odds).
         tv: weight of the total variation (default 0.05).
@@ -49,7 +49,7 @@ class Transfer(EOT):
 
     access: ClassVar[Access] = "oblivious"
 
-    surrogates: str = "yolov3_tiny+yolov5+fcos+rcnn"
+    surrogates: str = "yolov5+fcos"
     steps: Count = 600
     loss: Loss = "log_odds"
     tv: NotNegative = 0.05
