@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import ClassVar
 
 import torch
@@ -12,8 +13,8 @@ from torch import Tensor
 from attacks.eot import EOT, Loss
 from bench.detection import STOP_SIGN, Detector, DetectorVictim, PatchOracle, Predictions, Scenes
 from bench.errors import UserError
-from bench.plugins import registry
 from bench.plugins.contracts import Access, Facts, Progress
+from bench.plugins.pair import choose
 from bench.plugins.ranges import Count, NotNegative, Share
 from bench.scenarios.axes import Axes
 
@@ -38,7 +39,7 @@ class Transfer(EOT):
         window: side in pixels of the square window around the sign (default 160).
         cutout: probability that a random square of the patch is grey in a view (default 0.9, as in T-SEA).
 
-    The other parameters are those of `eot`.
+    The other parameters are those of `eot`, without `target`: surrogates tell of the stop sign alone.
 
     Queries: none. The surrogates are asked about at most as many images as the threat model allows for the victim.
 
@@ -60,11 +61,11 @@ class Transfer(EOT):
         return super().craft(_InsteadOfTheVictim(self._detectors(), oracle), scenes, progress)
 
     def _detectors(self) -> list[Detector]:
-        victims = [registry.load("victim", name)() for name in self.surrogates.split(BETWEEN)]
+        victims = [choose("victim", name).component for name in self.surrogates.split(BETWEEN)]
         for victim in victims:
             if not isinstance(victim, DetectorVictim):
                 raise UserError(f"attack.surrogates={self.surrogates}: {type(victim).__name__} is no detector")
-        # Networks draw random weights before they get those of their file; the patch shall not depend on how many.
+        # A network draws random weights before it gets those of its file. The patch shall not depend on these draws.
         with torch.random.fork_rng(devices=[]):
             return [victim.load(0, Facts(axes=Axes(()))) for victim in victims]
 
@@ -73,11 +74,11 @@ class _Turns:
     """The surrogates' side of an oracle: each question goes to the next of them."""
 
     def __init__(self, detectors: Sequence[Detector]) -> None:
-        self.detectors, self.turn, self.spent = detectors, 0, 0
+        self.detectors, self.spent = cycle(detectors), 0
 
     def ask(self, pictures: Tensor, access: Access) -> Predictions:
-        detector = self.detectors[self.turn % len(self.detectors)]
-        self.turn, self.spent = self.turn + 1, self.spent + len(pictures)
+        detector = next(self.detectors)
+        self.spent += len(pictures)
         predictions = detector(pictures)
         of_sign = predictions.scores_of(detector.index(STOP_SIGN))
         return Predictions(predictions.boxes, of_sign, torch.ones_like(of_sign)[..., None])

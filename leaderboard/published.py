@@ -32,7 +32,7 @@ TIMES = ("attack_ms", "crafting_s", "wall_s")
 """Columns of measured times. They are published with three significant digits: more are noise, and a twentieth of a file."""
 
 SINGLE = ("linf", "l2", "linf_m", "linf_mps", "mean_speed")
-"""Columns that are published in single precision, which makes a file a sixth smaller. No score is computed from them."""
+"""Columns that are published in single precision, which makes a file a quarter smaller. No score is computed from them."""
 
 
 def published(track: Track) -> pa.Table:
@@ -71,7 +71,7 @@ def publish(folder: Path, file: Path, *, add: bool = False) -> int:
         if check(file)[0].name != name:
             raise UserError(f"{folder} has records of the track {name}, {file} has others")
         records = added(reading.upgraded(file), records)
-    records = in_single_precision(with_rounded_times(records))
+    records = rounded(records)
     with whole(file) as made:
         apart = [name for name in records.column_names if name in MEASURED]
         others = [name for name in records.column_names if name not in MEASURED]
@@ -86,20 +86,14 @@ def publish(folder: Path, file: Path, *, add: bool = False) -> int:
     return int(records.num_rows)
 
 
-def with_rounded_times(records: pa.Table) -> pa.Table:
-    """The records with their times as they are published."""
-    for name in set(TIMES) & set(records.column_names):
-        times = [None if one is None else float(f"{one:.3g}") for one in records[name].to_pylist()]
-        place = records.column_names.index(name)
-        records = records.set_column(place, records.schema.field(name), [times])
-    return records
-
-
-def in_single_precision(records: pa.Table) -> pa.Table:
-    """The records with the columns `SINGLE` as they are published."""
-    for name in set(SINGLE) & set(records.column_names):
-        place, field = records.column_names.index(name), records.schema.field(name)
-        records = records.set_column(place, field, records[name].cast(pa.float32(), safe=False).cast(field.type))
+def rounded(records: pa.Table) -> pa.Table:
+    """The records with as many digits as are published (`TIMES`, `SINGLE`)."""
+    for place, field in enumerate(records.schema):
+        if field.name in TIMES:
+            times = [None if one is None else float(f"{one:.3g}") for one in records[place].to_pylist()]
+            records = records.set_column(place, field, [times])
+        elif field.name in SINGLE:
+            records = records.set_column(place, field, records[place].cast(pa.float32(), safe=False).cast(field.type))
     return records
 
 

@@ -11,7 +11,7 @@ from envs.camera.world import StopSignApproach
 
 FACTS = StopSignApproach().facts
 
-# Tests run in processes of their own, one for each core or more: threads that wait for each other would only be in the way.
+# Tests run in as many processes as there are cores: threads that wait for each other would only be in the way.
 settle()
 
 

@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from torch import Tensor
 
-from bench.detection.patch import Patch
 from docs.figures import style
 from docs.figures.patches import patch_of, texels_of
 from docs.figures.sightings import (
@@ -41,32 +40,25 @@ def square_patch() -> Figure:
 
 def transfer() -> Figure:
     """A patch against another detector."""
-    made = style.figure(4.4, "transfer: a patch against yolov5, shown to yolov3_tiny")
-    crafted, below = made.subfigures(2, 1, height_ratios=(1.15, 1.5))
-    patch = patch_of("transfer", surrogates="yolov5")
-    _moments(crafted, patch)
-    assert patch.texels is not None
-    _signs(below, patch.texels)
+    made = style.figure(2.5, "transfer: a patch against yolov5, shown to yolov3_tiny")
+    _signs(made.subfigures(1, 1), texels_of("transfer", surrogates="yolov5"))
     return made
 
 
 def _crafted(attack: str) -> Figure:
     """The patch at several crafting steps, the sign with it, and the confidence."""
     made, (crafted, below) = _begun(attack, 6.4, (1.15, 3.6))
-    _moments(crafted, patch_of(attack))
-    _seen(below, attack)
-    return made
-
-
-def _moments(part: SubFigure, patch: Patch) -> None:
-    """The patch at several crafting steps."""
-    evolution = patch.evolution
+    evolution = patch_of(attack).evolution
     assert evolution is not None
     chosen = torch.linspace(0, len(evolution.steps) - 1, MOMENTS).round().long()
-    part.suptitle("as it comes about: step of the crafting, and score of a stop sign", x=0.01, ha="left", fontsize=10)
-    for axes, place in zip(part.subplots(1, MOMENTS), chosen, strict=True):
+    crafted.suptitle(
+        "as it comes about: step of the crafting, and score of a stop sign", x=0.01, ha="left", fontsize=10
+    )
+    for axes, place in zip(crafted.subplots(1, MOMENTS), chosen, strict=True):
         show(axes, evolution.texels[place] / 255)
         axes.set_title(f"step {int(evolution.steps[place])}: {float(evolution.losses['found'][place]):.2f}", fontsize=9)
+    _seen(below, attack)
+    return made
 
 
 def noise_patch() -> Figure:

@@ -23,7 +23,7 @@ from bench.plugins.track import Track, track, tracks
 from bench.records import store as results
 from bench.records.schema import schema
 from bench.run.config import run_config
-from leaderboard.published import in_single_precision, publish, published, with_rounded_times
+from leaderboard.published import publish, published, rounded
 from leaderboard.thesis import policy_records
 from leaderboard.thesis.numbers import printed
 from leaderboard.thesis.policy_records import Source, Wanted
@@ -154,7 +154,7 @@ def test_what_is_published_is_what_was_recorded(tmp_path: Path, name: str, recor
 
 def test_times_are_published_with_three_digits() -> None:
     times = {"wall_s": [1.23456, None], "attack_ms": [1234.5, 0.0], "safe_progress": [0.123456, 1.0]}
-    assert with_rounded_times(pa.table(times)).to_pydict() == {
+    assert rounded(pa.table(times)).to_pydict() == {
         "wall_s": [1.23, None],
         "attack_ms": [1230.0, 0.0],
         "safe_progress": [0.123456, 1.0],
@@ -163,7 +163,7 @@ def test_times_are_published_with_three_digits() -> None:
 
 def test_perturbations_are_published_in_single_precision_and_scores_as_they_are() -> None:
     exact = {"l2": [1 / 3, None], "safe_progress": [1 / 3, 1.0]}
-    assert in_single_precision(pa.table(exact)).to_pydict() == {
+    assert rounded(pa.table(exact)).to_pydict() == {
         "l2": [float(np.float32(1 / 3)), None],
         "safe_progress": [1 / 3, 1.0],
     }
