@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from bench.detection import PatchOracle, Predictions, Scenes
+from bench.errors import UserError
 
 SEEN = 0.5
 """Frames in which a smaller share of the sign is visible are not used."""
@@ -19,6 +20,9 @@ class Views:
         scenes: the scenes to craft on.
         window: side in pixels of the square windows; smaller where the picture is.
         translation: largest shift of the sign, as a share of the window.
+
+    Raises:
+        UserError: if the detector takes no picture of that size.
     """
 
     def __init__(self, oracle: PatchOracle, scenes: Scenes, *, window: int, translation: float) -> None:
@@ -26,6 +30,11 @@ class Views:
         self._seen = (scenes.visible >= SEEN).nonzero().squeeze(1)
         self._reach = scenes.reach(oracle.threat.budget)
         self._size = min(window, scenes.size[0]), min(window, scenes.size[1])
+        if any(side % oracle.stride for side in self._size):
+            taken = f"the sides of a picture must be multiples of {oracle.stride} for this detector"
+            raise UserError(
+                f"attack.window={window}: {taken}, for instance {max(window // oracle.stride, 1) * oracle.stride}"
+            )
 
     def draw(self, number: int) -> None:
         """Draw the frames and the places of the windows."""

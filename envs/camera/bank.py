@@ -23,7 +23,7 @@ from bench.files import whole
 from envs.camera import faces, sign, training_faces
 from envs.camera.frame import Frame, noise_level
 from envs.camera.objects import objects
-from envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
+from envs.camera.plate import Box, Colour, Plate, common, detail, filtered, opened, within
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
 from envs.weather import WEATHERS
@@ -43,6 +43,7 @@ def write(
     tensors: dict[str, NDArray[np.generic]] = {
         "crop": np.array([frame.crop for frame in frames], np.int32),
         "scale": np.array([frame.scale for frame in frames], np.float32),
+        "printed": np.array([frame.printed for frame in frames], np.float32),
         "visible": np.array([frame.visible for frame in frames], np.float32),
     }
     for name in ("picture", "black", "gain"):
@@ -77,13 +78,15 @@ def read(folder: Path, location: str, weather: str) -> list[tuple[Pose, Frame]]:
     for number, pose in enumerate(poses):
         x0, y0, x1, y1 = (int(edge) for edge in held["crop"][number])
         shape = (y1 - y0, x1 - x0, 3)
-        black_scale, gain_scale = (float(scale) for scale in held["scale"][number])
+        black_scale, gain_scale = held["scale"][number].tolist()
+        red, green, blue = held["printed"][number].tolist()
         frame = Frame(
             picture=parts["picture"][number],
             crop=(x0, y0, x1, y1),
             black=parts["black"][number].reshape(shape),
             gain=parts["gain"][number].reshape(shape),
             scale=(black_scale, gain_scale),
+            printed=(red, green, blue),
             visible=float(held["visible"][number]),
         )
         found.append((pose, frame))
@@ -170,19 +173,18 @@ class BankScenes(Scenes):
     ) -> list[Tensor]:
         """Windows of the images without sensor noise, [3, h, w] each."""
         numbers = frames.tolist()
-        faces: dict[int, tuple[Tensor, ...]] = {}
+        faces: dict[tuple[int, Colour], tuple[Tensor, ...]] = {}
         if patches is not None:
-            painted = sign.painted(patches, share)
-            faces = {side: filtered(painted, side).unbind() for side in {detail(self._plate(n).crop) for n in numbers}}
+            kinds = {_kind(self._plate(number)) for number in numbers}
+            painted = {printed: sign.painted(patches, share, printed) for _, printed in kinds}
+            faces = {(side, printed): filtered(painted[printed], side).unbind() for side, printed in kinds}
         shown = []
         for place, (number, (x, y)) in enumerate(zip(numbers, corners.tolist(), strict=True)):
             plate, window = self._plate(number), (x, y, x + size[1], y + size[0])
             picture = plate.cut(window)
             patched = common(window, plate.crop, _reach(self.poses[number], share))
             if patches is not None and patched:
-                picture[within(patched, window)] = plate.signed(
-                    faces[detail(plate.crop)][place % len(patches)], patched
-                )
+                picture[within(patched, window)] = plate.signed(faces[_kind(plate)][place % len(patches)], patched)
             shown.append(picture)
         return shown
 
@@ -216,6 +218,11 @@ class TrainingScenes(BankScenes):
         other = copy(self)
         other.decoys = training_faces.decoys(number * len(self), len(self))
         return other
+
+
+def _kind(plate: Plate) -> tuple[int, Colour]:
+    """Plates of one kind show a patch with the same face."""
+    return detail(plate.crop), plate.printed
 
 
 @cache

@@ -36,6 +36,7 @@ class Frame:
         crop: x0, y0, x1, y1 around the sign in pixels, inside the image; empty if the sign is outside.
         black, gain: uint8 [h, w, 3], coded with `GAMMA`.
         scale: light of code 255 in black and in gain.
+        printed: share of the gain that a print on the sign has, for each colour; 1 by day, little in headlights.
         visible: share of the sign that is inside the image and not hidden, in [0, 1].
     """
 
@@ -44,6 +45,7 @@ class Frame:
     black: NDArray[np.uint8]
     gain: NDArray[np.uint8]
     scale: tuple[float, float]
+    printed: tuple[float, float, float]
     visible: float
 
 
@@ -64,7 +66,8 @@ def frame(traced: Traced, pose: Pose, weather: Weather) -> Frame:
     gain, most_gain = _coded(traced.gain * between.transmitted[y0:y1, x0:x1] * factor)
     whole = cv2.contourArea(pose.camera.project(sign.corners(sign_x(pose.lanes))).astype(np.float32))
     visible = min(1.0, float(traced.coverage.sum()) / whole)
-    return Frame(webp.ravel(), traced.crop, black, gain, (most_black, most_gain), visible)
+    red, green, blue = traced.printed.tolist()
+    return Frame(webp.ravel(), traced.crop, black, gain, (most_black, most_gain), (red, green, blue), visible)
 
 
 def _coded(light: NDArray[np.float32]) -> tuple[NDArray[np.uint8], float]:

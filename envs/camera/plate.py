@@ -24,6 +24,8 @@ LEAST_GAIN = 0.03
 
 Box = tuple[int, int, int, int]
 """x0, y0, x1, y1 in pixels of the image."""
+Colour = tuple[float, float, float]
+"""A number for each of red, green and blue."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,7 @@ class Plate:
         picture: uint8 [3, H, W], developed, with a black sign, without sensor noise.
         crop: box around the sign; empty if the sign is outside.
         black, gain: float32 [3, h, w] on the crop; the exposed light is black + gain * texture.
+        printed: share of the gain that a print on the sign has, for each colour.
         face_from_pixel: homography [3, 3] (`sign.pixel_to_face`).
         post: where the post is in the image.
     """
@@ -42,6 +45,7 @@ class Plate:
     crop: Box
     black: Tensor
     gain: Tensor
+    printed: Colour
     face_from_pixel: Array
     post: Post
 
@@ -105,7 +109,7 @@ def opened(kept: Frame, camera: Camera, x: float) -> Plate:
         for code, most in zip((kept.black, kept.gain), kept.scale, strict=True)
     )
     planes = torch.from_numpy(picture).permute(2, 0, 1).contiguous()
-    return Plate(planes, kept.crop, black, gain, sign.pixel_to_face(x, camera), post_of(camera, x))
+    return Plate(planes, kept.crop, black, gain, kept.printed, sign.pixel_to_face(x, camera), post_of(camera, x))
 
 
 def common(*boxes: Box) -> Box | None:

@@ -24,7 +24,7 @@ from envs.camera.street.light import Light, light, lighting
 from envs.camera.street.render import Traced, load, trace, variant, works
 from envs.weather import WEATHERS
 
-VERSION = 3
+VERSION = 4
 """Version of the traced scene; raise it when the street or its light change."""
 
 
@@ -44,7 +44,7 @@ def traced(folder: Path, pose: Pose) -> Traced:
         found = trace(world, lit, pose.camera, layout.sign_x(pose.lanes), pose.seed)
         half = {name: value.astype(np.float16) for name, value in vars(found).items() if name != "crop"}
         with whole(path) as file:
-            np.savez(file, crop=np.array(found.crop), **half)
+            np.savez_compressed(file, crop=np.array(found.crop), **half)
     with np.load(path) as kept:
         single = {name: kept[name].astype(np.float32) for name in kept.files if name != "crop"}
         x0, y0, x1, y1 = (int(edge) for edge in kept["crop"])
@@ -71,7 +71,7 @@ def make(poses: Sequence[Pose], *, kept: Path, out: Path, progress: Callable[[fl
 
     Args:
         poses: poses of any places and lightings.
-        kept: folder of traced poses, some 4 MB each.
+        kept: folder of traced poses, some 6 MB each.
         out: folder of the bank.
         progress: called with the share done and a short text.
 

@@ -105,21 +105,22 @@ def face() -> NDArray[np.float32]:
     return np.ascontiguousarray(small.transpose(2, 0, 1))
 
 
-def painted(patches: Tensor | None, share: float) -> Tensor:
+def painted(patches: Tensor | None, share: float, printed: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Tensor:
     """Linear reflectances of the face with patches, [N, 3, TEXELS, TEXELS]; each texel of a patch is a square.
 
     Args:
         patches: sRGB in [0, 1], [N, 3, P, P]; None for the plain face, N = 1.
         share: side of the patch as a share of the sign's side, in (0, 1].
+        printed: what a print reflects as a share of what the sheeting reflects, for each colour; less than 1 in headlights.
     """
     plain = _reflectance().unsqueeze(0)
     if patches is None:
         return plain
     middle = patch_texels(share)
     side = middle.stop - middle.start
-    printed = torch.nn.functional.interpolate(linear(patches), size=(side, side), mode="nearest-exact")
+    light = linear(patches) * torch.tensor(printed).view(3, 1, 1)
     faces = plain.repeat(len(patches), 1, 1, 1)
-    faces[:, :, middle, middle] = printed
+    faces[:, :, middle, middle] = torch.nn.functional.interpolate(light, size=(side, side), mode="nearest-exact")
     return faces
 
 

@@ -43,7 +43,8 @@ def air(weather: Weather, depth: Image, street: Image, speed_mps: float, focal: 
 
     Args:
         weather: visibility and rain.
-        depth: [H, W] in m, inf for the sky.
+        depth: of each ray of a pixel in m, [rays, H, W], inf for the sky. A pixel at the edge of a pole gets the mean of the air
+            before the pole and the sky.
         street: linear light without weather, [H, W, 3]; the airlight has the colour of its sky.
         speed_mps: speed of the car, which lengthens the streaks.
         focal: focal length in pixels.
@@ -51,13 +52,14 @@ def air(weather: Weather, depth: Image, street: Image, speed_mps: float, focal: 
     """
     airlight = _airlight(street, depth)
     # Koschmieder (1924): contrast falls exponentially, and scattered skylight replaces the lost light.
-    transmitted = np.exp(-weather.extinction_per_m * np.minimum(depth, SKY_M))[..., None].astype(np.float32)
+    each = np.exp(-np.float32(weather.extinction_per_m) * np.minimum(depth, SKY_M))
+    transmitted = each.mean(0)[..., None].astype(np.float32)
     if weather.sun_elevation_deg < 0:
         airlight = airlight * 0.0
     added = airlight * (1 - transmitted)
     if weather.precipitation_mm_h > 0:
         rng = np.random.default_rng(seed)
-        cover = streaks(weather.precipitation_mm_h, depth, speed_mps, focal, rng)[..., None]
+        cover = streaks(weather.precipitation_mm_h, depth.min(0), speed_mps, focal, rng)[..., None]
         # A drop shows the world upside down, most of it sky (Garg and Nayar 2007, section 4: 0.94 of the sky's radiance).
         drop = 0.94 * airlight
         transmitted, added = transmitted * (1 - cover), added * (1 - cover) + drop * cover
@@ -66,7 +68,7 @@ def air(weather: Weather, depth: Image, street: Image, speed_mps: float, focal: 
 
 def _airlight(street: Image, depth: Image) -> NDArray[np.float32]:
     """Mean colour [3] of the visible sky, or of the brightest twentieth of the street."""
-    sky = np.isinf(depth)
+    sky = np.isinf(depth).all(0)
     if sky.mean() > 0.01:
         return street[sky].mean(0)
     luminance = street.mean(-1)

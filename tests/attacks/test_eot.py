@@ -131,6 +131,13 @@ def test_a_target_is_seen_instead() -> None:
         crafted(EOT(texels=8, steps=1, batch=1, window=32, target="bus"))
 
 
+def test_a_window_that_the_detector_does_not_take_is_refused() -> None:
+    coarse = RedDetector()
+    coarse.stride = 32
+    with pytest.raises(UserError, match=r"attack\.window=100: .* multiples of 32 .*, for instance 96"):
+        crafted(EOT(texels=8, steps=1, batch=1, window=100), detector=coarse)
+
+
 def test_it_stops_at_the_query_budget() -> None:
     _, oracle = crafted(EOT(texels=8, steps=100, batch=8, window=32), queries=30)
     assert oracle.spent == 24

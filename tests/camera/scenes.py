@@ -29,9 +29,8 @@ def lit(pose: Pose, level: float = 0.6) -> Traced:
     black = np.full((camera.height, camera.width, 3), 0.25, np.float32)
     black[depth == np.inf] = 0.9
     black[top:bottom, left:right] *= 1 - coverage[..., None]
-    return Traced(
-        black, (left, top, right, bottom), level * coverage[..., None] * np.ones(3, np.float32), coverage, depth
-    )
+    white = np.ones(3, np.float32)
+    return Traced(black, (left, top, right, bottom), level * coverage[..., None] * white, coverage, white, depth[None])
 
 
 def scenes(weather: str = "clear", lanes: int = 3) -> BankScenes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.errors import UserError
-from envs.camera import bank, sign
+from envs.camera import bank, develop, sign
+from envs.camera.bank import BankScenes
 from envs.camera.frame import frame
 from envs.camera.plate import detail, filtered
 from envs.camera.poses import approach
@@ -86,11 +88,43 @@ def test_weather_takes_contrast_from_the_far_sign_more_than_from_the_near_one(we
 @settings(max_examples=20, deadline=None)
 @given(visibility=st.floats(20, 5000), distance=st.floats(1, 200))
 def test_fog_follows_koschmieder(visibility: float, distance: float) -> None:
-    depth = np.full((4, 4), distance, np.float32)
+    depth = np.full((1, 4, 4), distance, np.float32)
     street = np.full((4, 4, 3), 0.1, np.float32)
     found = air(Weather(name="mist", visibility_m=visibility), depth, street, 10.0, 721.0, 0)
     assert np.allclose(found.transmitted, np.exp(-3.0 / visibility * distance), rtol=1e-4)
     assert np.allclose(found.added, 0.1 * (1 - found.transmitted), rtol=1e-4)
+
+
+def test_a_pixel_that_shows_pole_and_sky_gets_the_mean_of_their_air() -> None:
+    pole, sky = np.full((2, 4, 4), 10, np.float32), np.full((2, 4, 4), np.inf, np.float32)
+    street = np.full((4, 4, 3), 0.1, np.float32)
+    alone, none, both = (
+        air(WEATHERS["fog"], depth, street, 10.0, 721.0, 0).transmitted
+        for depth in (pole, sky, np.concatenate([pole, sky]))
+    )
+    assert np.allclose(both, (alone + none) / 2)
+    assert alone.min() > 0.5
+    assert none.max() < 0.01
+
+
+def test_a_print_is_darker_than_the_sheeting_under_it_where_the_light_is_retroreflected() -> None:
+    pose = approach("sun-behind-ego", 3, 1.0, "night")[6]
+    matt = lit(pose)
+    share = np.array([0.2, 0.3, 0.4], np.float32)
+    white, printed = (
+        BankScenes([(pose, frame(each, pose, WEATHERS["night"]))], ["night"])._plate(0)
+        for each in (matt, replace(matt, printed=share))
+    )
+    face, dim = (
+        filtered(sign.painted(torch.ones(1, 3, 8, 8), 0.5, plate.printed), detail(plate.crop))[0]
+        for plate in (white, printed)
+    )
+    light = [develop.light_of(white.signed(part, white.crop)) for part in (face, dim)]
+    row, column = (side // 2 for side in light[0].shape[1:])
+    ratio = (light[1] / light[0])[:, row - 5 : row + 5, column - 5 : column + 5]
+    assert torch.allclose(ratio.mean((1, 2)), torch.from_numpy(share), atol=0.01)
+    plain = [plate.plain for plate in (white, printed)]
+    assert torch.equal(*plain)
 
 
 def test_more_rain_hides_more() -> None:
@@ -100,7 +134,7 @@ def test_more_rain_hides_more() -> None:
 
 
 def test_night_has_no_airlight() -> None:
-    depth = np.full((4, 4), 20, np.float32)
+    depth = np.full((1, 4, 4), 20, np.float32)
     found = air(WEATHERS["night"], depth, np.ones((4, 4, 3), np.float32), 10.0, 721.0, 0)
     assert np.array_equal(found.transmitted, np.ones((4, 4, 1), np.float32))
     assert not found.added.any()
@@ -116,6 +150,7 @@ def test_the_bank_gives_back_what_was_written(tmp_path: Path) -> None:
         assert pose == wanted
         assert kept.crop == original.crop
         assert kept.scale == pytest.approx(original.scale)
+        assert kept.printed == original.printed
         for name in ("picture", "black", "gain"):
             assert np.array_equal(getattr(kept, name), getattr(original, name))
 

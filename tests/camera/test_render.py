@@ -68,3 +68,9 @@ def test_a_scene_that_was_traced_gives_the_same_picture_again() -> None:
     assert np.array_equal(first.black, again.black)
     assert np.array_equal(first.gain, again.gain)
     assert first.gain.max() > 0
+    assert (first.printed > 0).all()
+    assert (first.printed < 0.8).all()
+    assert first.depth.shape == (render.DEPTH_GRID**2, 32, 96)
+    # The sky is above, and the road is near below.
+    assert np.isinf(first.depth[:, 0]).mean() > 0.1
+    assert first.depth[:, -1].max() < 15

@@ -29,6 +29,8 @@ from envs.camera.street.vehicles import Part
 
 SAMPLES, GUIDE_SAMPLES, SIGN_SAMPLES = 8, 4, 64
 """Paths a pixel for the image, for the guides of the denoiser, and for the crop of the sign."""
+DEPTH_GRID = 4
+"""Rays along the side of a pixel for the depth. With their mean, fog would draw dark specks at the edges of poles."""
 BOUNCES = 5
 MARGIN = 3
 """Margin of the crop around the sign in pixels."""
@@ -45,13 +47,15 @@ class Traced:
         crop: x0, y0, x1, y1 around the sign in pixels, inside the image; empty if the sign is outside.
         gain: light that a white sign adds on the crop, [h, w, 3].
         coverage: share of each pixel of the crop that shows the sign, [h, w].
-        depth: depth along the line of sight in m, [H, W]; inf is the sky.
+        printed: share of the gain that a white print on the sign has, [3]: the rest is retroreflected by the sheeting under it.
+        depth: depth along the line of sight of each ray of a pixel in m, [rays, H, W]; inf is the sky.
     """
 
     black: NDArray[np.float32]
     crop: tuple[int, int, int, int]
     gain: NDArray[np.float32]
     coverage: NDArray[np.float32]
+    printed: NDArray[np.float32]
     depth: NDArray[np.float32]
 
 
@@ -113,7 +117,7 @@ def trace(world: Any, light: Light, camera: Camera, sign_x: float, seed: int) ->
     """
     mi = _mitsuba()
     path = mi.load_dict({"type": "path", "max_depth": BOUNCES})
-    guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal,depth:depth"})
+    guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
     crop = _crop(camera, sign_x)
 
     def seen(integrator: Any, samples: int, window: tuple[int, int, int, int] | None = None) -> NDArray[np.float32]:
@@ -121,8 +125,8 @@ def trace(world: Any, light: Light, camera: Camera, sign_x: float, seed: int) ->
         return np.array(mi.render(world, sensor=sensor, integrator=integrator, spp=samples, seed=seed), np.float32)
 
     picture, guide = seen(path, SAMPLES)[..., :3], seen(guides, GUIDE_SAMPLES)
-    albedo, normal, depth = guide[..., :3], guide[..., 3:6], guide[..., 6]
-    black = _denoised(picture, albedo, normal)
+    black = _denoised(picture, guide[..., :3], guide[..., 3:])
+    printed = np.ones(3, np.float32)
     gain = np.zeros((crop[3] - crop[1], crop[2] - crop[0], 3), np.float32)
     if gain.size:
         painted = mi.traverse(world)
@@ -138,10 +142,23 @@ def trace(world: Any, light: Light, camera: Camera, sign_x: float, seed: int) ->
         coverage = np.clip(albedo - no_albedo, 0, 1)
         gain = np.where(coverage[..., None] > 0, np.clip(bright - dark, 0, None), 0).astype(np.float32)
         if light.headlights:
+            matt = gain.sum((0, 1))
             gain += coverage[..., None] * _retroreflected(camera, sign_x)
+            printed = matt / np.maximum(gain.sum((0, 1)), 1e-6)
     else:
         coverage = gain[..., 0]
-    return Traced(black, crop, gain, coverage, np.where(depth > 0, depth, np.inf).astype(np.float32))
+    return Traced(black, crop, gain, coverage, printed, _depth(world, camera, seed))
+
+
+def _depth(world: Any, camera: Camera, seed: int) -> NDArray[np.float32]:
+    """Depth of each ray in m, [DEPTH_GRID ** 2, H, W]; inf is the sky."""
+    mi = _mitsuba()
+    sensor = mi.load_dict(_sensor(camera, None, DEPTH_GRID))
+    integrator = mi.load_dict({"type": "aov", "aovs": "depth:depth"})
+    seen = np.array(mi.render(world, sensor=sensor, integrator=integrator, spp=1, seed=seed), np.float32)
+    rays = seen.reshape(camera.height, DEPTH_GRID, camera.width, DEPTH_GRID).transpose(1, 3, 0, 2)
+    depth = rays.reshape(DEPTH_GRID**2, camera.height, camera.width)
+    return np.where(depth > 0, depth, np.inf).astype(np.float32)
 
 
 def _crop(camera: Camera, sign_x: float) -> tuple[int, int, int, int]:
@@ -281,10 +298,10 @@ def _face(x: float) -> Mesh:
     return Mesh(corners.astype(np.float32), np.array(fan, np.uint32), uv.astype(np.float32))
 
 
-def _sensor(camera: Camera, window: tuple[int, int, int, int] | None) -> dict[str, Any]:
+def _sensor(camera: Camera, window: tuple[int, int, int, int] | None, finer: int = 1) -> dict[str, Any]:
     mi = _mitsuba()
-    film: dict[str, Any] = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb"}
-    film |= {"component_format": "float32", "rfilter": {"type": "box"}}
+    film: dict[str, Any] = {"type": "hdrfilm", "width": finer * camera.width, "height": finer * camera.height}
+    film |= {"pixel_format": "rgb", "component_format": "float32", "rfilter": {"type": "box"}}
     if window is not None:
         x0, y0, x1, y1 = window
         film |= {"crop_offset_x": x0, "crop_offset_y": y0, "crop_width": x1 - x0, "crop_height": y1 - y0}
