@@ -23,7 +23,7 @@ from bench.files import whole
 from envs.camera import faces, sign, training_faces
 from envs.camera.frame import Frame, noise_level
 from envs.camera.objects import objects
-from envs.camera.plate import Box, Colour, Plate, common, detail, filtered, opened, within
+from envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
 from envs.camera.poses import Pose
 from envs.camera.street.layout import sign_x
 from envs.weather import WEATHERS
@@ -73,6 +73,8 @@ def read(folder: Path, location: str, weather: str) -> list[tuple[Pose, Frame]]:
             poses = [Pose(**fields) for fields in json.loads(file.metadata()["poses"])]
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"cannot read the frames {path}: {str(error).splitlines()[0]}") from None
+    if "printed" not in held:
+        raise UserError(f"the frames {path} are of an earlier version of cavbench; `bench render` makes them again")
     parts = {name: np.split(held[name], held[f"{name}_ends"][:-1]) for name in ("picture", "black", "gain")}
     found = []
     for number, pose in enumerate(poses):
@@ -173,7 +175,7 @@ class BankScenes(Scenes):
     ) -> list[Tensor]:
         """Windows of the images without sensor noise, [3, h, w] each."""
         numbers = frames.tolist()
-        faces: dict[tuple[int, Colour], tuple[Tensor, ...]] = {}
+        faces: dict[tuple[int, sign.Colour], tuple[Tensor, ...]] = {}
         if patches is not None:
             kinds = {_kind(self._plate(number)) for number in numbers}
             painted = {printed: sign.painted(patches, share, printed) for _, printed in kinds}
@@ -220,7 +222,7 @@ class TrainingScenes(BankScenes):
         return other
 
 
-def _kind(plate: Plate) -> tuple[int, Colour]:
+def _kind(plate: Plate) -> tuple[int, sign.Colour]:
     """Plates of one kind show a patch with the same face."""
     return detail(plate.crop), plate.printed
 

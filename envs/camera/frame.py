@@ -45,7 +45,7 @@ class Frame:
     black: NDArray[np.uint8]
     gain: NDArray[np.uint8]
     scale: tuple[float, float]
-    printed: tuple[float, float, float]
+    printed: sign.Colour
     visible: float
 
 

@@ -24,8 +24,6 @@ LEAST_GAIN = 0.03
 
 Box = tuple[int, int, int, int]
 """x0, y0, x1, y1 in pixels of the image."""
-Colour = tuple[float, float, float]
-"""A number for each of red, green and blue."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +43,7 @@ class Plate:
     crop: Box
     black: Tensor
     gain: Tensor
-    printed: Colour
+    printed: sign.Colour
     face_from_pixel: Array
     post: Post
 

@@ -13,6 +13,9 @@ from torch import Tensor
 from bench.detection.colour import linear
 from envs.camera.camera import Array, Camera
 
+Colour = tuple[float, float, float]
+"""A number for each of red, green and blue."""
+
 SIZE_M = 1.2
 """Width across flats: 48 inches, the oversized R1-1 of the MUTCD (2009, table 2B-1)."""
 HEIGHT_M = 2.7
@@ -105,7 +108,7 @@ def face() -> NDArray[np.float32]:
     return np.ascontiguousarray(small.transpose(2, 0, 1))
 
 
-def painted(patches: Tensor | None, share: float, printed: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Tensor:
+def painted(patches: Tensor | None, share: float, printed: Colour = (1.0, 1.0, 1.0)) -> Tensor:
     """Linear reflectances of the face with patches, [N, 3, TEXELS, TEXELS]; each texel of a patch is a square.
 
     Args:

@@ -10,6 +10,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
 from bench.errors import UserError
 from envs.camera import bank, develop, sign
@@ -161,6 +163,16 @@ def test_a_bank_that_is_not_there_or_cut_short_is_one_line(tmp_path: Path) -> No
     bank.path_of(tmp_path, "sun-beside", "fog").write_bytes(b"\x10\0\0\0\0\0\0\0{}")
     with pytest.raises(UserError, match="cannot read the frames"):
         bank.read(tmp_path, "sun-beside", "fog")
+
+
+def test_frames_of_an_earlier_version_are_one_line(tmp_path: Path) -> None:
+    pose = approach("sun-beside", 3, 1.0, "sun")[0]
+    path = bank.write(tmp_path, "sun-beside", "clear", [pose], [frame(lit(pose), pose, WEATHERS["clear"])], {})
+    with safe_open(path, "np") as file:
+        kept = {name: file.get_tensor(name) for name in file.keys() if name != "printed"}  # noqa: SIM118
+        save_file(kept, path, file.metadata())
+    with pytest.raises(UserError, match="an earlier version of cavbench; `bench render` makes them again"):
+        bank.read(tmp_path, "sun-beside", "clear")
 
 
 def test_the_face_is_red_with_white_letters() -> None:
