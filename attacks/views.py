@@ -31,9 +31,10 @@ class Views:
         self._reach = scenes.reach(oracle.threat.budget)
         self._size = min(window, scenes.size[0]), min(window, scenes.size[1])
         if any(side % oracle.stride for side in self._size):
-            taken = f"the sides of a picture must be multiples of {oracle.stride} for this detector"
+            fitting = max(min(self._size) // oracle.stride, 1) * oracle.stride
             raise UserError(
-                f"attack.window={window}: {taken}, for instance {max(window // oracle.stride, 1) * oracle.stride}"
+                f"attack.window={window}: the sides of a picture must be multiples of {oracle.stride} for this detector, "
+                f"for instance {fitting}"
             )
 
     def draw(self, number: int) -> None:

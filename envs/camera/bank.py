@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import asdict
 from functools import cache
@@ -71,10 +71,15 @@ def read(folder: Path, location: str, weather: str) -> list[tuple[Pose, Frame]]:
         with safe_open(path, "np") as file:
             held = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             poses = [Pose(**fields) for fields in json.loads(file.metadata()["poses"])]
-    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        if "printed" not in held:
+            raise UserError(f"the frames {path} are of an earlier version of cavbench; `bench render` makes them again")
+        return _frames(poses, held)
+    except (SafetensorError, ValueError, KeyError, IndexError, TypeError) as error:
         raise UserError(f"cannot read the frames {path}: {str(error).splitlines()[0]}") from None
-    if "printed" not in held:
-        raise UserError(f"the frames {path} are of an earlier version of cavbench; `bench render` makes them again")
+
+
+def _frames(poses: Sequence[Pose], held: Mapping[str, NDArray[np.generic]]) -> list[tuple[Pose, Frame]]:
+    """The poses with their frames, from the tensors of a file."""
     parts = {name: np.split(held[name], held[f"{name}_ends"][:-1]) for name in ("picture", "black", "gain")}
     found = []
     for number, pose in enumerate(poses):

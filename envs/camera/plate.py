@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bench.errors import UserError
 from envs.camera import develop, sign
 from envs.camera.bare import Post, post_of, without_sign
 from envs.camera.camera import Array, Camera
@@ -99,9 +100,14 @@ class Plate:
 
 
 def opened(kept: Frame, camera: Camera, x: float) -> Plate:
-    """Decode a frame of a camera, with the sign at `x` in m."""
+    """Decode a frame of a camera, with the sign at `x` in m.
+
+    Raises:
+        UserError: if its picture cannot be decoded.
+    """
     picture = cv2.imdecode(kept.picture, cv2.IMREAD_COLOR_RGB)
-    assert picture is not None
+    if picture is None:
+        raise UserError("the picture of a frame cannot be decoded; `bench render` makes the frames again")
     black, gain = (
         most * (torch.from_numpy(code).permute(2, 0, 1) / 255) ** GAMMA
         for code, most in zip((kept.black, kept.gain), kept.scale, strict=True)

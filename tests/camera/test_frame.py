@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
@@ -165,14 +166,33 @@ def test_a_bank_that_is_not_there_or_cut_short_is_one_line(tmp_path: Path) -> No
         bank.read(tmp_path, "sun-beside", "fog")
 
 
-def test_frames_of_an_earlier_version_are_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"printed": None}, "an earlier version of cavbench; `bench render` makes them again"),
+        ({"scale": None}, "cannot read the frames .*: 'scale'"),
+        ({"visible": np.zeros(0, np.float32)}, "cannot read the frames .*: index 0 is out of bounds"),
+        ({"printed": np.zeros((1, 2), np.float32)}, "cannot read the frames .*: not enough values"),
+        ({"crop": np.array([[0, 0, 9, 9]], np.int32)}, "cannot read the frames .*: cannot reshape"),
+    ],
+)
+def test_a_bank_of_an_earlier_version_or_with_wrong_tensors_is_one_line(
+    tmp_path: Path, changed: dict[str, NDArray[np.generic] | None], why: str
+) -> None:
     pose = approach("sun-beside", 3, 1.0, "sun")[0]
     path = bank.write(tmp_path, "sun-beside", "clear", [pose], [frame(lit(pose), pose, WEATHERS["clear"])], {})
     with safe_open(path, "np") as file:
-        kept = {name: file.get_tensor(name) for name in file.keys() if name != "printed"}  # noqa: SIM118
-        save_file(kept, path, file.metadata())
-    with pytest.raises(UserError, match="an earlier version of cavbench; `bench render` makes them again"):
+        kept = {name: file.get_tensor(name) for name in file.keys()} | changed  # noqa: SIM118
+        save_file({name: value for name, value in kept.items() if value is not None}, path, file.metadata())
+    with pytest.raises(UserError, match=why):
         bank.read(tmp_path, "sun-beside", "clear")
+
+
+def test_a_picture_that_is_none_is_one_line() -> None:
+    pose = approach("sun-beside", 3, 1.0, "sun")[0]
+    broken = replace(frame(lit(pose), pose, WEATHERS["clear"]), picture=np.full(100, 7, np.uint8))
+    with pytest.raises(UserError, match="cannot be decoded; `bench render` makes the frames again"):
+        BankScenes([(pose, broken)], ["clear"]).render(torch.tensor([0]), None, 0.5)
 
 
 def test_the_face_is_red_with_white_letters() -> None:

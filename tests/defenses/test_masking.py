@@ -185,16 +185,14 @@ def patches() -> dict[str, Tensor]:
     }
 
 
-@pytest.mark.parametrize(
-    ("weather", "kinds"), [("clear", ("eot",)), ("rain", ("noise", "white", "black", "red", "board", "eot"))]
-)
-def test_no_patch_lowers_the_confidence_below_the_certificate(weather: str, kinds: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("weather", ["clear", "rain"])
+def test_no_patch_lowers_the_confidence_below_the_certificate(weather: str) -> None:
     frames = scenes(weather=weather)
     least = certain(shipped(), frames, SHARE)
     assert least is not None
     assert least.mean() > 0.3
-    for kind in kinds:
-        assert (look(shipped(), frames, patches()[kind], SHARE).confidence >= least - 1e-4).all()
+    for texels in patches().values():
+        assert (look(shipped(), frames, texels, SHARE).confidence >= least - 1e-4).all()
 
 
 @settings(max_examples=10, deadline=None)

@@ -218,7 +218,7 @@ def test_no_leader_that_brakes_as_assumed_is_hit(seed: int, rate: float) -> None
     assert once.float().mean() > 0.5
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     speed=st.sampled_from([15.0, 18.0, 20.0, 23.0, 25.0, 30.0]),
     closing=st.floats(-6, 4),

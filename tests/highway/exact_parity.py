@@ -114,7 +114,7 @@ def test_any_world_is_bit_equal_for_a_few_steps(world: Case) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(random_cases())
 def test_any_of_many_worlds_is_bit_equal_for_a_few_steps(world: Case) -> None:
     assert not differences(compare(world))
