@@ -28,8 +28,8 @@ class Transfer(EOT):
 
     `eot` on surrogates: detectors of the zoo, each as it is without a defence. They take turns, a step each, so that the loss is
     in the mean that of all of them. The victim answers no question, so this is the attack of somebody who knows nothing about it.
-    If the victim is among its own surrogates, the attack is a white box on it. `cutout`, one of the tricks of T-SEA, keeps the
-    patch from relying on one small part; their ShakeDrop, which drops blocks inside of a network, is not here.
+    A run refuses a victim that is among the surrogates: on it the attack would be a white box. `cutout`, one of the tricks of
+    T-SEA, keeps the patch from relying on one small part; their ShakeDrop, which drops blocks inside of a network, is not here.
 
     Args:
         surrogates: names of detectors, joined by "+" (default yolov5+fcos).
@@ -60,14 +60,23 @@ class Transfer(EOT):
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         return super().craft(_InsteadOfTheVictim(self._detectors(), oracle), scenes, progress)
 
-    def _detectors(self) -> list[Detector]:
+    def misfit(self, victim: DetectorVictim) -> str:
+        """A patch against the victim itself would not be one of somebody who knows nothing about it."""
+        if any(type(victim) is type(surrogate) for surrogate in self._victims()):
+            return f"which attack.surrogates={self.surrogates} names: craft the patch against other detectors"
+        return ""
+
+    def _victims(self) -> list[DetectorVictim]:
         victims = [choose("victim", name).component for name in self.surrogates.split(BETWEEN)]
         for victim in victims:
             if not isinstance(victim, DetectorVictim):
                 raise UserError(f"attack.surrogates={self.surrogates}: {type(victim).__name__} is no detector")
+        return victims
+
+    def _detectors(self) -> list[Detector]:
         # A network draws random weights before it gets those of its file. The patch shall not depend on these draws.
         with torch.random.fork_rng(devices=[]):
-            return [victim.load(0, Facts(axes=Axes(()))) for victim in victims]
+            return [victim.load(0, Facts(axes=Axes(()))) for victim in self._victims()]
 
 
 class _Turns:

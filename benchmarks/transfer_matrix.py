@@ -1,10 +1,11 @@
 """Scores detectors under patches that were crafted against other detectors, and against several at once (`transfer`).
 
     python benchmarks/transfer_matrix.py [--detectors yolov3_tiny yolov5 fcos rcnn] [--hardened yolov3_tiny] [--steps 600]
-        [--cutout 0.9] [--lanes 3 4] [--weathers clear rain]
+        [--cutout 0.9] [--lanes 3 4] [--weathers clear rain] [--rows rcnn]
 
 Each row is a patch, each column a detector that sees it; hardened detectors have columns only. On the diagonal the attack is a
-white box. The last row is the universal patch, crafted against all. The score is the stop score, the mean over all approaches.
+white box. The last row is the universal patch, crafted against all. `--rows` names the surrogates of the rows to make, joined
+by + for a universal patch. The score is the stop score, the mean over all approaches.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ def main() -> None:
     parser.add_argument("--cutout", type=float, default=Transfer.cutout)
     parser.add_argument("--lanes", nargs="+", type=int, default=[3, 4])
     parser.add_argument("--weathers", nargs="+", default=["clear", "rain"])
+    parser.add_argument("--rows", nargs="+", default=[], help="make only these rows")
     asked = parser.parse_args()
     settle()
     threat, scenes = PatchThreat(), WORLD.training_scenes()
@@ -45,7 +47,7 @@ def main() -> None:
     approaches = [each for cell in cells for each in WORLD.approaches(cell, range(len(WORLD.locations)))]
     print(f"{'crafted against':<20}" + "".join(f"{name:>15}" for name in seeing) + "     (+ hardened)", flush=True)
     universal = [BETWEEN.join(asked.detectors)] if len(asked.detectors) > 1 else []
-    for surrogates in ("nothing", *asked.detectors, *universal):
+    for surrogates in asked.rows or ("nothing", *asked.detectors, *universal):
         patch = None
         if surrogates != "nothing":
             attack = Transfer(surrogates=surrogates, steps=asked.steps, cutout=asked.cutout)

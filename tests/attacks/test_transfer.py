@@ -11,6 +11,7 @@ from attacks.transfer import Transfer, _Turns
 from bench.detection import PatchThreat
 from bench.detection.crafting import craft
 from bench.errors import UserError
+from bench.plugins.pair import Pair, choose
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
 from bench.victims.detectors.yolov5 import YOLOv5
 from tests.attacks.test_eot import SCENES
@@ -57,6 +58,14 @@ def test_surrogates_take_turns_and_each_tells_of_the_stop_sign_only() -> None:
         told = turns.ask(shown, "gradients")
         assert torch.equal(told.scores_of(0), detector(shown).scores_of(detector.index("stop sign")))
     assert turns.spent == 8
+
+
+def test_a_run_refuses_a_victim_that_is_a_surrogate() -> None:
+    parts = {"defense": choose("defense", "none"), "world": choose("world", "camera"), "threat": PatchThreat()}
+    attack = choose("attack", "transfer", surrogates="fcos+yolov5")
+    Pair(attack=attack, victim=choose("victim", "yolov3_tiny"), **parts)
+    with pytest.raises(UserError, match=r"does not fit victim 'yolov5', which attack\.surrogates=fcos\+yolov5 names"):
+        Pair(attack=attack, victim=choose("victim", "yolov5"), **parts)
 
 
 @pytest.mark.parametrize(
