@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from attacks.eot import EOT, Loss
+from attacks.shake_drop import shake
 from bench.detection import STOP_SIGN, Detector, DetectorVictim, PatchOracle, Predictions, Scenes
 from bench.errors import UserError
 from bench.plugins.contracts import Access, Facts, Progress
@@ -28,8 +29,8 @@ class Transfer(EOT):
 
     `eot` on surrogates: detectors of the zoo, each as it is without a defence. They take turns, a step each, so that the loss is
     in the mean that of all of them. The victim answers no question, so this is the attack of somebody who knows nothing about it.
-    A run refuses a victim that is among the surrogates: on it the attack would be a white box. `cutout`, one of the tricks of
-    T-SEA, keeps the patch from relying on one small part; their ShakeDrop, which drops blocks inside of a network, is not here.
+    A run refuses a victim that is among the surrogates: on it the attack would be a white box. Two tricks of T-SEA keep the patch
+    from relying on one small part of itself (`cutout`), and on one network (`shake_drop`).
 
     Args:
         surrogates: names of detectors, joined by "+" (default yolov5+fcos).
@@ -38,6 +39,7 @@ class Transfer(EOT):
         tv: weight of the total variation (default 0.05).
         window: side in pixels of the square window around the sign (default 160).
         cutout: probability that a random square of the patch is grey in a view (default 0.9, as in T-SEA).
+        shake_drop: probability that a residual branch of a surrogate is scaled at random in a step (default 0; T-SEA: 0.5).
 
     The other parameters are those of `eot`, without `target`: surrogates tell of the stop sign alone.
 
@@ -56,9 +58,13 @@ class Transfer(EOT):
     tv: NotNegative = 0.05
     window: Count = 160
     cutout: Share = 0.9
+    shake_drop: Share = 0.0
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
-        return super().craft(_InsteadOfTheVictim(self._detectors(), oracle), scenes, progress)
+        detectors = self._detectors()
+        if self.shake_drop and not sum(shake(each, self.shake_drop, oracle.generator) for each in detectors):
+            raise UserError(f"attack.shake_drop={self.shake_drop:g}: {self.surrogates} has no residual branches")
+        return super().craft(_InsteadOfTheVictim(detectors, oracle), scenes, progress)
 
     def misfit(self, victim: DetectorVictim) -> str:
         """A patch against the victim itself would not be one of somebody who knows nothing about it."""

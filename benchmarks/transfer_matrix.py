@@ -1,7 +1,7 @@
 """Scores detectors under patches that were crafted against other detectors, and against several at once (`transfer`).
 
     python benchmarks/transfer_matrix.py [--detectors yolov3_tiny yolov5 fcos rcnn] [--hardened yolov3_tiny] [--steps 600]
-        [--cutout 0.9] [--lanes 3 4] [--weathers clear rain] [--rows rcnn]
+        [--cutout 0.9] [--shake-drop 0] [--lanes 3 4] [--weathers clear rain] [--rows rcnn]
 
 Each row is a patch, each column a detector that sees it; hardened detectors have columns only. On the diagonal the attack is a
 white box. The last row is the universal patch, crafted against all. `--rows` names the surrogates of the rows to make, joined
@@ -32,6 +32,7 @@ def main() -> None:
     parser.add_argument("--hardened", nargs="*", default=[], help="detectors that are scored hardened, too")
     parser.add_argument("--steps", type=int, default=Transfer.steps)
     parser.add_argument("--cutout", type=float, default=Transfer.cutout)
+    parser.add_argument("--shake-drop", type=float, default=Transfer.shake_drop)
     parser.add_argument("--lanes", nargs="+", type=int, default=[3, 4])
     parser.add_argument("--weathers", nargs="+", default=["clear", "rain"])
     parser.add_argument("--rows", nargs="+", default=[], help="make only these rows")
@@ -50,7 +51,9 @@ def main() -> None:
     for surrogates in asked.rows or ("nothing", *asked.detectors, *universal):
         patch = None
         if surrogates != "nothing":
-            attack = Transfer(surrogates=surrogates, steps=asked.steps, cutout=asked.cutout)
+            attack = Transfer(
+                surrogates=surrogates, steps=asked.steps, cutout=asked.cutout, shake_drop=asked.shake_drop
+            )
             victim = next(iter(seeing.values()))
             patch = craft(attack, victim, scenes, threat, attack_seed=0, progress=lambda share, text: None)
         stops = [

@@ -7,13 +7,15 @@ import torch
 from torch import Tensor
 
 from attacks.eot import CUT, EOT, cut_out
+from attacks.shake_drop import branches, shake
 from attacks.transfer import Transfer, _Turns
 from bench.detection import PatchThreat
 from bench.detection.crafting import craft
 from bench.errors import UserError
 from bench.plugins.pair import Pair, choose
+from bench.victims.detectors.fcos import FCOS
 from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
-from bench.victims.detectors.yolov5 import YOLOv5
+from bench.victims.detectors.yolov5 import Bottleneck, YOLOv5
 from tests.attacks.test_eot import SCENES
 from tests.conftest import FACTS
 from tests.framework.toy_camera import RedDetector
@@ -66,6 +68,46 @@ def test_a_run_refuses_a_victim_that_is_a_surrogate() -> None:
     Pair(attack=attack, victim=choose("victim", "yolov3_tiny"), **parts)
     with pytest.raises(UserError, match=r"does not fit victim 'yolov5', which attack\.surrogates=fcos\+yolov5 names"):
         Pair(attack=attack, victim=choose("victim", "yolov5"), **parts)
+
+
+def test_shaken_branches_are_scaled_by_one_factor_an_image_and_their_gradients_by_others() -> None:
+    block = Bottleneck(4, shortcut=True).double().eval()
+    block.requires_grad_(False)
+    x = torch.rand(3000, 4, 5, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).requires_grad_(True)
+    wanted = block(x) - x
+    assert shake(block, 0.5, torch.Generator().manual_seed(0)) == 1
+    factors, gradients = [], []
+    for _ in range(12):
+        branch = block(x) - x
+        scale = branch / wanted
+        assert torch.allclose(scale, scale.mean((1, 2, 3), keepdim=True).expand_as(scale), atol=1e-3)
+        factors.append(scale.mean((1, 2, 3)))
+        (slope,) = torch.autograd.grad(branch.sum(), x, retain_graph=True)
+        (plain,) = torch.autograd.grad(wanted.sum(), x, retain_graph=True)
+        gradients.append((slope / plain).flatten(1).median(1).values)
+    shaken = torch.tensor([bool((each - 1).abs().max() > 1e-3) for each in factors])
+    assert 2 <= shaken.sum() <= 10
+    for forwards, backwards in zip(factors, gradients, strict=True):
+        if (forwards - 1).abs().max() < 1e-3:
+            assert torch.allclose(backwards, torch.ones_like(backwards), atol=1e-3)
+            continue
+        for drawn in (forwards, backwards):
+            assert 0 <= drawn.min() < 0.02
+            assert 1.98 < drawn.max() <= 2.001
+            assert abs(drawn.mean() - 1) < 0.06
+        assert abs(torch.corrcoef(torch.stack((forwards, backwards)))[0, 1]) < 0.1
+
+
+def test_shake_drop_draws_from_the_seed_and_needs_residual_branches() -> None:
+    options = {"texels": 16, "steps": 2, "batch": 2, "window": 160}
+    plain, shaken, again = (
+        crafted(Transfer(surrogates="yolov5", shake_drop=share, **options))[0] for share in (0.0, 1.0, 1.0)
+    )
+    assert torch.equal(shaken, again)
+    assert not torch.equal(shaken, plain)
+    assert [len(list(branches(each.load(0, FACTS)))) for each in (YOLOv5(), FCOS(), YOLOv3Tiny())] == [7, 7, 0]
+    with pytest.raises(UserError, match=r"attack\.shake_drop=0\.5: yolov3_tiny has no residual branches"):
+        crafted(Transfer(surrogates="yolov3_tiny", shake_drop=0.5, **options))
 
 
 @pytest.mark.parametrize(
