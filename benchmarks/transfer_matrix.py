@@ -61,7 +61,7 @@ def main() -> None:
             for detector in seeing.values()
         ]
         print(
-            f"{'all' if BETWEEN in surrogates else surrogates:<20}" + "".join(f"{stop:>15.2f}" for stop in stops),
+            f"{'all' if surrogates in universal else surrogates:<20}" + "".join(f"{stop:>15.2f}" for stop in stops),
             flush=True,
         )
 
