@@ -20,6 +20,7 @@ from bench.detection.approach import score
 from bench.detection.crafting import craft
 from bench.errors import in_one_line
 from bench.plugins import registry
+from bench.plugins.pair import choose
 from bench.run.process import settle
 from envs.camera.world import StopSignApproach
 
@@ -51,9 +52,8 @@ def main() -> None:
     for surrogates in asked.rows or ("nothing", *asked.detectors, *universal):
         patch = None
         if surrogates != "nothing":
-            attack = Transfer(
-                surrogates=surrogates, steps=asked.steps, cutout=asked.cutout, shake_drop=asked.shake_drop
-            )
+            options = {"steps": asked.steps, "cutout": asked.cutout, "shake_drop": asked.shake_drop}
+            attack = choose("attack", "transfer", surrogates=surrogates, **options).component
             victim = next(iter(seeing.values()))
             patch = craft(attack, victim, scenes, threat, attack_seed=0, progress=lambda share, text: None)
         stops = [
