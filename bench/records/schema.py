@@ -118,6 +118,13 @@ PROBES: tuple[pa.Field, ...] = (
         nullable=True,
     ),
     field(
+        "nan_gradients",
+        FLOAT,
+        "gradients of the attack with a NaN or infinite entry, which then counted as 0",
+        "share, 0 to 1",
+        nullable=True,
+    ),
+    field(
         "redrawn",
         FLOAT,
         "probes on which the victim gave different scores to the same input: it is random",
