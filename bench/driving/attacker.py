@@ -96,7 +96,7 @@ class Attacker:
         counts = torch.zeros(4, observation.shape[0], dtype=torch.int64)
         excess = observation.new_zeros(observation.shape[0])
         if self.attack is None:
-            return Shown(observation, *counts, excess)
+            return Shown(observation, counts[0], counts[1], counts[2], counts[3], excess)
         if not self.begun:
             self._begin(self.attack, observation, policy_state)
         if self.frames is not None:
@@ -111,7 +111,7 @@ class Attacker:
             self.changed += (perturbed != observation).flatten(1).any(1)
             counts[:, rows] = torch.stack(self.enforcer.counts)
         milliseconds = (time.perf_counter() - start) * 1000
-        return Shown(perturbed, *counts, excess, milliseconds)
+        return Shown(perturbed, counts[0], counts[1], counts[2], counts[3], excess, milliseconds)
 
     def _begin(self, attack: DrivingAttack, observation: Tensor, policy_state: State) -> None:
         """Get the attack's initial state. It may not query the victim: no record would count these queries.

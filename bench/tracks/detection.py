@@ -15,7 +15,7 @@ from bench.plugins import registry
 from bench.plugins.contracts import Progress
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
-from bench.records.schema import FLOAT, PROBES, TEXT, field
+from bench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, TEXT, field
 
 if TYPE_CHECKING:
     from bench.recording.film import Film
@@ -190,7 +190,7 @@ class DetectionTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("patch",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP, *CERTIFIED)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP, *CERTIFIED, NAN_GRADIENTS)
     of_older: ClassVar[Mapping[str, str]] = {"stop_score": "confidence_mean"}
     scored_with: ClassVar[str] = "decoy_confidence"
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
-from bench.records.schema import FLOAT, PROBES, field
+from bench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, field
 
 if TYPE_CHECKING:
     from bench.driving import DrivingVictim, DrivingWorld
@@ -101,7 +101,7 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS)
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"
