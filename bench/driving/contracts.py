@@ -112,6 +112,14 @@ class DrivingVictim(Victim):
     def action_type(self) -> ActionType:
         """Whether it takes discrete lane-changing decisions or outputs continuous acceleration and steering."""
 
+    @property
+    def draws(self) -> bool:
+        """Whether its policies may draw from the random generators of the process when they answer.
+
+        That is measured and flagged. One that comes from outside may not, because nobody could repeat its score.
+        """
+        return True
+
     @abstractmethod
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         """The policy of training seed `seed`, in eval mode, without gradients on its weights.

@@ -277,6 +277,22 @@ class Track(ABC):
         """
         return None
 
+    def try_network(self, network: Any, pair: Pair, cells: Sequence[Cell]) -> list[str]:
+        """Try the loaded network of a pair before a run: is it what attacks, probes and replays rely on?
+
+        Args:
+            network: the defended victim; it is not driven afterwards.
+            pair: the pair.
+            cells: cells of the run.
+
+        Returns:
+            Warnings, each the end of a sentence that begins with the network.
+
+        Raises:
+            UserError: the end of such a sentence, if its score would be wrong.
+        """
+        return []
+
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         """Write the recording of an episode.
 

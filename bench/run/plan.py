@@ -35,7 +35,7 @@ def loadings(config: RunConfig, *, baselines: bool = True) -> list[Loading]:
     found: dict[str, Loading] = {}
     for pair in _pairs(config) if baselines else config.pairs:
         for training_seed in _training_seeds(pair, config):
-            loading = Loading(pair=pair, training_seed=training_seed)
+            loading = Loading(pair=pair, training_seed=training_seed, cells=config.grid.cells())
             found.setdefault(key_of(loading), loading)
     return list(found.values())
 

@@ -18,7 +18,7 @@ from typing import Protocol
 import pyarrow as pa
 
 from bench import files
-from bench.errors import UserError
+from bench.errors import RefusedNetworkError, UserError, message
 from bench.plugins.track import Track
 from bench.records import packing, store
 from bench.records.finished import finished as finished_units
@@ -98,13 +98,20 @@ def _loaded(config: RunConfig, back_end: Executor, watcher: RunWatcher, failures
         if any(is_foreign(part) for part in loading.pair.parts):
             foreign.append(Task(work=loading))
         else:
-            weights[key_of(loading)] = loading.weights()
+            try:
+                weights[key_of(loading)], warnings = loading.tried()
+            except RefusedNetworkError as error:
+                raise UserError(f"{loading} is refused: {message(error)}") from error
+            for line in warnings:
+                watcher.warn(line)
     with closing(back_end.map(foreign, watcher)) as finished:
         for task, outcome in chain.from_iterable(finished):
             assert isinstance(task.work, Loading)
             if isinstance(outcome, Outcome):
                 assert outcome.weights is not None
                 weights[key_of(task.work)] = outcome.weights
+                for line in outcome.warnings:
+                    watcher.warn(line)
             elif outcome.bad_input:
                 raise UserError(f"{task.work} {outcome.why}")
             elif line := failures.add(task.work, outcome):

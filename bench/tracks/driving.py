@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
 from bench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, field
+from bench.scenarios import Cell
 
 if TYPE_CHECKING:
     from bench.driving import DrivingVictim, DrivingWorld
@@ -206,6 +207,17 @@ class DrivingTrack(Track):
 
     def identity(self, pair: Pair) -> Mapping[str, object]:
         return {"action_type": _parts(pair)[0].action_type}
+
+    def try_network(self, network: Any, pair: Pair, cells: Sequence[Cell]) -> list[str]:
+        from bench.trial.policy import try_policy
+
+        victim, world = _parts(pair)
+        if not victim.sees:
+            return []
+        gradients = victim.answers == "gradients"
+        return try_policy(
+            network, world, cells, gradients=gradients, random=victim.draws or pair.defense.name != "none"
+        )
 
     def drive(self, job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
         from bench.driving.drive import drive

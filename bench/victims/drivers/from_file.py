@@ -99,6 +99,10 @@ class FileDriver(DrivingVictim):
     def action_type(self) -> ActionType:
         return self.actions
 
+    @property
+    def draws(self) -> bool:
+        return False
+
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         """The policy in the file, for any seed.
 

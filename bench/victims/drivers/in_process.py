@@ -38,6 +38,10 @@ class InProcess(DrivingVictim):
         return self.actions
 
     @property
+    def draws(self) -> bool:
+        return not all(isinstance(policy, FilePolicy) for policy in self.policies)
+
+    @property
     def seeded(self) -> bool:
         return len(self.policies) > 1
 
