@@ -16,6 +16,7 @@ from bench.plugins.contracts import Progress
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
 from bench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, TEXT, field
+from bench.scenarios import Cell
 
 if TYPE_CHECKING:
     from bench.recording.film import Film
@@ -286,6 +287,13 @@ class DetectionTrack(Track):
         from bench.detection.crafting import prepare
 
         return prepare(job, made_by, progress)
+
+    def try_network(self, network: Any, pair: Pair, cells: Sequence[Cell]) -> list[str]:
+        from bench.trial.detector import try_detector
+
+        victim: Any = pair.victim.component
+        world: Any = pair.world.component
+        return try_detector(network, victim, world, alone=pair.defense.name == "none") if victim.sees else []
 
     def drive(self, job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
         from bench.detection.drive import drive

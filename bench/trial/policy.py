@@ -67,12 +67,14 @@ def try_policy(
         UserError: the end of such a sentence, if its score would be wrong: it is in training mode, answers NaN, depends on the
             rest of the batch, or remembers what it is not given.
     """
-    if training := [name or "itself" for name, module in policy.named_modules() if module.training]:
-        raise UserError(f"is in training mode ({training[0]}): call eval() on it")
+    if policy.training:
+        raise UserError("is in training mode: call eval() on it")
     own = Stream("trial")
     with own.in_use():
-        moments = list(_moments(policy, _observed(world, tuple(cells), policy.action_type)))
-        _try_shape(policy, world, moments[0])
+        moments = []
+        for moment in _moments(policy, _observed(world, tuple(cells), policy.action_type)):
+            _try_answer(policy, world, moment)
+            moments.append(moment)
         drew = _try_memory(policy, moments, own)
         if drew and not random:
             raise UserError(
@@ -130,7 +132,8 @@ def _answer(policy: Policy, moment: Moment) -> Tensor:
         return policy.scores(moment.observation.clone(), None if moment.state is None else moment.state.clone())
 
 
-def _try_shape(policy: Policy, world: DrivingWorld, moment: Moment) -> None:
+def _try_answer(policy: Policy, world: DrivingWorld, moment: Moment) -> None:
+    """Raise UserError if an answer is no tensor of finite numbers, one for each action."""
     scores = _answer(policy, moment)
     width = len(world.facts.actions) if policy.action_type == "discrete" else 2
     if type(scores) is not Tensor or not scores.is_floating_point():
@@ -152,14 +155,16 @@ def _try_memory(policy: Policy, moments: Sequence[Moment], own: Stream) -> bool:
     Raises:
         UserError: if an answer depends on earlier calls, or a call leaves something behind.
     """
-    for moment in moments:
-        _answer(policy, moment)
-    before, marks = kept(policy), own.marks()
+    # What is kept for each size of a batch is there after this.
     first = [_answer(policy, moment) for moment in moments]
-    _answer(policy, moments[-1].of(torch.arange(EPISODES).flip(0)))
+    marks, before = own.marks(), kept(policy)
+    left: list[str] = []
+    for moment in moments:
+        _answer(policy, moment.of(torch.arange(EPISODES).flip(0)))
+        left = left or changed(before, kept(policy))
     again = [_answer(policy, moment) for moment in moments]
     drew = own.marks() != marks
-    if left := changed(before, kept(policy)):
+    if left:
         raise UserError(
             f"remembers earlier calls in {left[0]!r}: attacks and probes ask it between two decisions, so what it remembers must "
             "be in its state (Policy.initial and Policy.advance; docs/plugins.md)"
