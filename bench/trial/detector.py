@@ -67,11 +67,9 @@ def try_detector(detector: Detector, victim: DetectorVictim, world: CameraWorld,
         Warnings, each the end of a sentence that begins with the detector.
 
     Raises:
-        UserError: the end of such a sentence, if its score would be wrong: it is in training mode, answers NaN, depends on the
+        UserError: the end of such a sentence, if its score would be wrong: it answers NaN, depends on the
             rest of the batch, or remembers what it is not given.
     """
-    if detector.training:
-        raise UserError("is in training mode: call eval() on it")
     with Stream("trial").in_use():
         windows = Windows.of(world.training_scenes(), detector.stride)
         label = detector.index(STOP_SIGN)

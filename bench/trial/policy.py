@@ -64,11 +64,9 @@ def try_policy(
         Warnings, each the end of a sentence that begins with the policy.
 
     Raises:
-        UserError: the end of such a sentence, if its score would be wrong: it is in training mode, answers NaN, depends on the
+        UserError: the end of such a sentence, if its score would be wrong: it answers NaN, depends on the
             rest of the batch, or remembers what it is not given.
     """
-    if policy.training:
-        raise UserError("is in training mode: call eval() on it")
     own = Stream("trial")
     with own.in_use():
         moments = []
