@@ -115,8 +115,9 @@ def victim_of(
         raise UserError("an empty list of victims")
     observation = _observations(world.component, grid)
     try:
-        told = trained_in or _trained_in(objects, world, grid)
-        victim = in_process(objects, world.component.facts, observation, actions, told)
+        victim = in_process(
+            objects, world.component.facts, observation, actions, lambda: _trained_in(objects, world, grid, trained_in)
+        )
     except ValueError as error:
         raise UserError(str(error)) from error
     code = code_of_policies(victim)
@@ -124,18 +125,19 @@ def victim_of(
     return Chosen(kind="victim", name=label, component=victim, code=code)
 
 
-def _trained_in(objects: Sequence[object], world: Chosen[Any], grid: Grid) -> str:
-    """The world in which objects were trained, if all of them have their environments and these agree; otherwise `unknown`.
+def _trained_in(objects: Sequence[object], world: Chosen[Any], grid: Grid, stated: str | None) -> str:
+    """The world in which objects were trained: the stated one, or what their environments say if they agree, or `unknown`.
 
     Raises:
         UserError: if an environment changes observations or actions in a way that the world does not.
     """
-    found: set[str] = set()
-    for one in objects:
-        training = training_of(one) if is_model(one) else None
-        if training is None:
-            return UNKNOWN
-        found.add(training.world_of(world, grid, lambda own: str(chosen("world", own))))
+    trainings = [training_of(one) if is_model(one) else None for one in objects]
+    found = {
+        UNKNOWN if training is None else training.world_of(world, grid, lambda own: str(chosen("world", own)))
+        for training in trainings
+    }
+    if stated is not None:
+        return stated
     return found.pop() if len(found) == 1 else UNKNOWN
 
 

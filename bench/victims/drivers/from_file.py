@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from bench.errors import UserError
+from bench.errors import UserError, short
 from bench.plugins.ranges import Count
 from bench.victims.drivers.spaces import CONTROLS, UNKNOWN, Bounds, Expected
 from bench.victims.files.trial import RefusedError, failure, hashed, refuse_harm
@@ -209,10 +210,10 @@ def check_trained_in(world: str) -> None:
     Raises:
         ValueError: in one line.
     """
-    if not world.strip() or world != world.strip() or not world.isprintable():
+    if not world.isprintable() or not re.fullmatch(r"[^\s()]+(\(.*\))?", world):
         raise ValueError(
-            f"trained_in must be the world of the training as tables print it, for instance highway, got {world!r}; "
-            "leave it out if you do not know it"
+            "trained_in must be the world of the training as tables print it, for instance highway or "
+            f"highway(preset=thesis), got {short(world)!r}; leave it out if you do not know it"
         )
 
 

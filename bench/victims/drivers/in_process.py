@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -68,7 +68,7 @@ def in_process(
     facts: DrivingFacts,
     observation: Tensor,
     actions: str | None,
-    trained_in: str = UNKNOWN,
+    trained_in: Callable[[], str] = lambda: UNKNOWN,
 ) -> InProcess:
     """The victim of one object, or of several trainings of one policy.
 
@@ -77,7 +77,7 @@ def in_process(
         facts: facts of the world.
         observation: some observations of the world [B, V, F], to try the networks on.
         actions: type of actions of a torch network; None infers it from the size of its output.
-        trained_in: the world of their training.
+        trained_in: says the world of their training; called once they fit.
 
     Raises:
         UserError: if an object is no policy, does not fit the world, or the objects differ in their actions.
@@ -90,7 +90,7 @@ def in_process(
             f"a list of victims holds the trainings of one policy, got {', '.join(sorted(sources))} with "
             f"{' and '.join(sorted(types))} actions; score them one by one"
         )
-    victim = InProcess(source=sources.pop(), actions=types.pop(), trained_in=trained_in)
+    victim = InProcess(source=sources.pop(), actions=types.pop(), trained_in=trained_in())
     object.__setattr__(victim, "policies", policies)
     if any(is_model(one) for one in objects):
         object.__setattr__(victim, "libraries", (LIBRARY,))

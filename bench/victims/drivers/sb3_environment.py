@@ -60,10 +60,12 @@ class Training:
 
     def _of_gym(self, world: DrivingWorld, grid: Grid) -> Training | None:
         """The environment of a world that is made of a gymnasium environment."""
-        made = getattr(world, "environment", None)
-        if made is None:
+        # A model of Stable-Baselines3 comes with gymnasium; a run without one needs none.
+        from bench.gym.world import GymWorld
+
+        if not isinstance(world, GymWorld):
             return None
-        env = made(grid.cells()[0])
+        env = world.environment(grid.cells()[0])
         try:
             return chain(env)
         finally:

@@ -100,7 +100,7 @@ def _saved(given: str, sha256: str) -> Saved:
     try:
         return _read(given, json.loads(text))
     # Text of a stranger: it may be no JSON, or JSON of another form.
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         raise UserError(f"{given} cannot be read: it is not {FORMAT}, or a damaged one") from error
 
 
@@ -147,7 +147,7 @@ def _algorithm(name: str, data: Mapping[str, Any]) -> Algorithm:
     family = POLICIES.get(module)
     made = re.search(r"<function (\w+)\.", str(data["policy_class"].get("__init__")))
     policy = made[1] if made else ""
-    if family is None or policy.startswith(("Cnn", "MultiInput")) or "Cnn" in policy or "MultiInput" in policy:
+    if family is None or "Cnn" in policy or "MultiInput" in policy:
         raise UserError(f"{name} has the policy {short(f'{module}.{policy}'.rstrip('.'))}; {ONLY}")
     if family == ("ppo", "a2c"):
         # TRPO of sb3-contrib uses the same class of policies.
@@ -187,4 +187,4 @@ def _numbers(text: str, count: int) -> tuple[float, ...]:
 
 def _array(value: Any, size: int) -> NDArray[np.float32] | None:
     pickled = value.get(":serialized:") if isinstance(value, dict) else None
-    return floats(pickled, size) if isinstance(pickled, str) else None
+    return floats(pickled, size) if isinstance(pickled, str) and size > 0 else None

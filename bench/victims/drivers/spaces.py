@@ -99,7 +99,11 @@ class Expected:
         """
         shape = tuple(shape)
         rows, features = self.shape
-        own = shape in self._both((rows, features)) if rows else _has_rows(shape, features)
+        if self.facts.flat:
+            # Flattened it could be an array of the environment with another entry.
+            own = shape == (rows, features)
+        else:
+            own = shape in self._both((rows, features)) if rows else _has_rows(shape, features)
         native = self.facts.flat and shape in self._both(self.native)
         if native and (bounds is None or not self._beyond(bounds)):
             return self.facts.native

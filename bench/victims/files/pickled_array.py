@@ -18,7 +18,7 @@ def floats(pickled: str, size: int) -> NDArray[np.float32] | None:
 
     Args:
         pickled: the pickle, in base64.
-        size: numbers in a row of the array.
+        size: numbers in a row of the array, at least 1.
 
     Returns:
         None if the pickle cannot be read, or has no such block or several.
