@@ -113,9 +113,12 @@ def _policy(given: object, facts: DrivingFacts, observation: Tensor, actions: st
     elif isinstance(given, nn.Module):
         policy = _of_module(given, facts, observation, actions)
     else:
+        hint = ""
+        if hasattr(given, "step") and hasattr(given, "reset"):
+            hint = ". An environment is no policy; as a world it is a subclass of cavbench.gym.GymWorld"
         raise UserError(
             f"a victim is a name, a bench.driving.Policy, a torch.nn.Module or a model of Stable-Baselines3, "
-            f"got {type(given).__name__}"
+            f"got {type(given).__name__}{hint}"
         )
     policy.weights_sha256 = policy.weights_sha256 or state_digest(policy)
     try:
@@ -157,8 +160,10 @@ def _of_module(module: nn.Module, facts: DrivingFacts, observation: Tensor, acti
     """The policy of a network that takes observations [N, V, F], flattened or not, or flat ones in a flat world."""
     name = type(module).__name__
     network = ActorNetwork(module) if is_actor(module) else copy.deepcopy(module)
-    # Networks of other precisions compute in float32, as the world does.
-    network = network.cpu().float().eval()
+    network = network.cpu().eval()
+    # The weights of another precision compute in float32, as the world does.
+    if any(weight.is_floating_point() and weight.dtype != torch.float32 for weight in network.parameters()):
+        network = network.float()
     native = facts.native(observation)
     first, flat = tuple(native.shape[1:]), (native[0].numel(),)
     answers: dict[tuple[int, ...], Tensor] = {}

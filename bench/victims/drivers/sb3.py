@@ -140,6 +140,10 @@ def _network(saved: Saved, weights: dict[str, Tensor]) -> nn.Sequential:
         raise UserError(
             f"{saved.name} has the weights {strange[0]!r}, which no MlpPolicy of {saved.algorithm} has; {ONLY}"
         )
+    if any(key.endswith("weight") and weight.ndim != 2 for key, weight in weights.items()):
+        raise UserError(
+            f"{saved.name} has layers with weights between its linear ones ({saved.activation.__name__}); {ONLY}"
+        )
     layers = [layer for stem in stems for layer in _layers(weights, stem)]
     if not layers:
         raise UserError(f"{saved.name} has no {saved.algorithm} policy: {stems[0]} is not among its weights")

@@ -82,8 +82,8 @@ class ModelNetwork(nn.Module):
         self.policy = _copied(model.policy).cpu()
         self.policy.set_training_mode(False)
         if self.action_type == "continuous":
-            self.register_buffer("low", torch.as_tensor(actions.low))
-            self.register_buffer("high", torch.as_tensor(actions.high))
+            self.register_buffer("low", torch.as_tensor(actions.low).flatten())
+            self.register_buffer("high", torch.as_tensor(actions.high).flatten())
         self._set_normalisation(model.get_vec_normalize_env())
 
     def _set_normalisation(self, env: Any) -> None:
@@ -148,7 +148,11 @@ class ModelNetwork(nn.Module):
             same = bool((answer.argmax(-1).numpy() == wanted).all())
         else:
             shown = self.low + (answer.clamp(-1, 1) + 1) / 2 * (self.high - self.low)
-            same = bool(np.allclose(shown.numpy(), wanted, atol=CLOSE * float((self.high - self.low).max())))
+            same = bool(
+                np.allclose(
+                    shown.numpy(), wanted.reshape(shown.shape), atol=CLOSE * float((self.high - self.low).max())
+                )
+            )
         if not same:
             raise UserError(
                 f"{type(self.policy).__name__} of the model acts otherwise than its predict(deterministic=True). {INSTEAD}"

@@ -76,9 +76,9 @@ class Saved:
         if named is None:
             return nn.Tanh if self.algorithm in ("ppo", "a2c") else nn.ReLU
         match = re.fullmatch(r"<class 'torch\.nn\.modules\.activation\.(\w+)'>", str(named))
-        if match is None:
+        activation = getattr(nn, match[1], None) if match else None
+        if not (isinstance(activation, type) and issubclass(activation, nn.Module)):
             raise UserError(f"{self.name} has the activation {short(str(named))}, which is not one of torch's")
-        activation: type[nn.Module] = getattr(nn, match[1])
         return activation
 
 
@@ -148,7 +148,7 @@ def _algorithm(name: str, data: Mapping[str, Any]) -> Algorithm:
     made = re.search(r"<function (\w+)\.", str(data["policy_class"].get("__init__")))
     policy = made[1] if made else ""
     if family is None or "Cnn" in policy or "MultiInput" in policy:
-        raise UserError(f"{name} has the policy {short(f'{module}.{policy}'.rstrip('.'))}; {ONLY}")
+        raise UserError(f"{name} has the policy {short(policy or module)} of {short(module)}; {ONLY}")
     if family == ("ppo", "a2c"):
         # TRPO of sb3-contrib uses the same class of policies.
         if "cg_max_steps" in data:

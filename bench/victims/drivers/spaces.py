@@ -145,7 +145,7 @@ class Expected:
             why = "; highway-env's own tasks (Box(-inf, inf, …)) have other ranges, rows, order and decision rate"
         elif rows and shape not in self._both((rows, features)) and math.prod(shape) == rows * features:
             why = "; these are as many numbers in another arrangement"
-        elif not facts.flat and shape and shape[-1] == features and (bounds is None or not bounds.unbounded):
+        elif not facts.flat and len(shape) == 2 and shape[1] == features and (bounds is None or not bounds.unbounded):
             why = "; if it was trained in this world with other options, score it with the same (world.…=)"
         return (
             f"{name} {takes}, this world shows {wanted}{why}. Train it in {source}, or give cavbench.score a "
