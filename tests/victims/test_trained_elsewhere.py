@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -227,3 +228,15 @@ def test_a_part_of_a_model_that_does_not_sample_is_a_network() -> None:
     model = sb3_model("dqn", spaces(continuous=False))
     observation = torch.from_numpy(OBSERVATION)
     torch.testing.assert_close(loaded(model.q_net).scores(observation), loaded(model).scores(observation))
+
+
+def test_where_a_world_does_not_say_its_rows_the_policy_refuses_what_it_was_not_trained_on(tmp_path: Path) -> None:
+    facts = dataclasses.replace(WORLD.facts, rows=None)
+    policy = loaded(Path(saved(tmp_path / "m.zip", "dqn", spaces(continuous=False, shape=(5, 5)))["path"]), facts)
+    assert policy.scores(torch.zeros(3, 5, 5)).shape == (3, 5)
+    with pytest.raises(UserError, match=r"the policy takes observations \(5, 5\), this world shows \(10, 5\)"):
+        policy.scores(torch.zeros(3, 10, 5))
+    with pytest.raises(
+        UserError, match=r"was trained on Box\(-1, 1, \(10, 7\)\), this world shows Box\(-1, 1, \(V, 5\)\)"
+    ):
+        loaded(Path(saved(tmp_path / "n.zip", "dqn", spaces(continuous=False, shape=(10, 7)))["path"]), facts)
