@@ -190,8 +190,8 @@ class Bounded(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
         (Bounded, r"was trained on Box\(-1, 1, \(4,\)\), this world shows .* with x from -4.8 to 4.8"),
     ],
 )
-def test_a_model_of_other_observations_is_refused_alike_from_python_and_from_a_file(
-    cartpole: Any, tmp_path: Path, wrap: Any, line: str
+def test_a_model_of_other_observations_is_refused_alike_from_python_from_a_file_and_by_the_command(
+    cartpole: Any, bench: Bench, tmp_path: Path, wrap: Any, line: str
 ) -> None:
     sb3 = pytest.importorskip("stable_baselines3")
     world = cartpole.CartPole(max_steps=20)
@@ -202,6 +202,14 @@ def test_a_model_of_other_observations_is_refused_alike_from_python_and_from_a_f
             cavbench.score(victim, "none", world=world, pole=0.5, episodes=1, baselines=False, out=tmp_path)
         assert "\n" not in str(error.value)
         assert "defense" not in str(error.value)
+    words = (
+        f"attack=none world=cartpole victim=sb3 victim.path={tmp_path}/model.zip pole=0.5 episodes=1 executor=serial"
+    )
+    said = bench("run", *words.split(), f"out={tmp_path / 'results'}")
+    assert said.code != 0
+    assert re.search(line, " ".join(said.err.split()))
+    assert "defense" not in said.err
+    assert "Traceback" not in said.err
 
 
 def test_the_environment_of_a_model_says_whether_it_was_trained_in_the_world(cartpole: Any, tmp_path: Path) -> None:
