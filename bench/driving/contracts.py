@@ -53,6 +53,14 @@ class DrivingWorld(World):
         return None
 
     @property
+    def observed_rows(self) -> int | None:
+        """V, the number of rows in its observations [B, V, F]; None if the world does not say.
+
+        Policies from files are checked against it before anything is driven.
+        """
+        return None
+
+    @property
     def facts(self) -> DrivingFacts:
         return DrivingFacts(
             axes=self.axes,
@@ -62,6 +70,7 @@ class DrivingWorld(World):
             features=self.features,
             drivers=self.drivers,
             kinematics=self.kinematics,
+            rows=self.observed_rows,
         )
 
     @abstractmethod

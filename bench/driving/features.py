@@ -61,12 +61,16 @@ class DrivingFacts(Facts):
             `oracle` a planner that knows the world's hidden state, if any.
         kinematics: how its cars move; None if the world does not say.
         flat: whether the observation is one row, which the world's own environment gives as a flat array in physical units.
+        rows: V, the number of rows in its observations; None if the world does not say.
+        environment: the call that makes the world's gymnasium environment, for messages; empty if the world does not say.
     """
 
     features: Features
     drivers: tuple[Driver, ...] = ("agent",)
     kinematics: Kinematics | None = None
     flat: bool = False
+    rows: int | None = None
+    environment: str = ""
 
     def native(self, observation: Tensor) -> Tensor:
         """The observation [..., V, F] in the format of the world's own environment, which policies from outside expect.
@@ -86,5 +90,6 @@ class DrivingFacts(Facts):
     def written(self) -> dict[str, Any]:
         values = super().written() | {"features": asdict(self.features), "drivers": list(self.drivers)}
         # No report reads them.
-        del values["kinematics"]
+        for name in ("kinematics", "rows", "environment"):
+            del values[name]
         return values

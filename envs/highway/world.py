@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from bench.driving import ActionType, Driver, DrivingWorld, Dynamics, Features, Kinematics
+from bench.driving import ActionType, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
+from bench.plugins.parameters import differing
 from bench.scenarios import Axes, Cell
 from envs.highway.axes import AXES, STANDARD_V2
 from envs.highway.config import (
@@ -93,6 +94,16 @@ class HighwayWorld(DrivingWorld):
         config = self.config((AXES.cell(lanes=3, density=1.0),))
         return Kinematics(frames=config.substeps, target_speeds=config.target_speeds, **KINEMATICS)
 
+    @property
+    def observed_rows(self) -> int:
+        preset_rows = 5 if self.preset == "thesis" else 10
+        return self.observed_vehicles if self.observed_vehicles is not None else preset_rows
+
+    @property
+    def facts(self) -> DrivingFacts:
+        options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
+        return replace(super().facts, environment=f'cavbench.gym.make("highway"{options})')
+
     def config(
         self,
         cells: Sequence[Cell],
@@ -103,7 +114,6 @@ class HighwayWorld(DrivingWorld):
     ) -> HighwayConfig:
         """The environment's full configuration; arguments as in `DrivingWorld.make`."""
         thesis = self.preset == "thesis"
-        rows = self.observed_vehicles if self.observed_vehicles is not None else (5 if thesis else 10)
         preset_speeds = THESIS_TARGET_SPEEDS if thesis else STANDARD_TARGET_SPEEDS
         return HighwayConfig(
             cells=tuple(cells),
@@ -116,7 +126,7 @@ class HighwayWorld(DrivingWorld):
             action_repeat=action_repeat,
             target_speeds=self.target_speeds if self.target_speeds is not None else preset_speeds,
             features=self.features,
-            observed_vehicles=rows,
+            observed_vehicles=self.observed_rows,
             offroad_terminal=self.offroad_terminal,
         )
 

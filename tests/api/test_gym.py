@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -150,8 +151,8 @@ def test_the_command_scores_a_file_in_it(cartpole: Any, bench: Bench, tmp_path: 
     env = cartpole.CartPole().environment(cartpole.CARTPOLE_V1.cells()[0])
     sb3.PPO("MlpPolicy", env, seed=0, device="cpu").save(tmp_path / "model.zip")
     words = (
-        f"attack=pgd attack.objective=margin world=cartpole victim=sb3 victim.path={tmp_path}/model.zip victim.algo=ppo "
-        "victim.rows=1 victim.features=4"
+        f"attack=pgd attack.objective=margin world=cartpole victim=sb3 victim.path={tmp_path}/model.zip "
+        "victim.trained_in=cartpole(max_steps=50)"
     )
     said = bench(
         "run",
@@ -164,6 +165,71 @@ def test_the_command_scores_a_file_in_it(cartpole: Any, bench: Bench, tmp_path: 
     )
     assert said.code == 0, said.err
     assert "pgd" in said.out
+
+
+def square(env: Any) -> Any:
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (2, 2), np.float32)
+    return gymnasium.wrappers.TransformObservation(env, lambda observation: observation.reshape(2, 2), box)
+
+
+class Bounded(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
+    """All entries on [-1, 1]: what a policy in other units was trained on."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.observation_space = gymnasium.spaces.Box(-1, 1, (4,), np.float32)
+
+    def observation(self, observation: Any) -> Any:
+        return np.tanh(observation)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "line"),
+    [
+        (square, r"was trained on Box\(-inf, inf, \(2, 2\)\), this world shows an array of shape \(4,\)"),
+        (Bounded, r"was trained on Box\(-1, 1, \(4,\)\), this world shows .* with x from -4.8 to 4.8"),
+    ],
+)
+def test_a_model_of_other_observations_is_refused_alike_from_python_from_a_file_and_by_the_command(
+    cartpole: Any, bench: Bench, tmp_path: Path, wrap: Any, line: str
+) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    world = cartpole.CartPole(max_steps=20)
+    model = sb3.DQN("MlpPolicy", wrap(world.environment(cartpole.CARTPOLE_V1.cells()[0])), buffer_size=10, seed=0)
+    model.save(tmp_path / "model.zip")
+    for victim in (model, cavbench.component("victim", "sb3", path=str(tmp_path / "model.zip"))):
+        with pytest.raises(cavbench.UserError, match=line) as error:
+            cavbench.score(victim, "none", world=world, pole=0.5, episodes=1, baselines=False, out=tmp_path)
+        assert "\n" not in str(error.value)
+        assert "defense" not in str(error.value)
+    words = (
+        f"attack=none world=cartpole victim=sb3 victim.path={tmp_path}/model.zip pole=0.5 episodes=1 executor=serial"
+    )
+    said = bench("run", *words.split(), f"out={tmp_path / 'results'}")
+    assert said.code != 0
+    assert re.search(line, " ".join(said.err.split()))
+    assert "defense" not in said.err
+    assert "Traceback" not in said.err
+
+
+def test_the_environment_of_a_model_says_whether_it_was_trained_in_the_world(cartpole: Any, tmp_path: Path) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    world = cartpole.CartPole(max_steps=20)
+
+    def scored(env: Any) -> str:
+        model = sb3.DQN("MlpPolicy", env, buffer_size=10, seed=0)
+        found = cavbench.score(
+            model, "none", world=world, pole=0.5, episodes=1, baselines=False, out=tmp_path, actions=None
+        )
+        return str(json.loads(found.records.victim_params[0])["trained_in"])
+
+    own = world.environment(cartpole.CARTPOLE_V1.cells()[0])
+    assert scored(own) == "cartpole(max_steps=20)"
+    assert scored(gymnasium.make("CartPole-v0")) == "CartPole-v0"
+    with pytest.raises(cavbench.UserError, match="was trained behind NormalizeObservation, which the world does not"):
+        scored(gymnasium.wrappers.NormalizeObservation(own))
+    # cavbench.gym.make gives one row on [-1, 1], which such a policy is given, too.
+    assert scored(cavbench.gym.make(world, pole=0.5)) == "cartpole(max_steps=20)"
 
 
 def test_an_environment_that_is_not_as_declared_is_refused(cartpole: Any) -> None:
