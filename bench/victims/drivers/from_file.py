@@ -64,7 +64,10 @@ class FilePolicy(Policy):
             raise UserError(f"the policy takes observations {self.shape}, this world shows {own}")
         if not leading.numel():
             return observation.new_zeros(*leading, self.width)
-        output = self.network(shown.reshape(-1, *self.shape)).to(observation.dtype)
+        output = self.network(shown.reshape(-1, *self.shape))
+        if output.is_complex():
+            raise UserError("answers complex numbers; scores are real numbers")
+        output = output.to(observation.dtype)
         output = output if self.action_type == "discrete" else output.clamp(-1, 1)
         return output.reshape(*leading, output.shape[-1])
 
