@@ -29,7 +29,8 @@ class ObservationThreat(ThreatModel):
         queries: largest number of policy evaluations per episode and step.
         share: share of the frames of a full episode that may be attacked, rounded down; the attack chooses the frames.
 
-    `presence` cannot be changed and absent rows cannot be filled. Values are clipped to [-1, 1], the range of every sensor.
+    `presence` and the `fixed` features of the world cannot be changed, and absent rows cannot be filled. Values are clipped to
+    [-1, 1], the range of every sensor.
     """
 
     norm: Norm = "relative"
@@ -43,7 +44,7 @@ class ObservationThreat(ThreatModel):
         return math.floor(self.share * steps + 1e-9)
 
     def radius(self, observation: Tensor, features: Features, scale: float = 1.0) -> Tensor:
-        """[..., V, F] the largest deviation of each entry, on the normalised scale; 0 for presence and absent rows.
+        """[..., V, F] the largest deviation of each entry, on the normalised scale; 0 for presence, fixed features, absent rows.
 
         Args:
             observation: the true observation [..., V, F].
@@ -61,6 +62,8 @@ class ObservationThreat(ThreatModel):
             physical = measured * half_range + centre
             bound = torch.maximum(budget * physical.abs(), floor) / half_range
         bound = bound * (observation[..., :1] > 0)
+        if features.fixed:
+            bound = bound * features.forgeable().to(bound)
         return torch.cat((torch.zeros_like(observation[..., :1]), bound), -1)
 
     def reach(self, rows: int, features: Features, steps: int) -> float:

@@ -24,10 +24,22 @@ class Loading:
     Args:
         pair: attack, defence, victim, world, threat model.
         training_seed: seed of the victim.
+        cells: cells to ask the world about (`doubts`); empty to leave it alone, for worlds that another loading asks.
     """
 
     pair: Pair
     training_seed: int
+    cells: tuple[Cell, ...] = ()
+
+    def doubts(self) -> tuple[str, ...]:
+        """What makes the scores doubtful, one line each.
+
+        Raises:
+            UserError: if the world cannot be driven in its cells.
+        """
+        world = self.pair.world
+        of_world = world.component.doubts(self.cells) if self.cells else ()
+        return (*(f"world {world}: {line}" for line in of_world), *track_of(self.pair).doubts(self.pair))
 
     def weights(self) -> tuple[str, str]:
         """The hashes of the weights of the defended victim, and of an attack that learns (otherwise empty).

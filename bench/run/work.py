@@ -200,8 +200,8 @@ def _performed(task: Task, tell: Tell) -> Outcome:
             artefact = work.track.prepare(work.job, canonical(work.origin), partial(tell, str(work)))
             return Outcome(wall_s=time.perf_counter() - start, artefact=artefact)
         case Loading() as loading:
-            weights = loading.weights()
-            return Outcome(wall_s=time.perf_counter() - start, weights=weights)
+            doubts, weights = loading.doubts(), loading.weights()
+            return Outcome(wall_s=time.perf_counter() - start, weights=weights, warnings=doubts)
 
 
 def _driven(unit: Unit, task: Task) -> Outcome:
