@@ -38,6 +38,11 @@ class ObservationThreat(ThreatModel):
     queries: Natural = 1000
     share: Share = 1.0
 
+    def slip(self) -> str:
+        if self.norm != "relative" or self.budget < 1:
+            return ""
+        return f"a budget of {self.budget:g} lets each value change by {100 * self.budget:g} % of itself"
+
     def frames(self, steps: int) -> int:
         """Number of frames that may be attacked in an episode of at most `steps` decisions: floor(share * steps)."""
         # A share such as 0.3 is a little below three tenths.

@@ -296,6 +296,10 @@ class ThreatModel:
         """The threat model of all clean runs, so that runs under different threat models share them."""
         return cls(budget=0.0, access="oblivious", queries=0)  # type: ignore[call-arg]
 
+    def slip(self) -> str:
+        """What its budget would mean, if that is probably a slip of the pen; empty otherwise. A user confirms it in per cent."""
+        return ""
+
     @property
     def columns(self) -> dict[str, Any]:
         """Its columns of records, `threat_NAME` for each field; `threat_share` is 1 where the track has no such limit."""
