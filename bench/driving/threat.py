@@ -25,7 +25,7 @@ class ObservationThreat(ThreatModel):
         norm: `relative`: each measured value of a present row may change by `budget` times its value, or by the feature's
             floor (scaled with the budget) if that is larger (thesis 4.3.1). `linf`: it may change by `budget` on the [-1, 1]
             scale (thesis 4.4.3, read as a range; a stress test).
-        budget: size of the set, in [0, 2].
+        budget: size of the set, in [0, 2]. Users may write it in per cent, 10% for 0.1, and must from 100 % of a value on.
         queries: largest number of policy evaluations per episode and step.
         share: share of the frames of a full episode that may be attacked, rounded down; the attack chooses the frames.
 
