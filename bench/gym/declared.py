@@ -12,6 +12,7 @@ from bench.driving import ActionType
 from bench.errors import UserError
 from bench.plugins import registry
 from bench.plugins.fingerprint import canonical
+from bench.plugins.foreign import contained
 from bench.scenarios import Axes, Cell, Value
 
 if TYPE_CHECKING:
@@ -60,9 +61,10 @@ def check(world: GymWorld, env: gymnasium.Env[Any, Any], action_type: ActionType
 def _asked(world: GymWorld) -> tuple[int, ...]:
     flat = (len(world.features.names),)
     try:
-        env = world.environment(_any_cell(world))
-        space = env.observation_space
-        env.close()
+        with contained():
+            env = world.environment(_any_cell(world))
+            space = env.observation_space
+            env.close()
     # The environment of a plug-in may raise anything; it is made again, and then heard, when it is driven.
     except Exception:
         return flat

@@ -141,6 +141,15 @@ def test_actions_of_another_kind_are_refused(bad: Any) -> None:
         envs.step(bad)
 
 
+def test_the_first_example_of_the_page_runs(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    code = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
+    for long, short in (("20_000", "250"), ("episodes=20", f"episodes=1, out={str(tmp_path)!r}, baselines=False")):
+        assert long in code
+        code = code.replace(long, short)
+    exec(code, {})
+
+
 def test_a_model_trained_in_it_is_scored(tmp_path: Path) -> None:
     sb3 = pytest.importorskip("stable_baselines3")
     env = cavbench.gym.make("highway", max_steps=40, **CELL)
