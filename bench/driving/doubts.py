@@ -16,6 +16,7 @@ from bench.plugins.chain import Chain
 from bench.plugins.options import configured
 from bench.plugins.pair import Pair
 from bench.plugins.registry import MARK
+from bench.victims import zoo
 
 
 def doubts(pair: Pair, default_world: str) -> Iterator[str]:
@@ -28,7 +29,8 @@ def doubts(pair: Pair, default_world: str) -> Iterator[str]:
     facts: Any = pair.world.component.facts
     for name, part in _named(pair):
         yield from _too_fast(name, part, pair, facts)
-        yield from _trained_elsewhere(name, part, facts, default_world)
+        if _in_zoo(part, pair):
+            yield from _trained_elsewhere(name, part, facts, default_world)
 
 
 def hopeless(baselines: pa.Table) -> str:
@@ -64,10 +66,19 @@ def _too_fast(name: str, part: Any, pair: Pair, facts: DrivingFacts) -> Iterator
         )
 
 
+def _in_zoo(part: Any, pair: Pair) -> bool:
+    """Whether a victim or a defence has networks in the zoo; others may take their networks from anywhere."""
+    if not hasattr(part, "trained_in"):
+        return False
+    victim: Any = pair.victim.component
+    try:
+        return bool(zoo.seeds(zoo.Recipe.of(victim, None if part is victim else part)))
+    except NotImplementedError:
+        return False
+
+
 def _trained_elsewhere(name: str, part: Any, facts: DrivingFacts, default_world: str) -> Iterator[str]:
     """A network of the zoo is at home in the world that its recipe names."""
-    if not hasattr(part, "trained_in") or not (getattr(part, "learns", False) or getattr(part, "trains", False)):
-        return
     first, *others = [*shlex.split(part.trained_in), ""]
     values = [word for word in (first, *others) if "=" in word]
     world = first if first and "=" not in first else default_world

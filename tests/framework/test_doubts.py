@@ -11,6 +11,7 @@ import pytest
 import cavbench
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import track
+from bench.victims import zoo
 from tests.framework.conftest import Bench
 
 FAST = {"target_speeds": (20.0, 25.0, 30.0)}
@@ -63,12 +64,13 @@ def test_a_filter_that_cannot_brake_is_named(victim: str, defense: str, of: str)
         (FAST, "its target speeds were 10, 15, 20, 25, 30 m/s, here they are 20, 25, 30 m/s"),
     ],
 )
-def test_a_network_of_another_world_is_named(world: dict[str, Any], line: str) -> None:
+def test_a_network_of_another_world_is_named(world: dict[str, Any], line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if world == {"preset": "thesis"}:
         line = "it saw y from -20 to 20 m, here y is -100 to 100 m"
     (said,) = doubts("dqn", world=world)
     assert said.startswith(f"dqn was trained in another world: {line}")
     (key, value), *_ = world.items()
+    monkeypatch.setattr(zoo, "seeds", lambda recipe: [0])  # As if it had been trained there.
     text = f"[{','.join(map(str, value))}]" if isinstance(value, tuple) else value
     assert doubts("dqn", world=world, trained_in=f"{key}={text}") == []
     assert doubts("dqn", trained_in=f"{key}={text}"), "and the other way round"
