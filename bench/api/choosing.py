@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from bench.driving import DrivingWorld
 from bench.errors import UserError
-from bench.plugins import registry, suites
+from bench.plugins import budgets, registry, suites
 from bench.plugins.bytecode import code_of
 from bench.plugins.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
 from bench.plugins.pair import Chosen, Pair, choose
@@ -171,13 +171,17 @@ def threat_of(
         UserError: if a value is not allowed.
     """
     if isinstance(given, ThreatModel):
-        return given
+        return budgets.checked(given, python=True)
     values = dict(given or {})
+    budget, confirmed = budgets.read(values.get("budget"))
+    values |= {} if budget is None else {"budget": budget}
     if chosen_suites and "access" not in values:
         values["access"] = max((suite.access for suite in chosen_suites), key=get_args(Access).index)
     model = victim.component.threat
     try:
-        return model(**values)
+        return budgets.checked(model(**values), confirmed=confirmed, python=True)
+    except UserError:
+        raise
     except (ValueError, TypeError) as error:
         raise UserError(f"threat: {str(error).splitlines()[0]}") from error
 

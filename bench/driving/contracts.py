@@ -115,6 +115,8 @@ class DrivingVictim(Victim):
     """Who is at the wheel; its policies must have the same. Only a victim that does not see may leave it to the world."""
     policy_type: ClassVar[type[Policy] | None] = None
     """The class of its trained policies; the zoo builds it from a card."""
+    brakes_to: ClassVar[float | None] = None
+    """The target speed in m/s that SLOWER must be able to end at; None if it needs none. A run warns where it cannot."""
 
     @property
     @abstractmethod
@@ -253,6 +255,8 @@ class DrivingDefense(Defense):
     """Protects a driving policy."""
 
     track: ClassVar[str] = "driving"
+    brakes_to: ClassVar[float | None] = None
+    """As `DrivingVictim.brakes_to`."""
 
     @abstractmethod
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:

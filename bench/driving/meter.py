@@ -40,7 +40,7 @@ class Meter:
         self.subject, self.facts = subject, facts
         features = facts.features
         self.half_range = features.half_range().numpy()
-        self.positions = np.array([unit == "m" for unit in features.units])
+        self.positions, self.speeds = (np.array([unit == wanted for unit in features.units]) for wanted in ("m", "m/s"))
         self.sums = np.zeros((len(self.SUMS), batch))
         self.linf_max, self.excess_max = np.zeros(batch, np.float32), np.zeros(batch, np.float32)
         self.min_ttc = np.full(batch, np.inf, np.float32)
@@ -79,7 +79,7 @@ class Meter:
             linf,
             np.sqrt(np.square(offset).sum((1, 2))),
             physical[..., self.positions].max((1, 2), initial=0.0),
-            physical[..., ~self.positions].max((1, 2), initial=0.0),
+            physical[..., self.speeds].max((1, 2), initial=0.0),
             np.full(len(running), shown.milliseconds / max(running.sum(), 1)),
         )
         self.sums += np.where(running, np.stack(measured), 0.0)

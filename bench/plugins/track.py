@@ -207,6 +207,14 @@ class Track(ABC):
         """The baseline pairs that a pair is compared with; every run also drives these."""
         yield from ()
 
+    def doubts(self, pair: Pair) -> Iterator[str]:
+        """What makes scores of a pair doubtful whatever the cell, one line each; a run says it before it drives."""
+        yield from ()
+
+    def hopeless(self, baselines: pa.Table) -> str:
+        """What to say if the records of all baselines of a run show nothing but failures; empty otherwise."""
+        return ""
+
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
         """The name of the baseline that records are for other records, themselves included; empty if they are not one.
 

@@ -27,11 +27,23 @@ class Loading:
         pair: attack, defence, victim, world, threat model.
         training_seed: seed of the victim.
         cells: cells of the run, whose observations the network is tried on.
+        asks_world: whether to ask the world, too, what it doubts about these cells; one loading of a world does.
     """
 
     pair: Pair
     training_seed: int
     cells: tuple[Cell, ...] = ()
+    asks_world: bool = False
+
+    def doubts(self) -> tuple[str, ...]:
+        """What makes the scores doubtful, one line each.
+
+        Raises:
+            UserError: if the world cannot be driven in its cells.
+        """
+        world = self.pair.world
+        of_world = world.component.doubts(self.cells) if self.asks_world else ()
+        return (*(f"world {world}: {line}" for line in of_world), *track_of(self.pair).doubts(self.pair))
 
     def weights(self) -> tuple[str, str]:
         """The hashes of the weights of the defended victim, and of an attack that learns (otherwise empty).
@@ -42,13 +54,13 @@ class Loading:
         return self.pair.weights_sha256(self.training_seed), self.pair.adversary_sha256(self.training_seed)
 
     def tried(self) -> tuple[tuple[str, str], tuple[str, ...]]:
-        """As `weights`, with the warnings about the network (`Track.try_network`).
+        """As `weights`, with what makes the scores doubtful (`doubts`), and the warnings about the network (`Track.try_network`).
 
         Raises:
             UserError: if a network cannot be loaded.
             RefusedNetworkError: if its score would be wrong.
         """
-        pair, named = self.pair, self.pair.defended
+        pair, named, doubts = self.pair, self.pair.defended, self.doubts()
         network = pair.network(self.training_seed)
         weights = weights_of(network)
         try:
@@ -59,7 +71,8 @@ class Loading:
         # The network of a stranger may raise anything.
         except Exception as error:
             raise RefusedNetworkError(f"it fails when it is tried: {reason(error)} (--debug shows why)") from error
-        return (weights, pair.adversary_sha256(self.training_seed)), tuple(f"{named} {line}" for line in warnings)
+        lines = (*doubts, *(f"{named} {line}" for line in warnings))
+        return (weights, pair.adversary_sha256(self.training_seed)), lines
 
     def __str__(self) -> str:
         seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from bench.driving import DrivingVictim, DrivingWorld
     from bench.recording.film import Film
 
+FEW = 3
+"""So many fixed features are named in a sentence."""
 BEST_BLIND, IDM, ORACLE, RANDOM = "best blind", "idm", "oracle_planner", "random"
 
 MEASUREMENTS: tuple[pa.Field, ...] = (
@@ -175,6 +177,16 @@ class DrivingTrack(Track):
             none = {"attack": choose("attack", "none"), "defense": choose("defense", "none")}
             yield replace(pair, **none, victim=choose("victim", name, **params), threat=type(pair.threat).of_nobody())
 
+    def doubts(self, pair: Pair) -> Iterator[str]:
+        from bench.driving.doubts import doubts
+
+        return doubts(pair, self.world)
+
+    def hopeless(self, baselines: pa.Table) -> str:
+        from bench.driving.doubts import hopeless
+
+        return hopeless(baselines)
+
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
         same_world = all(own[name] == other[name] for name in ("world", "world_params"))
         same_actions = own["action_type"] == other["action_type"] or other["victim"] in (IDM, ORACLE)
@@ -196,7 +208,9 @@ class DrivingTrack(Track):
             for name, floor, unit in zip(features.get("names", ()), floors, features.get("units", ()), strict=False)
         ]
         by_floor = f", or by its floor ({', '.join(minima)})" if minima else ""
-        return f"each measured value may be off by {deviation}{by_floor}; presence cannot be forged"
+        fixed = features.get("fixed", ())
+        named = fixed if len(fixed) <= FEW else [f"{len(fixed)} fixed features"]
+        return f"each measured value may be off by {deviation}{by_floor}; {' and '.join(['presence', *named])} cannot be forged"
 
     def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
         steps = column("steps")
