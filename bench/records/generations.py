@@ -25,6 +25,8 @@ AXES_OF_V1 = (
 )
 CELL_OF_V1 = "to_json({'lanes': lanes, 'density': density, 'weather': weather})::varchar"
 
+LONGEST_FOOTER = 2**26
+"""Most bytes of the footer of a Parquet file, which names its columns and where they are."""
 SQL = {FLOAT: "double", INT: "bigint", TEXT: "varchar", pa.bool_(): "boolean"}
 """The types of probes in SQL."""
 ADDED = {"threat_share": "1.0::double"}
@@ -69,6 +71,8 @@ def check(path: Path, *, thoroughly: bool = False) -> tuple[Track, pa.Schema]:
     if path.exists() and not path.is_file():
         raise UserError(f"the record {path} is not a file; delete it and run again to recreate it")
     try:
+        if _length(path) > LONGEST_FOOTER:
+            raise pa.ArrowInvalid("footer")
         found = pq.read_table(path).schema if thoroughly else pq.read_schema(path)
     except (pa.ArrowException, OSError) as error:
         reason = "missing" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
@@ -100,12 +104,17 @@ def _encoded(generation: pa.Schema) -> tuple[bytes, ...]:
 def _footer(path: Path) -> bytes:
     """The footer of a Parquet file, which names its columns; empty if it cannot be read."""
     try:
-        if not path.is_file():
+        if not path.is_file() or (size := _length(path)) > LONGEST_FOOTER:
             return b""
         with path.open("rb") as file:
-            file.seek(-8, os.SEEK_END)
-            size = int.from_bytes(file.read(4), "little")
             file.seek(-8 - size, os.SEEK_END)
             return file.read(size)
     except OSError:
         return b""
+
+
+def _length(path: Path) -> int:
+    """The length of a Parquet file's footer, as the file states it."""
+    with path.open("rb") as file:
+        file.seek(-8, os.SEEK_END)
+        return int.from_bytes(file.read(4), "little")
