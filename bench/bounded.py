@@ -106,13 +106,13 @@ def sha256(path: Path, *, most: int, name: str = "", links: bool = True) -> str:
     return hasher.hexdigest()
 
 
-def read_json(path: Path, *, most: int = TEXT, name: str = "", finite: bool = True) -> Any:
+def read_json(path: Path, *, most: int = TEXT, name: str = "", finite: bool = True, links: bool = True) -> Any:
     """The value in a JSON file; arguments as of `size` and `parsed`.
 
     Raises:
         UserError: as `opened`, or if it is not JSON as `parsed` takes it.
     """
-    found = content(path, most=most, name=name)
+    found = content(path, most=most, name=name, links=links)
     try:
         return parsed(found, finite=finite)
     except ValueError as error:
