@@ -136,7 +136,7 @@ def _refused(records: pa.Table, names: Sequence[str], check: Callable[..., objec
         except ValueError as error:
             yield row, f"{names[0]} {short(str(values[0]))}: {error}"
         except RecursionError:
-            yield row, f"{names[0]} {short(str(values[0]))}: nested too deeply"
+            yield row, f"{' or '.join(names)} {short(str(values[0]))}: nested too deeply"
 
 
 def _cell(cell: str, facts: str, example: Mapping[str, object]) -> None:

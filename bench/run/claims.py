@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.errors import UserError, short
+from bench.errors import UserError, message, short
 from bench.plugins import registry
 from bench.plugins.device import recorded
 from bench.plugins.device import stated as stated_device
 from bench.plugins.fingerprint import canonical
 from bench.plugins.pair import IN_PROCESS, Pair
+from bench.records import reading
 from bench.records.schema import AUDIT, SEQUENTIAL
 from bench.run.config import RunConfig
 from bench.run.plan import cells_of
@@ -73,7 +75,12 @@ def of(units: Sequence[pa.Table]) -> Claim:
             )
     first = records.slice(0, 1).to_pylist()[0]
     _check_loadable(first)
-    pair = pair_of(first)
+    try:
+        pair = pair_of(first)
+    except (UserError, ValueError, TypeError) as error:
+        raise UserError(
+            f"the columns {', '.join(OF_THE_PAIR[1:])} of the records make no pair: {message(error)}"
+        ) from None
     if pair.id != first["pair"]:
         raise UserError(
             f"the records name the pair {short(first['pair'])}, but the columns {', '.join(OF_THE_PAIR[1:])} make it {pair.id}"
@@ -206,6 +213,8 @@ def _wrong(key: str, records: pa.Table, unit: Unit) -> Iterator[tuple[str, str]]
         yield "libraries", f"it is {short(libraries)}, not canonical JSON of the versions of {', '.join(sorted(here))}"
     if not all(isinstance(version, str) for version in there.values()):
         yield "libraries", "a version is no text"
+    if _one(records, "created_at") > datetime.now(UTC) + reading.SKEW:
+        yield "created_at", "it is in the future"
     if not machine.isprintable() or not 0 < len(machine) <= LONGEST_MACHINE:
         yield "machine", f"it is {short(machine)}, which is no printable text of at most {LONGEST_MACHINE} characters"
     if _one(records, "unit") != key:
