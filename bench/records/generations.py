@@ -89,7 +89,7 @@ def glance(path: Path) -> tuple[Track, pa.Schema]:
     footer = _footer(path)
     for track in tracks():
         for generation in generations(track):
-            if all(name in footer for name in _encoded(generation)):
+            if all(name in footer for name in _encoded(generation)) and _elements(footer) == _wanted(generation):
                 return track, generation
     return check(path)
 
@@ -99,6 +99,29 @@ def _encoded(generation: pa.Schema) -> tuple[bytes, ...]:
     """The names of the columns, those that only some tracks have first: a file of another track is told at the first of them."""
     common = {field.name for field in (*IDENTITY, *PROVENANCE)}
     return tuple(name.encode() for name in sorted(generation.names, key=common.__contains__))
+
+
+def _wanted(generation: pa.Schema) -> int:
+    """How many elements the schema in a footer has: the root, one for each column, and two more for a list."""
+    return 1 + sum(3 if pa.types.is_list(column.type) else 1 for column in generation)
+
+
+def _elements(footer: bytes) -> int:
+    """How many elements the schema in a footer has; 0 where it is not written as Parquet's compact Thrift always is.
+
+    The footer begins with the version (field 1, a varint) and the header of the list of elements (field 2).
+    """
+    place = 1
+    while place < len(footer) and footer[place] & 0x80:
+        place += 1
+    # Type and number of the two fields; the list's header has its length, or says that it follows.
+    if footer[:1] != b"\x15" or footer[place + 1 : place + 2] != b"\x19" or len(footer) < place + 5:
+        return 0
+    header = footer[place + 2]
+    if header >> 4 < 15:
+        return header >> 4
+    low, high = footer[place + 3], footer[place + 4]
+    return low if low < 0x80 else (low & 0x7F) | high << 7
 
 
 def _footer(path: Path) -> bytes:
