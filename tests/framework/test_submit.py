@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
@@ -80,8 +83,6 @@ def test_its_command_drives_the_same_records(bench: Bench, submission: Path, tmp
 
 
 def test_changed_scores_are_found_though_the_hashes_fit(bench: Bench, submission: Path) -> None:
-    import hashlib
-
     about = json.loads((submission / "submission.json").read_text())
     for name in about["files"]:
         path = submission / name
@@ -144,3 +145,42 @@ def test_only_a_whole_grid_and_a_new_folder_are_taken(bench: Bench, submission: 
     said = bench("submit", "nudge-guard", f"results={tmp_path / 'results'}", f"out={submission}")
     assert (said.code, "is not empty" in said.err) == (2, True)
     assert bench("submit", "nudge-guard", f"results={tmp_path / 'results'}").code == 2
+
+
+def test_a_patch_is_crafted_again_not_taken(bench: Bench, tmp_path: Path) -> None:
+    results, folder, board = (tmp_path / name for name in ("results", "submission", "board"))
+    words = (
+        "attack=paint",
+        "victim=red",
+        "world=red_street",
+        "lanes=3",
+        "density=1",
+        "weather=clear,fog",
+        "seeds=0",
+        "record=0",
+    )
+    assert bench("run", *words, "executor=serial", f"out={results}").code == 0
+    assert bench("submit", "paint", f"results={results}", f"out={folder}").code == 0
+    said = bench("verify", str(folder), f"out={board}")
+    assert said.code == 0, said.err + said.out
+    assert said.out.count("bit for bit the same") == 2
+    (patch,) = (folder / "patches").iterdir()
+    assert (board / "patches" / patch.name).exists()
+    # A weak patch under the name of the strong one, and the records that it gives.
+    weak = bench("run", "attack=blank", *words[1:], "executor=serial", f"out={tmp_path / 'weak'}")
+    assert weak.code == 0
+    driven = reading.read(tmp_path / "weak", track=track("detection"))
+    score = driven.filter(pc.equal(driven["attack"], "blank"))["stop_score"][0].as_py()
+    about = json.loads((folder / "submission.json").read_text())
+    for path in (folder / "episodes").iterdir():
+        records = pq.read_table(path)
+        place = records.schema.get_field_index("stop_score")
+        scores = pa.array([score] * records.num_rows, pa.float64())
+        pq.write_table(records.set_column(place, records.schema.field(place), scores), path)
+        about["files"][f"episodes/{path.name}"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    patch.write_bytes(next((tmp_path / "weak" / "patches").iterdir()).read_bytes())
+    about["files"][f"patches/{patch.name}"] = hashlib.sha256(patch.read_bytes()).hexdigest()
+    (folder / "submission.json").write_text(json.dumps(about))
+    said = bench("verify", str(folder), f"out={tmp_path / 'other'}")
+    assert (said.code, "it differs in stop_score" in said.out) == (1, True)
+    assert not list((tmp_path / "other").glob("episodes/*"))
