@@ -163,7 +163,7 @@ def _copied(folder: Path, place: Path, own: Track) -> dict[str, str]:
     for name in _files(folder, own):
         if name == DESCRIPTION:
             continue
-        most = SHORT if name == CARD else bounded.TEXT if name.endswith(".json") else bounded.WEIGHTS
+        most = SHORT if name == CARD else bounded.WEIGHTS if name.endswith(".safetensors") else bounded.TEXT
         target, hasher = place / name, hashlib.sha256()
         target.parent.mkdir(parents=True, exist_ok=True)
         with bounded.opened(folder / name, most=min(most, left), links=False) as file, target.open("xb") as copy:
