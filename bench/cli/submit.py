@@ -97,7 +97,8 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
                 holds = _audited(found, claim, verified, salt, episodes or EPISODES, console) and holds
             _print_row(found, verified, console, report)
             if not holds:
-                console.print(Text("The submission does not hold.", style="bold red"))
+                kept = "" if out is None else f" What was driven here is in {place}; nothing was added to {out}."
+                console.print(Text.assemble(("The submission does not hold.", "bold red"), kept), soft_wrap=True)
                 return 1
             if out is not None:
                 added, there = verification.add(verified, place, out)

@@ -16,6 +16,9 @@ import pytest
 from bench.plugins import registry
 from bench.plugins.track import track
 from bench.records import reading
+from bench.run.claims import _names_a_file
+from bench.run.config import run_config
+from bench.run.submission import weights_of
 from tests.framework.conftest import Said
 
 Bench = Callable[..., Said]
@@ -184,3 +187,12 @@ def test_a_patch_is_crafted_again_not_taken(bench: Bench, tmp_path: Path) -> Non
     said = bench("verify", str(folder), f"out={tmp_path / 'other'}")
     assert (said.code, "it differs in stop_score" in said.out) == (1, True)
     assert not list((tmp_path / "other").glob("episodes/*"))
+
+
+def test_a_detector_is_submitted_with_the_weights_of_its_own_training_seed(toy_folder: Path) -> None:
+    words = "attack=eot victim=yolov5 victim.trained=3 world=camera"
+    (pair,) = run_config(words.split()).pairs
+    assert {name.rpartition("/")[2] for name in weights_of(pair, [0, 1])} >= {"seed3.safetensors", "seed3.json"}
+    # Its parameter `path` is empty: it names no file of this machine.
+    assert not _names_a_file(json.loads(pair.victim.params))
+    assert _names_a_file({"links": [{"path": "/etc/passwd"}]})
