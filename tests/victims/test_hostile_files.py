@@ -463,11 +463,51 @@ def test_a_member_that_states_a_smaller_size_is_not_unpacked_further(tmp_path: P
         Archive(bytes(content), "liar.zip")
 
 
-def test_two_members_of_one_name_are_refused() -> None:
+def zipped(*members: tuple[str, bytes]) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("data", "one")
-        with pytest.warns(UserWarning, match="Duplicate"):
-            archive.writestr("data", "two")
+        for name, content in members:
+            archive.writestr(name, content)
+    return file.getvalue()
+
+
+def with_comment(content: bytes) -> bytes:
+    return content[:-2] + struct.pack("<H", 22) + content[-22:]
+
+
+def renamed(content: bytes) -> bytes:
+    """The list at the end has another name than the member itself."""
+    place = content.rindex(b"data")
+    return content[:place] + b"dbta" + content[place + 4 :]
+
+
+HONEST = zipped(("data", b"one"), ("more", b"two"))
+DAMAGED, ALONE = "it is not a zip archive, or a damaged one", "there is something before or after it"
+READ_OTHERWISE = {
+    "names that differ in case": (zipped(("data", b"one"), ("Data", b"two")), "two of its members have the same name"),
+    "the same in another alphabet": (zipped(("stra\u00dfe", b"1"), ("STRASSE", b"2")), "have the same name"),
+    "bytes before": (b"MZ" + HONEST, ALONE),
+    "an archive before": (HONEST + zipped(("data", b"two")), ALONE),
+    "bytes after": (HONEST + b"more", f"{DAMAGED}|{ALONE}"),
+    "a second end in a comment": (with_comment(HONEST), f"{DAMAGED}|{ALONE}"),
+    "a zero byte in a name": (
+        zipped(("data.x", b"1")).replace(b"data.x", b"data\0x"),
+        "a name that others read otherwise",
+    ),
+    "another name at the member": (renamed(zipped(("data", b"1"))), "or a damaged one"),
+}
+
+
+@pytest.mark.parametrize("what", READ_OTHERWISE)
+def test_an_archive_that_another_reader_reads_otherwise_is_refused(what: str) -> None:
+    assert Archive(HONEST, "honest.zip").members == {"data": b"one", "more": b"two"}
+    content, why = READ_OTHERWISE[what]
+    with pytest.raises(UserError, match=why):
+        Archive(content, "crafted.zip")
+
+
+def test_two_members_of_one_name_are_refused() -> None:
+    with pytest.warns(UserWarning, match="Duplicate"):
+        content = zipped(("data", b"one"), ("data", b"two"))
     with pytest.raises(UserError, match="two of its members have the same name"):
-        Archive(file.getvalue(), "twice.zip")
+        Archive(content, "twice.zip")
