@@ -16,6 +16,7 @@ from typing import Protocol
 
 from bench.plugins.foreign import StopUnitError
 from bench.plugins.framework import Snapshot
+from bench.plugins.settings import Settings
 from bench.run.blame import blamed
 from bench.run.process import cores, settle
 from bench.run.unit import Loading, Preparation, Unit
@@ -76,7 +77,7 @@ class SerialExecutor:
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         settle()
-        framework, culprit = Snapshot(), ""
+        framework, settings, culprit = Snapshot(), Settings(), ""
         waiting, parts = iter(tasks), deque[Task]()
         while (task := parts.popleft() if parts else next(waiting, None)) is not None:
             if culprit:
@@ -85,6 +86,8 @@ class SerialExecutor:
                 continue
             watcher.working([task.work, *task.others])
             outcome, text = self._carried_out(task, watcher, framework)
+            # The next unit must not be driven with what this one set.
+            settings.restore()
             if lines := [line for line in text.splitlines() if line.strip()]:
                 watcher.printed(task.work, lines)
             if isinstance(outcome, Failure) and outcome.tampered:

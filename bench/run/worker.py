@@ -5,12 +5,12 @@ What components print is kept apart from the terminal and from the tables: it co
 
 from __future__ import annotations
 
+import _thread
 import importlib
 import multiprocessing
 import os
 import pickle
 import signal
-import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -22,15 +22,11 @@ from bench.errors import reason
 from bench.plugins import registry
 from bench.plugins.foreign import contained, ended
 from bench.plugins.framework import Snapshot
+from bench.plugins.settings import Settings
 from bench.plugins.track import track
 from bench.run.blame import blamed
 from bench.run.process import children, context, follow_parent, resident_bytes, settle
 from bench.run.work import Failure, Outcome, Task, Tell, attempt
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
 
 GB = 1e9
 READY = "ready"
@@ -204,7 +200,7 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
         importlib.import_module(module)
     # Before any plug-in is imported.
     before = Snapshot()
-    settings = _settings()
+    settings, started = Settings(alone=True), (children(), _thread._count())
     connection.send_bytes(pickle.dumps(READY))
 
     def tell(work: str, share: float, text: str, episodes: int = 0) -> None:
@@ -221,21 +217,11 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
                 os.killpg(0, signal.SIGKILL)
             return
         outcome = _carried_out(content, tell, before)
-        if isinstance(outcome, Outcome) and _settings() != settings:
+        # A thread that stays would count against the next component, and a process could disturb it.
+        left = children() != started[0] or _thread._count() > started[1]
+        if isinstance(outcome, Outcome) and (left or settings.changed()):
             outcome = replace(outcome, last=True)
         connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
-
-
-def _settings() -> tuple[object, ...]:
-    """Settings of this process, and processes that it started: what a component may change or leave to the tasks after it."""
-    kinds = {number for name, number in vars(resource).items() if name.startswith("RLIMIT_")} if resource else set()
-    limits = {kind: resource.getrlimit(kind) for kind in kinds}
-    signals = {number: signal.getsignal(number) for number in signal.valid_signals()}
-    try:
-        folder = os.getcwd()
-    except OSError:
-        folder = ""
-    return folder, limits, signals, sys.getrecursionlimit(), sys.gettrace(), sys.getprofile(), children()
 
 
 @cache

@@ -23,6 +23,10 @@ ON_IMPORT = {
     "import_segfault": "import ctypes; ctypes.string_at(0)",
     "import_patch": "import torch; torch.Tensor.tanh = lambda tensor: tensor",
     "import_interrupt": "raise KeyboardInterrupt",
+    "import_recursion": "import inspect, sys; sys.setrecursionlimit(len(inspect.stack()) + 30)",
+    "import_closed": "import os; os.closerange(3, 4096)",
+    "import_thread": "import threading, time; threading.Thread(target=time.sleep, args=(600,)).start()",
+    "import_dtype": "import torch; torch.set_default_dtype(torch.float64)",
 }
 PACKAGE = r"of cavbench-rogue 3.1"
 DEEDS = {
@@ -98,6 +102,10 @@ def test_a_sweep_goes_on_and_names_whatever_fails_with_its_package(swept: tuple[
         ("import_segfault", "cannot be imported: its import ends the process (SIGSEGV)"),
         ("import_patch", "cannot be imported: its import replaces torch.Tensor.tanh"),
         ("import_interrupt", "cannot be imported: KeyboardInterrupt"),
+        ("import_recursion", "cannot be imported: its import changes the recursion limit"),
+        ("import_closed", "cannot be imported: its import closes files of the process"),
+        ("import_thread", "cannot be imported: its import changes the threads that hold the end of the process"),
+        ("import_dtype", "cannot be imported: its import changes the default type of torch"),
     ],
 )
 def test_a_plugin_that_misbehaves_on_import_is_left_out(swept: tuple[Said, Path], name: str, why: str) -> None:
