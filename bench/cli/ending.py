@@ -8,9 +8,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
-from types import FrameType
 
 from bench.errors import bounded
 
@@ -76,34 +75,18 @@ def _watch(code: int, phase: list[str]) -> None:
 
 def _held(phase: str) -> str:
     """What holds the end, and whose it is."""
-    frames = sys._current_frames()
-    main = threading.main_thread()
-    if phase == "threads":
-        held = [one for one in threading.enumerate() if not one.daemon and one is not main]
-        what = f"the thread {held[0].name!r}" if len(held) == 1 else f"{len(held)} threads"
-        owners = [_owner(frames.get(one.ident or 0), getattr(one, "_target", None)) for one in held]
-        owners = list(dict.fromkeys(filter(None, owners)))
-    else:
+    from bench.plugins.threads import left, owner
+
+    held = left() if phase == "threads" else [threading.main_thread()]
+    what = f"the thread {held[0].name!r}" if len(held) == 1 else f"{len(held)} threads"
+    if phase == "hooks":
         what = "a hook for the end of the process"
-        owners = list(filter(None, [_owner(frames.get(main.ident or 0), None)]))
+    owners = dict.fromkeys(filter(None, map(owner, held)))
     who = " and ".join(owners) if owners else f"one of {', '.join(sorted(set(_foreign().values())))}"
-    return f"{what} of {who} does not end"
-
-
-def _owner(frame: FrameType | None, target: object) -> str:
-    """The package whose code a thread runs; empty if it is none of a plug-in."""
-    packages = _foreign()
-    modules = [str(getattr(target, "__module__", "")), *_modules(frame)]
-    return next((packages[top] for module in modules if (top := module.partition(".")[0]) in packages), "")
+    return f"{what} of {who} {'do' if len(held) > 1 else 'does'} not end"
 
 
 def _foreign() -> dict[str, str]:
     from bench.plugins.registry import foreign
 
     return foreign()
-
-
-def _modules(frame: FrameType | None) -> Iterator[str]:
-    while frame is not None:
-        yield str(frame.f_globals.get("__name__", ""))
-        frame = frame.f_back

@@ -36,7 +36,7 @@ LATE = {
     ),
     "two threads": (
         "def main(): [threading.Thread(target=wait).start() for _ in range(2)]",
-        "2 threads of cavbench-late 2.0 does not end",
+        "2 threads of cavbench-late 2.0 do not end",
     ),
     "a hook": (
         "def main(): atexit.register(wait)",

@@ -37,6 +37,9 @@ DEEDS = {
     "segfault": "it ended its worker process (SIGSEGV)",
     "hang": "it took longer than unit_timeout=10 seconds",
     "leak": "it used",
+    "leak in a session": "it used",
+    "leak in memory files": "it used",
+    "leak in temporary files": "it used",
     "memory error": "MemoryError",
     "nan": "Rogue.perturb returned numbers that are NaN or infinite",
     "shape": "Rogue.perturb returned shape (2, 2, 1)",
@@ -48,7 +51,7 @@ DEEDS = {
     "patch bench": "is refused: bench.driving.meter.Meter.columns was replaced",
 }
 """What the line says about each deed that fails a unit."""
-HARMLESS = ("none", "reseed", "print", "print much", "fork", "fork and stay")
+HARMLESS = ("none", "reseed", "print", "print much", "fork", "fork and stay", "leave a thread")
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +154,14 @@ def test_copies_of_a_worker_do_no_work_and_end_with_it(swept: tuple[Said, Path])
         state = Path(f"/proc/{copy}/stat")
         # One that ended may wait for its end to be read.
         assert not state.exists() or state.read_text().rpartition(") ")[2].startswith("Z")
+
+
+@pytest.mark.slow
+def test_a_process_in_a_session_of_its_own_ends_with_the_worker(swept: tuple[Said, Path]) -> None:
+    said, _ = swept
+    orphans = re.findall(r"prints: orphan (\d+)", said.err)
+    assert orphans
+    assert not any(Path(f"/proc/{orphan}").exists() for orphan in orphans)
 
 
 @pytest.mark.slow
