@@ -8,6 +8,8 @@ import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from bench import bounded
+from bench.bounded import spelled
 from bench.errors import UserError
 
 LARGEST = 2**30
@@ -60,12 +62,10 @@ class Archive:
         """The archive in a file.
 
         Raises:
-            UserError: if the file is larger than an archive may unpack to, or as the constructor.
+            UserError: if it is no regular file, is larger than an archive may unpack to, or as the constructor.
         """
         name = name or str(path)
-        if path.stat().st_size > LARGEST:
-            raise UserError(f"{name} is refused: it has more than {_size(LARGEST)}")
-        return cls(path.read_bytes(), name)
+        return cls(bounded.content(path, most=LARGEST, name=name), name)
 
     def member(self, name: str) -> bytes:
         """The content of a member.
@@ -92,7 +92,7 @@ class Archive:
         allowed = min(LARGEST, max(RATIO * size, SMALL))
         if total > allowed:
             raise UserError(
-                f"{self.name} is refused: {_size(size)} unpack to {_size(total)}, more than the {_size(allowed)} allowed"
+                f"{self.name} is refused: {spelled(size)} unpack to {spelled(total)}, more than the {spelled(allowed)} allowed"
             )
         if len(members) > MEMBERS:
             raise UserError(f"{self.name} is refused: it has {len(members)} members, at most {MEMBERS} are allowed")
@@ -121,12 +121,3 @@ def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     if len(content) != member.file_size:
         raise zipfile.BadZipFile(f"{member.filename} has another size than it states")
     return content
-
-
-def _size(count: float) -> str:
-    """A number of bytes for people: 3.0 GB."""
-    for unit in ("bytes", "kB", "MB"):
-        if count < 1000:
-            return f"{count:.0f} {unit}" if unit == "bytes" else f"{count:.1f} {unit}"
-        count /= 1000
-    return f"{count:.1f} GB"

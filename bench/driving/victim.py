@@ -99,7 +99,7 @@ class CountedPolicy:
         """The scores [B, A] (or [B, 2]) and the actions with which the victim drives.
 
         Raises:
-            UserError: if the scores are NaN or infinite.
+            UserError: if the scores are NaN, infinite or complex.
         """
         scores = self._scores(observation, state)
         if not bool(scores.sum().isfinite()) and not bool(scores.isfinite().all()):
@@ -159,4 +159,6 @@ class CountedPolicy:
         scores = self.policy.scores(observation, state)
         if type(scores) is not Tensor:
             raise TamperError(f"the victim's scores are a {type(scores).__name__}, not a torch.Tensor", "defense")
+        if scores.is_complex():
+            raise UserError(f"the victim ({type(self.policy).__name__}) answered complex scores")
         return scores

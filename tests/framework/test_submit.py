@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,24 +22,33 @@ RUN = (
 )  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for `results` and `submission`, which the first test fills."""
+    return tmp_path_factory.mktemp("made")
+
+
 @pytest.fixture
-def submission(bench: Bench, tmp_path: Path) -> Path:
-    results, folder = tmp_path / "results", tmp_path / "submission"
-    assert bench(*RUN, f"out={results}").code == 0
-    said = bench("submit", "nudge-guard", f"results={results}", f"out={folder}")
-    assert said.code == 0, said.err
-    return folder
+def submission(bench: Bench, made: Path, tmp_path: Path) -> Path:
+    """A submission of its own for a test, beside the results that it was written from."""
+    if not (made / "submission").exists():
+        assert bench(*RUN, f"out={made / 'results'}").code == 0
+        said = bench("submit", "nudge-guard", f"results={made / 'results'}", f"out={made / 'submission'}")
+        assert said.code == 0, said.err
+    for name in ("results", "submission"):
+        shutil.copytree(made / name, tmp_path / name)
+    return tmp_path / "submission"
 
 
 def test_a_submission_is_verified_and_becomes_a_row(bench: Bench, submission: Path, tmp_path: Path) -> None:
     about = json.loads((submission / "submission.json").read_text())
     assert about["packages"] == ["cavbench-toy 1.0"]
     assert about["commands"]["install"] == "pip install cavbench-toy==1.0"
-    said = bench("verify", str(submission), "sample=2", "audit=false", f"out={tmp_path / 'board'}")
+    said = bench("verify", str(submission), "audit=false", f"out={tmp_path / 'board'}")
     assert said.code == 0, said.err + said.out
     assert "execute the code of cavbench" in said.out
     assert "cavbench-toy 1.0" in said.out
-    assert said.out.count("bit for bit the same") == 2
+    assert said.out.count("bit for bit the same") == 4
     assert "The submission holds." in said.out
     board = reading.read(tmp_path / "board", track=track("driving"))
     assert {"nudge", "none"} == set(board["attack"].to_pylist())
@@ -85,7 +95,7 @@ def test_changed_scores_are_found_though_the_hashes_fit(bench: Bench, submission
             pq.write_table(better.cast(records.schema), path)
             about["files"][name] = hashlib.sha256(path.read_bytes()).hexdigest()
     (submission / "submission.json").write_text(json.dumps(about))
-    said = bench("verify", str(submission), "audit=false")
+    said = bench("verify", str(submission), "audit=false", "sample=all")
     assert said.code == 1
     assert "though nothing has changed" in said.out
     assert "The submission does not hold." in said.out
@@ -94,10 +104,14 @@ def test_changed_scores_are_found_though_the_hashes_fit(bench: Bench, submission
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        (lambda folder: next(folder.glob("episodes/*")).write_bytes(b"x"), "is missing, too large, or not as"),
+        (lambda folder: next(folder.glob("episodes/*")).write_bytes(b"x"), "is missing, or not as"),
         (lambda folder: (folder / "run.py").write_text("print('executed')"), "is not allowed in a submission"),
         (lambda folder: (folder / "weights.pt").symlink_to("/etc/passwd"), "is not allowed in a submission"),
-        (lambda folder: (folder / "zoo.json").write_text("{}"), "is not listed in submission.json"),
+        (lambda folder: (folder / "zoo.json").write_text("{}"), "is not allowed in a submission"),
+        (
+            lambda folder: (folder / "episodes" / f"{'0' * 64}.parquet").write_text("{}"),
+            "is not listed in submission.json",
+        ),
         (lambda folder: (folder / "submission.json").write_text("[]"), "is not a submission"),
     ],
 )
