@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from bench import bounded
 from bench.archive import LARGEST
 from bench.errors import UserError, short
 
@@ -42,7 +43,7 @@ def whole(path: Path, name: str) -> bytes:
     """
     import onnx
 
-    content = _read(path, name, LARGEST)
+    content = bounded.content(path, most=LARGEST, name=name)
     try:
         model = onnx.ModelProto.FromString(content)
     # The class of this exception is in the package of protocol buffers, which onnx brings.
@@ -98,7 +99,7 @@ def _beside(tensor: Any, path: Path, name: str, most: int) -> bytes:
         raise UserError(f"{what} has other sizes in {short(place)!r} than in the model; export it again")
     if size > most:
         raise UserError(f"{name} is refused: it has more than {LARGEST >> 30} GiB with the files beside it")
-    with file.open("rb") as opened:
+    with bounded.opened(file, most=LARGEST, links=False) as opened:
         opened.seek(offset)
         content = opened.read(size)
     if len(content) != size:
@@ -126,9 +127,3 @@ def _size(tensor: Any) -> int | None:
 def _whole(text: str) -> int | None:
     """A whole number of at least 0 in decimal digits; None for anything else."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None
-
-
-def _read(path: Path, name: str, most: int) -> bytes:
-    if path.stat().st_size > most:
-        raise UserError(f"{name} is refused: it has more than {most >> 30} GiB")
-    return path.read_bytes()
