@@ -220,7 +220,7 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
         importlib.import_module(module)
     # Before any plug-in is imported.
     before = Snapshot()
-    settings, started = Settings(alone=True), (children(), _thread._count())
+    settings, started = Settings(alone=True), _running()
     connection.send_bytes(pickle.dumps(READY))
 
     def tell(work: str, share: float, text: str, episodes: int = 0) -> None:
@@ -237,11 +237,24 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
                 os.killpg(0, signal.SIGKILL)
             return
         outcome = _carried_out(content, tell, before)
-        # A thread that stays would count against the next component, and a process could disturb it.
-        left = children() != started[0] or _thread._count() > started[1]
-        if isinstance(outcome, Outcome) and (left or settings.changed()):
+        if isinstance(outcome, Outcome) and (_left(started) or settings.changed()):
             outcome = replace(outcome, last=True)
         connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
+
+
+def _running() -> tuple[frozenset[int], int]:
+    """The processes that this one started, and the number of its threads."""
+    return children(), _thread._count()
+
+
+def _left(before: tuple[frozenset[int], int]) -> bool:
+    """Whether a task left a process, which could disturb the next component, or a thread, which would count against it."""
+    try:
+        processes, threads = _running()
+    # With a low limit of open files, nothing can be read.
+    except OSError:
+        return True
+    return processes != before[0] or threads > before[1]
 
 
 @cache
