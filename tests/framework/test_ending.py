@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from bench.errors import UserError
+from bench.plugins import registry
+from bench.run.executors import ProcessExecutor
+from bench.run.tree import resident_bytes
+from bench.run.worker import Limits
 from tests.framework.conftest import import_path
 from tests.framework.distributions import install
 
@@ -84,3 +92,20 @@ def test_a_command_ends_whatever_a_plugin_left(what: str, tmp_path: Path) -> Non
         assert found.stderr == ""
     if what == "nothing":
         assert found.stdout.endswith("and the hooks are heard\n")
+
+
+def test_a_thread_that_fills_the_runs_own_process_stops_the_run_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    executor = ProcessExecutor(1, Limits(memory_gb=0.5))
+    executor._check_own_memory(resident_bytes(os.getpid()))
+    monkeypatch.setattr(registry, "_FOREIGN", {"late": "cavbench-late 2.0"})
+    code: dict[str, Any] = {"__name__": "late.inner"}
+    exec("def fill(end): end.wait(30)", code)
+    end = threading.Event()
+    threading.Thread(target=code["fill"], args=(end,), name="filler", daemon=True).start()
+    try:
+        with pytest.raises(
+            UserError, match=r"grew by .* GB, more than unit_memory=0.5 GB, by the thread 'filler' of cavbench-late 2.0"
+        ):
+            executor._check_own_memory(resident_bytes(os.getpid()) - 600_000_000)
+    finally:
+        end.set()
