@@ -1,5 +1,6 @@
 # make run: installs what running needs and prints the first score. make test, make lint, make docs: the checks of CI.
-# make bench: the speed figures. make licences: the licence of all that is installed. make wheel-check: the wheel in an environment of its own. All but `run` install what development needs.
+# make bench: the speed figures. make licences: the licence of all that is installed. make wheel-check: the wheel in an environment
+# of its own. All but `run` install what development needs.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
