@@ -403,3 +403,16 @@ def test_records_of_format_1_are_converted(written: Path, units: list[Unit]) -> 
     assert upgraded["return"].to_pylist() == today["return"].to_pylist()
     assert set(upgraded["world_facts"].to_pylist()) == {json.dumps(TRACK.facts_of_v1, separators=(",", ":"))}
     assert None in upgraded["same_answer"].to_pylist()
+
+
+def test_rows_are_not_hidden_by_what_a_file_says_of_its_values(written: Path, units: list[Unit]) -> None:
+    """A file states the least and the greatest value of each column, and readers skip what cannot match."""
+    key = units[0].fingerprint
+    path = results.path_of(written, key)
+    honest = read(written, [key])
+    content = path.read_bytes()
+    footer = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
+    other = bytes(reversed(key.encode()))
+    assert key.encode() in content[footer:]
+    path.write_bytes(content[:footer] + content[footer:].replace(key.encode(), other))
+    assert read(written, [key]).equals(honest)
