@@ -169,13 +169,12 @@ def test_a_victim_that_cannot_answer_is_named_and_drives_nothing(site: Path, tmp
     words = ("victim=toy,bad_answers", "victim.answer=nan,shape", *CELL)
     said = ran(site, "run", "attack=none", *words, "executor=serial", f"out={tmp_path}")
     assert said.code == 2
-    # A probe may ask before the first decision.
     asked = re.search(
-        r"answered NaN or infinite scores (while driving|to a query) \(victim 'bad_answers' (.*)", said.err
+        r"is refused: it answers NaN or infinity on observations of this world \(victim 'bad_answers' (.*)", said.err
     )
     assert asked
-    assert asked[2].startswith(PACKAGE)
-    assert "the victim has 2 actions, the world has 5: LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER" in said.err
+    assert asked[1].startswith(PACKAGE)
+    assert "is refused: it has 2 actions, the world has 5: LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER" in said.err
     assert set(reading.read(tmp_path, track=track("driving"))["victim"].to_pylist()) == {"toy"}
 
 
