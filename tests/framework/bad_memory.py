@@ -49,7 +49,8 @@ class _Mean(Policy):
         return TensorDict({"seen": seen}, batch_size=episodes.shape)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
-        self.calls += 1
+        if self.rule.startswith("counts"):
+            self.calls += 1
         seen: Any = self.kept if self.rule == "object" else state["seen"] if state is not None else None
         now = observation.mean(-2)
         scores = self.layer(now if seen is None else (now + seen) / 2)
