@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +26,7 @@ from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
 from bench.plugins.progress import share_done
 from bench.trust.identifiers import opaque
+from bench.trust.kept import unchanged
 from bench.trust.streams import Stream
 from bench.trust.watch import Watch
 
@@ -94,6 +96,8 @@ def rollout(
         NotJointError: if there are several units, and the victim's answers depend on the rest of the batch, or anything was
             drawn from the random generators of the process, which the units share.
     """
+    # The run's own: the objects that it was given may be reached by an attack or a victim.
+    facts, threat = deepcopy(facts), deepcopy(threat)
     frames = threat.frames(facts.max_steps)
     episodes = torch.as_tensor(list(seeds), dtype=torch.int64)
     salts = [attack_seed] * len(seeds) if isinstance(attack_seed, int) else list(attack_seed)
@@ -102,6 +106,7 @@ def rollout(
     with (
         torch.no_grad(),
         victims_draws.in_use(),
+        unchanged({"attack": attack} if attack else {}, "attack"),
         Watch(policy, "victim", listens=attack is not None) as watch,
     ):
         subject = CountedPolicy(policy, watch, attacks_draws)
