@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from copy import deepcopy
 from itertools import accumulate, pairwise
 
-from bench.driving import attacker, enforcer, meter, oracle, probes, threat, victim
+from bench.driving import attacker, enforcer, meter, oracle, probes, shadows, threat, victim
 from bench.driving import rollout as rollouts
 from bench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
 from bench.driving.meter import Columns
@@ -20,7 +20,7 @@ from bench.plugins.track import Driven, Job
 from bench.trust.seal import Seal
 from bench.trust.streams import Stream
 
-SEAL = Seal(attacker, enforcer, meter, oracle, probes, rollouts, threat, victim)
+SEAL = Seal(attacker, enforcer, meter, oracle, probes, rollouts, shadows, threat, victim)
 
 
 def drive(job: Job, traced: Sequence[int]) -> Driven:

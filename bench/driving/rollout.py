@@ -113,7 +113,8 @@ def rollout(
         attacker = Attacker(attack, subject, threat, facts.features, seed=attack_seed, dynamics=dynamics, frames=frames)
         td = env.reset(TensorDict({"seed": episodes}, batch_size=env.batch_size))
         state = subject.initial(torch.cat([opaque([seed], salt) for seed, salt in zip(seeds, salts, strict=True)]))
-        meter, probe = Meter(subject, facts, td["info", "x"].squeeze(-1)), Probe(len(seeds), subject, entropy)
+        meter = Meter(subject, facts, td["info", "x"].squeeze(-1))
+        probe = Probe(len(seeds), subject, entropy, rehearsed=attack is not None and attack.access == "dynamics")
         _check_actions(subject, td["observation"], state, facts)
         if several:
             gradients = attack is not None and attack.access in ("gradients", "dynamics")
@@ -122,10 +123,11 @@ def rollout(
             share_done(step / facts.max_steps)
             truth, running = td["observation"], ~td["done"].squeeze(-1)
             probing = probe.due()
-            attacker.enforcer.asked = [] if probing else None
+            asked = attacker.enforcer.asked = [] if probing else None
             shown = attacker.show(truth, running, state)
-            if probing:
-                scores, action = probe.driven(shown.observation, truth, running, state, attacker.enforcer.asked or [])
+            if probing or probe.shadow:
+                rehearsal = attacker.enforcer.rehearsed
+                scores, action = probe.driven(shown.observation, truth, running, state, asked, rehearsal)
             else:
                 scores, action = subject.driven(shown.observation, state)
             td = env.step(td.set("action", action))["next"]
@@ -135,6 +137,7 @@ def rollout(
             state = subject.advance(shown.observation, action, state)
             if bool(td["done"].all()):
                 break
+        probe.end()
     if several and (victims_draws.used() or attacks_draws.used()):
         raise NotJointError
     reach = threat.reach(td["observation"].shape[-2], facts.features, facts.max_steps)
