@@ -106,7 +106,7 @@ def rollout(
     with (
         torch.no_grad(),
         victims_draws.in_use(),
-        unchanged({"attack": attack} if attack else {}, "attack"),
+        unchanged({type(attack).__name__: attack} if attack else {}, "attack"),
         Watch(policy, "victim", listens=attack is not None) as watch,
     ):
         subject = CountedPolicy(policy, watch, attacks_draws)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from abc import ABCMeta
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -80,8 +81,9 @@ class Custody:
         if isinstance(value, FunctionType):
             return _FUNCTION if self._functions and self._is_own(value.__module__) else None
         if isinstance(value, type):
-            kind = _CLASS if self._functions else _DATA
-            return kind if self._is_own(value.__module__) else None
+            # Libraries keep books on classes that they make: TorchRL on those of environments.
+            plain = type(value) in (type, ABCMeta) and self._is_own(value.__module__)
+            return (_CLASS if self._functions else _DATA) if plain else None
         known = isinstance(value, SimpleNamespace) or _is_network(value) or self._is_own(type(value).__module__)
         return _INSTANCE if known and hasattr(value, "__dict__") else None
 

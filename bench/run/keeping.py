@@ -21,7 +21,8 @@ class Keeping:
     `end` finds what changed, and puts it back:
 
     - A component, its class or the threat model may not change: `refused` says what did, and whose it is.
-    - What else a plug-in's package keeps, such as a cache, is forgotten: `forgotten` names it. No other unit can depend on it.
+    - What else a plug-in's package keeps, such as a cache, is forgotten: `forgotten` names it, `origin` the package. No other
+      unit can depend on it.
 
     Args:
         pairs: attack, defence, victim, world, threat model.
@@ -45,7 +46,8 @@ class Keeping:
         """Find what changed, and put it back."""
         for part, custody in self._held:
             if (names := custody.changed()) and self.refused is None:
-                self.refused = f"{listed(names)} changed while it was measured", (part,)
+                # Whoever reaches the world can have changed it.
+                self.refused = f"{listed(names)} changed while it was measured", () if part.kind == "world" else (part,)
             custody.restore()
             if is_foreign(part):
                 forget_computed(part.component)
@@ -68,6 +70,9 @@ class Keeping:
                 os.environ[key] = self._environment[key]
         for name, module in _modules(self._packages).items():
             _clear_caches(name, module)
+        ships = {_package(part): part.shipped_by for part in self._parts if _package(part) in self._packages}
+        kept = {package for package in ships if any(name.partition(".")[0] == package for name in names)}
+        self.origin = " and ".join(sorted({ships[package] for package in kept or ships}))
         self.forgotten = tuple(names) + tuple(f"the environment variable {key}" for key in sorted(changed))
 
 

@@ -195,7 +195,7 @@ def _noted(outcome: Outcome | Failure, keeping: Keeping) -> Outcome | Failure:
     """The outcome, with a line about what plug-ins kept; their process does no other work."""
     if not keeping.forgotten or not isinstance(outcome, Outcome):
         return outcome
-    line = f"{keeping.origin} kept {listed(keeping.forgotten)} after a unit; it was put back, so no unit depends on another"
+    line = f"{keeping.origin} kept {listed(keeping.forgotten)} after a unit: it was put back, so that no unit depends on another"
     return replace(outcome, last=True, warnings=(*outcome.warnings, line))
 
 
