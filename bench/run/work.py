@@ -23,6 +23,7 @@ from bench.plugins.progress import listening
 from bench.records.store import table
 from bench.run.blame import blamed, named
 from bench.run.keeping import Keeping
+from bench.run.reach import within_reach
 from bench.run.unit import Loading, Preparation, Unit
 from bench.trust.watch import TamperError
 
@@ -146,7 +147,7 @@ def _together(task: Task, tell: Tell) -> Outcome | Failure:
     """The outcomes of a task with several units: one after the other, if one batch gives no results."""
     keeping = Keeping([task.work.pair, *(unit.pair for unit in task.others)])
     try:
-        with contained():
+        with contained(), within_reach([task.work.pair, *(unit.pair for unit in task.others)]):
             outcomes: Sequence[Outcome | Failure] = _in_one_batch(task, tell)
     # Each unit alone says what is wrong with it.
     except Exception:
@@ -202,7 +203,7 @@ def _noted(outcome: Outcome | Failure, keeping: Keeping) -> Outcome | Failure:
 def _alone(task: Task, tell: Tell) -> Outcome | Failure:
     work = task.work
     try:
-        with contained():
+        with contained(), within_reach([work.pair]):
             return _performed(task, tell)
     except TamperError as error:
         return Failure(why=f"is refused: {message(error)}{blamed(work.pair, error)}", trace=traceback.format_exc())

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import os
+import tempfile
+import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
+from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -35,6 +41,14 @@ Deed = Literal[
     "cache",
     "attribute",
     "default",
+    "npz",
+    "torch file",
+    "temporary",
+    "package",
+    "caught",
+    "shared",
+    "reads",
+    "harmless files",
 ]
 MEMORY: dict[str, int] = {}
 SEEN: list[int] = []
@@ -110,9 +124,38 @@ class Bends(DrivingAttack):
             case "default":
                 found = bool(attributed())
                 attributed().append(1)
+            case "npz" | "torch file" | "temporary" | "package" | "caught" | "shared" | "reads" | "harmless files":
+                found = self.filed()
             case _:
                 found = False
         return found
+
+    def filed(self) -> bool:
+        """Whether a file says so."""
+        home = Path(__file__).parent
+        match self.deed:
+            case "npz":
+                np.savez("memo.npz", here=1)
+            case "torch file":
+                torch.save({"here": 1}, "memo.pt")
+            case "temporary":
+                Path("/tmp/bends-memo").write_text("here")
+            case "package":
+                (home / "memo.txt").write_text("here")
+            case "caught":
+                with suppress(BaseException):
+                    os.mkdir("memo")
+            case "shared":
+                SharedMemory("bends-memo", create=True, size=1).close()
+            case "reads":
+                return "here" in Path("kept.txt").read_text()
+            case "harmless files":
+                with tempfile.NamedTemporaryFile("w") as file:
+                    file.write("here")
+                with open(os.devnull, "w") as file:
+                    file.write("here")
+                warnings.warn(Path(__file__).read_text()[:20], stacklevel=1)
+        return False
 
     def step(self, observation: Tensor, oracle: Oracle, state: Any) -> tuple[Tensor, Any]:
         features, answer = (

@@ -16,7 +16,7 @@ from tests.framework.distributions import install, install_toy
 HERE = Path(__file__).parent
 CELL = ("world=toy", "lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0", "record=0", "reference=false")
 PACKAGE = "of cavbench-bends 2.0"
-OWN_COPY = ("none", "features", "threat", "observation", "parts")
+OWN_COPY = ("none", "features", "threat", "observation", "parts", "harmless files")
 """Deeds that reach nothing but the attack's own copies: it scores as one that does nothing."""
 FORGOTTEN = {
     "global": "bending.MEMORY.here",
@@ -24,7 +24,7 @@ FORGOTTEN = {
     "tensor": "bending.COUNT",
     "environment": "the environment variable BENDS",
     "attribute": "bending.attributed.attribute here",
-    "default": "bending.attributed",
+    "default": "bending.attributed.defaults.0",
 }
 """Memories that end with the unit, and what the line about them names."""
 REFUSED = {
@@ -34,6 +34,16 @@ REFUSED = {
     "constant": "bench.driving.probes.EVERY was replaced",
 }
 """Deeds that a unit is refused for."""
+FILES = {
+    "npz": "it wrote memo.npz while it was measured: a plug-in may keep no memory across units",
+    "torch file": "it wrote memo.pt while",
+    "temporary": "it wrote /tmp/bends-memo while",
+    "package": "memo.txt while",
+    "caught": "it wrote memo while",
+    "shared": "it shared memory with other processes while",
+    "reads": "it read kept.txt while",
+}
+"""Memories on disk that a unit is refused for."""
 SILENT = ("cache", "itself once")
 """Caches of functions and properties are emptied without a word: honest plug-ins have them."""
 
@@ -51,10 +61,32 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def swept(request: pytest.FixtureRequest, site: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Said, Path]:
     """Every deed, two draws each, by one worker, and an honest attack after them."""
     out = tmp_path_factory.mktemp(f"swept_{request.param}_")
-    deeds = [*OWN_COPY, *FORGOTTEN, *SILENT, *([] if request.param == "serial" else REFUSED)]
+    deeds = [*OWN_COPY, *FORGOTTEN, *SILENT] if request.param == "serial" else ["none", "global", *REFUSED]
     listed = ",".join(f"'{deed}'" for deed in deeds)
     words = ("attack=bends,noise", f"attack.deed={listed}", "attack.draw=0,1", "victim=toy", "workers=1", *CELL)
     return ran(site, "run", *words, f"executor={request.param}", f"out={out}"), out
+
+
+@pytest.mark.slow
+def test_a_memory_on_disk_is_refused_and_not_written(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "kept.txt").write_text("here")
+    listed = ",".join(f"'{deed}'" for deed in FILES)
+    words = ("attack=bends,noise", f"attack.deed={listed}", "victim=toy", *CELL, "executor=serial")
+    said = ran(site, "run", *words, f"out={tmp_path / 'out'}")
+    assert said.code == 2
+    for deed, why in FILES.items():
+        (line,) = {
+            line for line in said.err.splitlines() if line.startswith("error: ") and f"bends(deed={deed})" in line
+        }
+        assert "is refused: " in line
+        assert why in line
+        assert PACKAGE in line
+    assert {path.name for path in tmp_path.iterdir()} == {"kept.txt", "out"}
+    assert not Path("/tmp/bends-memo").exists()
+    assert set(reading.read(tmp_path / "out", track=track("driving"))["attack"].to_pylist()) == {"noise", "none"}
 
 
 def scores(out: Path) -> dict[tuple[str, str], list[float]]:
@@ -70,8 +102,7 @@ def scores(out: Path) -> dict[tuple[str, str], list[float]]:
 def test_nothing_that_a_deed_changes_or_remembers_reaches_a_score(swept: tuple[Said, Path]) -> None:
     said, out = swept
     of_deeds = {key[1]: values for key, values in scores(out).items() if key[0] == "bends"}
-    harmless = {name for name in (*OWN_COPY, *FORGOTTEN, *SILENT)}
-    assert len(of_deeds) == 2 * len(harmless), said.err
+    assert len(of_deeds) == (4 if "processes" in str(out) else 2 * len({*OWN_COPY, *FORGOTTEN, *SILENT})), said.err
     draws = {draw: {tuple(values) for name, values in of_deeds.items() if f'"draw":{draw}' in name} for draw in (0, 1)}
     assert len(draws[0] | draws[1]) == 1
 
@@ -79,11 +110,9 @@ def test_nothing_that_a_deed_changes_or_remembers_reaches_a_score(swept: tuple[S
 @pytest.mark.slow
 def test_what_a_plugin_keeps_is_named(swept: tuple[Said, Path]) -> None:
     said, _ = swept
-    for what in FORGOTTEN.values():
-        assert (
-            f"cavbench-bends 2.0 kept {what} after a unit: it was put back, so that no unit depends on another"
-            in said.err
-        )
+    for deed, what in FORGOTTEN.items():
+        if f"deed={deed}" in said.err:
+            assert f" kept {what} after a unit: it was put back, so that no unit depends on another" in said.err
     assert "cached" not in said.err
 
 
