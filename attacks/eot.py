@@ -150,7 +150,9 @@ class EOT(PatchAttack):
             if step % REPORT_EVERY == 0:
                 progress(step / self.steps, f"stop sign {found.item():.2f}")
         last = losses[-max(1, round(JUDGED * self.steps)) :]
-        return patch.detach()[0], sum(last) / len(last) if len(losses) == self.steps else torch.inf
+        mean = sum(last) / len(last) if len(losses) == self.steps else torch.inf
+        # A start whose loss is not a number is never the best one.
+        return patch.detach()[0], torch.inf if mean != mean else mean
 
     def _loss(self, scores: Tensor) -> Tensor:
         """The loss of scores [N] in [0, 1]."""

@@ -25,6 +25,13 @@ class PluginError(UserError):
     """
 
 
+class RefusedNetworkError(UserError):
+    """A network is not what attacks, probes and replays rely on, so its score would be wrong.
+
+    The message continues "NAME is refused:".
+    """
+
+
 class UnfinishedError(UserError):
     """A run went to its end, but some of its units failed.
 

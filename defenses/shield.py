@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from annotated_types import Interval
@@ -44,6 +44,8 @@ class Shield(DrivingDefense):
         braking_s: how long a car ahead is assumed to brake, in s.
         distance: room between two cars that is always kept, in m.
     """
+
+    brakes_to: ClassVar[float | None] = 10.0
 
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from bench.driving import DrivingWorld
 from bench.errors import UserError
-from bench.plugins import registry, suites
+from bench.plugins import budgets, registry, suites
 from bench.plugins.bytecode import code_of
 from bench.plugins.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
 from bench.plugins.pair import Chosen, Pair, choose
@@ -22,6 +22,9 @@ from bench.plugins.track import track
 from bench.run.config import combined, grid_of
 from bench.scenarios import Grid, SeedBlock, Value
 from bench.victims.drivers.in_process import code_of_policies, in_process
+from bench.victims.drivers.sb3_environment import training_of
+from bench.victims.drivers.sb3_model import is_model
+from bench.victims.drivers.spaces import UNKNOWN
 
 BASES: dict[str, type[Component]] = {"attack": Attack, "defense": Defense, "victim": Victim, "world": World}
 TRIED = 4
@@ -80,7 +83,15 @@ def world_of(given: World | str | None, victim: object) -> Chosen[Any]:
     return choose("world", track(name).world)
 
 
-def victim_of(given: Any, world: Chosen[Any], grid: Grid, *, name: str | None, actions: str | None) -> Chosen[Any]:
+def victim_of(
+    given: Any,
+    world: Chosen[Any],
+    grid: Grid,
+    *,
+    name: str | None,
+    actions: str | None,
+    trained_in: str | None = None,
+) -> Chosen[Any]:
     """The victim: a name, a component, or policies that were given as objects, one for each training seed.
 
     Raises:
@@ -89,6 +100,11 @@ def victim_of(given: Any, world: Chosen[Any], grid: Grid, *, name: str | None, a
     if isinstance(given, str | Victim):
         if name is not None or actions is not None:
             raise UserError("name= and actions= are for a victim that is an object, such as a torch.nn.Module")
+        if trained_in is not None:
+            raise UserError(
+                "trained_in= is for a victim that is an object; a file has it as a parameter: "
+                'cavbench.component("victim", "sb3", path=…, trained_in=…)'
+            )
         return chosen("victim", given)
     if not isinstance(world.component, DrivingWorld):
         raise UserError(
@@ -97,10 +113,32 @@ def victim_of(given: Any, world: Chosen[Any], grid: Grid, *, name: str | None, a
     objects = several(given)
     if not objects:
         raise UserError("an empty list of victims")
-    victim = in_process(objects, world.component.facts, _observations(world.component, grid), actions)
+    observation = _observations(world.component, grid)
+    try:
+        victim = in_process(
+            objects, world.component.facts, observation, actions, lambda: _trained_in(objects, world, grid, trained_in)
+        )
+    except ValueError as error:
+        raise UserError(str(error)) from error
     code = code_of_policies(victim)
     label = name or f"{type(objects[0]).__name__}-{victim.policies[0].weights_sha256[:HASH_DIGITS]}"
     return Chosen(kind="victim", name=label, component=victim, code=code)
+
+
+def _trained_in(objects: Sequence[object], world: Chosen[Any], grid: Grid, stated: str | None) -> str:
+    """The world in which objects were trained: the stated one, or what their environments say if they agree, or `unknown`.
+
+    Raises:
+        UserError: if an environment changes observations or actions in a way that the world does not.
+    """
+    trainings = [training_of(one) if is_model(one) else None for one in objects]
+    found = {
+        UNKNOWN if training is None else training.world_of(world, grid, lambda own: str(chosen("world", own)))
+        for training in trainings
+    }
+    if stated is not None:
+        return stated
+    return found.pop() if len(found) == 1 else UNKNOWN
 
 
 def pairs_of(
@@ -133,13 +171,17 @@ def threat_of(
         UserError: if a value is not allowed.
     """
     if isinstance(given, ThreatModel):
-        return given
+        return budgets.checked(given, python=True)
     values = dict(given or {})
+    budget, confirmed = budgets.read(values.get("budget"))
+    values |= {} if budget is None else {"budget": budget}
     if chosen_suites and "access" not in values:
         values["access"] = max((suite.access for suite in chosen_suites), key=get_args(Access).index)
     model = victim.component.threat
     try:
-        return model(**values)
+        return budgets.checked(model(**values), confirmed=confirmed, python=True)
+    except UserError:
+        raise
     except (ValueError, TypeError) as error:
         raise UserError(f"threat: {str(error).splitlines()[0]}") from error
 

@@ -51,6 +51,7 @@ def score(
     progress: bool | None = None,
     name: str | None = None,
     actions: Literal["discrete", "continuous"] | None = None,
+    trained_in: str | None = None,
     **axes: Value | Sequence[Value],
 ) -> Scores:
     """Score attacks on a defended victim, as `bench run` does: the same scenarios, threat model, records and resuming.
@@ -60,8 +61,9 @@ def score(
 
     Args:
         victim: a name, as on the command line; or an object: a `bench.driving.Policy`, a `torch.nn.Module` that maps
-            observations [N, V, F] or [N, V * F] to values [N, A] of the discrete actions or to actions [N, 2] in [-1, 1], or a
-            model of Stable-Baselines3. A list of objects holds the trainings of one policy, one for each training seed.
+            observations [N, V, F] or [N, V * F] to values [N, A] of the discrete actions or to actions [N, 2] in [-1, 1], an
+            actor of TorchRL, or a model of Stable-Baselines3. A list of objects holds the trainings of one policy, one for each
+            training seed.
         attack: an attack or a suite, or a list of them: names, or objects such as `component("attack", "pgd", steps=50)`.
         defense: a defence, or a list of them; a name or an object each.
         world: name or object; by default that of the victim's track.
@@ -79,6 +81,8 @@ def score(
         progress: whether to show a progress bar; by default on a terminal.
         name: how records call a victim that is an object; by default its class and the first digits of its weights' hash.
         actions: type of actions of a torch network whose output fits both.
+        trained_in: the world in which a victim that is an object was trained, as tables print it: "highway". By default what its
+            environment says, if it has one, otherwise `unknown`, on which tables remark.
         axes: values on the axes of the world, for instance lanes=3 or weather=["clear", "fog"].
 
     Returns:
@@ -91,7 +95,7 @@ def score(
         raise UserError(f"by must be 'pair' or 'cell', got {by!r}")
     in_world = world_of(world, victim)
     asked = grid_with(in_world, grid, episodes, axes)
-    attacked = victim_of(victim, in_world, asked, name=name, actions=actions)
+    attacked = victim_of(victim, in_world, asked, name=name, actions=actions, trained_in=trained_in)
     pairs, skipped = pairs_of(attack, defense, attacked, in_world, threat)
     checked_for_workers(pairs, workers)
     policies = getattr(attacked.component, "policies", ())

@@ -20,7 +20,12 @@ if TYPE_CHECKING:
 
 TRIED_WITH = ("victim", "world")
 """Keys that choose the victim and the world to check a component with."""
-MARKS = {"pass": ("✓", "green"), "fail": ("✗ fix", "bold red"), "skip": ("– skipped", "dim")}
+MARKS = {
+    "pass": ("✓", "green"),
+    "fail": ("✗ fix", "bold red"),
+    "skip": ("– skipped", "dim"),
+    "doubt": ("? look", "yellow"),
+}
 
 
 def print_checks(name: str, words: Sequence[str], console: Console) -> int:
@@ -49,7 +54,8 @@ def print_checks(name: str, words: Sequence[str], console: Console) -> int:
             outcomes = list(examine(kind, name, values, **tried_with))
         console.print(_table(outcomes))
         counts = Counter(outcome.status for outcome in outcomes)
-        summary = f"{counts['pass']} passed, {counts['fail']} to fix, {counts['skip']} skipped\n"
+        look = f"{counts['doubt']} to look at, " if counts["doubt"] else ""
+        summary = f"{counts['pass']} passed, {counts['fail']} to fix, {look}{counts['skip']} skipped\n"
         console.print(Text(summary, style="bold red" if counts["fail"] else "green"))
         failed = failed or counts["fail"] > 0
     return int(failed)
@@ -62,7 +68,7 @@ def _table(outcomes: Sequence[Outcome]) -> Table:
     table.add_column(ratio=1)
     for outcome in outcomes:
         mark, style = MARKS[outcome.status]
-        text = Text(outcome.text, style="" if outcome.status == "fail" else "dim")
+        text = Text(outcome.text, style="" if outcome.status in ("fail", "doubt") else "dim")
         table.add_row(outcome.check, Text(mark, style=style), text)
     return table
 

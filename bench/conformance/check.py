@@ -14,7 +14,7 @@ from typing import Any, Literal
 from bench.errors import UserError
 from bench.plugins.registry import Kind
 
-Status = Literal["pass", "fail", "skip"]
+Status = Literal["pass", "fail", "skip", "doubt"]
 Check = Callable[[], str | None]
 """Returns a remark or None if the check passes; raises otherwise."""
 
@@ -25,8 +25,8 @@ class Outcome:
 
     Args:
         check: name of the check.
-        status: pass, fail, or skip if it does not apply.
-        text: one line: what to fix, why it does not apply, or a remark.
+        status: pass, fail, skip if it does not apply, or doubt if only its author can say whether it is right.
+        text: one line: what to fix, why it does not apply, what to look at, or a remark.
     """
 
     check: str
@@ -36,6 +36,10 @@ class Outcome:
 
 class BrokenRuleError(Exception):
     """A rule is broken; the message says in one line which one, and what to fix."""
+
+
+class DoubtError(Exception):
+    """What a check found may be wrong; the arguments are one line each."""
 
 
 class NotApplicableError(Exception):
@@ -98,6 +102,8 @@ class Suite(ABC):
                 yield Outcome(name, "pass", check() or "")
             except BrokenRuleError as failure:
                 yield Outcome(name, "fail", one_line(failure))
+            except DoubtError as doubt:
+                yield from (Outcome(name, "doubt", line) for line in doubt.args)
             except NotApplicableError as reason:
                 yield Outcome(name, "skip", one_line(reason))
             # Third-party code may raise anything: tell its author what, and where.

@@ -24,6 +24,8 @@ from bench.trust.streams import Stream
 
 Columns = dict[str, NDArray[np.generic]]
 
+OF_GRADIENTS = ("zero_gradients", "nan_gradients")
+"""Counts of a crafting that are recorded as shares of its gradients."""
 SAME_CONFIDENCE = 0.01
 """Two confidences count as the same answer if they differ by at most this."""
 SAME_MEAN = 0.1
@@ -130,7 +132,10 @@ def score(
         "crafting_s": crafted.seconds,
         "excess": crafted.excess,
         "gradient_queries": float(crafted.gradients),
-        "zero_gradients": crafted.zero_gradients / crafted.gradients if crafted.gradients else np.nan,
+        **{
+            name: getattr(crafted, name) / max(crafted.gradients, 1) if crafted.gradients else np.nan
+            for name in OF_GRADIENTS
+        },
         "draws": np.nan,
         "non_printability": np.nan if texels is None else float(non_printability(texels)),
         **probed(detector, approaches, seen, texels, share, entropy),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -75,6 +75,10 @@ class DetectorVictim(Victim):
     def seeded(self) -> bool:
         """Whether the detector depends on the training seed; if not, the seeds of a run are patch seeds only."""
         return False
+
+    def alternatives(self) -> Mapping[str, DetectorVictim]:
+        """The same victim with other parameters that could be meant, by the words to type; for a hint if it sees no sign."""
+        return {}
 
     @abstractmethod
     def load(self, seed: int, facts: Facts) -> Detector:

@@ -59,6 +59,7 @@ def craft(
         queries=enforcer.spent,
         gradients=enforcer.backwards,
         zero_gradients=enforcer.zeros,
+        nan_gradients=enforcer.nans,
         seconds=seconds,
         excess=excess,
         evolution=enforcer.oracle.evolution,

@@ -20,7 +20,8 @@ from bench.trust.watch import TamperError, Watch
 class PatchEnforcer:
     """Enforces the access level and the query budget of a patch attack; `oracle` is what the attack is given.
 
-    `spent` counts the queries, `backwards` the images whose gradient was computed, `zeros` the gradients that were 0 everywhere.
+    `spent` counts the queries, `backwards` the images whose gradient was computed, `zeros` the gradients that were 0 everywhere,
+    `nans` those with a NaN or infinite entry.
 
     Args:
         detector: the victim.
@@ -43,7 +44,7 @@ class PatchEnforcer:
         self.detector, self.access = detector, access
         self.threat = deepcopy(threat)
         self.watch, self.stream = watch, stream
-        self.spent = self.backwards = self.zeros = self._evaluated = 0
+        self.spent = self.backwards = self.zeros = self.nans = self._evaluated = 0
         self.oracle = PatchOracle(
             self, threat, generator, label=detector.index(STOP_SIGN), stride=detector.stride, names=detector.names
         )
@@ -117,6 +118,12 @@ class PatchEnforcer:
             if away:
                 self._switch(True)
 
-    def _came_back(self, gradient: Tensor) -> None:
+    def _came_back(self, gradient: Tensor) -> Tensor:
+        """The gradient [N, 3, H, W], with 0 for each entry that is NaN or infinite: one such pixel would spoil every texel."""
+        if not bool(gradient.sum().isfinite()):
+            lost = ~gradient.isfinite()
+            gradient = gradient.masked_fill(lost, 0.0)
+            self.nans += int(lost.flatten(1).any(1).sum())
         self.backwards += len(gradient)
         self.zeros += int((gradient == 0).flatten(1).all(1).sum())
+        return gradient

@@ -15,7 +15,7 @@ from bench.errors import UserError
 
 MOMENTS = 20
 """Largest number of crafting steps kept in an `Evolution`."""
-MEASURED = ("queries", "gradients", "zero_gradients", "seconds", "excess")
+MEASURED = ("queries", "gradients", "zero_gradients", "nan_gradients", "seconds", "excess")
 LOSS = "loss."
 
 
@@ -42,7 +42,7 @@ class Patch:
         texels: float32 [3, P, P] sRGB in [0, 1]; None for no patch.
         queries: number of images sent to the detector.
         gradients: number of images whose gradient was computed.
-        zero_gradients: number of these gradients that were 0 everywhere.
+        zero_gradients, nan_gradients: number of these gradients that were 0 everywhere, and of those with NaN or infinity.
         seconds: wall time.
         excess: largest distance from the attack's texels to [0, 1], before projection.
         evolution: intermediate patches that the attack reported; None if it reported nothing.
@@ -52,6 +52,7 @@ class Patch:
     queries: int = 0
     gradients: int = 0
     zero_gradients: int = 0
+    nan_gradients: int = 0
     seconds: float = 0.0
     excess: float = 0.0
     evolution: Evolution | None = None
@@ -87,6 +88,7 @@ class Patch:
                 queries=int(header["queries"]),
                 gradients=int(header["gradients"]),
                 zero_gradients=int(header.get("zero_gradients", 0)),
+                nan_gradients=int(header.get("nan_gradients", 0)),
                 seconds=float(header["seconds"]),
                 excess=float(header["excess"]),
                 evolution=_evolution(tensors),

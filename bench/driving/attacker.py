@@ -28,7 +28,8 @@ class Shown:
     Args:
         observation: [B, V, F], in the perturbation set.
         queries: int64 [B] evaluations of the victim.
-        gradients, zero_gradients: int64 [B] number of gradients computed, and number of gradients that were 0 everywhere.
+        gradients, zero_gradients, nan_gradients: int64 [B] number of gradients computed, of those that were 0 everywhere, and
+            of those that were NaN or infinite where the attack may change the value.
         excess: [B] L-inf distance from the attack's answer before projection to the set, on the normalised scale.
         milliseconds: the attack's wall time for the whole batch.
     """
@@ -37,6 +38,7 @@ class Shown:
     queries: Tensor
     gradients: Tensor
     zero_gradients: Tensor
+    nan_gradients: Tensor
     excess: Tensor
     milliseconds: float = 0.0
 
@@ -91,10 +93,10 @@ class Attacker:
             running: bool [B]; the other episodes are neither attacked nor counted.
             policy_state: the victim's state for the B episodes.
         """
-        counts = torch.zeros(3, observation.shape[0], dtype=torch.int64)
+        counts = torch.zeros(4, observation.shape[0], dtype=torch.int64)
         excess = observation.new_zeros(observation.shape[0])
         if self.attack is None:
-            return Shown(observation, counts[0], counts[1], counts[2], excess)
+            return Shown(observation, counts[0], counts[1], counts[2], counts[3], excess)
         if not self.begun:
             self._begin(self.attack, observation, policy_state)
         if self.frames is not None:
@@ -109,7 +111,7 @@ class Attacker:
             self.changed += (perturbed != observation).flatten(1).any(1)
             counts[:, rows] = torch.stack(self.enforcer.counts)
         milliseconds = (time.perf_counter() - start) * 1000
-        return Shown(perturbed, counts[0], counts[1], counts[2], excess, milliseconds)
+        return Shown(perturbed, counts[0], counts[1], counts[2], counts[3], excess, milliseconds)
 
     def _begin(self, attack: DrivingAttack, observation: Tensor, policy_state: State) -> None:
         """Get the attack's initial state. It may not query the victim: no record would count these queries.

@@ -53,6 +53,14 @@ class DrivingWorld(World):
         return None
 
     @property
+    def observed_rows(self) -> int | None:
+        """V, the number of rows in its observations [B, V, F]; None if the world does not say.
+
+        Policies from files are checked against it before anything is driven.
+        """
+        return None
+
+    @property
     def facts(self) -> DrivingFacts:
         return DrivingFacts(
             axes=self.axes,
@@ -62,6 +70,7 @@ class DrivingWorld(World):
             features=self.features,
             drivers=self.drivers,
             kinematics=self.kinematics,
+            rows=self.observed_rows,
         )
 
     @abstractmethod
@@ -106,11 +115,21 @@ class DrivingVictim(Victim):
     """Who is at the wheel; its policies must have the same. Only a victim that does not see may leave it to the world."""
     policy_type: ClassVar[type[Policy] | None] = None
     """The class of its trained policies; the zoo builds it from a card."""
+    brakes_to: ClassVar[float | None] = None
+    """The target speed in m/s that SLOWER must be able to end at; None if it needs none. A run warns where it cannot."""
 
     @property
     @abstractmethod
     def action_type(self) -> ActionType:
         """Whether it takes discrete lane-changing decisions or outputs continuous acceleration and steering."""
+
+    @property
+    def draws(self) -> bool:
+        """Whether its policies may draw from the random generators of the process when they answer.
+
+        That is measured and flagged. One that comes from outside may not, because nobody could repeat its score.
+        """
+        return True
 
     @abstractmethod
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
@@ -236,6 +255,8 @@ class DrivingDefense(Defense):
     """Protects a driving policy."""
 
     track: ClassVar[str] = "driving"
+    brakes_to: ClassVar[float | None] = None
+    """As `DrivingVictim.brakes_to`."""
 
     @abstractmethod
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -63,7 +63,7 @@ class Enforcer:
         self.asked: list[tuple[Tensor | None, Tensor]] | None = None
         self.rehearsed: tuple[int, Tensor | None] | None = None
         self._step = 0
-        self.spent = self.gradients = self.zero_gradients = torch.empty(0, dtype=torch.int64)
+        self.spent = self.gradients = self.zero_gradients = self.nan_gradients = torch.empty(0, dtype=torch.int64)
 
     def begin(self, observation: Tensor, state: State = None, scale: float = 1.0, parts: Sequence[Part] = ()) -> Oracle:
         """The oracle of a step, with counters at 0; the oracle of the step before answers no more.
@@ -76,10 +76,11 @@ class Enforcer:
         """
         radius = self.threat.radius(observation, self.features, scale)
         low, high = bounds(observation, radius)
-        self._truth, self._low, self._high = map(_fixed, (observation, low, high))
+        self._truth, self._low, self._high, self._radius = map(_fixed, (observation, low, high, radius))
         self._state = state
         self._evaluations, self._step = self.subject.evaluations, self._step + 1
-        self.spent, self.gradients, self.zero_gradients = torch.zeros(3, observation.shape[0], dtype=torch.int64)
+        counters = torch.zeros(4, observation.shape[0], dtype=torch.int64)
+        self.spent, self.gradients, self.zero_gradients, self.nan_gradients = counters
         threat, features = self._shown
         return Oracle(
             _Door(self, self._step),
@@ -116,9 +117,9 @@ class Enforcer:
             raise TamperError("the attack evaluated the victim's network past the oracle", "attack")
 
     @property
-    def counts(self) -> tuple[Tensor, Tensor, Tensor]:
-        """int64 [B] each: queries, gradients, and gradients that were 0 everywhere, of this step."""
-        return self.spent, self.gradients, self.zero_gradients
+    def counts(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """int64 [B] each, of this step: queries, gradients, gradients that were 0 everywhere, and those with NaN or infinity."""
+        return self.spent, self.gradients, self.zero_gradients, self.nan_gradients
 
     def remembered(self, observation: Tensor, rows: Tensor | None) -> State:
         """The victim's state for each observation of [..., B, V, F], flattened to [N]."""
@@ -161,13 +162,37 @@ class Enforcer:
             )
         self.spent = torch.from_numpy(wanted)
 
-    def count(self, gradient: Tensor, rows: Tensor | None) -> None:
-        """Count the gradients [..., B, n], and those that are 0 everywhere."""
-        zero = (gradient == 0).all(-1)
+    def free(self, rows: Tensor | None) -> Tensor:
+        """bool [B, V * F] the entries that the attack may change, of all episodes or of `rows`."""
+        free = torch.from_numpy(self._radius > 0).flatten(1)
+        return free if rows is None else free[rows]
+
+    def counted(self, gradient: Tensor, rows: Tensor | None, free: Callable[[], Tensor] | None = None) -> Tensor:
+        """The gradients [..., B, n], with 0 for each entry that is NaN or infinite, after they were counted.
+
+        An attack averages over the entries of a gradient, so one NaN would spoil them all: a victim with such a gradient would
+        look robust.
+
+        Args:
+            gradient: as the victim's graph gives it.
+            rows: the episodes.
+            free: the entries that matter, bool [B, n]; None for all. A NaN in another entry costs the attack nothing.
+        """
         places = torch.arange(len(self.spent)) if rows is None else rows
-        for counter, counted in ((self.gradients, torch.ones_like(zero)), (self.zero_gradients, zero)):
-            counts = counted.long().flatten(0, -2).sum(0) if counted.ndim > 1 else counted.long()
-            counter.index_add_(0, places, counts)
+        # One sum is cheaper than a look at every entry.
+        if not bool(gradient.sum().isfinite()):
+            lost = ~gradient.isfinite()
+            gradient = gradient.masked_fill(lost, 0.0)
+            self._add(self.nan_gradients, (lost if free is None else lost & free()).any(-1), places)
+        zero = (gradient == 0).all(-1)
+        self._add(self.gradients, torch.ones_like(zero), places)
+        self._add(self.zero_gradients, zero, places)
+        return gradient
+
+    @staticmethod
+    def _add(counter: Tensor, found: Tensor, places: Tensor) -> None:
+        """Add the marks [..., B] to the counter of their episodes."""
+        counter.index_add_(0, places, found.long().flatten(0, -2).sum(0) if found.ndim > 1 else found.long())
 
 
 class _Door:
@@ -229,9 +254,9 @@ class _Door:
 
         with enforcer.subject.asked():
             value, gradient = enforcer.subject.differentiated(observation.flatten(0, -3), state, shaped)
-        gradient = gradient.reshape(observation.shape)
-        enforcer.count(gradient.flatten(-2), rows)
-        return value, gradient
+        gradient = gradient.reshape(observation.shape).flatten(-2)
+        gradient = enforcer.counted(gradient, rows, lambda: enforcer.free(rows))
+        return value, gradient.reshape(observation.shape)
 
     def value(self, observation: Tensor, action: Tensor, rows: Tensor | None) -> Tensor:
         enforcer = self._enforcer
@@ -243,8 +268,7 @@ class _Door:
         value = value.reshape(observation.shape[:-2])
         if gradient is None:
             return value
-        gradient = gradient.reshape(action.shape)
-        enforcer.count(gradient, rows)
+        gradient = enforcer.counted(gradient.reshape(action.shape), rows)
         return _Tangent.apply(action, value, gradient)
 
 

@@ -33,6 +33,10 @@ class Features:
         units: for instance m and m/s.
         floors: resolution of the sensor, in `units`: the smallest radius of the `relative` set at a budget of 0.1; empty for
             none.
+        fixed: names of the features that no attack can change, like `presence`: flags, one-hot codes, the clock.
+
+    Raises:
+        ValueError: if `fixed` names a feature that there is not.
     """
 
     names: tuple[str, ...]
@@ -40,6 +44,21 @@ class Features:
     high: tuple[float, ...]
     units: tuple[str, ...]
     floors: tuple[float, ...] = ()
+    fixed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.fixed, str):
+            raise ValueError(f"features.fixed is a tuple of names: write ({self.fixed!r},)")
+        if strange := [name for name in self.fixed if name not in self.names]:
+            raise ValueError(f"features.fixed names {strange[0]!r}, which is not one of features.names")
+
+    def forgeable(self) -> Tensor:
+        """[F - 1] 1 for the features that an attack may change, 0 for those that are `fixed`."""
+        return torch.tensor([float(name not in self.fixed) for name in self.names])
+
+    def written(self) -> dict[str, Any]:
+        """As plain JSON values for records; without `fixed` if there is none, as in records from before it."""
+        return {name: value for name, value in asdict(self).items() if name != "fixed" or value}
 
     def half_range(self) -> Tensor:
         """[F - 1] size of one normalised unit, in physical units."""
@@ -60,20 +79,29 @@ class DrivingFacts(Facts):
         drivers: supported drivers: `agent` executes the policy's actions; `idm` is the world's own rule-based driver, if any, and
             `oracle` a planner that knows the world's hidden state, if any.
         kinematics: how its cars move; None if the world does not say.
-        flat: whether the observation is one row, which the world's own environment gives as a flat array in physical units.
+        flat: whether the observation is one row, which the world's own environment gives as an array in physical units.
+        shape: shape of that array; empty for [F - 1].
+        rows: V, the number of rows in its observations; None if the world does not say.
+        environment: the call that makes the world's gymnasium environment, for messages; empty if the world does not say.
     """
 
     features: Features
     drivers: tuple[Driver, ...] = ("agent",)
     kinematics: Kinematics | None = None
     flat: bool = False
+    shape: tuple[int, ...] = ()
+    rows: int | None = None
+    environment: str = ""
 
     def native(self, observation: Tensor) -> Tensor:
         """The observation [..., V, F] in the format of the world's own environment, which policies from outside expect.
 
-        Itself, or the measured values [..., F - 1] in physical units if `flat`.
+        Itself or, if `flat`, the measured values [..., *shape] in physical units, in row-major order.
         """
-        return self.features.physical(observation).squeeze(-2) if self.flat else observation
+        if not self.flat:
+            return observation
+        measured = self.features.physical(observation).squeeze(-2)
+        return measured.unflatten(-1, self.shape) if self.shape else measured
 
     def blind_policies(self, action_type: ActionType) -> list[str]:
         """Names of this world's input-independent policies: each constant action, and `right_then_slower` if possible."""
@@ -84,7 +112,11 @@ class DrivingFacts(Facts):
         return [*constant, RIGHT_THEN_SLOWER] if sequence else constant
 
     def written(self) -> dict[str, Any]:
-        values = super().written() | {"features": asdict(self.features), "drivers": list(self.drivers)}
+        values = super().written() | {
+            "features": self.features.written(),
+            "drivers": list(self.drivers),
+        }
         # No report reads them.
-        del values["kinematics"]
+        for name in ("kinematics", "shape", "rows", "environment"):
+            del values[name]
         return values

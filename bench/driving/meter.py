@@ -40,14 +40,14 @@ class Meter:
         self.subject, self.facts = subject, facts
         features = facts.features
         self.half_range = features.half_range().numpy()
-        self.positions = np.array([unit == "m" for unit in features.units])
+        self.positions, self.speeds = (np.array([unit == wanted for unit in features.units]) for wanted in ("m", "m/s"))
         self.sums = np.zeros((len(self.SUMS), batch))
         self.linf_max, self.excess_max = np.zeros(batch, np.float32), np.zeros(batch, np.float32)
         self.min_ttc = np.full(batch, np.inf, np.float32)
         self.crashed, self.offroad = np.zeros(batch, np.bool_), np.zeros(batch, np.bool_)
         self.start_x = start_x.numpy().copy()
         self.end_x = self.start_x.copy()
-        self.gradients, self.zero_gradients = np.zeros(batch), np.zeros(batch)
+        self.gradients, self.zero_gradients, self.nan_gradients = np.zeros((3, batch))
         self.assured = np.zeros(batch)
         self.queries: list[NDArray[np.int64]] = []
         self.actions: list[NDArray[np.int64]] = []
@@ -79,7 +79,7 @@ class Meter:
             linf,
             np.sqrt(np.square(offset).sum((1, 2))),
             physical[..., self.positions].max((1, 2), initial=0.0),
-            physical[..., ~self.positions].max((1, 2), initial=0.0),
+            physical[..., self.speeds].max((1, 2), initial=0.0),
             np.full(len(running), shown.milliseconds / max(running.sum(), 1)),
         )
         self.sums += np.where(running, np.stack(measured), 0.0)
@@ -93,6 +93,7 @@ class Meter:
         self.assured += np.nan if assured is None else np.where(running, assured.numpy(), 0.0)
         self.gradients += shown.gradients.numpy()
         self.zero_gradients += shown.zero_gradients.numpy()
+        self.nan_gradients += shown.nan_gradients.numpy()
         self.queries.append(np.where(running, shown.queries.numpy(), -1))
         if self.subject.action_type == "discrete":
             self.actions.append(np.where(running, action.numpy(), -1))
@@ -136,8 +137,13 @@ class Meter:
             "action_counts": self._action_counts(),
             "assured": self.assured / steps,
             "gradient_queries": self.gradients / steps,
-            "zero_gradients": np.where(self.gradients > 0, self.zero_gradients / np.maximum(self.gradients, 1), np.nan),
+            "zero_gradients": self._share_of_gradients(self.zero_gradients),
+            "nan_gradients": self._share_of_gradients(self.nan_gradients),
         }
+
+    def _share_of_gradients(self, count: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[B] a count of gradients as a share of all of them; NaN where there were none."""
+        return np.where(self.gradients > 0, count / np.maximum(self.gradients, 1), np.nan)
 
     def _action_counts(self) -> NDArray[np.generic]:
         """[B, A] how often each discrete action was taken; [B, 0] for continuous actions."""

@@ -25,11 +25,12 @@ class ObservationThreat(ThreatModel):
         norm: `relative`: each measured value of a present row may change by `budget` times its value, or by the feature's
             floor (scaled with the budget) if that is larger (thesis 4.3.1). `linf`: it may change by `budget` on the [-1, 1]
             scale (thesis 4.4.3, read as a range; a stress test).
-        budget: size of the set, in [0, 2].
+        budget: size of the set, in [0, 2]. Users may write it in per cent, 10% for 0.1, and must from 100 % of a value on.
         queries: largest number of policy evaluations per episode and step.
         share: share of the frames of a full episode that may be attacked, rounded down; the attack chooses the frames.
 
-    `presence` cannot be changed and absent rows cannot be filled. Values are clipped to [-1, 1], the range of every sensor.
+    `presence` and the `fixed` features of the world cannot be changed, and absent rows cannot be filled. Values are clipped to
+    [-1, 1], the range of every sensor.
     """
 
     norm: Norm = "relative"
@@ -37,13 +38,18 @@ class ObservationThreat(ThreatModel):
     queries: Natural = 1000
     share: Share = 1.0
 
+    def slip(self) -> str:
+        if self.norm != "relative" or self.budget < 1:
+            return ""
+        return f"a budget of {self.budget:g} lets each value change by {100 * self.budget:g} % of itself"
+
     def frames(self, steps: int) -> int:
         """Number of frames that may be attacked in an episode of at most `steps` decisions: floor(share * steps)."""
         # A share such as 0.3 is a little below three tenths.
         return math.floor(self.share * steps + 1e-9)
 
     def radius(self, observation: Tensor, features: Features, scale: float = 1.0) -> Tensor:
-        """[..., V, F] the largest deviation of each entry, on the normalised scale; 0 for presence and absent rows.
+        """[..., V, F] the largest deviation of each entry, on the normalised scale; 0 for presence, fixed features, absent rows.
 
         Args:
             observation: the true observation [..., V, F].
@@ -61,6 +67,8 @@ class ObservationThreat(ThreatModel):
             physical = measured * half_range + centre
             bound = torch.maximum(budget * physical.abs(), floor) / half_range
         bound = bound * (observation[..., :1] > 0)
+        if features.fixed:
+            bound = bound * features.forgeable().to(bound)
         return torch.cat((torch.zeros_like(observation[..., :1]), bound), -1)
 
     def reach(self, rows: int, features: Features, steps: int) -> float:

@@ -97,7 +97,7 @@ class CountedPolicy:
         own = Stream("aside")
         with own.in_use():
             before = own.marks()
-            scores = self._scores(plain(observation), state)
+            scores = self._scores(plain(observation), state, "while driving")
             self.draws = self.draws or own.marks() != before
         return scores
 
@@ -107,9 +107,7 @@ class CountedPolicy:
         Raises:
             UserError: if the scores are NaN or infinite.
         """
-        scores = self._scores(plain(observation), state)
-        if not bool(scores.sum().isfinite()) and not bool(scores.isfinite().all()):
-            raise UserError(f"the victim ({type(self.policy).__name__}) answered NaN or infinite scores while driving")
+        scores = self._scores(plain(observation), state, "while driving")
         return scores, self.policy.choose(scores)
 
     def decided(self, observation: Tensor, state: State) -> Tensor:
@@ -160,9 +158,17 @@ class CountedPolicy:
             found = torch.autograd.grad(value.sum(), asked, allow_unused=True) if value.requires_grad else (None,)
         return value.detach(), torch.zeros_like(asked).detach() if found[0] is None else found[0]
 
-    def _scores(self, observation: Tensor, state: State) -> Tensor:
+    def _scores(self, observation: Tensor, state: State, where: str = "to a query") -> Tensor:
+        """The scores of the policy.
+
+        Raises:
+            UserError: if they are NaN or infinite: no attack could choose such a point, so the victim would look robust.
+        """
         self.evaluations += len(observation)
         scores = self.policy.scores(observation, state)
         if type(scores) is not Tensor:
             raise TamperError(f"the victim's scores are a {type(scores).__name__}, not a torch.Tensor", "defense")
+        # One sum is cheaper than a look at every score.
+        if not bool(scores.sum().isfinite()) and not bool(scores.isfinite().all()):
+            raise UserError(f"the victim ({type(self.policy).__name__}) answered NaN or infinite scores {where}")
         return scores

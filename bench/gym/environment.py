@@ -21,6 +21,8 @@ from bench.plugins.pair import choose
 from bench.scenarios import Cell, Grid, SeedBlock
 
 LAST_SEED = 2**31
+CONTROLS = 2
+"""Size of a continuous action: acceleration and steering."""
 Observation = NDArray[np.float32]
 
 
@@ -50,16 +52,28 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode. `seed` fixes it and those after it."""
-        super().reset(seed=seed)
+        """Start an episode. `seed` fixes it and those after it.
+
+        Raises:
+            UserError: if the seed is not a whole number of at least 0, or there are options.
+        """
+        if options:
+            raise UserError(
+                f"reset takes no options, got {', '.join(map(repr, options))}: the axes are arguments of make"
+            )
+        super().reset(seed=checked_seed(seed))
         self.cell = self.cells[int(self.np_random.integers(len(self.cells)))]
         self.scenario = int(drawn_seeds(self.np_random, 1)[0])
         self._begin(self.cell, self.scenario)
         return self._td["observation"][0].numpy(), self._info()
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Carry out an action."""
-        batch = torch.as_tensor(np.asarray(action)).unsqueeze(0)
+        """Carry out an action.
+
+        Raises:
+            UserError: if it is not in the action space.
+        """
+        batch = torch.as_tensor(checked_actions(action, self.action_type, ())).unsqueeze(0)
         self._td = self._env.step(self._td.set("action", batch))["next"]
         reward, terminated, truncated = (self._td[name].item() for name in ("reward", "terminated", "truncated"))
         return self._td["observation"][0].numpy(), reward, terminated, truncated and not terminated, self._info()
@@ -129,7 +143,39 @@ def spaces_of(
     shown = spaces.Box(-1.0, 1.0, tuple(observation.shape[1:]), np.float32)
     if action_type == "discrete":
         return shown, spaces.Discrete(len(world.actions))
-    return shown, spaces.Box(-1.0, 1.0, (2,), np.float32)
+    return shown, spaces.Box(-1.0, 1.0, (CONTROLS,), np.float32)
+
+
+def checked_seed(seed: Any) -> int | None:
+    """A seed of `reset` as Python's own number; None stays None.
+
+    Raises:
+        UserError: if it is not a whole number of at least 0.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, bool | np.bool_) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise UserError(f"a seed is a whole number of at least 0, got {seed!r}")
+    return int(seed)
+
+
+def checked_actions(actions: Any, action_type: ActionType, leading: tuple[int, ...]) -> NDArray[Any]:
+    """The actions as the engine takes them: int64 [*leading], or float32 [*leading, 2].
+
+    Raises:
+        UserError: if they have another shape or type. Their range is checked by the world.
+    """
+    found = np.asarray(actions)
+    shape = leading if action_type == "discrete" else (*leading, CONTROLS)
+    kinds = "iu" if action_type == "discrete" else "iuf"
+    if found.shape != shape or found.dtype.kind not in kinds:
+        what = "whole numbers" if action_type == "discrete" else "numbers"
+        raise UserError(
+            f"{action_type} actions are {what} of shape {list(shape)}, got {found.dtype} {list(found.shape)}"
+        )
+    if not np.isfinite(found).all():
+        raise UserError("an action is NaN or infinite")
+    return found.astype(np.int64 if action_type == "discrete" else np.float32)
 
 
 def drawn_seeds(generator: np.random.Generator, count: int) -> NDArray[np.int64]:

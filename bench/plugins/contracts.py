@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, get_args
 
@@ -123,6 +123,14 @@ class World(Component):
     def facts(self) -> Facts:
         """What victims, defences and reports may know of this world."""
         return Facts(axes=self.axes)
+
+    def doubts(self, cells: Sequence[Any]) -> Sequence[str]:
+        """What makes scores in these cells doubtful, one line each; a run says it before it drives. It may take seconds.
+
+        Raises:
+            UserError: if the world cannot be driven in these cells.
+        """
+        return ()
 
 
 class Victim(Component):
@@ -287,6 +295,10 @@ class ThreatModel:
     def of_nobody(cls) -> Self:
         """The threat model of all clean runs, so that runs under different threat models share them."""
         return cls(budget=0.0, access="oblivious", queries=0)  # type: ignore[call-arg]
+
+    def slip(self) -> str:
+        """What its budget would mean, if that is probably a slip of the pen; empty otherwise. A user confirms it in per cent."""
+        return ""
 
     @property
     def columns(self) -> dict[str, Any]:

@@ -30,6 +30,7 @@ BESIDE_THE_RESULT = frozenset(
         "shadow",
         "statistics",
         "tracks",
+        "trial",
     ]
 )
 """Packages and modules of `bench` that choose, store or show results: editing them outdates no record."""

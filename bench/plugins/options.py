@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import PluginError, UserError, short
-from bench.plugins import registry, suites
+from bench.plugins import budgets, registry, suites
 from bench.plugins.contracts import Access, Defense, ThreatModel
 from bench.plugins.pair import Chosen, choose
 from bench.plugins.parameters import Parameter, flattened, parameters
@@ -214,9 +214,12 @@ class Options:
             raise UserError(registry.unknown(f"key {strange[0]!r} of the {self.track} track", strange[0], known))
         found = []
         for values in itertools.product(*(self.values[key] for key in keys)):
-            arguments = _arguments("threat", "model", owned, dict(zip(names, values, strict=True)))
+            given = dict(zip(names, values, strict=True))
+            budget, confirmed = budgets.read(given.get("budget"))
+            given |= {} if budget is None else {"budget": str(budget)}
+            arguments = _arguments("threat", "model", owned, given)
             try:
-                found.append(model(**arguments))
+                found.append(budgets.checked(model(**arguments), confirmed=confirmed))
             except ValueError as error:
                 raise UserError(str(error)) from error
         return found

@@ -184,21 +184,32 @@ class Pair:
             UserError: if the network cannot be loaded.
         """
         adversary = _loaded(str(self.attack), lambda: self.armed(training_seed).adversary)
-        return "" if adversary is None else _weights(adversary)
+        return "" if adversary is None else weights_of(adversary)
 
-    def weights_sha256(self, training_seed: int) -> str:
-        """The network's own `weights_sha256`; if it has none, the hash of its state.
+    @property
+    def defended(self) -> str:
+        """The victim, and its defence if it has one, as in a sentence."""
+        return str(self.victim) if self.defense.name == "none" else f"{self.defense} + {self.victim}"
+
+    def network(self, training_seed: int) -> Any:
+        """The defended network of a training seed, as `load`.
 
         Raises:
             UserError: if it cannot be loaded, or is not a network of the track.
         """
-        network = _loaded(f"{self.defense} + {self.victim}", lambda: self.load(training_seed))
+        network = _loaded(self.defended, lambda: self.load(training_seed))
         wanted = self.victim.component.network
         if not isinstance(network, wanted):
-            raise PluginError(
-                f"{self.defense} + {self.victim} loads a {type(network).__name__}, but a {wanted.__name__} is needed"
-            )
-        return _weights(network)
+            raise PluginError(f"{self.defended} loads a {type(network).__name__}, but a {wanted.__name__} is needed")
+        return network
+
+    def weights_sha256(self, training_seed: int) -> str:
+        """The hash of the weights of the defended network.
+
+        Raises:
+            UserError: if it cannot be loaded, or is not a network of the track.
+        """
+        return weights_of(self.network(training_seed))
 
     def __str__(self) -> str:
         return f"{self.attack} + {self.defense} + {self.victim}"
@@ -216,7 +227,7 @@ def _loaded(named: str, load: Callable[[], Any]) -> Any:
         raise PluginError(f"{named} cannot be loaded: {reason(error)} (--debug shows the traceback)") from error
 
 
-def _weights(network: Any) -> str:
+def weights_of(network: Any) -> str:
     """The network's own `weights_sha256`; if it has none, the hash of its state, which is empty without weights."""
     carried = str(getattr(network, "weights_sha256", ""))
     return carried if carried or not network.state_dict() else state_digest(network)

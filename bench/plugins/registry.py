@@ -135,10 +135,27 @@ def find(group: str, name: str, noun: str) -> Entry:
         return _joined([find(group, link, noun) for link in split(name)])
     plain = _plain(name)
     if plain not in known:
-        raise UserError(unknown(f"{noun} {plain!r}", plain, known))
+        hint = _of_file(name) if noun == "victim" else ""
+        raise UserError(f"unknown {noun} {name!r}; {hint}" if hint else unknown(f"{noun} {plain!r}", plain, known))
     if complaint := problem(known[plain]):
         raise UserError(f"{noun} {plain!r} is {complaint}")
     return known[plain][0]
+
+
+def _of_file(name: str) -> str:
+    """How a file is given as a victim; empty if the name is not that of a file."""
+    suffix = name[name.rfind(".") :] if "." in name else ""
+    if suffix in (".pt", ".pth"):
+        return (
+            "such a file has weights without their network: write a .pt2 with torch.export.save and victim=torch "
+            "victim.path=…, or give the network itself to cavbench.score"
+        )
+    if reader := {".zip": "sb3", ".pt2": "torch", ".onnx": "onnx"}.get(suffix):
+        return (
+            f"a file is given as victim={reader} victim.path={name} (from Python "
+            f'cavbench.component("victim", "{reader}", path={name!r}))'
+        )
+    return ""
 
 
 def _joined(links: list[Entry]) -> Entry:

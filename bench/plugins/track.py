@@ -207,6 +207,14 @@ class Track(ABC):
         """The baseline pairs that a pair is compared with; every run also drives these."""
         yield from ()
 
+    def doubts(self, pair: Pair) -> Iterator[str]:
+        """What makes scores of a pair doubtful whatever the cell, one line each; a run says it before it drives."""
+        yield from ()
+
+    def hopeless(self, baselines: pa.Table) -> str:
+        """What to say if the records of all baselines of a run show nothing but failures; empty otherwise."""
+        return ""
+
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
         """The name of the baseline that records are for other records, themselves included; empty if they are not one.
 
@@ -276,6 +284,22 @@ class Track(ABC):
             None if they must be carried out one by one.
         """
         return None
+
+    def try_network(self, network: Any, pair: Pair, cells: Sequence[Cell]) -> list[str]:
+        """Try the loaded network of a pair before a run: is it what attacks, probes and replays rely on?
+
+        Args:
+            network: the defended victim; it is not driven afterwards.
+            pair: the pair.
+            cells: cells of the run.
+
+        Returns:
+            Warnings, each the end of a sentence that begins with the network.
+
+        Raises:
+            UserError: the end of such a sentence, if its score would be wrong.
+        """
+        return []
 
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         """Write the recording of an episode.

@@ -156,3 +156,12 @@ PROBES: tuple[pa.Field, ...] = (
     ),
 )
 """Columns for the flags of a leaderboard; null if not measured. A track that measures them lists them in `probes`."""
+
+NAN_GRADIENTS = field(
+    "nan_gradients",
+    FLOAT,
+    "gradients of the attack with a NaN or infinite entry, which then counted as 0",
+    "share, 0 to 1",
+    nullable=True,
+)
+"""A later probe: older records end before it, so a track lists it last."""

@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
+from bench.errors import RefusedNetworkError
 from bench.plugins.pair import Chosen, Pair
 from bench.run.unit import is_foreign
 
@@ -23,7 +24,11 @@ def blamed(pair: Pair, error: BaseException | None = None) -> str:
     """
     sides = [kind for side in getattr(error, "sides", ()) for kind in SIDES[side]]
     parts = [part for part in pair.parts if part.kind in sides]
-    parts = parts or (_raised_by(pair, error) if error else []) or [part for part in pair.parts if is_foreign(part)]
+    if isinstance(error, RefusedNetworkError):
+        # Whichever part of the network it is, its user knows the objects that he gave.
+        parts = [part for part in (pair.defense, pair.victim) if is_foreign(part) and not part.code]
+    else:
+        parts = parts or (_raised_by(pair, error) if error else []) or [part for part in pair.parts if is_foreign(part)]
     return named(parts)
 
 

@@ -31,12 +31,19 @@ def plan(config: RunConfig) -> list[Unit]:
 
 
 def loadings(config: RunConfig, *, baselines: bool = True) -> list[Loading]:
-    """The networks of a run, each once: of all its pairs and training seeds; without `baselines`, of the requested pairs only."""
+    """The networks of a run, each once: of all its pairs and training seeds; without `baselines`, of the requested pairs only.
+
+    The first of each world also asks it about the cells of the run.
+    """
     found: dict[str, Loading] = {}
+    asked: set[str] = set()
     for pair in _pairs(config) if baselines else config.pairs:
         for training_seed in _training_seeds(pair, config):
-            loading = Loading(pair=pair, training_seed=training_seed)
+            world = canonical([pair.world.name, pair.world.params])
+            cells, asks = config.grid.cells(), world not in asked
+            loading = Loading(pair=pair, training_seed=training_seed, cells=cells, asks_world=asks)
             found.setdefault(key_of(loading), loading)
+            asked.add(world)
     return list(found.values())
 
 

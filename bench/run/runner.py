@@ -18,11 +18,12 @@ from typing import Protocol
 import pyarrow as pa
 
 from bench import files
-from bench.errors import UserError
+from bench.errors import RefusedNetworkError, UserError, message
 from bench.plugins.track import Track
 from bench.records import packing, store
 from bench.records.finished import finished as finished_units
 from bench.run import artefacts
+from bench.run.baselines import hopeless
 from bench.run.batches import batches
 from bench.run.config import RunConfig
 from bench.run.executors import EXECUTORS, Executor, Finished, Watcher
@@ -80,6 +81,8 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
             wanted = list(units)
         else:
             wanted = drive_until(config, weights, driving.carry_out)
+    if line := hopeless(config, units.values(), driving.finished):
+        watcher.warn(line)
     if failures:
         finished = [key for key in wanted if key in driving.finished]
         raise failures.error(finished, len(wanted) - len(finished))
@@ -89,26 +92,36 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
 def _loaded(config: RunConfig, back_end: Executor, watcher: RunWatcher, failures: Failures) -> Weights:
     """The hashes of the networks. Built-in components are loaded here, plug-ins where they are driven.
 
+    What makes the scores doubtful is said before anything is driven.
+
     Raises:
         UserError: if a network is missing.
     """
     weights: dict[str, tuple[str, str]] = {}
+    doubts: dict[str, None] = {}
     foreign = []
     for loading in loadings(config):
         if any(is_foreign(part) for part in loading.pair.parts):
             foreign.append(Task(work=loading))
         else:
-            weights[key_of(loading)] = loading.weights()
+            try:
+                weights[key_of(loading)], found = loading.tried()
+            except RefusedNetworkError as error:
+                raise UserError(f"{loading} is refused: {message(error)}") from error
+            doubts |= dict.fromkeys(found)
     with closing(back_end.map(foreign, watcher)) as finished:
         for task, outcome in chain.from_iterable(finished):
             assert isinstance(task.work, Loading)
             if isinstance(outcome, Outcome):
                 assert outcome.weights is not None
                 weights[key_of(task.work)] = outcome.weights
+                doubts |= dict.fromkeys(outcome.warnings)
             elif outcome.bad_input:
                 raise UserError(f"{task.work} {outcome.why}")
             elif line := failures.add(task.work, outcome):
                 watcher.failed(line)
+    for line in doubts:
+        watcher.warn(line)
     return weights
 
 

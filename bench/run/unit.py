@@ -8,10 +8,12 @@ from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any
 
+from bench.errors import RefusedNetworkError, UserError, message, reason
 from bench.plugins import registry
 from bench.plugins.device import CPU, said
 from bench.plugins.fingerprint import canonical, code_digest, digest, libraries, machine
-from bench.plugins.pair import Chosen, Pair
+from bench.plugins.foreign import contained
+from bench.plugins.pair import Chosen, Pair, weights_of
 from bench.plugins.track import Job, Track, track_of
 from bench.records.schema import AUDIT, SEQUENTIAL
 from bench.scenarios import Cell, SeedBlock
@@ -24,10 +26,24 @@ class Loading:
     Args:
         pair: attack, defence, victim, world, threat model.
         training_seed: seed of the victim.
+        cells: cells of the run, whose observations the network is tried on.
+        asks_world: whether to ask the world, too, what it doubts about these cells; one loading of a world does.
     """
 
     pair: Pair
     training_seed: int
+    cells: tuple[Cell, ...] = ()
+    asks_world: bool = False
+
+    def doubts(self) -> tuple[str, ...]:
+        """What makes the scores doubtful, one line each.
+
+        Raises:
+            UserError: if the world cannot be driven in its cells.
+        """
+        world = self.pair.world
+        of_world = world.component.doubts(self.cells) if self.asks_world else ()
+        return (*(f"world {world}: {line}" for line in of_world), *track_of(self.pair).doubts(self.pair))
 
     def weights(self) -> tuple[str, str]:
         """The hashes of the weights of the defended victim, and of an attack that learns (otherwise empty).
@@ -37,9 +53,31 @@ class Loading:
         """
         return self.pair.weights_sha256(self.training_seed), self.pair.adversary_sha256(self.training_seed)
 
+    def tried(self) -> tuple[tuple[str, str], tuple[str, ...]]:
+        """As `weights`, with what makes the scores doubtful (`doubts`), and the warnings about the network (`Track.try_network`).
+
+        Raises:
+            UserError: if a network cannot be loaded.
+            RefusedNetworkError: if its score would be wrong.
+        """
+        pair, named, doubts = self.pair, self.pair.defended, self.doubts()
+        network = pair.network(self.training_seed)
+        weights = weights_of(network)
+        try:
+            with contained():
+                warnings = track_of(pair).try_network(network, pair, self.cells)
+        except UserError as error:
+            raise RefusedNetworkError(f"it {message(error)}") from error
+        # The network of a stranger may raise anything.
+        except Exception as error:
+            raise RefusedNetworkError(f"it fails when it is tried: {reason(error)} (--debug shows why)") from error
+        lines = (*doubts, *(f"{named} {line}" for line in warnings))
+        return (weights, pair.adversary_sha256(self.training_seed)), lines
+
     def __str__(self) -> str:
         seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""
-        return f"{self.pair}{seed}"
+        named = str(self.pair) if self.pair.attack.component.learns else self.pair.defended
+        return f"{named}{seed}"
 
 
 @dataclass(frozen=True, kw_only=True)

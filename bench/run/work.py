@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import pyarrow as pa
 
 from bench import files
-from bench.errors import PluginError, UserError, message, reason
+from bench.errors import PluginError, RefusedNetworkError, UserError, message, reason
 from bench.plugins.custody import listed
 from bench.plugins.fingerprint import canonical
 from bench.plugins.foreign import contained
@@ -207,6 +207,10 @@ def _alone(task: Task, tell: Tell) -> Outcome | Failure:
             return _performed(task, tell)
     except TamperError as error:
         return Failure(why=f"is refused: {message(error)}{blamed(work.pair, error)}", trace=traceback.format_exc())
+    except RefusedNetworkError as error:
+        shipped = blamed(work.pair, error)
+        why, bad_input = f"is refused: {message(error)}{shipped}", not shipped
+        return Failure(why=why, bad_input=bad_input, trace=traceback.format_exc())
     except UserError as error:
         why, bad_input = f"failed: {message(error)}{blamed(work.pair, error)}", not isinstance(error, PluginError)
         return Failure(why=why, bad_input=bad_input, trace=traceback.format_exc())
@@ -226,8 +230,8 @@ def _performed(task: Task, tell: Tell) -> Outcome:
             artefact = work.track.prepare(work.job, canonical(work.origin), partial(tell, str(work)))
             return Outcome(wall_s=time.perf_counter() - start, artefact=artefact)
         case Loading() as loading:
-            weights = loading.weights()
-            return Outcome(wall_s=time.perf_counter() - start, weights=weights)
+            weights, warnings = loading.tried()
+            return Outcome(wall_s=time.perf_counter() - start, weights=weights, warnings=warnings)
 
 
 def _driven(unit: Unit, task: Task) -> Outcome:

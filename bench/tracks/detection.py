@@ -15,7 +15,8 @@ from bench.plugins import registry
 from bench.plugins.contracts import Progress
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
-from bench.records.schema import FLOAT, PROBES, TEXT, field
+from bench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, TEXT, field
+from bench.scenarios import Cell
 
 if TYPE_CHECKING:
     from bench.recording.film import Film
@@ -190,7 +191,7 @@ class DetectionTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("patch",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP, *CERTIFIED)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP, *CERTIFIED, NAN_GRADIENTS)
     of_older: ClassVar[Mapping[str, str]] = {"stop_score": "confidence_mean"}
     scored_with: ClassVar[str] = "decoy_confidence"
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")
@@ -286,6 +287,13 @@ class DetectionTrack(Track):
         from bench.detection.crafting import prepare
 
         return prepare(job, made_by, progress)
+
+    def try_network(self, network: Any, pair: Pair, cells: Sequence[Cell]) -> list[str]:
+        from bench.trial.detector import try_detector
+
+        victim: Any = pair.victim.component
+        world: Any = pair.world.component
+        return try_detector(network, victim, world, alone=pair.defense.name == "none") if victim.sees else []
 
     def drive(self, job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
         from bench.detection.drive import drive

@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 
 from bench.plugins.pair import Pair, choose
 from bench.plugins.track import Baseline, Contrast, Driven, Job, Measure, Track
-from bench.records.schema import FLOAT, PROBES, field
+from bench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, field
+from bench.scenarios import Cell
 
 if TYPE_CHECKING:
     from bench.driving import DrivingVictim, DrivingWorld
     from bench.recording.film import Film
 
+FEW = 3
+"""So many fixed features are named in a sentence."""
 BEST_BLIND, IDM, ORACLE, RANDOM = "best blind", "idm", "oracle_planner", "random"
 
 MEASUREMENTS: tuple[pa.Field, ...] = (
@@ -101,7 +104,7 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS)
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"
@@ -174,6 +177,16 @@ class DrivingTrack(Track):
             none = {"attack": choose("attack", "none"), "defense": choose("defense", "none")}
             yield replace(pair, **none, victim=choose("victim", name, **params), threat=type(pair.threat).of_nobody())
 
+    def doubts(self, pair: Pair) -> Iterator[str]:
+        from bench.driving.doubts import doubts
+
+        return doubts(pair, self.world)
+
+    def hopeless(self, baselines: pa.Table) -> str:
+        from bench.driving.doubts import hopeless
+
+        return hopeless(baselines)
+
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
         same_world = all(own[name] == other[name] for name in ("world", "world_params"))
         same_actions = own["action_type"] == other["action_type"] or other["victim"] in (IDM, ORACLE)
@@ -195,7 +208,9 @@ class DrivingTrack(Track):
             for name, floor, unit in zip(features.get("names", ()), floors, features.get("units", ()), strict=False)
         ]
         by_floor = f", or by its floor ({', '.join(minima)})" if minima else ""
-        return f"each measured value may be off by {deviation}{by_floor}; presence cannot be forged"
+        fixed = features.get("fixed", ())
+        named = fixed if len(fixed) <= FEW else [f"{len(fixed)} fixed features"]
+        return f"each measured value may be off by {deviation}{by_floor}; {' and '.join(['presence', *named])} cannot be forged"
 
     def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
         steps = column("steps")
@@ -206,6 +221,17 @@ class DrivingTrack(Track):
 
     def identity(self, pair: Pair) -> Mapping[str, object]:
         return {"action_type": _parts(pair)[0].action_type}
+
+    def try_network(self, network: Any, pair: Pair, cells: Sequence[Cell]) -> list[str]:
+        from bench.trial.policy import try_policy
+
+        victim, world = _parts(pair)
+        if not victim.sees:
+            return []
+        gradients = victim.answers == "gradients"
+        return try_policy(
+            network, world, cells, gradients=gradients, random=victim.draws or pair.defense.name != "none"
+        )
 
     def drive(self, job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
         from bench.driving.drive import drive

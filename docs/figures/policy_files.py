@@ -79,22 +79,20 @@ def sb3_file() -> Figure:
         model.save(path)
         return model.q_net
 
-    return _figure("sb3", "dqn.zip", write, "attacks may ask for scores and gradients", algo="dqn")
+    return _figure("sb3", "dqn.zip", write, "attacks may ask for scores and gradients")
 
 
 def _any_batch() -> dict[str, dict[int, object]]:
     return {"observation": {0: torch.export.Dim("batch")}}
 
 
-def _figure(
-    victim: str, file: str, write: Callable[[Path], Callable[[Tensor], Tensor]], access: str, **params: str
-) -> Figure:
+def _figure(victim: str, file: str, write: Callable[[Path], Callable[[Tensor], Tensor]], access: str) -> Figure:
     """Q-values of the policy that `write` saves and returns, and of the victim loaded from its file."""
     observations = torch.tensor(episode("attack=none", "victim=dqn")[1]["observation"])
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         path = Path(folder) / file
         original = write(path)(observations)
-        read: Policy = choose("victim", victim, path=str(path), **params).component.load(0, FACTS)
+        read: Policy = choose("victim", victim, path=str(path)).component.load(0, FACTS)
         values = read.scores(observations)
     same = int((values.argmax(-1) == original.argmax(-1)).sum())
     most = float((values - original).abs().max())

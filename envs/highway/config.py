@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal, get_args
 
@@ -13,7 +13,7 @@ from bench.driving.kinematics import CarFollowing
 from bench.scenarios import Cell
 from envs.highway.axes import AXES
 
-Preset = Literal["standard", "thesis"]
+Preset = Literal["standard", "thesis", "wide"]
 
 ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 """Discrete actions by number, as in highway-env's DiscreteMetaAction (envs/common/action.py)."""
@@ -28,6 +28,8 @@ STANDARD_FEATURES = Features(
     units=UNITS,
     floors=FLOORS,
 )
+WIDE_FEATURES = replace(STANDARD_FEATURES, low=(-100.0, -32.0, -40.0, -20.0), high=(100.0, 32.0, 40.0, 20.0))
+"""The standard ranges with room for eight lanes."""
 THESIS_FEATURES = Features(
     names=("x", "y", "vx", "vy"),
     low=(-100.0, -100.0, 0.0, 0.0),
@@ -134,6 +136,12 @@ class HighwayConfig:
             "target_speeds": THESIS_TARGET_SPEEDS,
         }
         return cls(**(defaults | changes))  # type: ignore[arg-type]
+
+
+def lanes_held(features: Features) -> int:
+    """The largest number of lanes whose right edge the range of y holds: a car beyond it would not see that it left the road."""
+    width, high = KINEMATICS["lane_width"], features.high[features.names.index("y")]
+    return int((high - width / 2) // width) + 1
 
 
 def check_target_speeds(speeds: Sequence[float]) -> None:

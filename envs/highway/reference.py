@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from bench.scenarios import Cell
 from envs.highway.config import ACTIONS, HighwayConfig
+from envs.highway.constants import own_constants
 from envs.highway.dynamics import VEHICLE_LENGTH
 from envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED
 from envs.highway.engine import Flag, Number, check_seeds
@@ -120,14 +121,16 @@ class SensedHighwayEnv(FaramaHighwayEnv):
     def start(self, seed: int) -> NDArray[np.float32]:
         """Reset to a scenario and return its observation [V, 5]."""
         self.scenario_seed, self.decisions = seed, 0
-        observation, _ = self.reset(seed=seed)
+        with own_constants():
+            observation, _ = self.reset(seed=seed)
         return observation
 
     def decide(self, action: Any) -> tuple[NDArray[np.float32], float, bool]:
         """Make one decision; return observation [V, 5], reward and terminated."""
         self.decisions += 1
         # An IDMVehicle must act once per frame; with an action, highway-env would call it twice.
-        observation, reward, terminated, _, _ = self.step(None if self.idm_ego else action)
+        with own_constants():
+            observation, reward, terminated, _, _ = self.step(None if self.idm_ego else action)
         return observation, float(reward), bool(terminated)
 
     def progress(self) -> float:

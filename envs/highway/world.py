@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from bench.driving import ActionType, Driver, DrivingWorld, Dynamics, Features, Kinematics
+from bench.driving import ActionType, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
+from bench.errors import UserError
+from bench.plugins.parameters import differing
 from bench.scenarios import Axes, Cell
 from envs.highway.axes import AXES, STANDARD_V2
 from envs.highway.config import (
@@ -17,14 +19,19 @@ from envs.highway.config import (
     STANDARD_TARGET_SPEEDS,
     THESIS_FEATURES,
     THESIS_TARGET_SPEEDS,
+    WIDE_FEATURES,
     HighwayConfig,
     Preset,
+    lanes_held,
 )
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
 Backend = Literal["batched", "reference"]
+OTHER_FEATURES = {"thesis": THESIS_FEATURES, "wide": WIDE_FEATURES}
+BUSY = 2.0
+"""Above this density cars crash at the start whoever drives."""
 REFERENCE = "highway-env"
 """The distribution that the backend `reference` needs."""
 
@@ -34,8 +41,9 @@ class HighwayWorld(DrivingWorld):
     """A straight highway with IDM/MOBIL traffic: highway-env 1.12.1's `highway-v0`, 15 Hz, 30 seconds.
 
     Args:
-        preset: `standard` (x +-100 m, y +-20 m, vx +-40 m/s, vy +-20 m/s, 10 rows, target speeds 10 to 30 by 5) or
-            `thesis` (x, y +-100 m, velocities 0 to 20 m/s, 5 rows, target speeds 20, 25, 30).
+        preset: `standard` (x +-100 m, y +-20 m, vx +-40 m/s, vy +-20 m/s, 10 rows, target speeds 10 to 30 by 5; up to 5 lanes),
+            `wide` (the same with y +-32 m, for up to 8 lanes) or `thesis` (x, y +-100 m, velocities 0 to 20 m/s, 5 rows, target
+            speeds 20, 25, 30).
         vehicles: number of traffic vehicles besides the ego.
         observed_vehicles: number of rows in an observation, including the ego; None for the preset's.
         target_speeds: speeds in m/s for FASTER and SLOWER; None for the preset's.
@@ -73,9 +81,9 @@ class HighwayWorld(DrivingWorld):
         if self.target_speeds is not None:
             # A list from a configuration file would make the world unhashable.
             object.__setattr__(self, "target_speeds", tuple(float(speed) for speed in self.target_speeds))
-        if self.preset == "thesis":
+        if self.preset in OTHER_FEATURES:
             # The class attribute has the ranges of the standard preset.
-            object.__setattr__(self, "features", THESIS_FEATURES)
+            object.__setattr__(self, "features", OTHER_FEATURES[self.preset])
         if self.backend == "reference":
             if find_spec("highway_env") is None:
                 raise ValueError(f"backend=reference needs {REFERENCE}: pip install 'cavbench[reference]'")
@@ -93,6 +101,16 @@ class HighwayWorld(DrivingWorld):
         config = self.config((AXES.cell(lanes=3, density=1.0),))
         return Kinematics(frames=config.substeps, target_speeds=config.target_speeds, **KINEMATICS)
 
+    @property
+    def observed_rows(self) -> int:
+        preset_rows = 5 if self.preset == "thesis" else 10
+        return self.observed_vehicles if self.observed_vehicles is not None else preset_rows
+
+    @property
+    def facts(self) -> DrivingFacts:
+        options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
+        return replace(super().facts, environment=f'cavbench.gym.make("highway"{options})')
+
     def config(
         self,
         cells: Sequence[Cell],
@@ -103,7 +121,6 @@ class HighwayWorld(DrivingWorld):
     ) -> HighwayConfig:
         """The environment's full configuration; arguments as in `DrivingWorld.make`."""
         thesis = self.preset == "thesis"
-        rows = self.observed_vehicles if self.observed_vehicles is not None else (5 if thesis else 10)
         preset_speeds = THESIS_TARGET_SPEEDS if thesis else STANDARD_TARGET_SPEEDS
         return HighwayConfig(
             cells=tuple(cells),
@@ -116,9 +133,33 @@ class HighwayWorld(DrivingWorld):
             action_repeat=action_repeat,
             target_speeds=self.target_speeds if self.target_speeds is not None else preset_speeds,
             features=self.features,
-            observed_vehicles=rows,
+            observed_vehicles=self.observed_rows,
             offroad_terminal=self.offroad_terminal,
         )
+
+    def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
+        """Whether the observation holds all lanes, and whether the traffic leaves a way through.
+
+        Raises:
+            UserError: if there are more lanes than the range of y holds.
+        """
+        self._check_lanes(cells)
+        densest = max(cell.density for cell in cells)
+        if densest <= BUSY:
+            return ()
+        return [
+            f"density {densest:g} makes crashes without any attack: highway-env's own IDM driver crashes in 11 % of the episodes "
+            f"at 3 and in 26 % at 4, a car that only brakes in 22 % and 56 %; at {BUSY:g} in 0 % and 2 %"
+        ]
+
+    def _check_lanes(self, cells: Sequence[Cell]) -> None:
+        most, held = max(cell.lanes for cell in cells), lanes_held(self.features)
+        if most > held:
+            raise UserError(
+                f"on {most} lanes y reaches {4 * most - 2} m, but the observation of preset {self.preset} ends at "
+                f"{self.features.high[1]:g} m, so that a car cannot see where the road ends: give at most {held} lanes, or write "
+                "world.preset=wide (y to 32 m) with drivers that are trained in it"
+            )
 
     def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics:
         """See `bench.driving.DrivingWorld.dynamics`; on the compiled engine for both backends."""
@@ -134,7 +175,12 @@ class HighwayWorld(DrivingWorld):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        """See `bench.driving.DrivingWorld.make`."""
+        """See `bench.driving.DrivingWorld.make`.
+
+        Raises:
+            UserError: if there are more lanes than the range of y holds.
+        """
+        self._check_lanes(cells)
         config = self.config(cells, action_type=action_type, driver=driver, action_repeat=action_repeat)
         # Imported here because both load torchrl and numba or pygame, which `bench list` must not load.
         if self.backend == "batched":

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from tensordict import TensorDict
 
 import cavbench
 from bench.conformance import complaints
+from bench.driving import DrivingAttack, Features
+from bench.gym import GymWorld
 from bench.plugins import registry
-from bench.scenarios import SeedBlock
+from bench.scenarios import Axes, Axis, Cell, Grid, SeedBlock
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 
@@ -71,6 +76,81 @@ def test_a_vector_environment_drives_like_single_ones() -> None:
     envs.close()
 
 
+def test_a_list_of_seeds_gives_each_episode_its_own() -> None:
+    options = {"num_envs": 4, "max_steps": 4, **CELL, "lanes": [3, 4]}
+    envs = cavbench.gym.make_vec("highway", **options)
+    alone = [cavbench.gym.make("highway", max_steps=4, **CELL | {"lanes": cell.lanes}) for cell in envs.cells]
+    seen, info = envs.reset(seed=[1, 9, 9, 9])
+    starts = [env.reset(seed=seed) for env, seed in zip(alone, [1, 9, 9, 9], strict=True)]
+    assert info["cell"]["lanes"].tolist() == [3, 4, 3, 4]
+    for step in range(11):
+        for place, (observation, truth) in enumerate(starts):
+            assert (seen[place] == observation).all(), f"episode {place} in step {step}"
+            assert truth["scenario"] == info["scenario"][place]
+        seen, _, _, truncated, info = envs.step(np.array([1, 1, 3, 4]))
+        # A reset is a step of its own (NEXT_STEP).
+        begins = step % 5 == 4
+        assert truncated.all() == (step % 5 == 3)
+        starts = [env.reset() if begins else env.step(a)[::4] for env, a in zip(alone, [1, 1, 3, 4], strict=True)]
+    numbered, again = (envs.reset(seed=seed)[0].copy() for seed in (7, np.array([7, 8, 9, 10])))
+    assert (numbered == again).all(), "as gymnasium: seed, seed + 1, ..."
+
+
+def test_a_mask_starts_some_episodes() -> None:
+    envs = cavbench.gym.make_vec("highway", num_envs=3, **CELL)
+    with pytest.raises(cavbench.UserError, match="the first reset starts all episodes"):
+        envs.reset(options={"reset_mask": np.array([True, False, False])})
+    envs.reset(seed=[4, 5, 6])
+    before, *_ = envs.step(np.array([3, 3, 3]))
+    after, info = envs.reset(seed=[8, 8, 8], options={"reset_mask": np.array([True, False, True])})
+    assert info["_scenario"].tolist() == [True, False, True]
+    assert (after[1] == before[1]).all()
+    fresh, _ = cavbench.gym.make("highway", **CELL).reset(seed=8)
+    assert (after[0] == fresh).all()
+    assert (after[2] == fresh).all()
+    assert envs.np_random_seed == (8, 5, 8)
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
+        ({"seed": [1, 2]}, "one for each of the 3 episodes, got 2"),
+        ({"seed": [1, -2, 3]}, "at least 0, got -2"),
+        ({"seed": -1}, "at least 0, got -1"),
+        ({"seed": 1.5}, "at least 0, got 1.5"),
+        ({"seed": [True, 1, 1]}, "at least 0, got True"),
+        ({"options": {"lanes": 4}}, "option 'reset_mask' only, got 'lanes'"),
+        ({"options": {"reset_mask": np.zeros(3, bool)}}, "at least one True"),
+        ({"options": {"reset_mask": np.ones(2, bool)}}, r"of shape \[3\]"),
+    ],
+)
+def test_what_a_reset_cannot_do_is_refused(asked: dict[str, Any], line: str) -> None:
+    envs = cavbench.gym.make_vec("highway", num_envs=3, **CELL)
+    envs.reset(seed=0)
+    with pytest.raises(cavbench.UserError, match=line):
+        envs.reset(**asked)
+    if "reset_mask" not in str(asked) and not isinstance(asked.get("seed"), list):
+        with pytest.raises(cavbench.UserError, match=r"at least 0|takes no options"):
+            cavbench.gym.make("highway", **CELL).reset(**asked)
+
+
+@pytest.mark.parametrize("bad", [np.array([1.5, 1, 1]), np.array([1, 1]), 3, np.array([True, False, True])])
+def test_actions_of_another_kind_are_refused(bad: Any) -> None:
+    envs = cavbench.gym.make_vec("highway", num_envs=3, **CELL)
+    envs.reset(seed=0)
+    with pytest.raises(cavbench.UserError, match=r"discrete actions are whole numbers of shape \[3\]"):
+        envs.step(bad)
+
+
+def test_the_first_example_of_the_page_runs(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    code = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
+    for long, short in (("20_000", "250"), ("episodes=20", f"episodes=1, out={str(tmp_path)!r}, baselines=False")):
+        assert long in code
+        code = code.replace(long, short)
+    exec(code, {})
+
+
 def test_a_model_trained_in_it_is_scored(tmp_path: Path) -> None:
     sb3 = pytest.importorskip("stable_baselines3")
     env = cavbench.gym.make("highway", max_steps=40, **CELL)
@@ -101,19 +181,248 @@ def test_an_actor_critic_is_scored_after_its_training(tmp_path: Path) -> None:
 @pytest.fixture
 def cartpole(plugins: Path) -> Iterator[Any]:
     """The module of the page, installed as a package."""
-    code = next(
+    install_cartpole(plugins, page_code())
+    import cartpole  # type: ignore[import-not-found]
+
+    yield cartpole
+    del sys.modules["cartpole"]
+
+
+def page_code() -> str:
+    """The module of the page."""
+    return next(
         block for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if "GymWorld)" in block
     )
+
+
+def install_cartpole(plugins: Path, code: str) -> None:
     points = {
         "cavbench.worlds": {"cartpole": "cartpole:CartPole"},
         "cavbench.grids": {"cartpole-v1": "cartpole:CARTPOLE_V1"},
     }
     install(plugins, "cartpole", points, {"cartpole": code})
     registry.installed.cache_clear()
-    import cartpole  # type: ignore[import-not-found]
+    sys.modules.pop("cartpole", None)
 
-    yield cartpole
-    del sys.modules["cartpole"]
+
+class Road(gymnasium.Env[Any, Any]):
+    """Ten steps of a grid of numbers; what it returns and says is set from outside."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2, 3), np.float64)
+
+    def __init__(self, world: Any) -> None:
+        self.world, self.action_space = world, gymnasium.spaces.Discrete(2, start=5)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.time = 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> Any:
+        assert action in (5, 6)
+        self.time += 1
+        told = self.world.tells(self.time, action)
+        return self._seen(), self.world.reward, self.time == self.world.ends, False, told
+
+    def _seen(self) -> Any:
+        drawn = self.np_random.uniform(-1, 1, (2, 3))
+        drawn[:, 0] = 1.0
+        return drawn
+
+
+AXIS = Axes((Axis(name="width", kind="int", meaning="of nothing", low=1, high=9),))
+ROAD_V1 = Grid(name="road-v1", world="road", axes=AXIS, values={"width": (3,)}, episodes=4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoadWorld(GymWorld):
+    """Two rows of three numbers.
+
+    Args:
+        max_steps: decisions.
+        reward: of each step.
+        ends: the step that terminates.
+    """
+
+    axes: ClassVar[Axes] = AXIS
+    grid: ClassVar[str] = "road-v1"
+    features: ClassVar[Features] = Features(
+        names=("there0", "x0", "y0", "there1", "x1", "y1"),
+        low=(0.0, -1.0, -1.0) * 2, high=(1.0, 1.0, 1.0) * 2, units=("", "m", "rad") * 2, fixed=("there0", "there1"),
+    )  # fmt: skip
+    actions: ClassVar[tuple[str, ...]] = ("A", "B")
+    hz: ClassVar[float] = 1.0
+    tells: ClassVar[Callable[[int, int], dict[str, Any]]] = staticmethod(lambda time, action: {})
+
+    max_steps: int = 10
+    reward: float = 0.5
+    ends: int = 10
+
+    def environment(self, cell: Cell) -> gymnasium.Env[Any, Any]:
+        return Road(self)
+
+
+def told(
+    world: type[RoadWorld] = RoadWorld, /, says: Callable[[int, int], dict[str, Any]] | None = None, **changes: Any
+) -> Any:
+    """A world with other class attributes; `says` is what its environment tells in `info`."""
+    parts = changes | ({"tells": staticmethod(says)} if says else {})
+    return type("Told", (world,), parts)
+
+
+def scored(world: RoadWorld, tmp_path: Path, attack: Any = "none", **options: Any) -> Any:
+    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(6, 2))
+    return cavbench.score(
+        network, attack, world=world, grid=ROAD_V1, episodes=3, seeds=[0], actions="discrete", out=tmp_path, **options
+    )
+
+
+@pytest.mark.parametrize(
+    ("says", "terminated", "failed"),
+    [
+        ({}, True, True),
+        ({}, False, False),
+        ({"crashed": True}, False, True),
+        ({"crashed": False}, True, False),
+        ({"crashed": np.False_, "rewards": {"on_road_reward": 0.0}}, True, True),
+        ({"crashed": False, "rewards": {"on_road_reward": True}}, True, False),
+        ({"is_success": False}, False, False),
+        ({"is_success": False}, True, True),
+        ({"is_success": True}, True, False),
+        ({"success": 1.0}, True, False),
+        ({"crashed": True, "is_success": True}, True, True),
+        ({"crashed": False, "is_success": False}, True, True),
+    ],
+)
+def test_failing_is_what_the_environment_tells(says: dict[str, Any], terminated: bool, failed: bool) -> None:
+    assert RoadWorld().failed(terminated, says) is failed
+
+
+def test_who_arrives_has_not_crashed(tmp_path: Path) -> None:
+    """As in merge-v0, where every driver terminates."""
+    arrives = told(says=lambda time, action: {"crashed": action == 6})()
+    found = scored(arrives, tmp_path).set_index("victim")
+    assert found.loc["blind(policy=a)" if "blind(policy=a)" in found.index else "blind", "crashed"] == 0.0
+    assert found.loc["blind(policy=b)", "crashed"] == 1.0
+
+
+def test_an_array_of_several_dimensions_is_shown_as_it_is() -> None:
+    world = RoadWorld()
+    env = world.make(ROAD_V1.cells() * 3)
+    seen = env.reset(TensorDict({"seed": torch.arange(3)}, batch_size=[3]))["observation"]
+    assert seen.shape == (3, 1, 7)
+    native = world.facts.native(seen)
+    assert native.shape == (3, 2, 3)
+    for place in range(3):
+        torch.testing.assert_close(
+            native[place].double(), torch.from_numpy(Road(world).reset(seed=place)[0]), rtol=0, atol=1e-6
+        )
+    assert "shape" not in world.facts.written(), "records are as before"
+
+
+def test_a_shape_that_cannot_be_asked_for_must_be_declared() -> None:
+    def cautious(self: Any, cell: Any) -> Any:
+        if cell.width != 3:
+            raise RuntimeError("only three")
+        return Road(self)
+
+    shy = told(environment=cautious)
+    assert shy().facts.shape == (6,)
+    with pytest.raises(cavbench.UserError, match=r"observes arrays \[2, 3\], not \[6\]: write shape: ClassVar"):
+        shy().make(ROAD_V1.cells())
+    assert told(environment=cautious, shape=(2, 3))().make(ROAD_V1.cells()).batch_size == (1,)
+
+
+@pytest.mark.parametrize("threat", [{"norm": "linf", "budget": 0.5}, {"norm": "relative", "budget": 0.9}])
+def test_nobody_forges_a_fixed_feature(threat: dict[str, Any], tmp_path: Path) -> None:
+    class Liar(DrivingAttack):
+        access: ClassVar[Any] = "oblivious"
+
+        def perturb(self, observation: torch.Tensor, oracle: Any) -> torch.Tensor:
+            assert oracle.radius[..., [0, 1, 4]].abs().max() == 0 < oracle.radius[..., [2, 3, 5, 6]].max()
+            return -torch.ones_like(observation)
+
+    class Honest(torch.nn.Module):
+        def forward(self, observation: torch.Tensor) -> torch.Tensor:
+            """Action 0 where both rows are there."""
+            there = observation[..., 0].sum(-1) - 1.999
+            return torch.stack([there, -there], -1)
+
+    found = cavbench.score(
+        Honest(), dataclass(frozen=True, kw_only=True)(Liar)(), world=RoadWorld(), grid=ROAD_V1, episodes=2, seeds=[0],
+        actions="discrete", out=tmp_path, threat=threat, baselines=False,
+    )  # fmt: skip
+    rows = found.records[found.records.attack == "Liar"]
+    assert np.stack(rows.action_counts).sum(0).tolist() == [20, 0], "it is shown that both rows are there"
+    assert rows.linf_m.max() > 0
+    assert rows.linf_mps.max() == 0, "radians are not metres a second"
+    assert '"fixed":["there0","there1"]' in rows.world_facts.iloc[0]
+
+
+def test_a_fixed_feature_has_a_name() -> None:
+    with pytest.raises(ValueError, match=r"features\.fixed names 'y'"):
+        Features(("x",), (0.0,), (1.0,), ("",), fixed=("y",))
+    assert "fixed" not in Features(("x",), (0.0,), (1.0,), ("",)).written(), "built-in worlds are written as before"
+
+
+WIDE = replace(RoadWorld.features, low=(0.0, -200.0, -1.0) * 2, high=(1.0, 200.0, 1.0) * 2)
+NARROW = replace(RoadWorld.features, low=(0.0, -0.5, -1.0) * 2, high=(1.0, 0.5, 1.0) * 2)
+
+
+@pytest.mark.parametrize(
+    ("world", "line"),
+    [
+        (told()(), ""),
+        (
+            told(features=WIDE)(),
+            r"the declared range of x0 \(-200 to 200, seen -\S+ to \S+\) and x1 .*is used by less than 5 %",
+        ),
+        (
+            told(features=NARROW)(),
+            r"the declared range of x0 \(-0.5 to 0.5, seen .* is left by more than 1 % of the values",
+        ),
+        (told()(reward=-3.0), r"100 % of the rewards are outside \[0, 1\] \(-3 to -3 in 1000 random steps\)"),
+        (told(progress=lambda self, reward, info: 0.5)(reward=-3.0), ""),
+        (
+            told(environment=lambda self, cell: gymnasium.wrappers.TimeLimit(Road(self), 4))(),
+            "ends every episode after 4 steps, but max_steps is 10: no safe_progress can be above 0.4; write max_steps=4",
+        ),
+    ],
+)
+def test_random_steps_say_what_is_declared_wrongly(world: RoadWorld, line: str) -> None:
+    said = world.doubts(ROAD_V1.cells())
+    assert len(said) == bool(line)
+    assert re.search(line, " ".join(said))
+
+
+def test_a_run_says_it_before_the_baselines_are_driven(tmp_path: Path) -> None:
+    driven: list[str] = []
+
+    class Slow(told(features=WIDE)):  # type: ignore[misc]
+        def progress(self, reward: float, info: Any) -> float:
+            driven.append("a step")
+            return 0.5
+
+    object.__setattr__(world := Slow(ends=3), "features", WIDE)
+    with pytest.warns(UserWarning, match="range of x0") as said:
+        scored(world, tmp_path)
+    lines = [str(each.message) for each in said]
+    assert lines[0].startswith("world Slow(ends=3): the declared range of x0")
+    assert "every baseline fails in every episode (a, b, random; 9 episodes)" in lines[-1]
+    assert len(lines) == 2
+
+
+def test_a_progress_outside_its_range_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(cavbench.UserError, match=r"progress returned 3: return a share in \[0, 1\]"):
+        scored(told(progress=lambda self, reward, info: 3.0)(), tmp_path, baselines=False)
+
+
+def test_bench_check_asks_to_look_at_wrong_ranges(plugins: Path, bench: Bench) -> None:
+    install_cartpole(plugins, page_code().replace("(4.8, 4.0,", "(480.0, 4.0,"))
+    said = bench("check", "cartpole")
+    assert said.code == 0, "a doubt is no broken rule"
+    assert "1 to look at" in said.out
+    assert re.search(r"doubts +\? look +.*the declared range of x \(-4.8 to 480,", said.out)
 
 
 def balancing() -> torch.nn.Module:
@@ -150,8 +459,8 @@ def test_the_command_scores_a_file_in_it(cartpole: Any, bench: Bench, tmp_path: 
     env = cartpole.CartPole().environment(cartpole.CARTPOLE_V1.cells()[0])
     sb3.PPO("MlpPolicy", env, seed=0, device="cpu").save(tmp_path / "model.zip")
     words = (
-        f"attack=pgd attack.objective=margin world=cartpole victim=sb3 victim.path={tmp_path}/model.zip victim.algo=ppo "
-        "victim.rows=1 victim.features=4"
+        f"attack=pgd attack.objective=margin world=cartpole victim=sb3 victim.path={tmp_path}/model.zip "
+        "victim.trained_in=cartpole(max_steps=50)"
     )
     said = bench(
         "run",
@@ -164,6 +473,71 @@ def test_the_command_scores_a_file_in_it(cartpole: Any, bench: Bench, tmp_path: 
     )
     assert said.code == 0, said.err
     assert "pgd" in said.out
+
+
+def square(env: Any) -> Any:
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (2, 2), np.float32)
+    return gymnasium.wrappers.TransformObservation(env, lambda observation: observation.reshape(2, 2), box)
+
+
+class Bounded(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
+    """All entries on [-1, 1]: what a policy in other units was trained on."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.observation_space = gymnasium.spaces.Box(-1, 1, (4,), np.float32)
+
+    def observation(self, observation: Any) -> Any:
+        return np.tanh(observation)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "line"),
+    [
+        (square, r"was trained on Box\(-inf, inf, \(2, 2\)\), this world shows an array of shape \(4,\)"),
+        (Bounded, r"was trained on Box\(-1, 1, \(4,\)\), this world shows .* with x from -4.8 to 4.8"),
+    ],
+)
+def test_a_model_of_other_observations_is_refused_alike_from_python_from_a_file_and_by_the_command(
+    cartpole: Any, bench: Bench, tmp_path: Path, wrap: Any, line: str
+) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    world = cartpole.CartPole(max_steps=20)
+    model = sb3.DQN("MlpPolicy", wrap(world.environment(cartpole.CARTPOLE_V1.cells()[0])), buffer_size=10, seed=0)
+    model.save(tmp_path / "model.zip")
+    for victim in (model, cavbench.component("victim", "sb3", path=str(tmp_path / "model.zip"))):
+        with pytest.raises(cavbench.UserError, match=line) as error:
+            cavbench.score(victim, "none", world=world, pole=0.5, episodes=1, baselines=False, out=tmp_path)
+        assert "\n" not in str(error.value)
+        assert "defense" not in str(error.value)
+    words = (
+        f"attack=none world=cartpole victim=sb3 victim.path={tmp_path}/model.zip pole=0.5 episodes=1 executor=serial"
+    )
+    said = bench("run", *words.split(), f"out={tmp_path / 'results'}")
+    assert said.code != 0
+    assert re.search(line, " ".join(said.err.split()))
+    assert "defense" not in said.err
+    assert "Traceback" not in said.err
+
+
+def test_the_environment_of_a_model_says_whether_it_was_trained_in_the_world(cartpole: Any, tmp_path: Path) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    world = cartpole.CartPole(max_steps=20)
+
+    def scored(env: Any) -> str:
+        model = sb3.DQN("MlpPolicy", env, buffer_size=10, seed=0)
+        found = cavbench.score(
+            model, "none", world=world, pole=0.5, episodes=1, baselines=False, out=tmp_path, actions=None
+        )
+        return str(json.loads(found.records.victim_params[0])["trained_in"])
+
+    own = world.environment(cartpole.CARTPOLE_V1.cells()[0])
+    assert scored(own) == "cartpole(max_steps=20)"
+    assert scored(gymnasium.make("CartPole-v0")) == "CartPole-v0"
+    with pytest.raises(cavbench.UserError, match="was trained behind NormalizeObservation, which the world does not"):
+        scored(gymnasium.wrappers.NormalizeObservation(own))
+    # cavbench.gym.make gives one row on [-1, 1], which such a policy is given, too.
+    assert scored(cavbench.gym.make(world, pole=0.5)) == "cartpole(max_steps=20)"
 
 
 def test_an_environment_that_is_not_as_declared_is_refused(cartpole: Any) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import gymnasium
 import pytest
 import torch
 from torch import Tensor, nn
@@ -166,6 +167,15 @@ def test_an_attack_of_the_caller_is_driven_again_when_its_code_changes(score: Ca
     [
         ({"victim": "dqnn"}, "unknown victim 'dqnn'; did you mean 'dqn'?"),
         ({"victim": 3}, "a victim is a name, a bench.driving.Policy, a torch.nn.Module or a model"),
+        (
+            {"victim": "dqn.zip"},
+            r"unknown victim 'dqn.zip'; a file is given as victim=sb3 victim.path=dqn.zip \(from Python",
+        ),
+        ({"victim": "best.pt"}, "unknown victim 'best.pt'; such a file has weights without their network"),
+        (
+            {"victim": gymnasium.Env()},
+            "An environment is no policy; as a world it is a subclass of cavbench.gym.GymWorld",
+        ),
         ({"victim": nn.Linear(5, 5)}, r"Linear must map observations \[4, 10, 5\] or \[4, 50\]"),
         (
             {"victim": nn.Sequential(nn.Flatten(), nn.Linear(50, 4))},

@@ -156,6 +156,6 @@ def test_queries_are_counted_for_their_episodes() -> None:
     oracle.scores(asked_about((3,), 2), torch.tensor([4, 1]))
     oracle.gradient(asked_about((2, 2), 1), weighed, torch.tensor([4]))
     assert oracle.spent.tolist() == [0, 3, 0, 0, 7, 0]
-    spent, gradients, _ = enforcer.counts
+    spent, gradients, *_ = enforcer.counts
     assert spent.tolist() == oracle.spent.tolist()
     assert gradients.tolist() == [0, 0, 0, 0, 4, 0]

@@ -135,8 +135,8 @@ FAILS_AT_WORK = {
         "attack=crooked",
         "threat.access=oblivious",
     ): "attack 'crooked' needs access 'scores', but the threat model allows",
-    ("victim=bad", "victim.rule=nothing"): "none + bad(rule=nothing) loads a NoneType, but a Policy is needed",
-    ("victim=bad", "victim.rule=raise"): "none + bad(rule=raise) cannot be loaded: ZeroDivisionError: at a loss",
+    ("victim=bad", "victim.rule=nothing"): "bad(rule=nothing) loads a NoneType, but a Policy is needed",
+    ("victim=bad", "victim.rule=raise"): "bad(rule=raise) cannot be loaded: ZeroDivisionError: at a loss",
 }
 
 

@@ -78,6 +78,12 @@ def test_in_a_sweep_a_parameter_is_passed_to_the_components_that_have_it() -> No
     assert (noise.distribution, nudge.pause) == ("gaussian", 0.5)
 
 
+def test_a_budget_may_be_in_per_cent() -> None:
+    budgets = [pair.threat.budget for pair in read("attack=noise threat.budget=2%,10%,200%").pairs]
+    assert budgets == [0.02, 0.1, 2.0]
+    assert read("attack=noise threat.norm=linf threat.budget=2").pairs[0].threat.budget == 2
+
+
 def test_a_clean_pair_is_the_same_under_every_threat_model() -> None:
     assert len(read("attack=none threat.budget=0.1,0.2").pairs) == 1
 
@@ -105,6 +111,10 @@ BAD = {
     "threat=linf": "unknown key 'threat'",
     "threat.norm=l2": "unknown threat.norm 'l2'; known: relative, linf",
     "threat.budget=-1": "threat.budget must be between 0 and 2, got -1",
+    "threat.budget=2": "lets each value change by 200 % of itself: write threat.budget=2% for 2 %, or threat.budget=200% if you",
+    "threat.budget=0.1,1": "write threat.budget=1% for 1 %, or threat.budget=100% if you mean that",
+    "threat.budget=x%": "threat.budget must be a number, such as 0.1, or per cent, such as 10%, got x%",
+    "threat.budget=201%": "threat.budget must be between 0 and 2",
     "threat.budget=much": "threat.budget must be a number, got much",
     "attack=noise attack.steps=3": "unknown parameter attack.steps of noise; known: distribution, scale",
     "attack=noise attack.distribution=normal": "'normal'; did you mean 'uniform'? known: uniform, gaussian",

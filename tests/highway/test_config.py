@@ -50,7 +50,7 @@ def test_a_bad_configuration_is_refused_with_the_reason(bad: dict[str, Any], mes
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        ({"preset": "mine"}, "preset must be one of standard, thesis, got 'mine'"),
+        ({"preset": "mine"}, "preset must be one of standard, thesis, wide, got 'mine'"),
         ({"backend": "torch"}, "backend must be one of batched, reference, got 'torch'"),
         ({"vehicles": -1}, "vehicles must be between"),
         ({"target_speeds": (1.0,)}, "target_speeds must be"),

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pytest
 import torch
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.kinematics import Vehicle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
@@ -15,10 +20,12 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from bench.driving import ActionType, Driver
+from bench.errors import UserError
 from bench.scenarios import Cell, SeedBlock
 from envs.highway.axes import AXES
 from envs.highway.world import Backend, HighwayWorld
 
+PAGE = Path(__file__).parents[2] / "docs" / "worlds" / "highway.md"
 CLEAR = AXES.cell(lanes=3, density=1.0)
 MIXED = (CLEAR, AXES.cell(lanes=4, density=2.0, weather="rain"), AXES.cell(lanes=5, density=1.0, weather="fog"))
 IDLE, LANE_RIGHT, FASTER, SLOWER = 1, 2, 3, 4
@@ -232,3 +239,61 @@ def test_observations_stay_in_range_and_rows_are_compact(cells: list[Cell], seed
     assert (present[..., 0] == 1).all()
     assert (present.diff(dim=-1) <= 0).all()
     assert not observation[present == 0].any()
+
+
+def test_the_reference_does_not_depend_on_what_else_the_process_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Making an intersection of highway-env rewrites constants of the class of all IDM drivers."""
+    for name in ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN"):
+        monkeypatch.setattr(IDMVehicle, name, getattr(IDMVehicle, name))  # Restored after the test.
+    gymnasium.make("intersection-v0").reset(seed=0)
+    assert IDMVehicle.DISTANCE_WANTED == 7
+    monkeypatch.setattr(Vehicle, "MAX_SPEED", 20.0)
+    ours, theirs = (make(backend=backend, driver="idm", vehicles=20) for backend in ("batched", "reference"))
+    states = [start(env, 5) for env in (ours, theirs)]
+    for a, b in zip(
+        *(drive(env, at, torch.ones(60, 1)) for env, at in zip((ours, theirs), states, strict=True)), strict=True
+    ):
+        for key in a.keys(True, True):
+            torch.testing.assert_close(a.get(key), b.get(key), rtol=1e-5, atol=1e-5)
+    assert (IDMVehicle.DISTANCE_WANTED, IDMVehicle.MAX_SPEED) == (7, 20.0), "others of the process keep theirs"
+    assert "MAX_SPEED" not in vars(IDMVehicle)
+
+
+def test_a_sum_over_a_rollout_counts_each_episode_to_its_end() -> None:
+    """The example of docs/worlds/highway.md."""
+    code = next(
+        block for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if "rollout" in block
+    )
+    found: dict[str, Any] = {}
+    torch.manual_seed(0)
+    exec(code, found)
+    rewards, returns = found["episodes"]["next", "reward"].squeeze(-1), found["returns"]
+    lengths = found["episodes"]["next", "done"].squeeze(-1).int().argmax(1) + 1
+    assert len(set(lengths.tolist())) > 1
+    for row, length, total in zip(rewards, lengths, returns, strict=True):
+        assert total == pytest.approx(float(row[:length].sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize("preset", ["standard", "wide", "thesis"])
+def test_every_lane_is_within_the_observation(preset: Any) -> None:
+    """On more lanes than the range of y holds, a car would not see the edge of the road: such roads are refused."""
+    world = HighwayWorld(preset=preset)
+    for lanes in range(2, 9):
+        cell = AXES.cell(lanes=lanes, density=1.0)
+        edge = 4 * (lanes - 1) + 2
+        if edge <= world.features.high[1]:
+            assert world.make([cell]).batch_size == (1,)
+            assert not world.doubts([cell])
+            continue
+        for ask in (world.make, world.doubts):
+            with pytest.raises(
+                UserError, match=f"on {lanes} lanes y reaches {edge} m, .* at most 5 lanes, or .*preset=wide"
+            ):
+                ask([CLEAR, cell])
+    assert lanes == 8
+
+
+def test_dense_traffic_is_doubted() -> None:
+    assert not HighwayWorld().doubts([AXES.cell(lanes=3, density=2.0)])
+    (line,) = HighwayWorld().doubts([AXES.cell(lanes=3, density=2.0), AXES.cell(lanes=3, density=3.0)])
+    assert line.startswith("density 3 makes crashes without any attack")

@@ -25,6 +25,7 @@ from bench.errors import UserError
 from bench.plugins.pair import choose
 from bench.run.config import run_config
 from bench.run.plan import plan
+from bench.victims.drivers.in_process import in_process
 from envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts
@@ -37,6 +38,18 @@ ALGORITHMS = [
     ("sac", True),
     ("td3", True),
     ("ddpg", True),
+]
+FAITHFUL: list[tuple[str, bool, dict[str, Any]]] = [
+    *((algo, continuous, {}) for algo, continuous in ALGORITHMS),
+    ("a2c", True, {}),
+    ("ppo", True, {"activation_fn": nn.ELU, "net_arch": []}),
+    ("ppo", True, {"use_sde": True}),
+    ("ppo", True, {"use_sde": True, "squash_output": True}),
+    ("a2c", True, {"use_sde": True, "squash_output": True, "use_expln": True, "full_std": False}),
+    ("sac", True, {"use_sde": True}),
+    ("sac", True, {"use_sde": True, "clip_mean": 0.7}),
+    ("sac", True, {"use_sde": True, "clip_mean": 0.0}),
+    ("td3", True, {"net_arch": {"pi": [30], "qf": [20, 20]}, "n_critics": 1}),
 ]
 SHORT = "lanes=3 density=2 weather=clear episodes=3 seeds=0 world.max_steps=40 reference=false"
 
@@ -52,6 +65,17 @@ class Scores(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         observation = observation.reshape(-1, 10, 5) if self.flat else observation
         return self.policy.scores(observation)[:, : self.outputs]
+
+
+class Fewer(nn.Module):
+    """A network of 5 rows."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(25, 5)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.linear(observation.flatten(1))
 
 
 def torch_file(
@@ -81,10 +105,12 @@ def onnx_file(
     return str(path)
 
 
-def spaces(*, continuous: bool, shape: tuple[int, ...] = (10, 5), high: float = 1.0) -> gymnasium.Env[Any, Any]:
-    """A dummy environment with these spaces."""
+def spaces(
+    *, continuous: bool, shape: tuple[int, ...] = (10, 5), high: float = 1.0, seen: float = 1.0
+) -> gymnasium.Env[Any, Any]:
+    """A dummy environment with these spaces: observations in [-seen, seen], actions in [-high, high]."""
     env: gymnasium.Env[Any, Any] = gymnasium.Env()
-    env.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
+    env.observation_space = gymnasium.spaces.Box(-seen, seen, shape, np.float32)
     box = gymnasium.spaces.Box(-high, high, (2,), np.float32)
     env.action_space = box if continuous else gymnasium.spaces.Discrete(5)
     return env
@@ -93,7 +119,8 @@ def spaces(*, continuous: bool, shape: tuple[int, ...] = (10, 5), high: float = 
 def sb3_model(algo: str, env: gymnasium.Env[Any, Any], **policy: object) -> Any:
     """A model of Stable-Baselines3 with random weights, large enough that its actions vary."""
     sb3 = pytest.importorskip("stable_baselines3")
-    model = getattr(sb3, algo.upper())("MlpPolicy", env, device="cpu", seed=0, policy_kwargs=policy)
+    sde = {"use_sde": policy.pop("use_sde")} if "use_sde" in policy else {}
+    model = getattr(sb3, algo.upper())("MlpPolicy", env, device="cpu", seed=0, policy_kwargs=policy, **sde)
     with torch.no_grad():
         for weight in model.policy.parameters():
             weight.add_(0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(weight.numel())))
@@ -143,18 +170,23 @@ def test_a_gradient_attack_on_a_black_box_is_refused_before_any_work() -> None:
     run_config(["attack=zo", "victim=onnx", "victim.path=nowhere.onnx"])
 
 
-@pytest.mark.parametrize(("algo", "continuous"), ALGORITHMS)
-def test_a_policy_of_stable_baselines_acts_like_its_own_predict(tmp_path: Path, algo: str, continuous: bool) -> None:
-    policy: dict[str, object] = {"activation_fn": nn.ELU} if algo == "ppo" and continuous else {}
+@pytest.mark.parametrize(("algo", "continuous", "policy"), FAITHFUL)
+def test_a_policy_of_stable_baselines_acts_like_its_own_predict_as_a_file_and_as_an_object(
+    tmp_path: Path, algo: str, continuous: bool, policy: dict[str, Any]
+) -> None:
     model = sb3_model(algo, spaces(continuous=continuous), **policy)
     model.save(tmp_path / "model.zip")
-    actions = "continuous" if continuous else "discrete"
-    victim = choose("victim", "sb3", path=str(tmp_path / "model.zip"), algo=algo, actions=actions).component
-    observation = 2 * torch.rand(200, 10, 5, generator=torch.Generator().manual_seed(0)) - 1
+    observation = 2 * torch.rand(100, 10, 5, generator=torch.Generator().manual_seed(0)) - 1
     wanted, _ = model.predict(observation.numpy(), deterministic=True)
-    decided = victim.load(0, FACTS).decide(observation)
     assert len(np.unique(wanted, axis=0)) > 1
-    torch.testing.assert_close(decided, torch.from_numpy(wanted), rtol=0, atol=1e-6)
+    if continuous:
+        assert np.abs(wanted).max() > 0.5, "squashing would not matter"
+    victim = choose("victim", "sb3", path=str(tmp_path / "model.zip")).component
+    assert victim.action_type == ("continuous" if continuous else "discrete")
+    given = in_process([model], FACTS, observation, None)
+    for policy_ in (victim.load(0, FACTS), given.load(0, FACTS)):
+        for _ in range(2):
+            torch.testing.assert_close(policy_.decide(observation), torch.from_numpy(wanted), rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("algo", ["sac", "td3"])
@@ -215,12 +247,37 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
     "rows": (
         "torch",
         lambda path: {"path": torch_file(path), "rows": "15"},
-        "takes observations [10, 5], victim.rows and victim.features say [15, 5] or [75]",
+        "victim.rows=15 is not this world's observation, which has 10 rows of 5 features",
+    ),
+    "features": (
+        "torch",
+        lambda path: {"path": torch_file(path), "features": "7"},
+        "victim.features=7 is not this world's observation, which has 10 rows of 5 features",
+    ),
+    "no world": (
+        "torch",
+        lambda path: {"path": str(path), "trained_in": "' '"},
+        "trained_in must be the world of the training",
+    ),
+    "another arrangement": (
+        "torch",
+        lambda path: {"path": torch_file(path, Scores(flat=True), (5, 10))},
+        "takes observations (5, 10), this world shows (10, 5), or flattened (50,); these are as many numbers in another",
+    ),
+    "fewer rows": (
+        "torch",
+        lambda path: {"path": torch_file(path, Fewer(), (5, 5))},
+        "takes observations (5, 5), this world shows (10, 5)",
+    ),
+    "fewer rows in onnx": (
+        "onnx",
+        lambda path: {"path": onnx_file(path, Fewer(), (5, 5))},
+        "takes observations (5, 5), this world shows (10, 5)",
     ),
     "two scores": (
         "torch",
         lambda path: {"path": torch_file(path, Scores(2))},
-        "returns [1, 2] for 1 observation, discrete actions need [1, 5]",
+        "discrete actions need [1, 5]; if these are acceleration and steering, set victim.actions=continuous",
     ),
     "other actions": (
         "torch",
@@ -232,21 +289,60 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
     "fixed onnx": ("onnx", lambda path: {"path": onnx_file(path, fixed=True)}, "has a fixed batch size of 3"),
     "no zip": ("sb3", lambda path: bad_text(path) | {"algo": "dqn"}, "cannot be read: it is not a zip archive"),
     "unknown algo": ("sb3", lambda path: {"path": str(path), "algo": "dqm"}, "unknown victim.algo 'dqm'"),
-    "no algo": ("sb3", lambda path: {"path": str(path)}, "needs victim.algo=…"),
     "another algo": (
         "sb3",
         lambda path: {"path": sb3_file(path, "dqn"), "algo": "ppo"},
-        "has no ppo policy: mlp_extractor.policy_net is not among its weights",
+        "is a model of dqn, victim.algo says ppo; leave victim.algo out",
     ),
     "continuous": (
         "sb3",
-        lambda path: {"path": sb3_file(path, "ppo", continuous=True), "algo": "ppo"},
-        "was trained for continuous actions [2], this ppo victim needs 5 discrete actions; set victim.actions=continuous",
+        lambda path: {"path": sb3_file(path, "ppo", continuous=True), "actions": "discrete"},
+        "has continuous actions, victim.actions says discrete; leave victim.actions out",
     ),
     "other rows": (
         "sb3",
         lambda path: {"path": sb3_file(path, "dqn"), "algo": "dqn", "rows": "5"},
-        "takes observations [10, 5], victim.rows and victim.features say [5, 5] or [25]",
+        "victim.rows=5 is not this world's observation",
+    ),
+    "highway-env's default": (
+        "sb3",
+        lambda path: saved(path, "dqn", spaces(continuous=False, shape=(5, 5), seen=np.inf)),
+        "was trained on Box(-inf, inf, (5, 5)), this world shows Box(-1, 1, (10, 5)); highway-env's own tasks",
+    ),
+    "other bounds": (
+        "sb3",
+        lambda path: saved(path, "ppo", spaces(continuous=False, seen=np.inf)),
+        "was trained on Box(-inf, inf, (10, 5)), this world shows Box(-1, 1, (10, 5)); highway-env's own tasks",
+    ),
+    "two frames": (
+        "sb3",
+        lambda path: saved(path, "dqn", spaces(continuous=False, shape=(5, 10))),
+        'another arrangement. Train it in cavbench.gym.make("highway")',
+    ),
+    "other range of actions": (
+        "sb3",
+        lambda path: saved(path, "sac", spaces(continuous=True, high=2.0)),
+        'actions in Box(-2, 2, (2,)), not in [-1, 1]. Train it in cavbench.gym.make("highway", action_type="continuous")',
+    ),
+    "three actions": (
+        "sb3",
+        lambda path: saved(path, "dqn", with_actions(gymnasium.spaces.Discrete(3))),
+        "was trained for 3 discrete actions, this world takes 5 discrete ones (LANE_LEFT, IDLE,",
+    ),
+    "actions from 1": (
+        "sb3",
+        lambda path: saved(path, "ppo", with_actions(gymnasium.spaces.Discrete(5, start=1))),
+        "numbers its actions from 1; they must be numbered from 0",
+    ),
+    "many actions": (
+        "sb3",
+        lambda path: saved(path, "ppo", with_actions(gymnasium.spaces.MultiDiscrete([5, 5]))),
+        "was trained for actions of MultiDiscrete; the type must be Discrete or Box",
+    ),
+    "own extractor": (
+        "sb3",
+        lambda path: {"path": sb3_file(path, "ppo", features_extractor_class=extractor())},
+        "has the features extractor",
     ),
     "own activation": (
         "sb3",
@@ -254,6 +350,23 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
         "is not one of torch's",
     ),
 }
+
+
+def saved(path: Path, algo: str, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    sb3_model(algo, env).save(path)
+    return {"path": str(path)}
+
+
+def with_actions(space: gymnasium.Space[Any]) -> gymnasium.Env[Any, Any]:
+    env = spaces(continuous=False)
+    env.action_space = space
+    return env
+
+
+def extractor() -> type[nn.Module]:
+    """A features extractor that computes what `Flatten` does, in code of its own."""
+    layers = pytest.importorskip("stable_baselines3.common.torch_layers")
+    return type("Own", (layers.FlattenExtractor,), {})
 
 
 class Softer(nn.ReLU):

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from bench.archive import Archive
+from bench.driving import DrivingFacts
 from bench.errors import UserError
 from bench.run.config import component
 from bench.victims.detectors import yolov5_file
@@ -370,7 +371,7 @@ class Crashing(FileDriver):
 
     format: ClassVar[str] = "a file that crashes"
 
-    def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
+    def read(self, path: Path, sha256: str, facts: DrivingFacts) -> FilePolicy:
         ctypes.string_at(0)
         raise AssertionError
 

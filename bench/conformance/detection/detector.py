@@ -11,6 +11,7 @@ from bench.conformance.check import Check, Suite, require
 from bench.conformance.detection.street import Street
 from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
 from bench.detection import STOP_SIGN, Detector, Predictions
+from bench.trial.memory import changed, kept
 
 PICTURES = 3
 
@@ -72,7 +73,10 @@ class DetectorSuite(Suite):
     def same_picture_same_answer(self) -> None:
         """Two loads and two calls give the same predictions."""
         pictures, detector = self._pictures(), self.subject.load()
-        first = detector(pictures).scores
+        first, before = detector(pictures).scores, kept(detector)
+        detector(pictures.flip(0))
+        left = changed(before, kept(detector))
+        require(not left, f"it remembers earlier images in {left}: return what is remembered (initial and advance)")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(1)
             second, again = detector(pictures).scores, self.subject.load()(pictures).scores

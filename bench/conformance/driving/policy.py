@@ -7,11 +7,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from bench.conformance.check import Check, NotApplicableError, Subject, Suite, require
+from bench.conformance.check import BrokenRuleError, Check, NotApplicableError, Subject, Suite, one_line, require
 from bench.conformance.driving.state import not_noisy
 from bench.conformance.driving.traffic import observations, rows_of_observation
 from bench.conformance.network import check_frozen, check_gradient, check_white_box, unchanged
+from bench.conformance.scenarios import first_cell
 from bench.driving import DrivingWorld, Policy, State
+from bench.errors import UserError
+from bench.trial.policy import try_policy
 
 EPISODES = 6
 
@@ -35,6 +38,7 @@ class PolicySuite(Suite):
             "sees": self.looks,
             "gradient": self.differentiable,
             "weights left alone": self.keeps_weights,
+            "as a run tries it": self.tried,
         }
 
     def frozen(self) -> None:
@@ -141,6 +145,17 @@ class PolicySuite(Suite):
         with unchanged(policy, self.subject.load_victim):
             policy.decide(self._observations(), state)
             self.subject.load()
+
+    def tried(self) -> str:
+        """A run would not refuse it: no memory outside of its state, and one answer in every batch and every copy."""
+        if not self.victim.sees:
+            raise NotApplicableError("it ignores its input")
+        gradients = self.victim.answers == "gradients"
+        policy = self.subject.load()
+        try:
+            return "; ".join(try_policy(policy, self.world, [first_cell(self.world)], gradients=gradients, random=True))
+        except UserError as error:
+            raise BrokenRuleError(f"a run refuses it: it {one_line(error)}") from None
 
     def _ready(self) -> tuple[Policy, State]:
         """A newly loaded policy and its initial state."""

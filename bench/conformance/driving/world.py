@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from bench.conformance.check import Check, Suite, one_line, require
+from bench.conformance.check import Check, DoubtError, Suite, one_line, require
 from bench.conformance.scenarios import first_cell
 from bench.driving import ActionType, Driver, DrivingFacts, DrivingWorld
 from bench.errors import UserError
@@ -38,6 +38,7 @@ class WorldSuite(Suite):
             "determinism": self.same_seed_same_traffic,
             "batching": self.neighbours_do_not_matter,
             "actions": self.takes_its_actions,
+            "doubts": self.is_as_declared,
         }
 
     def describes_its_observation(self) -> None:
@@ -174,6 +175,11 @@ class WorldSuite(Suite):
                 bool(steps[-1]["reward"].isfinite().all()), f"the reward of {action_type} actions is NaN or infinite"
             )
         return refused
+
+    def is_as_declared(self) -> None:
+        """A short drive finds nothing that makes scores in the default grid doubtful."""
+        if doubts := self.component.doubts(registry.grid(self.component.grid).cells()):
+            raise DoubtError(*doubts)
 
     def _action_types(self) -> tuple[ActionType, ...]:
         """The action types to check: discrete only if the world names discrete actions."""

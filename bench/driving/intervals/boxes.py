@@ -67,6 +67,9 @@ class Assumed:
             larger, smaller = value / max(1 - self.budget, 1e-3), value / (1 + self.budget)
             low = torch.minimum(value - floor, torch.minimum(larger, smaller))
             high = torch.maximum(value + floor, torch.maximum(larger, smaller))
+        if features.fixed:
+            forged = features.forgeable().to(value) > 0
+            low, high = torch.where(forged, low, value), torch.where(forged, high, value)
         noise = torch.tensor([self.noise if name in ALONG else 0.0 for name in features.names]).to(value)
         noise = noise * (torch.arange(value.shape[-2]) > 0).to(value).unsqueeze(-1)
         low, high = low - noise, high + noise

@@ -14,7 +14,7 @@ from bench.errors import UserError
 from bench.victims.detectors.layout import CORNERS, Layout, allowed, layout_of, split
 from bench.victims.files.trial import RefusedError, failure
 
-Boxes = Literal["auto", "corners", "centre"]
+Boxes = Literal["auto", "corners", "corners_yx", "centre"]
 Scaling = Literal["unit", "byte", "imagenet"]
 Order = Literal["rgb", "bgr"]
 STRIDE = 32
@@ -53,7 +53,8 @@ class Output:
     """How the network writes boxes.
 
     Args:
-        boxes: `corners` [x1, y1, x2, y2], `centre` [x, y, width, height]; `auto`: as is usual in the layout of the outputs.
+        boxes: `corners` [x1, y1, x2, y2], `corners_yx` [y1, x1, y2, x2], `centre` [x, y, width, height]; `auto`: as is usual in
+            the layout of the outputs.
         normalised: whether they are shares of the input's width and height.
     """
 
@@ -122,12 +123,14 @@ class FileDetector(Detector):
                 f"{self.path} returns {boxes.shape[1]} boxes for an image; from 1 to {MOST_BOXES} are allowed, "
                 "all of them before non-maximum suppression"
             )
+        if self.made.boxes == "corners_yx":
+            boxes = boxes[..., [1, 0, 3, 2]]
         if self.made.normalised:
             boxes = boxes * boxes.new_tensor([shown.shape[3], shown.shape[2]] * 2)
         return self._corners(boxes, layout), objectness, classes, shift, scale
 
     def _corners(self, boxes: Tensor, layout: Layout) -> Tensor:
-        if self.made.boxes == "corners" or (self.made.boxes == "auto" and layout in CORNERS):
+        if self.made.boxes in ("corners", "corners_yx") or (self.made.boxes == "auto" and layout in CORNERS):
             return boxes
         centre, half = boxes[..., :2], boxes[..., 2:] / 2
         return torch.cat((centre - half, centre + half), -1)

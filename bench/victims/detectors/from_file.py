@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -49,8 +52,8 @@ class DetectorFile(DetectorVictim):
         path: the file.
         names: class names in the order of the scores, one of which is "stop sign": joined by `+`, as in "car+stop sign", or a
             text file with one in each line; empty for the 80 classes of COCO.
-        boxes: `corners`: [x1, y1, x2, y2]; `centre`: [x, y, width, height]; `auto`: corners if boxes are an output of their own,
-            otherwise centre, as in YOLO.
+        boxes: `corners`: [x1, y1, x2, y2]; `corners_yx`: [y1, x1, y2, x2], as TensorFlow writes them; `centre`: [x, y, width,
+            height]; `auto`: corners if boxes are an output of their own, otherwise centre, as in YOLO.
         normalised: boxes are shares of the input's width and height, not pixels.
         scaling: values of the pixels: `unit`: [0, 1]; `byte`: [0, 255]; `imagenet`: [0, 1], minus the mean of ImageNet, over its
             standard deviation.
@@ -75,6 +78,23 @@ class DetectorFile(DetectorVictim):
             # Both depend on the file's format.
             object.__setattr__(self, "answers", "scores")
             object.__setattr__(self, "libraries", (onnx_runtime.LIBRARY,))
+
+    def alternatives(self) -> Mapping[str, DetectorVictim]:
+        """Other readings of its pixels and boxes, which differ in one or two parameters; those that differ in one come first."""
+        choices: dict[str, tuple[object, ...]] = {
+            "scaling": get_args(Scaling),
+            "channels": get_args(Order),
+            "boxes": ("auto", "corners", "corners_yx", "centre"),
+            "normalised": (False, True),
+        }
+        found: list[tuple[int, str, DetectorVictim]] = []
+        for values in itertools.product(*choices.values()):
+            given = dict(zip(choices, values, strict=True))
+            words = [
+                f"victim.{name}={str(value).lower()}" for name, value in given.items() if value != getattr(self, name)
+            ]
+            found.append((len(words), " ".join(words), replace(self, **given)))  # type: ignore[arg-type]
+        return {words: victim for count, words, victim in sorted(found, key=itemgetter(0)) if count in (1, 2)}
 
     def zoo_name(self) -> str:
         """A file has no trained or defended versions.

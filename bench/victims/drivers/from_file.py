@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,12 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from bench.errors import UserError
+from bench.errors import UserError, short
 from bench.plugins.ranges import Count
+from bench.victims.drivers.spaces import CONTROLS, UNKNOWN, Bounds, Expected
 from bench.victims.files.trial import RefusedError, failure, hashed, refuse_harm
 
-CONTROLS = 2
-"""Size of a continuous action: acceleration and steering."""
 TRIED = (1, 2, 1500)
 """Batch sizes on which a policy is tested: attacks query many points of many episodes at once."""
 
@@ -27,7 +28,7 @@ class FilePolicy(Policy):
 
     Args:
         network: maps observations [N, *shape] to scores [N, A], or to actions [N, 2], which are clipped to [-1, 1].
-        shape: input shape: [V, F] or, flattened, [V * F]; with flat facts [F - 1].
+        shape: input shape: that of the observation (after `native`), or that flattened.
         action_type: discrete or continuous.
         width: size of the output for one observation.
         sha256: hash of the file.
@@ -58,9 +59,15 @@ class FilePolicy(Policy):
 
     def forward(self, observation: Tensor) -> Tensor:
         leading = observation.shape[:-2]
+        shown = self._native(observation)
+        if (own := tuple(shown.shape[len(leading) :])) != self.shape and (math.prod(own),) != self.shape:
+            raise UserError(f"the policy takes observations {self.shape}, this world shows {own}")
         if not leading.numel():
             return observation.new_zeros(*leading, self.width)
-        output = self.network(self._native(observation).reshape(-1, *self.shape))
+        output = self.network(shown.reshape(-1, *self.shape))
+        if output.is_complex():
+            raise UserError("answers complex numbers; scores are real numbers")
+        output = output.to(observation.dtype)
         output = output if self.action_type == "discrete" else output.clamp(-1, 1)
         return output.reshape(*leading, output.shape[-1])
 
@@ -82,9 +89,11 @@ class FileDriver(DrivingVictim):
         path: the file.
         actions: `discrete`: the output is the values or logits of the world's actions (on the highway LANE_LEFT, IDLE,
             LANE_RIGHT, FASTER, SLOWER), and the largest is taken; `continuous`: it is [acceleration, steering] in [-1, 1].
-        rows: number of rows of its observation, including the ego; the world must have the same number.
-        features: size of a row: presence and the measured features. A world from a gymnasium environment has 1 row, of the
-            values of that environment's observation.
+        rows: number of rows of its observation, including the ego; None for the world's. Another number is refused.
+        features: size of a row: presence and the measured features; None for the world's. A world from a gymnasium environment
+            has 1 row, of the values of that environment's observation.
+        trained_in: the world of its training, as tables print it: `highway`, or `highway(preset=thesis)`. A file does not say
+            it; tables remark on what is unknown, and on a world other than the run's.
     """
 
     format: ClassVar[str]
@@ -92,12 +101,21 @@ class FileDriver(DrivingVictim):
 
     path: str
     actions: Literal["discrete", "continuous"] = "discrete"
-    rows: Count = 10
-    features: Count = 5
+    rows: Count | None = None
+    features: Count | None = None
+    trained_in: str = UNKNOWN
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_trained_in(self.trained_in)
 
     @property
     def action_type(self) -> ActionType:
         return self.actions
+
+    @property
+    def draws(self) -> bool:
+        return False
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         """The policy in the file, for any seed.
@@ -111,39 +129,66 @@ class FileDriver(DrivingVictim):
 
     def _loaded(self, facts: DrivingFacts, sha256: str) -> FilePolicy:
         """The policy, which was tried. Its kernels may crash on a crafted file."""
-        width = len(facts.actions) if self.action_type == "discrete" else CONTROLS
+        self._check_given(facts)
         try:
-            policy = self.read(Path(self.path).expanduser(), sha256, width)
+            policy = self.read(Path(self.path).expanduser(), sha256, facts)
         except UserError:
             raise
         # A truncated file, or one in another format, can fail anywhere in the library that reads it.
         except Exception as error:
             raise UserError(f"{self.path} cannot be read: it is not {self.format}, or a damaged one") from error
-        policy.native = facts.native if facts.flat else None
-        self._try(policy, [self.rows, self.features + facts.flat])
+        rows, size = Expected(facts=facts, rows=self.rows).shape
+        self._try(policy, [rows or math.prod(policy.shape) // size, size])
         return policy
 
+    def _check_given(self, facts: DrivingFacts) -> None:
+        """Refuse `rows` and `features` that are not the world's."""
+        rows, size = Expected(facts=facts, rows=self.rows).shape
+        own = {"rows": rows, "features": size - facts.flat}
+        for name, number in own.items():
+            if (given := getattr(self, name)) not in (None, number):
+                raise UserError(
+                    f"victim.{name}={given} is not this world's observation, which has {own['rows'] or 'any number of'} rows of "
+                    f"{own['features']} features; leave it out, and train the policy in this world"
+                )
+
     @abstractmethod
-    def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
+    def read(self, path: Path, sha256: str, facts: DrivingFacts) -> FilePolicy:
         """Read the policy from a file.
 
         Args:
             path: path of the file.
             sha256: hash of its content.
-            width: required size of the output for one observation.
+            facts: facts of the world.
 
         Raises:
-            UserError: if it does not match the parameters.
+            UserError: if it does not match the parameters or the world.
         """
 
-    def check_observation(self, shape: Sequence[object]) -> None:
-        """Raise UserError unless `shape`, [V, F] or [V * F], matches `rows` and `features`."""
-        if list(shape) not in ([self.rows, self.features], [self.rows * self.features]):
-            wanted = f"[{self.rows}, {self.features}] or [{self.rows * self.features}]"
+    def width(self, facts: DrivingFacts) -> int:
+        """The required size of the output for one observation."""
+        return len(facts.actions) if self.action_type == "discrete" else CONTROLS
+
+    def fitted(
+        self, facts: DrivingFacts, shape: Sequence[int | None], bounds: Bounds | None = None
+    ) -> Callable[[Tensor], Tensor] | None:
+        """What converts the world's observations for the policy (`Expected.fit`); None if nothing has to.
+
+        Args:
+            facts: facts of the world.
+            shape: shape of its observations without the batch; None for an axis of any size.
+            bounds: its observation space, if the file says it.
+
+        Raises:
+            UserError: if it takes other observations than those of the world.
+        """
+        sides = [side for side in shape if side is not None]
+        if len(sides) < len(shape):
             raise UserError(
-                f"{self.path} takes observations {list(shape)}, victim.rows and victim.features say {wanted}; "
-                "they must match each other and the world"
+                f"{self.path} takes observations {['any' if side is None else side for side in shape]}: export it with "
+                "fixed sizes of the observation; only the batch size is dynamic"
             )
+        return Expected(facts=facts, rows=self.rows).fit(self.path, sides, bounds)
 
     def _try(self, policy: FilePolicy, observation: Sequence[int]) -> None:
         for batch in TRIED:
@@ -158,8 +203,25 @@ class FileDriver(DrivingVictim):
             if list(scores.shape) != wanted:
                 raise UserError(
                     f"{self.path} returns {list(scores.shape)} for {_observations(batch)}, "
-                    f"{self.action_type} actions need {wanted}"
+                    f"{policy.action_type} actions need {wanted}{self._hint(policy, scores)}"
                 )
+
+    def _hint(self, policy: FilePolicy, scores: Tensor) -> str:
+        two = scores.shape[-1:] == (CONTROLS,) and policy.action_type == "discrete"
+        return "; if these are acceleration and steering, set victim.actions=continuous" if two else ""
+
+
+def check_trained_in(world: str) -> None:
+    """Refuse what cannot be the name of a world in a table.
+
+    Raises:
+        ValueError: in one line.
+    """
+    if not world.isprintable() or not re.fullmatch(r"[^\s()]+(\(.*\))?", world):
+        raise ValueError(
+            "trained_in must be the world of the training as tables print it, for instance highway or "
+            f"highway(preset=thesis), got {short(world)!r}; leave it out if you do not know it"
+        )
 
 
 def _observations(batch: int) -> str:

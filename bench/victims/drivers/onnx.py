@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from bench.driving import DrivingFacts
 from bench.errors import UserError
 from bench.plugins.contracts import Access
 from bench.victims.drivers.from_file import FileDriver, FilePolicy
@@ -25,10 +26,10 @@ class ONNX(FileDriver):
     answers: ClassVar[Access] = "scores"
     format: ClassVar[str] = "an ONNX model"
 
-    def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
+    def read(self, path: Path, sha256: str, facts: DrivingFacts) -> FilePolicy:
         model = onnx_runtime.read(path, self.path, sha256)
         batch, *shape = model.shape
-        self.check_observation(shape)
+        native = self.fitted(facts, shape)
         if batch is not None:
             raise UserError(f"{self.path} has a fixed batch size of {batch}: export it with a dynamic first axis")
 
@@ -36,4 +37,4 @@ class ONNX(FileDriver):
             return model.run(observation, model.outputs[:1])[0]
 
         sizes = [side for side in shape if side is not None]
-        return FilePolicy(network, sizes, self.action_type, width, model.sha256)
+        return FilePolicy(network, sizes, self.action_type, self.width(facts), model.sha256, native=native)

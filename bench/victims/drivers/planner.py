@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from annotated_types import Interval
@@ -49,6 +49,8 @@ class Planner(DrivingVictim):
         gain: progress by which another lane must be better.
         detour: progress that a lane loses for every lane between it and the next one.
     """
+
+    brakes_to: ClassVar[float | None] = 10.0
 
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"

@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import torch
+from torch import Tensor, nn
+
+from bench.driving import DrivingFacts
 from bench.errors import UserError
 from bench.victims.drivers.from_file import FileDriver, FilePolicy
 from bench.victims.files.torch_graph import Single
@@ -22,16 +26,36 @@ class TorchExport(FileDriver):
 
     format: ClassVar[str] = "a program of torch.export.save"
 
-    def read(self, path: Path, sha256: str, width: int) -> FilePolicy:
+    def read(self, path: Path, sha256: str, facts: DrivingFacts) -> FilePolicy:
         program = read(path, self.path)
         if (count := len(program.graph.outputs)) != 1:
             raise UserError(f"{self.path} returns {count} values, a driver returns one tensor")
         batch, *shape = program.shape
-        self.check_observation(shape)
+        native = self.fitted(facts, shape)
         if batch is not None:
             raise UserError(
                 f"{self.path} has a fixed batch size of {batch}: export it with "
                 'dynamic_shapes={"observation": {0: torch.export.Dim("batch")}}'
             )
+        if program.dtype is None or not program.dtype.is_floating_point:
+            raise UserError(f"{self.path} takes observations of {program.dtype}: export it for torch.float32")
+        network = Typed(Single(program.graph), program.dtype)
         sizes = [side for side in shape if side is not None]
-        return FilePolicy(Single(program.graph), sizes, self.action_type, width, sha256)
+        return FilePolicy(network, sizes, self.action_type, self.width(facts), sha256, native=native)
+
+
+class Typed(nn.Module):
+    """A network that is given its input as numbers of its own precision.
+
+    Args:
+        network: the network.
+        dtype: what it takes.
+    """
+
+    def __init__(self, network: nn.Module, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.network, self.dtype = network, dtype
+
+    def forward(self, observation: Tensor) -> Tensor:
+        answer: Tensor = self.network(observation.to(self.dtype))
+        return answer

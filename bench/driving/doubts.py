@@ -1,0 +1,113 @@
+"""What makes the scores of a pair doubtful in a world, before anything is driven, and what all its baselines say afterwards."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from bench.driving.features import DrivingFacts, Features
+from bench.errors import UserError
+from bench.plugins.chain import Chain
+from bench.plugins.options import configured
+from bench.plugins.pair import Pair
+from bench.plugins.registry import MARK
+from bench.victims import zoo
+
+
+def doubts(pair: Pair, default_world: str) -> Iterator[str]:
+    """The doubts about a pair, one line each.
+
+    Args:
+        pair: a pair of the driving track.
+        default_world: name of the world that drivers are trained in if nothing else is said.
+    """
+    facts: Any = pair.world.component.facts
+    for name, part in _named(pair):
+        yield from _too_fast(name, part, pair, facts)
+        if _in_zoo(part, pair):
+            yield from _trained_elsewhere(name, part, facts, default_world)
+
+
+def hopeless(baselines: pa.Table) -> str:
+    """What to say if every baseline fails in every episode of these records; empty otherwise."""
+    failed = pc.or_(baselines["crashed"], baselines["offroad"])
+    if not len(baselines) or not pc.all(failed).as_py():
+        return ""
+    pairs = set(zip(baselines["victim"].to_pylist(), baselines["victim_params"].to_pylist(), strict=True))
+    drivers = sorted({str(json.loads(params).get("policy", name)) for name, params in pairs})
+    return (
+        f"every baseline fails in every episode ({', '.join(drivers)}; {len(baselines)} episodes): the task may be too hard for "
+        "them, or arriving counts as a failure (`GymWorld.failed` says what one is)"
+    )
+
+
+def _named(pair: Pair) -> list[tuple[str, Any]]:
+    """The victim, and the defence or its links, with their names."""
+    defense = pair.defense.component
+    links = defense.links if isinstance(defense, Chain) else (defense,)
+    return [(pair.victim.name, pair.victim.component), *zip(pair.defense.name.split(MARK), links, strict=False)]
+
+
+def _too_fast(name: str, part: Any, pair: Pair, facts: DrivingFacts) -> Iterator[str]:
+    """Drivers and filters that brake by SLOWER need a target speed that is low enough."""
+    victim: Any = pair.victim.component
+    needed = getattr(part, "brakes_to", None)
+    if needed is None or facts.kinematics is None or victim.action_type != "discrete":
+        return
+    if (slowest := facts.kinematics.target_speeds[0]) > needed:
+        yield (
+            f"{name} brakes by SLOWER, which ends at {slowest:g} m/s in this world; it was made for {needed:g} m/s and crashes "
+            "into slower traffic without any attack: give world.target_speeds a lower first speed"
+        )
+
+
+def _in_zoo(part: Any, pair: Pair) -> bool:
+    """Whether a victim or a defence has networks in the zoo; others may take their networks from anywhere."""
+    if not hasattr(part, "trained_in"):
+        return False
+    victim: Any = pair.victim.component
+    try:
+        return bool(zoo.seeds(zoo.Recipe.of(victim, None if part is victim else part)))
+    except NotImplementedError:
+        return False
+
+
+def _trained_elsewhere(name: str, part: Any, facts: DrivingFacts, default_world: str) -> Iterator[str]:
+    """A network of the zoo is at home in the world that its recipe names."""
+    first, *others = [*shlex.split(part.trained_in), ""]
+    values = [word for word in (first, *others) if "=" in word]
+    world = first if first and "=" not in first else default_world
+    try:
+        made = configured("world", world, dict(word.split("=", 1) for word in values))
+        home: Any = made.component.facts
+    # Whether its world can still be made does not matter here.
+    except UserError:
+        return
+    if isinstance(home, DrivingFacts) and (differs := _difference(home, facts)):
+        yield f"{name} was trained in another world: {differs}; train it in this one (bench train), or choose its own"
+
+
+def _difference(home: DrivingFacts, here: DrivingFacts) -> str:
+    """The first difference between two worlds that changes what a driver sees or what its actions do; empty for none."""
+    if home.features.names != here.features.names:
+        return f"it saw {', '.join(home.features.names)}"
+    for place, name in enumerate(home.features.names):
+        ranges = [_range(facts.features, place) for facts in (home, here)]
+        if ranges[0] != ranges[1]:
+            return f"it saw {name} from {ranges[0]}, here {name} is {ranges[1]}"
+    if home.decision_hz != here.decision_hz:
+        return f"it decided {home.decision_hz:g} times a second, here it does {here.decision_hz:g} times"
+    speeds = [None if facts.kinematics is None else facts.kinematics.target_speeds for facts in (home, here)]
+    if speeds[0] != speeds[1]:
+        told = [", ".join(f"{speed:g}" for speed in each or ()) for each in speeds]
+        return f"its target speeds were {told[0]} m/s, here they are {told[1]} m/s"
+    return ""
+
+
+def _range(features: Features, place: int) -> str:
+    return f"{features.low[place]:g} to {features.high[place]:g} {features.units[place]}"

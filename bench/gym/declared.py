@@ -1,0 +1,91 @@
+"""What a `GymWorld` declares of its environment, compared with the environment."""
+
+from __future__ import annotations
+
+from math import prod
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+from gymnasium import spaces
+
+from bench.driving import ActionType
+from bench.errors import UserError
+from bench.plugins import registry
+from bench.plugins.fingerprint import canonical
+from bench.plugins.foreign import contained
+from bench.scenarios import Axes, Cell, Value
+
+if TYPE_CHECKING:
+    from bench.gym.world import GymWorld
+
+CONTROLS = 2
+_shapes: dict[tuple[type, str], tuple[int, ...]] = {}
+"""Shapes of the observations of environments that were asked, by class and parameters of the world."""
+
+
+def native_shape(world: GymWorld) -> tuple[int, ...]:
+    """Shape of the array that the environment itself returns.
+
+    It is `world.shape` or, if that is empty, what an environment says that is made once for it. A world whose environment cannot
+    be made without a cell of its grid has a flat one.
+    """
+    if world.shape:
+        return world.shape
+    key = (type(world), canonical(world))
+    if key not in _shapes:
+        _shapes[key] = _asked(world)
+    return _shapes[key]
+
+
+def check(world: GymWorld, env: gymnasium.Env[Any, Any], action_type: ActionType) -> None:
+    """Refuse an environment whose spaces are not those of the world.
+
+    Raises:
+        UserError: says what differs.
+    """
+    name, count, space = type(world).__name__, len(world.features.names), env.observation_space
+    if not isinstance(space, spaces.Box) or prod(space.shape) != count:
+        raise UserError(f"{name} declares {count} features, its environment observes {space}")
+    if space.shape != (shape := native_shape(world)):
+        raise UserError(
+            f"the environment of {name} observes arrays {list(space.shape)}, not {list(shape)}: "
+            f"write shape: ClassVar[tuple[int, ...]] = {space.shape} in the class"
+        )
+    action = env.action_space
+    if action_type == "discrete" and not (isinstance(action, spaces.Discrete) and action.n == len(world.actions)):
+        raise UserError(f"{name} names {len(world.actions)} discrete actions, its environment takes {action}")
+    if action_type == "continuous" and not (isinstance(action, spaces.Box) and action.shape == (CONTROLS,)):
+        raise UserError(f"continuous policies have {CONTROLS} controls, the environment of {name} takes {action}")
+
+
+def _asked(world: GymWorld) -> tuple[int, ...]:
+    flat = (len(world.features.names),)
+    try:
+        with contained():
+            env = world.environment(_any_cell(world))
+            space = env.observation_space
+            env.close()
+    # The environment of a plug-in may raise anything; it is made again, and then heard, when it is driven.
+    except Exception:
+        return flat
+    return space.shape if isinstance(space, spaces.Box) and prod(space.shape) == prod(flat) else flat
+
+
+def _any_cell(world: GymWorld) -> Cell:
+    """The first cell of the world's grid or, if that is not installed, one of values that the axes allow."""
+    if world.grid in registry.entries(registry.GRIDS):
+        return registry.grid(world.grid).cells()[0]
+    return _allowed(world.axes)
+
+
+def _allowed(axes: Axes) -> Cell:
+    found: dict[str, Value] = {}
+    for name, axis in axes.items():
+        tried = (axis.default, *axis.choices, axis.low, axis.high, axis.above + 1, 1, 0)
+        for value in tried:
+            try:
+                found[name] = axis.checked(value)  # type: ignore[arg-type]
+                break
+            except (ValueError, OverflowError):
+                continue
+    return axes.cell(**found)
