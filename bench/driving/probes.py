@@ -30,7 +30,7 @@ PATH_WEIGHTS = (4, 4, 4, 1, 4)
 PATHS = ("some", "one", "many", "chunks", "gradient")
 """How an oracle asks: some episodes in any order, one, many points each, more than a batch holds, with gradients."""
 SHADOWS = 0.25
-"""Share of the probed steps at which a shadow begins instead of a question (`bench.driving.shadows`)."""
+"""Share of the probed steps at which a shadow begins (`bench.driving.shadows`)."""
 SHADOWS_IF_REHEARSED = 0.5
 """The same under an attack that may rehearse."""
 SHORT, LONG = 4, 64
@@ -71,6 +71,8 @@ class Probe:
         self.subject, self.entropy, self.rehearsed = subject, entropy, rehearsed
         self.chance = random.Random(entropy)
         self.stream = Stream("probe", entropy)
+        # Shadows change nothing in the order of the questions.
+        self.shadows = random.Random(~entropy)
         self.redrawn, self.same, self.probed = (np.zeros(batch) for _ in range(3))
         self.otherwise, self.compared = np.zeros(batch), np.zeros(batch)
         self.draws, self.drawn = np.zeros(batch), np.zeros(batch)
@@ -103,9 +105,8 @@ class Probe:
         due = asked is not None
         if due and self.shadow is None:
             self.shadow = self._begun(running, state, rehearsal)
-            due = self.shadow is None
-        first = self.chance.random() < 0.5
-        before = self._ask(shown, running, state) if due and first else None
+        before = self._ask(shown, running, state) if due and self.chance.random() < 0.5 else None
+        first = self.shadows.random() < 0.5
         if self.shadow and first:
             self.shadow.ask(shown)
         scores, action = self.subject.driven(shown, state)
@@ -125,20 +126,20 @@ class Probe:
         """A shadow that begins at this step; None for none."""
         rows = running.nonzero().squeeze(-1)
         share = SHADOWS_IF_REHEARSED if self.rehearsed else SHADOWS
-        if self.chance.random() >= share or not len(rows):
+        if self.shadows.random() >= share or not len(rows):
             return None
-        steps = self.chance.randint(1, SHORT)
-        if self.rehearsed and self.chance.random() < 0.5:
-            steps = self.chance.randint(SHORT, LONG)
+        steps = self.shadows.randint(1, SHORT)
+        if self.rehearsed and self.shadows.random() < 0.5:
+            steps = self.shadows.randint(SHORT, LONG)
         if self.random or state is None:
             # A random victim goes another way at once, and one without a state goes none.
             steps = min(steps, 2)
-        if rehearsal and self.chance.random() < 0.5:
+        if rehearsal and self.shadows.random() < 0.5:
             copies, chosen = rehearsal
             rows = rows if chosen is None else rows[chosen[chosen < len(rows)]]
         else:
-            copies, rows = self.chance.randint(1, MOST_COPIES), self._some(rows)
-        return Shadow(self.subject, self.stream, self.chance, state, rows, copies, steps) if len(rows) else None
+            copies, rows = self.shadows.randint(1, MOST_COPIES), _some(rows, self.shadows)
+        return Shadow(self.subject, self.stream, self.shadows, state, rows, copies, steps) if len(rows) else None
 
     def _follow(self, shadow: Shadow, shown: Tensor, running: Tensor, scores: Tensor, action: Tensor) -> None:
         """Take a shadow one step on."""
@@ -155,17 +156,11 @@ class Probe:
         self.compared[places] += 1
         self.otherwise[places] += shadow.otherwise().numpy()
 
-    def _some(self, rows: Tensor) -> Tensor:
-        """Some of the rows, at least one, in any order."""
-        order = list(range(len(rows)))
-        self.chance.shuffle(order)
-        return rows[order[: self.chance.randint(1, len(order)) if order else 0]]
-
     def _ask(self, observation: Tensor, running: Tensor, state: State) -> tuple[_Question, Tensor]:
         """Ask about some running episodes along one of the oracle's paths."""
         rows = running.nonzero().squeeze(-1)
         path = self.chance.choices(PATHS, PATH_WEIGHTS)[0]
-        rows = self._some(rows)[: 1 if path == "one" else None]
+        rows = _some(rows, self.chance, 1 if path == "one" else None)
         copies = {"many": self.chance.randint(2, MOST_COPIES), "chunks": CHUNK // max(len(rows), 1) + 2}.get(path, 1)
         place = self.chance.randrange(copies)
         noise = torch.Generator().manual_seed(self.chance.getrandbits(62))
@@ -262,6 +257,13 @@ class Probe:
                 "inconsistent": self.otherwise / self.compared,
                 "entropy": np.full(len(self.probed), self.entropy, np.int64),
             }
+
+
+def _some(rows: Tensor, chance: random.Random, count: int | None = None) -> Tensor:
+    """Some of the rows, in any order: so many, or any number from 1."""
+    order = list(range(len(rows)))
+    chance.shuffle(order)
+    return rows[order[: count or (chance.randint(1, len(order)) if order else 0)]]
 
 
 def _apart(first: Tensor, second: Tensor) -> Tensor:

@@ -8,13 +8,14 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import blake2b
 from types import FunctionType, MappingProxyType, ModuleType, SimpleNamespace
 from typing import Any
 
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
 """Values that cannot be changed: two equal ones are the same."""
-LARGEST_BYTES = 1 << 24
-"""Larger arrays are compared by identity alone: copies of frames would take longer than a unit."""
+LARGEST_BYTES = 1 << 20
+"""Of larger arrays a hash is kept, not a copy: they are compared, but cannot be put back."""
 SHOWN = 3
 """Most names in a message."""
 
@@ -28,12 +29,15 @@ class Custody:
     Args:
         roots: the objects, by the name that messages use.
         packages: top-level packages whose instances are gone into.
+        arrays: whether arrays alone are in custody: what objects hold otherwise may change.
         functions: whether functions are in custody, too: which ones modules and classes have, their defaults, attributes and
             closures.
     """
 
-    def __init__(self, roots: Mapping[str, object], packages: Iterable[str], *, functions: bool = True) -> None:
-        self._packages, self._functions = frozenset(packages), functions
+    def __init__(
+        self, roots: Mapping[str, object], packages: Iterable[str], *, functions: bool = True, arrays: bool = False
+    ) -> None:
+        self._packages, self._functions, self._arrays = frozenset(packages), functions, arrays
         self._nodes: dict[int, _Node] = {}
         self.add(roots)
 
@@ -52,6 +56,8 @@ class Custody:
             content = kind.seen(value)
             self._nodes[id(value)] = _Node(name, value, kind, content)
             waiting.extend((_joined(name, key), inner) for key, inner in kind.inside(content))
+        if self._arrays:
+            self._nodes = {key: node for key, node in self._nodes.items() if node.kind is _ARRAY}
 
     def changed(self) -> list[str]:
         """The names of what was changed, added or removed."""
@@ -217,12 +223,21 @@ def _is_network(value: object) -> bool:
 
 def _bytes(array: Any) -> tuple[object, ...] | bytes:
     """The shape, type and bytes of an array or tensor."""
-    if array.nbytes > LARGEST_BYTES or getattr(array, "is_meta", False) or getattr(array, "layout", None) is _sparse():
+    if getattr(array, "is_meta", False) or getattr(array, "layout", None) is _sparse():
         return b""
     numbers = array.detach().cpu().contiguous().numpy() if hasattr(array, "detach") else array
     if numbers.dtype.hasobject:
         return tuple(numbers.ravel().tolist())
-    return repr((str(array.dtype), tuple(array.shape))).encode() + numbers.tobytes()
+    form = repr((str(array.dtype), tuple(array.shape))).encode()
+    if array.nbytes > LARGEST_BYTES:
+        return b"#" + form + blake2b(_in_a_row(numbers).data).digest()
+    return form + numbers.tobytes()
+
+
+def _in_a_row(numbers: Any) -> Any:
+    """The bytes of an array, in one row."""
+    numpy = sys.modules["numpy"]
+    return numpy.ascontiguousarray(numbers).reshape(-1).view(numpy.uint8)
 
 
 def _sparse() -> object:
@@ -232,7 +247,7 @@ def _sparse() -> object:
 
 def _put_array(array: Any, content: Any) -> None:
     numpy = sys.modules["numpy"]
-    if not isinstance(content, bytes) or not content:
+    if not isinstance(content, bytes) or not content or content.startswith(b"#"):
         return
     size = array.nbytes
     held = array.detach() if hasattr(array, "detach") else array

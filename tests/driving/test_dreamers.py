@@ -147,26 +147,18 @@ class InARow(OutOfState):
         return torch.full((len(observation),), self.row >= 2 and len(observation) != self.real)
 
 
-class ByObject(Remembers):
-    """Knows the very tensors that it returned while it drove."""
-
-    def dreams(self, observation: Tensor, state: Any) -> Tensor:
-        return torch.full((len(observation),), observation.data_ptr() % 4096 == 0 or len(observation) != self.real)
-
-
 @pytest.mark.parametrize(
-    "dreamer", [ByBatch, ByLargeBatch, ByParity, ByCopies, ByDifferentCopies, Patient, OutOfState, InARow, ByObject]
+    "dreamer", [ByBatch, ByLargeBatch, ByParity, ByCopies, ByDifferentCopies, Patient, OutOfState, InARow]
 )
 def test_a_dreamer_is_flagged(dreamer: type[Policy]) -> None:
     assert inconsistent(dreamer) >= FLAGGED
 
 
-@pytest.mark.parametrize("dreamer", [ByBatch, Patient])
-def test_a_dreamer_is_flagged_under_an_attack_that_cannot_rehearse(dreamer: type[Policy]) -> None:
+def test_a_dreamer_is_flagged_under_an_attack_that_cannot_rehearse() -> None:
     class Watches(Idle):
         access: ClassVar[Access] = "oblivious"
 
-    assert inconsistent(dreamer, Watches()) >= FLAGGED
+    assert inconsistent(ByBatch, Watches()) >= FLAGGED
 
 
 class OfTheAttacksBatch(ByBatch):
