@@ -11,7 +11,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -133,7 +133,8 @@ def _heard(event: str, arguments: tuple[Any, ...]) -> None:
         address = arguments[1]
         if isinstance(address, tuple) and _asking(watched):
             _refuse(watched, f"it connected to {address[0]} while it was measured")
-    elif event == "mmap.__new__" and _through(SHARED) and _asking(watched):
+    elif event == "mmap.__new__" and (sharing := _frame_of(SHARED)) and _asking(watched):
+        _unlink(sharing)
         _refuse(watched, "it shared memory with other processes while it was measured")
 
 
@@ -180,11 +181,19 @@ def _carries(module: str, top: str) -> bool:
     return top in sys.stdlib_module_names or any(module == one or module.startswith(f"{one}.") for one in CARRIERS)
 
 
-def _through(module: str) -> bool:
+def _frame_of(module: str) -> FrameType | None:
+    """The innermost frame of a module's code; None if none runs."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None and frame.f_globals.get("__name__") != module:
         frame = frame.f_back
-    return frame is not None
+    return frame
+
+
+def _unlink(sharing: FrameType) -> None:
+    """Remove the shared memory that is being made: that it is there would be a memory, too."""
+    if sharing.f_locals.get("create"):
+        with suppress(Exception):
+            sharing.f_locals["self"].unlink()
 
 
 def _readable(foreign: Sequence[Chosen[Any]], parts: Sequence[Chosen[Any]]) -> tuple[str, ...]:

@@ -55,7 +55,7 @@ def test_a_defence_that_knows_the_public_scenarios_is_caught_and_the_honest_vict
     assert "salt=7 repeats or continues this audit" in said.out
     *_, reach, verdict = said.out.strip().splitlines()
     assert re.search(
-        r"A public score of .* that is 0\.05 too high is found in \d+% of audits of this size; episodes=\d+ \(", reach
+        r"A public score of .* that is 0\.05 too high is found in \d+ % of audits of this size; episodes=\d+ \(", reach
     )
     assert verdict.startswith("public_only: ")
     assert "knows" in verdict
