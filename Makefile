@@ -1,5 +1,6 @@
 # make run: installs what running needs and prints the first score. make test, make lint, make docs: the checks of CI.
-# make bench: the speed figures. make wheel-check: the wheel in an environment of its own. All but `run` install what development needs.
+# make bench: the speed figures. make licences: the licence of all that is installed. make wheel-check: the wheel in an environment
+# of its own. All but `run` install what development needs.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,7 +8,7 @@ HAS_BROWSER := (for name in chromium chromium-browser google-chrome; do command 
 RUN_STAMP := $(VENV)/installed-to-run
 DEV_STAMP := $(VENV)/installed-to-develop
 
-.PHONY: run test lint docs bench soak wheel-check install install-dev browser debian-browser clean
+.PHONY: run test lint docs bench soak licences wheel-check install install-dev browser debian-browser clean
 
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
@@ -36,16 +37,25 @@ install: $(RUN_STAMP)
 
 install-dev: $(DEV_STAMP)
 
-# torch is installed first and alone: the resolver may otherwise choose a build with gigabytes of CUDA.
-$(RUN_STAMP): pyproject.toml constraints.txt
+# Every distribution has its hash in a lock (locks/lock.py), but torch: its builds for CPU and CUDA have one version and other files.
+# It comes last, when all that it needs is there; the resolver may otherwise choose a build with gigabytes of CUDA.
+LOCKED := $(BIN)/python -m pip install --quiet --require-hashes --no-deps --no-build-isolation
+
+$(RUN_STAMP): pyproject.toml constraints.txt locks/build.txt locks/run.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(LOCKED) -r locks/build.txt
+	$(LOCKED) -r locks/run.txt
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e .
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
 	touch $@
 
-$(DEV_STAMP): $(RUN_STAMP)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+$(DEV_STAMP): $(RUN_STAMP) locks/develop.txt
+	$(LOCKED) -r locks/develop.txt
 	touch $@
+
+# The licence of every installed distribution; fails for one that nobody has looked at.
+licences: install-dev
+	$(BIN)/python locks/licences.py
 
 # The browser for the tests of the leaderboard's page: one on the PATH, else Debian's (as root), else Playwright's own.
 # Without a browser these tests are skipped, and say why.

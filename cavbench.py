@@ -33,6 +33,7 @@ def __dir__() -> list[str]:
 
 def main() -> None:
     """The command `bench`."""
+    from bench.cli.ending import ended
     from bench.cli.main import main as command
 
-    command()
+    ended(command)

@@ -1,5 +1,6 @@
 """`python -m bench`: the command line."""
 
+from bench.cli.ending import ended
 from bench.cli.main import main
 
-main()
+ended(main)

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from bench import bounded
+from bench.bounded import spelled
 from bench.errors import UserError
 
 LARGEST = 2**30
 """Most bytes that an archive may unpack to."""
 RATIO, SMALL = 100, 2**20
 """An archive may unpack to 100 times its size, and to 1 MiB in any case: weights hardly compress, so more is a bomb."""
+END, END_MARK = struct.Struct("<4s4H2IH"), b"PK\x05\x06"
+"""The record at the end of an archive: disks, numbers of members, size and place of their list, length of a comment."""
 MEMBERS = 20_000
 """Most members of an archive."""
 
@@ -21,7 +26,9 @@ class Archive:
     """The members of a zip file, unpacked into memory within the bounds of this module.
 
     The bounds are checked twice: on the sizes that the archive states, and on the bytes that come out of it, because a
-    stated size can be wrong. Two members of the same name are refused: another reader might take the other one.
+    stated size can be wrong. What another reader might read otherwise is refused: two members whose names differ in case only
+    (torch's reader ignores case), names with a zero byte, bytes before the first member or after the end, a list of members
+    that is elsewhere than the end says.
 
     Args:
         content: the bytes of the archive.
@@ -37,6 +44,10 @@ class Archive:
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
                 members = archive.infolist()
                 self._check(members, len(content))
+                if not _is_plain(content, archive):
+                    raise UserError(
+                        f"{name} cannot be read: it is not a zip archive alone, there is something before or after it"
+                    )
                 self.members = {member.filename: _unpacked(archive, member) for member in members}
         # A damaged archive can fail anywhere in the decompressors.
         except (zipfile.BadZipFile, OSError, EOFError, ValueError, NotImplementedError, RuntimeError) as error:
@@ -51,12 +62,10 @@ class Archive:
         """The archive in a file.
 
         Raises:
-            UserError: if the file is larger than an archive may unpack to, or as the constructor.
+            UserError: if it is no regular file, is larger than an archive may unpack to, or as the constructor.
         """
         name = name or str(path)
-        if path.stat().st_size > LARGEST:
-            raise UserError(f"{name} is refused: it has more than {_size(LARGEST)}")
-        return cls(path.read_bytes(), name)
+        return cls(bounded.content(path, most=LARGEST, name=name), name)
 
     def member(self, name: str) -> bytes:
         """The content of a member.
@@ -83,12 +92,26 @@ class Archive:
         allowed = min(LARGEST, max(RATIO * size, SMALL))
         if total > allowed:
             raise UserError(
-                f"{self.name} is refused: {_size(size)} unpack to {_size(total)}, more than the {_size(allowed)} allowed"
+                f"{self.name} is refused: {spelled(size)} unpack to {spelled(total)}, more than the {spelled(allowed)} allowed"
             )
         if len(members) > MEMBERS:
             raise UserError(f"{self.name} is refused: it has {len(members)} members, at most {MEMBERS} are allowed")
-        if len({member.filename for member in members}) < len(members):
-            raise UserError(f"{self.name} is refused: two of its members have the same name")
+        if len({member.filename.casefold() for member in members}) < len(members):
+            raise UserError(
+                f"{self.name} is refused: two of its members have the same name, but for upper and lower case"
+            )
+        if any(member.orig_filename != member.filename for member in members):
+            raise UserError(f"{self.name} is refused: a member has a name that others read otherwise")
+
+
+def _is_plain(content: bytes, archive: zipfile.ZipFile) -> bool:
+    """Whether an archive fills its file, from the first member to the end record, and that record says what was read."""
+    members = archive.infolist()
+    mark, *_, count, _, start, comment = END.unpack(content[-END.size :])
+    first = min((member.header_offset for member in members), default=archive.start_dir)
+    whole = mark == END_MARK and not comment and first == 0
+    # Records of more than 4 GiB or 65,535 members stand in a second one before, and the last may say "there".
+    return whole and count in (len(members), 2**16 - 1) and start in (archive.start_dir, 2**32 - 1)
 
 
 def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
@@ -98,12 +121,3 @@ def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     if len(content) != member.file_size:
         raise zipfile.BadZipFile(f"{member.filename} has another size than it states")
     return content
-
-
-def _size(count: float) -> str:
-    """A number of bytes for people: 3.0 GB."""
-    for unit in ("bytes", "kB", "MB"):
-        if count < 1000:
-            return f"{count:.0f} {unit}" if unit == "bytes" else f"{count:.1f} {unit}"
-        count /= 1000
-    return f"{count:.1f} GB"

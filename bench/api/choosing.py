@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from bench.driving import DrivingWorld
 from bench.errors import UserError
 from bench.plugins import budgets, registry, suites
-from bench.plugins.bytecode import code_of
+from bench.plugins.bytecode import content_of
 from bench.plugins.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
 from bench.plugins.pair import Chosen, Pair, choose
 from bench.plugins.registry import GROUPS, Kind
@@ -71,7 +71,7 @@ def chosen(kind: Kind, given: object, track_name: str = "") -> Chosen[Any]:
             return Chosen(kind=kind, name=name, component=given)
     if missing := given.missing():
         raise UserError(f"{kind} {type(given).__name__} does not implement {', '.join(missing)}")
-    return Chosen(kind=kind, name=type(given).__name__, component=given, code=code_of(given))
+    return Chosen(kind=kind, name=type(given).__name__, component=given, code=content_of(given))
 
 
 def world_of(given: World | str | None, victim: object) -> Chosen[Any]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -23,20 +20,18 @@ from bench.cli.terminal import Console
 from bench.cli.words import split
 from bench.errors import UserError, short
 from bench.files import scratch
-from bench.records import reading, store
+from bench.records import reading
 from bench.records.schema import AUDIT
-from bench.run import runner, submission
+from bench.run import claims, received, runner, submission, verification
 from bench.run.audit import SALTS, AuditConfig
-from bench.run.config import RunConfig
-from bench.run.replay import Repeated, pair_of, repeat
+from bench.run.claims import Claim
 from bench.run.submission import Submission
-from bench.scenarios import Cell, Grid, SeedBlock
+from bench.run.verification import Verified
+from bench.scenarios import SeedBlock
 from bench.statistics.unpaired import ENOUGH_SCENARIOS
 
 SAMPLE, EPISODES = 3, 20
 """Units that are replayed, and scenarios in each cell that are drawn, if nothing else is said."""
-CLOSE = 0.02
-"""Largest difference of a unit's score between machines or libraries."""
 
 
 def submit(words: Sequence[str], console: Console) -> None:
@@ -48,28 +43,28 @@ def submit(words: Sequence[str], console: Console) -> None:
     names, options = split(words, ("out", "results"), names=1)
     if not names or "out" not in options:
         raise UserError("name the pair and the folder: bench submit PAIR out=FOLDER")
-    (pair,) = names
-    results = Path(options.get("results", "results")).expanduser()
-    (own, records), *_ = records_of(results, pair)
-    made = submission.write(results, pair_named(pair, records), Path(options["out"]).expanduser(), own=own)
-    console.print(Text(f"{made.folder}: {len(made.about['files'])} files of {made.pair}."), soft_wrap=True)
-    console.print(Text(f"It was driven by: {made.about['commands']['run']}", style="dim"), soft_wrap=True)
+    results, out = (Path(options.get(key, "results")).expanduser() for key in ("results", "out"))
+    (own, records), *_ = records_of(results, names[0])
+    count = submission.write(results, pair_named(names[0], records), out, own=own)
+    with received.received(out) as found:
+        about = found.about
+    console.print(Text(f"{out}: {count} files of {about['pair']}."), soft_wrap=True)
+    console.print(Text(f"It was driven by: {about['commands']['run']}", style="dim"), soft_wrap=True)
     console.print(
-        Text(
-            f"Fill in {made.folder / submission.CARD}, try `bench verify {made.folder}`, and send the folder (docs/submit.md)."
-        ),
+        Text(f"Fill in {out / submission.CARD}, try `bench verify {out}`, and send the folder (docs/submit.md)."),
         soft_wrap=True,
     )
 
 
 def verify(words: Sequence[str], console: Console, report: Report) -> int:
-    """Check a submission: its files, some units again, and fresh scenarios; then print its row.
+    """Check a submission: its files, its records, some units again, and fresh scenarios; then print its row.
 
     Returns:
         0 if it holds, otherwise 1.
 
     Raises:
-        UserError: if it is no submission, a component is not installed, or an option is not allowed.
+        UserError: if it is no submission, a component is not installed, a record is not what its pair gives, or an option is
+            not allowed.
     """
     names, options = split(words, ("sample", "episodes", "salt", "audit", "out"), names=1)
     if not names:
@@ -77,28 +72,43 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
     salt, episodes = (_number(options, key) for key in ("salt", "episodes"))
     if episodes is not None and episodes < ENOUGH_SCENARIOS:
         raise UserError(f"episodes must be at least {ENOUGH_SCENARIOS}, got {episodes}: fewer are too few to compare")
-    found = submission.read(Path(names[0]).expanduser())
-    packages = submission.installed(found)
-    console.print(
-        Text(
-            f"{found.pair}: all files are as described. The next steps execute the code of {', '.join(packages)}, "
-            "as installed here."
-        ),
-        soft_wrap=True,
-    )
-    with _zoo_of(found):
-        holds = _replayed(found, _sample(options.get("sample", str(SAMPLE))), console)
-        if options.get("audit", "true") != "false":
-            holds = _audited(found, salt, episodes or EPISODES, console) and holds
-    report(found.track, found.records)
-    if not holds:
-        console.print(Text("The submission does not hold.", style="bold red"))
-        return 1
-    if "out" in options:
-        _merge(found, Path(options["out"]).expanduser())
+    out = Path(options["out"]).expanduser() if "out" in options else None
+    sample = _sample(options.get("sample", str(SAMPLE) if out is None else "all"))
+    if out is not None and sample is not None:
+        raise UserError("out= takes what is driven here, which must be all of it: leave out sample, or leave out out")
+    with received.received(Path(names[0]).expanduser()) as found:
+        packages = received.installed(found)
         console.print(
-            Text(f"Its records are in {options['out']}: `bench report html=PAGE out={options['out']}` has its row.")
+            Text(
+                f"{found.pair}: all files are as described. The next steps execute the code of {', '.join(packages)}, "
+                "as installed here."
+            ),
+            soft_wrap=True,
         )
+        claim = claims.of(list(found.records.values()))
+        submission.check_description(found, claim.pair)
+        received.check_weights(found, submission.weights_of(claim.pair, claim.config.seeds))
+        with _zoo_of(found), verification.staging(out, claim) as place:
+            with RunProgress(Console(stderr=True)) as progress:
+                verified = verification.drive(found, claim, place, progress, sample=sample, out=out)
+            _print_replays(verified, console)
+            holds = verification.hold(verified.again)
+            if options.get("audit", "true") != "false":
+                holds = _audited(found, claim, verified, salt, episodes or EPISODES, console) and holds
+            _print_row(found, verified, console, report)
+            if not holds:
+                kept = "" if out is None else f" What was driven here is in {place}; nothing was added to {out}."
+                console.print(Text.assemble(("The submission does not hold.", "bold red"), kept), soft_wrap=True)
+                return 1
+            if out is not None:
+                added, there = verification.add(verified, place, out)
+                kept = f", {there} were there already" if there else ""
+                console.print(
+                    Text(
+                        f"{added} units that were driven here are in {out}{kept}: `bench report html=PAGE out={out}` has the row."
+                    ),
+                    soft_wrap=True,
+                )
     console.print(Text("The submission holds.", style="bold green"))
     return 0
 
@@ -133,73 +143,48 @@ def _zoo_of(found: Submission) -> Iterator[None]:
             os.environ["CAVBENCH_ZOO"] = before
 
 
-def _replayed(found: Submission, sample: int | None, console: Console) -> bool:
-    """Drive some units of the pair again, which nobody could foresee, and print a line for each."""
-    units = sorted(pc.unique(found.own["unit"]).to_pylist())
-    chosen = units if sample is None else secrets.SystemRandom().sample(units, min(sample, len(units)))
-    holds = True
-    for number, unit in enumerate(chosen, 1):
-        record = found.own.filter(pc.equal(found.own["unit"], unit)).slice(0, 1).to_pylist()[0]
-        again = repeat(found.folder, record)
-        said, fine = _said(again, found.track.metric)
-        holds = holds and fine
-        line = Text(f"replay {number} of {len(chosen)}: {again.unit}: {said}", style="" if fine else "bold red")
-        console.print(line, soft_wrap=True)
-    return holds
+def _print_replays(verified: Verified, console: Console) -> None:
+    """A line for each unit that was driven again."""
+    for number, again in enumerate(verified.again, 1):
+        line = f"replay {number} of {len(verified.again)}: {again.unit}: {again.said}"
+        console.print(Text(line, style="" if again.holds else "bold red"), soft_wrap=True)
 
 
-def _said(again: Repeated, metric: str) -> tuple[str, bool]:
-    before, after = (pc.mean(records[metric]).as_py() for records in (again.before, again.after))
-    if not again.differences:
-        return "bit for bit the same", True
-    scores = f"{metric} {before:.3f} recorded, {after:.3f} again; it differs in {', '.join(again.differences)}"
-    if again.changed:
-        return f"{scores} (changed here: {again.changed})", abs(before - after) <= CLOSE
-    return f"{scores}, though nothing has changed", False
+def _print_row(found: Submission, verified: Verified, console: Console, report: Report) -> None:
+    """The row: of what was driven here if that is all of it, otherwise as submitted, which is said."""
+    report(found.track, _row(found, verified))
+    if left := len(found.records) - len(verified.again):
+        driven = f"{len(verified.again)} of its {len(found.records)} units were driven again"
+        console.print(Text(f"The row is as submitted: {driven}, {left} were not."), soft_wrap=True)
 
 
-def _audited(found: Submission, salt: int | None, episodes: int, console: Console) -> bool:
+def _row(found: Submission, verified: Verified) -> pa.Table:
+    """The records of the pair: driven here if all were, otherwise as submitted; its controls are always driven here."""
+    if len(verified.again) == len(found.records):
+        return verified.records
+    controls = verified.records.filter(pc.not_equal(verified.records["pair"], found.pair))
+    return pa.concat_tables([*found.records.values(), controls])
+
+
+def _audited(
+    found: Submission, claim: Claim, verified: Verified, salt: int | None, episodes: int, console: Console
+) -> bool:
     """Drive the pair on scenarios drawn now, and compare them with the submitted ones."""
-    pair = pair_of(found.own.slice(0, 1).to_pylist()[0])
-    world = pair.world.component
-    if not world.redraws:
-        console.print(Text(f"World {pair.world.name!r} has a fixed set of scenarios: it is not audited."))
+    grid, world = claim.config.grid, claim.pair.world
+    if not world.component.redraws:
+        console.print(Text(f"World {world.name!r} has a fixed set of scenarios: it is not audited."))
         return True
-    given = len(set(found.own["seed"].to_pylist()))
-    if given < ENOUGH_SCENARIOS:
-        console.print(Text(f"Not audited: it has {given} scenarios a cell, an audit needs {ENOUGH_SCENARIOS}."))
+    if grid.episodes < ENOUGH_SCENARIOS:
+        console.print(Text(f"Not audited: it has {grid.episodes} scenarios a cell, an audit needs {ENOUGH_SCENARIOS}."))
         return False
-    seeds = sorted(set(found.own["training_seed"].to_pylist()))
-    cells = [Cell(**cell) for cell in _cells(found.own)]
-    values = {axis: tuple(dict.fromkeys(cell[axis] for cell in cells)) for axis in world.axes}
     salt = secrets.randbelow(SALTS) if salt is None else salt
-    drawn = Grid(
-        name=AUDIT,
-        world=pair.world.name,
-        axes=world.axes,
-        values=values,
-        episodes=episodes,
-        first_seed=SeedBlock.AUDIT + salt,
-    )
+    drawn = replace(grid, name=AUDIT, episodes=episodes, block=0, first_seed=SeedBlock.AUDIT + salt)
     with scratch() as folder:
-        config = RunConfig(pairs=(pair,), grid=drawn, seeds=tuple(seeds), out=folder, record=0, reference=False)
+        config = replace(claim.config, grid=drawn, out=folder, reference=False)
         with RunProgress(Console(stderr=True)) as progress:
             units = runner.run(config, progress)
         fresh = reading.read(config.out, units, track=found.track)
-    both = AuditConfig(public=replace(config, out=found.folder), drawn=config, salt=salt)
+    both = AuditConfig(public=claim.config, drawn=config, salt=salt)
+    public = _row(found, verified)
     console.print(Text(f"Fresh scenarios (salt={salt}), {drawn.episodes} a cell:"))
-    return verdict(differences(both, pa.concat_tables([found.records, fresh]), found.track), found.track, console)
-
-
-def _cells(records: pa.Table) -> list[dict[str, Any]]:
-    return [json.loads(text) for text in pc.unique(records["cell"]).to_pylist()]
-
-
-def _merge(found: Submission, out: Path) -> None:
-    """Copy the records and artefacts of a submission into a results folder."""
-    store.prepare(out)
-    folders = [store.FOLDER, *([found.track.artefact[1]] if found.track.artefact else [])]
-    for folder in folders:
-        (out / folder).mkdir(exist_ok=True)
-        for path in (found.folder / folder).glob("*"):
-            shutil.copyfile(path, out / folder / path.name)
+    return verdict(differences(both, pa.concat_tables([public, fresh]), found.track), found.track, console)

@@ -29,6 +29,18 @@ LOCAL = "127.0.0.1"
 """The web viewer is offered to this machine only."""
 STARTS_S = 30.0
 """Seconds within which the web viewer must answer."""
+GUARD = """
+import os, signal, subprocess, sys, threading
+
+def end():
+    sys.stdin.buffer.read()
+    os.killpg(0, signal.SIGKILL)
+
+viewer = subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL)
+threading.Thread(target=end, daemon=True).start()
+sys.exit(viewer.wait())
+"""
+"""Starts the viewer, and ends it with itself when its standard input closes: as soon as its parent is gone, also by kill -9."""
 
 
 def open_recording(run: str, where: Sequence[str], out: Path, console: Console, *, web: bool = False) -> None:
@@ -138,13 +150,14 @@ def _seconds(text: str | None) -> tuple[float, float] | None:
 
 
 def _serve(path: Path, console: Console) -> None:
-    """Serve a recording and rerun's web viewer on this machine, until Ctrl-C."""
+    """Serve a recording and rerun's web viewer on this machine, until Ctrl-C, or whatever else ends this process."""
     import rerun as rr
 
     ports = {"grpc": _free_port(), "web": _free_port()}
     command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", LOCAL, "--port", str(ports["grpc"])]
     server = subprocess.Popen(
-        [*command, "--web-viewer-port", str(ports["web"]), str(path)],
+        [sys.executable, "-c", GUARD, *command, "--web-viewer-port", str(ports["web"]), str(path)],
+        stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         start_new_session=True,
@@ -160,7 +173,7 @@ def _serve(path: Path, console: Console) -> None:
     finally:
         # `python -m rerun` starts the viewer as a process of its own.
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(server.pid, signal.SIGTERM)
+            os.killpg(server.pid, signal.SIGKILL)
         server.wait()
 
 

@@ -69,7 +69,7 @@ def look(detector: Detector, scenes: Scenes, texels: Tensor | None, share: float
         share: side of the patch as a share of the sign's side.
 
     Raises:
-        UserError: if a prediction is NaN or infinite.
+        UserError: if a prediction is NaN, infinite or complex.
     """
     patches = texels.unsqueeze(0) if texels is not None else None
     return _sight(detector, scenes, lambda frames: scenes.render(frames, patches, share))
@@ -79,7 +79,7 @@ def look_at_decoys(detector: Detector, scenes: Scenes) -> Sight | None:
     """Run the detector on each frame with the frame's decoy in the place of the stop sign; None if the world has none.
 
     Raises:
-        UserError: if a prediction is NaN or infinite.
+        UserError: if a prediction is NaN, infinite or complex.
     """
     return _sight(detector, scenes, scenes.render_decoys) if scenes.decoys else None
 
@@ -128,7 +128,7 @@ def glance(detector: Detector, pictures: Tensor, boxes: Tensor, moved_m: Tensor,
         state: what the detector remembers of the frames before.
 
     Raises:
-        UserError: if a prediction is NaN or infinite.
+        UserError: if a prediction is NaN, infinite or complex.
     """
     label = detector.index(STOP_SIGN)
     alone = _finite(detector(pictures), detector)
@@ -146,9 +146,10 @@ def glance(detector: Detector, pictures: Tensor, boxes: Tensor, moved_m: Tensor,
 
 
 def _finite(predictions: Predictions, detector: Detector) -> Predictions:
-    if all(bool(part.isfinite().all()) for part in (predictions.boxes, predictions.objectness, predictions.classes)):
+    parts = (predictions.boxes, predictions.objectness, predictions.classes)
+    if all(bool(part.isfinite().all()) and not part.is_complex() for part in parts):
         return predictions
-    raise UserError(f"the victim ({type(detector).__name__}) answered NaN or infinite boxes or scores")
+    raise UserError(f"the victim ({type(detector).__name__}) answered NaN, infinite or complex boxes or scores")
 
 
 def candidates_of(predictions: Predictions, label: int) -> list[Detections]:

@@ -56,7 +56,7 @@ class PatchThreat(ThreatModel):
             texels: [3, P, P]; they are confined to the perturbation set, NaN and infinite values become grey.
 
         Raises:
-            UserError: if the shape is wrong.
+            UserError: if the shape is wrong, or its numbers are complex.
         """
         if (
             texels.ndim != 3
@@ -66,6 +66,8 @@ class PatchThreat(ThreatModel):
         ):
             wanted = f"[3, P, P] with P from {SIDES[0]} to {SIDES[-1]}"
             raise UserError(f"a patch must be {wanted}, the attack made one of {list(texels.shape)}")
+        if texels.is_complex():
+            raise UserError("a patch must be of real numbers, the attack made one of complex ones")
         given = texels.detach().to("cpu", torch.float32)
         given = torch.where(given.isnan(), GREY, given)
         patch = self.confine(torch.where(given.isinf(), GREY, given))

@@ -142,6 +142,8 @@ class Attacker:
         if type(answer) is not Tensor or answer.shape != observation.shape:
             got = f"shape {tuple(answer.shape)}" if type(answer) is Tensor else f"a {type(answer).__name__}"
             raise UserError(f"{name}.perturb returned {got}, not a torch.Tensor of shape {tuple(observation.shape)}")
+        if answer.is_complex():
+            raise UserError(f"{name}.perturb returned complex numbers")
         if (self.state is None) != (state is None):
             raise UserError(f"{name}.step and {name}.initial must both return a state or both return None")
         if self.state is not None and state is not None:

@@ -105,7 +105,7 @@ class CountedPolicy:
         """The scores [B, A] (or [B, 2]) and the actions with which the victim drives.
 
         Raises:
-            UserError: if the scores are NaN or infinite.
+            UserError: if the scores are NaN, infinite or complex.
         """
         scores = self._scores(plain(observation), state, "while driving")
         return scores, self.policy.choose(scores)
@@ -171,4 +171,6 @@ class CountedPolicy:
         # One sum is cheaper than a look at every score.
         if not bool(scores.sum().isfinite()) and not bool(scores.isfinite().all()):
             raise UserError(f"the victim ({type(self.policy).__name__}) answered NaN or infinite scores {where}")
+        if scores.is_complex():
+            raise UserError(f"the victim ({type(self.policy).__name__}) answered complex scores")
         return scores

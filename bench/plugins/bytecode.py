@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import sys
 import types
 from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
 from typing import Any
 
+from bench.plugins.content import content, is_empty
 from bench.plugins.fingerprint import digest
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None))
@@ -26,10 +30,10 @@ LIBRARIES = (
 
 
 def code_of(*objects: Any) -> str:
-    """sha256 of the code of classes and functions, with what they use of their own modules.
+    """sha256 of the code of classes and functions, with what they use of their own modules and of others of the user.
 
     The compiled code counts, so comments and layout do not; another version of Python gives another hash. Followed are base
-    classes, and the functions, classes and plain constants of the same module that the code names.
+    classes, and the functions, classes and values (numbers, tables, networks) that the code names; libraries are not.
 
     Args:
         objects: classes, functions or instances of classes.
@@ -42,7 +46,7 @@ def code_of(*objects: Any) -> str:
 
 def _follow(item: Any, seen: dict[str, Any]) -> None:
     name = f"{item.__module__}.{item.__qualname__}"
-    if name in seen or item.__module__.partition(".")[0] in LIBRARIES:
+    if name in seen or _is_library(item.__module__):
         return
     seen[name] = None
     if isinstance(item, types.FunctionType):
@@ -51,40 +55,66 @@ def _follow(item: Any, seen: dict[str, Any]) -> None:
     for base in item.__bases__:
         _follow(base, seen)
     values = {key: value for key, value in vars(item).items() if not (key.startswith("__") and key != "__init__")}
-    seen[name] = {key: _value(value, item.__module__, seen) for key, value in sorted(values.items())}
+    seen[name] = {key: _value(value, seen) for key, value in sorted(values.items())}
+
+
+@cache
+def _is_library(module: str) -> bool:
+    """Whether a module is no code of the user's: of Python, of the libraries that records name, or installed."""
+    top = module.partition(".")[0]
+    file = getattr(sys.modules.get(top), "__file__", None) or ""
+    installed = bool({"site-packages", "dist-packages"} & set(Path(file).parts))
+    return top in LIBRARIES or (top in sys.stdlib_module_names and top != "__main__") or installed
 
 
 def _function(function: types.FunctionType, seen: dict[str, Any]) -> list[Any]:
-    """Its code, its defaults and its closure; what it names of its own module is followed."""
-    for name in sorted(set(_names(function.__code__))):
-        used = function.__globals__.get(name)
-        if isinstance(used, (*PLAIN, tuple)):
-            seen[f"{function.__module__}.{name}"] = repr(used)
-        elif isinstance(used, type | types.FunctionType) and used.__module__ == function.__module__:
-            _follow(used, seen)
-    closure = [cell.cell_contents for cell in function.__closure__ or () if not _empty(cell)]
+    """Its code, its defaults and its closure; what it names of its own module, or of another one of the user's, is followed."""
+    names = sorted(set(_names(function.__code__)))
+    for name in names:
+        if name not in function.__globals__:
+            continue
+        used = function.__globals__[name]
+        if isinstance(used, types.ModuleType):
+            if not _is_library(used.__name__):
+                for inner in (inner for inner in names if hasattr(used, inner)):
+                    _use(f"{used.__name__}.{inner}", getattr(used, inner), seen)
+        else:
+            _use(f"{function.__module__}.{name}", used, seen)
+    closure = [cell.cell_contents for cell in function.__closure__ or () if not is_empty(cell)]
     given = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values(), *closure]
-    return [_code(function.__code__), *(_value(value, function.__module__, seen) for value in given)]
+    return [_code(function.__code__), *(_value(value, seen) for value in given)]
 
 
-def _value(value: Any, module: str, seen: dict[str, Any]) -> Any:
+def _use(name: str, used: Any, seen: dict[str, Any]) -> None:
+    """Follow what code uses by its name: a class or a function, or a number, a network or a table that it reads."""
+    if isinstance(used, type | types.FunctionType):
+        _follow(used, seen)
+    elif not isinstance(used, types.ModuleType | types.BuiltinFunctionType) and name not in seen:
+        seen[name] = None
+        seen[name] = _value(used, seen)
+
+
+def _value(value: Any, seen: dict[str, Any]) -> Any:
     """What stands for an attribute, a default or a closed-over value: its code, or its text if that is stable."""
     value = inspect.unwrap(value) if callable(value) else value
     match value:
         case staticmethod() | classmethod():
-            return _value(value.__func__, module, seen)
+            return _value(value.__func__, seen)
         case property():
-            return [_value(part, module, seen) for part in (value.fget, value.fset) if part]
+            return [_value(part, seen) for part in (value.fget, value.fset) if part]
         case types.FunctionType():
             return _function(value, seen)
         case type():
-            if value.__module__ == module:
-                _follow(value, seen)
+            _follow(value, seen)
             return f"{value.__module__}.{value.__qualname__}"
         case tuple() | list():
-            return [_value(part, module, seen) for part in value]
+            return [_value(part, seen) for part in value]
         case _:
-            return repr(value) if isinstance(value, PLAIN) else type(value).__qualname__
+            if isinstance(value, PLAIN):
+                return repr(value)
+            # An object of the user's: its code and what it holds.
+            _follow(type(value), seen)
+            return content(value)
 
 
 def _code(code: types.CodeType) -> list[Any]:
@@ -104,18 +134,6 @@ def _names(code: types.CodeType) -> Iterator[str]:
             yield from _names(part)
 
 
-def _empty(cell: types.CellType) -> bool:
-    try:
-        cell.cell_contents  # noqa: B018
-    except ValueError:
-        return True
-    return False
-
-
-def plain_attributes(module: Any) -> dict[str, Any]:
-    """The structure and the plain attributes of a `torch.nn.Module` and its parts: what its weights do not say."""
-    found: dict[str, Any] = {"": repr(module)}
-    for name, part in module.named_modules():
-        own = {key: value for key, value in vars(part).items() if not key.startswith("_") and key != "training"}
-        found[name] = {key: repr(value) for key, value in sorted(own.items()) if isinstance(value, (*PLAIN, tuple))}
-    return found
+def content_of(given: Any) -> str:
+    """sha256 of all that an object holds, its networks among it, and of the code of its class."""
+    return digest([code_of(given), content(vars(given))])

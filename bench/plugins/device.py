@@ -75,5 +75,10 @@ def said(device: str) -> str:
 
 def recorded(machine: str) -> str:
     """The device that the column `machine` of a record names, if it is here; otherwise the processor."""
+    return "cuda" if stated(machine) == "cuda" and _gpu() else CPU
+
+
+def stated(machine: str) -> str:
+    """The device that the column `machine` of a record names, whether it is here or not."""
     named = re.search(rf"{VICTIM_ON}(\w+)", machine)
-    return "cuda" if named and named[1] == "cuda" and _gpu() else CPU
+    return named[1] if named else CPU

@@ -19,6 +19,7 @@ LIBRARIES = ("torch", "torchrl", "tensordict", "numba", "numpy")
 
 BESIDE_THE_RESULT = frozenset(
     [
+        "bounded",
         "cli",
         "conformance",
         "errors",

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import atexit
 import faulthandler
 import os
 import select
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from io import FileIO
 from types import FrameType
 
-from bench.errors import EscapeError, reason
+from bench.errors import EscapeError, Notice, reason
 from bench.plugins.framework import Snapshot
+from bench.plugins.settings import RECURSION, Settings
 
 HARM_S = 120
 """Seconds that the import of a module, or reading a file, may take."""
-SURVIVED = b"survived"
+END_S = 5.0
+"""Seconds that the hooks may take that a module leaves for the end of the process."""
+SURVIVED, ENDED = b"survived", b"."
+CLOSED = 113
+"""Exit code of a copy that cannot report, because what it reports to was closed."""
 
 
 class StopUnitError(BaseException):
@@ -63,7 +71,29 @@ def contained() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def harm(act: Callable[[], object], seconds: float = HARM_S) -> str:
+@contextmanager
+def unchanged() -> Iterator[None]:
+    """Run foreign code that must not change the settings of this process. They are put back.
+
+    Raises:
+        EscapeError: if it does; names the settings.
+    """
+    before, limit, changed = Settings(), sys.getrecursionlimit(), ""
+    try:
+        yield
+    finally:
+        # First of all: with a low limit, nothing else could be called.
+        lowered = sys.getrecursionlimit()
+        sys.setrecursionlimit(limit)
+        changed = RECURSION if lowered != limit else before.changed()
+        before.restore()
+        # A filter of the foreign code stays, but hides no line of ours.
+        warnings.simplefilter("always", Notice)
+    if changed:
+        raise EscapeError(f"it changes {changed}")
+
+
+def harm(act: Callable[[], object], seconds: float = HARM_S, *, stays: bool = False) -> str:
     """Do something in a copy of this process, and say what that does to the copy; empty if it does no harm.
 
     Exceptions are no harm: the same act in this process reports them.
@@ -71,9 +101,11 @@ def harm(act: Callable[[], object], seconds: float = HARM_S) -> str:
     Args:
         act: imports a module, or reads a file.
         seconds: how long it may take.
+        stays: whether what it does stays in a process, as a module does: then the settings of the process must be as before,
+            and its hooks for the end of the process must end.
 
     Returns:
-        That it ends the process, does not end, or replaces functions of the framework; empty without `os.fork`.
+        That it ends the process, does not end, replaces functions of the framework, or changes settings; empty without `os.fork`.
     """
     if sys.platform != "linux":
         return ""
@@ -83,9 +115,15 @@ def harm(act: Callable[[], object], seconds: float = HARM_S) -> str:
         warnings.simplefilter("ignore", DeprecationWarning)
         child = os.fork()
     if not child:
-        _act_and_end(act, write)
+        _act_and_end(act, write, stays)
     os.close(write)
-    said = _said(read, seconds)
+    with os.fdopen(read, "rb", buffering=0) as pipe:
+        said = _said(pipe, seconds)
+        reported = bool(said and said.startswith(SURVIVED))
+        last = reported and (not stays or said.endswith(ENDED) or _said(pipe, END_S) is not None)  # type: ignore[union-attr]
+    if said == b"":
+        # It ends by itself, and its exit code says why.
+        _wait(child, END_S)
     # What it started ends, too.
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)
@@ -94,15 +132,23 @@ def harm(act: Callable[[], object], seconds: float = HARM_S) -> str:
     _, status = os.waitpid(child, 0)
     if said is None:
         return f"does not end within {seconds:g} s"
-    if not said.startswith(SURVIVED):
+    if not reported:
         code = os.waitstatus_to_exitcode(status)
-        return f"ends the process ({ended(code)})"
-    changed = said.removeprefix(SURVIVED).decode(errors="replace")
-    return f"replaces {changed}" if changed else ""
+        return "closes files of the process" if code == CLOSED else f"ends the process ({ended(code)})"
+    found = said.removeprefix(SURVIVED).partition(b"\n")[0].decode(errors="replace")
+    return found or ("" if last else f"leaves a hook for the end of the process that does not end within {END_S:g} s")
 
 
-def _act_and_end(act: Callable[[], object], write: int) -> None:
+def _wait(child: int, seconds: float) -> None:
+    """Wait until a process has ended, or for so long; its end can still be read."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and not os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT | os.WNOHANG):
+        time.sleep(0.01)
+
+
+def _act_and_end(act: Callable[[], object], write: int, stays: bool) -> None:
     """In the copy: do it without a word on the terminal, report, and end."""
+    code = 0
     try:
         os.setsid()
         silence = os.open(os.devnull, os.O_RDWR)
@@ -113,19 +159,33 @@ def _act_and_end(act: Callable[[], object], write: int) -> None:
             sys.modules["torch"].set_num_threads(1)
         # A crash is reported in our own words.
         faulthandler.disable()
-        framework = Snapshot()
+        # The hooks of this process are not the module's.
+        atexit._clear()
+        framework, settings, limit = Snapshot(), Settings(alone=True), sys.getrecursionlimit()
         with suppress(BaseException):
             act()
-        os.write(write, SURVIVED + framework.changed().encode())
+        lowered = sys.getrecursionlimit()
+        sys.setrecursionlimit(limit)
+        found = ""
+        if stays and (changed := RECURSION if lowered != limit else settings.changed()):
+            found = f"changes {changed}"
+        elif replaced := framework.changed():
+            found = f"replaces {replaced}"
+        code = CLOSED
+        os.write(write, SURVIVED + found.encode() + b"\n")
+        code = 0
+        if stays:
+            with suppress(BaseException):
+                atexit._run_exitfuncs()
+            os.write(write, ENDED)
     finally:
-        os._exit(0)
+        os._exit(code)
 
 
-def _said(read: int, seconds: float) -> bytes | None:
+def _said(pipe: FileIO, seconds: float) -> bytes | None:
     """What the copy writes until it ends or reports; None if it does neither in time."""
-    with os.fdopen(read, "rb", buffering=0) as pipe:
-        ready = select.select([pipe], [], [], seconds)[0]
-        return pipe.read(4096) if ready else None
+    ready = select.select([pipe], [], [], seconds)[0]
+    return pipe.read(4096) if ready else None
 
 
 def ended(code: int) -> str:

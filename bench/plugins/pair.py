@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Generic, TypeVar
@@ -12,7 +13,8 @@ from bench.errors import PluginError, UserError, message, reason
 from bench.plugins import registry, sources
 from bench.plugins.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
 from bench.plugins.fingerprint import canonical, digest, state_digest
-from bench.plugins.foreign import contained
+from bench.plugins.foreign import contained, unchanged
+from bench.plugins.framework import OWN
 from bench.plugins.parameters import differing
 from bench.plugins.registry import Kind
 
@@ -64,7 +66,7 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
     """
     component = registry.load(kind, name)
     try:
-        with contained():
+        with contained(), nullcontext() if component.__module__.partition(".")[0] in OWN else unchanged():
             return Chosen(kind=kind, name=name, component=component(**params))
     except (ValueError, TypeError) as error:
         raise UserError(f"{kind} {name!r}: {message(error) or type(error).__name__}") from error

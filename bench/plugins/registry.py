@@ -17,8 +17,8 @@ from importlib import metadata
 from typing import Any, Literal, get_args
 
 from bench import shadow
-from bench.errors import PluginError, UserError, reason
-from bench.plugins.foreign import contained, harm
+from bench.errors import EscapeError, PluginError, UserError, reason
+from bench.plugins.foreign import contained, harm, unchanged
 from bench.scenarios import Grid
 
 Kind = Literal["attack", "defense", "victim", "world"]
@@ -169,7 +169,8 @@ def _joined(links: list[Entry]) -> Entry:
 def resolve(group: str, name: str, noun: str) -> Any:
     """Import the object of an entry point.
 
-    Foreign modules are imported in a copy of this process first, which may end or hang in place of this one.
+    Foreign modules are imported in a copy of this process first, which may end or hang in place of this one. They must leave the
+    settings of the process as they are.
 
     Raises:
         UserError: if there is no such name.
@@ -179,19 +180,38 @@ def resolve(group: str, name: str, noun: str) -> Any:
     point = metadata.EntryPoint(name=name, value=entry.target, group=group)
     if entry.distribution != OWN and (why := _harm(point.module)):
         raise PluginError(f"{_where(group, name, noun)} cannot be imported: {why}")
+    if entry.distribution != OWN:
+        _FOREIGN[point.module.partition(".")[0]] = entry.shipped_by
     try:
-        with contained():
+        with contained(), contextlib.nullcontext() if entry.distribution == OWN else unchanged():
             return point.load()
     # Importing a plug-in may raise anything; that must not break the other components.
     except Exception as error:
         why = shadow.explanation(point.module, entry.distribution) or reason(error)
+        # A second import of it would do nothing, and seem to be harmless.
+        if isinstance(error, EscapeError):
+            _REFUSED[point.module] = why
         raise PluginError(f"{_where(group, name, noun)} cannot be imported: {why}") from error
 
 
-@cache
+def foreign() -> dict[str, str]:
+    """The packages of plug-ins that were imported in this process, with their versions, by their top-level modules."""
+    return dict(_FOREIGN)
+
+
+_FOREIGN: dict[str, str] = {}
+_REFUSED: dict[str, str] = {}
+"""Foreign modules that are imported and must not be used, with the reason."""
+
+
 def _harm(module: str) -> str:
     """What importing a module does to a process; empty for nothing, or if it is imported already."""
-    why = "" if module in sys.modules else harm(partial(importlib.import_module, module))
+    return _REFUSED.get(module) or _tried(module)
+
+
+@cache
+def _tried(module: str) -> str:
+    why = "" if module in sys.modules else harm(partial(importlib.import_module, module), stays=True)
     return f"its import {why}" if why else ""
 
 

@@ -25,6 +25,8 @@ AXES_OF_V1 = (
 )
 CELL_OF_V1 = "to_json({'lanes': lanes, 'density': density, 'weather': weather})::varchar"
 
+LONGEST_FOOTER = 2**26
+"""Most bytes of the footer of a Parquet file, which names its columns and where they are."""
 SQL = {FLOAT: "double", INT: "bigint", TEXT: "varchar", pa.bool_(): "boolean"}
 """The types of probes in SQL."""
 ADDED = {"threat_share": "1.0::double"}
@@ -69,6 +71,8 @@ def check(path: Path, *, thoroughly: bool = False) -> tuple[Track, pa.Schema]:
     if path.exists() and not path.is_file():
         raise UserError(f"the record {path} is not a file; delete it and run again to recreate it")
     try:
+        if _length(path) > LONGEST_FOOTER:
+            raise pa.ArrowInvalid("footer")
         found = pq.read_table(path).schema if thoroughly else pq.read_schema(path)
     except (pa.ArrowException, OSError) as error:
         reason = "missing" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
@@ -85,7 +89,7 @@ def glance(path: Path) -> tuple[Track, pa.Schema]:
     footer = _footer(path)
     for track in tracks():
         for generation in generations(track):
-            if all(name in footer for name in _encoded(generation)):
+            if all(name in footer for name in _encoded(generation)) and _elements(footer) == _wanted(generation):
                 return track, generation
     return check(path)
 
@@ -97,15 +101,43 @@ def _encoded(generation: pa.Schema) -> tuple[bytes, ...]:
     return tuple(name.encode() for name in sorted(generation.names, key=common.__contains__))
 
 
+def _wanted(generation: pa.Schema) -> int:
+    """How many elements the schema in a footer has: the root, one for each column, and two more for a list."""
+    return 1 + sum(3 if pa.types.is_list(column.type) else 1 for column in generation)
+
+
+def _elements(footer: bytes) -> int:
+    """How many elements the schema in a footer has; 0 where it is not written as Parquet's compact Thrift always is.
+
+    The footer begins with the version (field 1, a varint) and the header of the list of elements (field 2).
+    """
+    place = 1
+    while place < len(footer) and footer[place] & 0x80:
+        place += 1
+    # Type and number of the two fields; the list's header has its length, or says that it follows.
+    if footer[:1] != b"\x15" or footer[place + 1 : place + 2] != b"\x19" or len(footer) < place + 5:
+        return 0
+    header = footer[place + 2]
+    if header >> 4 < 15:
+        return header >> 4
+    low, high = footer[place + 3], footer[place + 4]
+    return low if low < 0x80 else (low & 0x7F) | high << 7
+
+
 def _footer(path: Path) -> bytes:
     """The footer of a Parquet file, which names its columns; empty if it cannot be read."""
     try:
-        if not path.is_file():
+        if not path.is_file() or (size := _length(path)) > LONGEST_FOOTER:
             return b""
         with path.open("rb") as file:
-            file.seek(-8, os.SEEK_END)
-            size = int.from_bytes(file.read(4), "little")
             file.seek(-8 - size, os.SEEK_END)
             return file.read(size)
     except OSError:
         return b""
+
+
+def _length(path: Path) -> int:
+    """The length of a Parquet file's footer, as the file states it."""
+    with path.open("rb") as file:
+        file.seek(-8, os.SEEK_END)
+        return int.from_bytes(file.read(4), "little")

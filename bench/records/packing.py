@@ -54,7 +54,9 @@ def pack(out: Path) -> None:
 
 
 def units_in(path: Path) -> set[str]:
-    """The fingerprints of the units in a file of records; empty if it was deleted."""
+    """The fingerprints of the units in a file of records; empty if it was deleted, or is no file."""
+    if not path.is_file():
+        return set()
     try:
         column = pq.read_table(path, columns=["unit"], read_dictionary=["unit"])["unit"]
     except FileNotFoundError:

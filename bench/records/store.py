@@ -7,6 +7,7 @@ Files are written atomically, so a killed run leaves only finished units. Whethe
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,24 +16,30 @@ import pyarrow.parquet as pq
 
 from bench import files
 from bench.errors import UserError
-from bench.plugins.track import Columns, Track
+from bench.plugins.track import Columns, Track, tracks
 from bench.records import validity
 from bench.records.schema import schema
 
 FOLDER, MANY = "episodes", "packed-"
 """The folder of the records, and the beginning of the names of files with many units."""
+LATER = ("recordings", "set_aside", "stops", "verifying")
+"""Folders that a run or a check makes when it needs them."""
 TOGETHER = 16
 """So many units that are finished at once are written to one file: a file of its own for each takes ten times as long."""
 
 
 def prepare(out: Path) -> None:
-    """Create the results folder and check that it is writable, before any work is done.
+    """Create the results folder and check that all of it is writable, before any work is done.
 
     Raises:
-        UserError: if the folder cannot be written.
+        UserError: if the folder cannot be written, or a file has the name of a folder in it.
     """
     files.check_folder(out, "the results folder")
     files.check_folder(out / FOLDER, "the results folder")
+    later = [out / name for name in (*LATER, *(track.artefact[1] for track in tracks() if track.artefact))]
+    for path in (*later, *(out / "recordings").glob("*")):
+        if os.path.lexists(path):
+            files.check_folder(path, "the results folder")
 
 
 def path_of(out: Path, unit: str) -> Path:

@@ -136,7 +136,7 @@ def _refused(records: pa.Table, names: Sequence[str], check: Callable[..., objec
         except ValueError as error:
             yield row, f"{names[0]} {short(str(values[0]))}: {error}"
         except RecursionError:
-            yield row, f"{names[0]} {short(str(values[0]))}: nested too deeply"
+            yield row, f"{' or '.join(names)} {short(str(values[0]))}: nested too deeply"
 
 
 def _cell(cell: str, facts: str, example: Mapping[str, object]) -> None:
@@ -149,6 +149,9 @@ def _cell(cell: str, facts: str, example: Mapping[str, object]) -> None:
             raise ValueError(f"world_facts has no {name}")
         if name in world and name != "axes" and not _alike(world[name], value):
             raise ValueError(f"world_facts has a wrong {name}: {short(str(world[name]))}")
+        # Where a world has decisions, the example has some per second, and an episode has at least one.
+        if name in FACTS and isinstance(value, int) and value and not world[name]:
+            raise ValueError(f"world_facts has a wrong {name}: it must be above 0")
 
 
 def _alike(value: object, example: object) -> bool:

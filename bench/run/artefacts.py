@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench import files
+from bench import bounded, files
 from bench.errors import UserError
 from bench.run.unit import Preparation
 
@@ -36,9 +36,8 @@ def read(path: Path) -> bytes:
     """The content of an artefact.
 
     Raises:
-        UserError: if it is missing.
+        UserError: if it is missing, or is no regular file of at most 1 GiB.
     """
-    try:
-        return path.read_bytes()
-    except OSError:
-        raise UserError(f"{path} is missing; run the same command again to create it") from None
+    if not path.exists():
+        raise UserError(f"{path} is missing; run the same command again to create it")
+    return bounded.content(path, most=bounded.WEIGHTS)

@@ -142,6 +142,8 @@ def run_config(words: Sequence[str]) -> RunConfig:
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     given = Options(words, kinds=KINDS, settings=RunOptions, axes=list(axes))
     settings = given.settings()
+    if settings["executor"] != "ray" and any(word.startswith("ray.") for word in words):
+        raise UserError("ray.address is of executor=ray: add executor=ray, or leave it out")
     with _one_line():
         standard = _grid(given, settings["grid"])
         grid = standard.with_(episodes=settings["episodes"], **given.cell_values(standard.axes))

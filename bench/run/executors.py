@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import signal
 import threading
 from collections import deque
@@ -14,13 +15,17 @@ from multiprocessing.connection import wait
 from types import FrameType
 from typing import Protocol
 
+from bench.errors import UserError
 from bench.plugins.foreign import StopUnitError
 from bench.plugins.framework import Snapshot
+from bench.plugins.settings import Settings
+from bench.plugins.threads import holders
 from bench.run.blame import blamed
 from bench.run.process import cores, settle
+from bench.run.tree import resident_bytes
 from bench.run.unit import Loading, Preparation, Unit
 from bench.run.work import Failure, Outcome, Task, attempt
-from bench.run.worker import Limits, Worker, packed
+from bench.run.worker import GB, Limits, Worker, packed
 
 NEWS_S = 1.0
 """Seconds between two looks at the workers' time and memory."""
@@ -76,7 +81,7 @@ class SerialExecutor:
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         settle()
-        framework, culprit = Snapshot(), ""
+        framework, settings, culprit = Snapshot(), Settings(), ""
         waiting, parts = iter(tasks), deque[Task]()
         while (task := parts.popleft() if parts else next(waiting, None)) is not None:
             if culprit:
@@ -85,6 +90,8 @@ class SerialExecutor:
                 continue
             watcher.working([task.work, *task.others])
             outcome, text = self._carried_out(task, watcher, framework)
+            # The next unit must not be driven with what this one set.
+            settings.restore()
             if lines := [line for line in text.splitlines() if line.strip()]:
                 watcher.printed(task.work, lines)
             if isinstance(outcome, Failure) and outcome.tampered:
@@ -143,6 +150,7 @@ class ProcessExecutor:
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         waiting, retries = iter(tasks), Retries()
+        before = resident_bytes(os.getpid())
         busy: dict[Worker, Task] = {}
         told: list[Task] = []
         try:
@@ -165,6 +173,7 @@ class ProcessExecutor:
                     told = list(busy.values())
                     watcher.working([work for task in told for work in (task.work, *task.others)])
                 wait([source for worker in busy for source in worker.sources], NEWS_S)
+                self._check_own_memory(before)
                 for worker in list(busy):
                     for item in worker.news():
                         if not isinstance(item, Outcome | Failure):
@@ -182,6 +191,16 @@ class ProcessExecutor:
             # Those still busy were stopped by the caller.
             for worker in busy:
                 worker.close()
+
+    def _check_own_memory(self, before: int) -> None:
+        """Raise UserError if this process, which only keeps records, grew by more than a unit may use."""
+        grown = (resident_bytes(os.getpid()) - before) / GB
+        if self.limits.memory_gb and grown > self.limits.memory_gb:
+            owners = " and ".join(holders()) or "something that a plug-in left"
+            raise UserError(
+                f"the run is stopped, what is finished is kept: its own process grew by {grown:.1f} GB, more than "
+                f"unit_memory={self.limits.memory_gb:.3g} GB, by {owners}; use the plug-in alone to see what it does"
+            )
 
     def close(self) -> None:
         for worker in self.idle:

@@ -94,15 +94,6 @@ def context(*modules: str) -> BaseContext:
     return made
 
 
-def resident_bytes(process: int) -> int:
-    """The physical memory of a process in bytes; 0 if that cannot be read."""
-    try:
-        pages = Path(f"/proc/{process}/statm").read_text().split()[1]
-    except (OSError, IndexError):
-        return 0
-    return int(pages) * os.sysconf("SC_PAGE_SIZE")
-
-
 def machine_bytes() -> int:
     """The physical memory that this machine, or the container, has in bytes; 0 if that cannot be read."""
     limits = []

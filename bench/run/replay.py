@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -192,6 +192,11 @@ def _artefacts(out: Path, unit: Unit, record: Mapping[str, Any]) -> dict[str, by
 
 def _differences(unit: Unit, before: pa.Table, after: pa.Table) -> tuple[str, ...]:
     columns = [column.name for column in unit.track.measurements if column.name not in unit.track.unrepeatable]
+    return differing(columns, before, after)
+
+
+def differing(columns: Iterable[str], before: pa.Table, after: pa.Table) -> tuple[str, ...]:
+    """The columns in which two tables of the same rows differ in any bit."""
     return tuple(name for name in columns if not _equal(before[name], after[name]))
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench import files
+from bench import bounded, files
 from bench.errors import UserError
 from bench.plugins.pair import Pair
 from bench.plugins.track import track_of
@@ -131,9 +131,9 @@ def read(out: Path, pairs: Iterable[str]) -> list[Stop]:
         path = out / FOLDER / f"{pair}.json"
         if path.exists():
             try:
-                content = json.loads(path.read_bytes())
+                content = bounded.read_json(path, finite=False)
                 found.append(Stop(**content | {"by": tuple(content["by"])}))
-            except (OSError, ValueError, TypeError, KeyError):
+            except (UserError, ValueError, TypeError, KeyError):
                 raise UserError(f"{path} cannot be read; run the same command again to recreate it") from None
     return found
 

@@ -8,7 +8,7 @@ do not depend on the executor, the number of workers or the order of work.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cache
 from itertools import chain
@@ -53,8 +53,17 @@ class RunWatcher(Watcher, Protocol):
         """Something went wrong that does not affect the records."""
 
 
-def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
+Choice = Callable[[Mapping[str, Unit]], Collection[str]]
+"""Chooses some of a run's units, given by their fingerprints, when their networks are loaded."""
+
+
+def run(config: RunConfig, watcher: RunWatcher, choose: Choice | None = None) -> list[str]:
     """Carry out the unfinished units of a run, and return the fingerprints of its units; with `until`, of those it needed.
+
+    Args:
+        config: the run.
+        watcher: is told what happens.
+        choose: leaves out some of the units; not with `until`.
 
     Raises:
         UserError: if the results folder cannot be written, weights are missing, or no pair can be driven.
@@ -70,6 +79,9 @@ def run(config: RunConfig, watcher: RunWatcher) -> list[str]:
         if not any(key_of(loading) in weights for loading in loadings(config, baselines=False)):
             raise failures.error((), 0)
         units = {unit.fingerprint: unit for part in rounds(config) for unit in units_of(part, weights)}
+        if choose is not None:
+            chosen = choose(units)
+            units = {key: unit for key, unit in units.items() if key in chosen}
         driving = _Driving(config.out, _recorded(config, units.values()), back_end, watcher, failures)
         driving.finished |= finished_units(config.out, units)
         packing.pack(config.out)

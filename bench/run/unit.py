@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -237,10 +238,26 @@ class Unit(Work):
     @cached_property
     def fingerprint(self) -> str:
         """sha256 of everything that determines the result."""
-        before = {"artefact": self.artefact} if self.artefact else {}
+        return self._digest(self.origin, self.artefact)
+
+    def fingerprint_with(self, *, code: str, libraries: Mapping[str, str], device: str, artefact: str) -> str:
+        """The fingerprint that it has where it is driven by other code, with other libraries, or on another device.
+
+        Args:
+            code: hash of the source code.
+            libraries: versions of the libraries.
+            device: where the victim computes.
+            artefact: fingerprint of what was prepared there; empty for nothing.
+        """
+        there = {key: value for key, value in self.origin.items() if key != "device"}
+        there |= {"code": code, "libraries": libraries} | ({"device": device} if device != CPU else {})
+        return self._digest(there, artefact)
+
+    def _digest(self, origin: Mapping[str, object], artefact: str) -> str:
+        before = {"artefact": artefact} if artefact else {}
         scenarios = {"cell": canonical(self.cell), "seeds": [self.seeds.start, self.seeds.stop]}
         rule = {"rule": SEQUENTIAL} if self.sequential else {}
-        return digest(self.origin | scenarios | before | rule)
+        return digest({**origin, **scenarios, **before, **rule})
 
     @property
     def grid(self) -> str:

@@ -5,32 +5,31 @@ What components print is kept apart from the terminal and from the tables: it co
 
 from __future__ import annotations
 
+import _thread
 import importlib
 import multiprocessing
 import os
 import pickle
 import signal
-import sys
+import tempfile
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from bench import files
 from bench.errors import reason
 from bench.plugins import registry
 from bench.plugins.foreign import contained, ended
 from bench.plugins.framework import Snapshot
+from bench.plugins.settings import Settings
 from bench.plugins.track import track
+from bench.run import tree
 from bench.run.blame import blamed
-from bench.run.process import children, context, follow_parent, resident_bytes, settle
+from bench.run.process import children, context, follow_parent, settle
 from bench.run.work import Failure, Outcome, Task, Tell, attempt
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
 
 GB = 1e9
 READY = "ready"
@@ -46,7 +45,7 @@ class Limits:
 
     Args:
         seconds: wall time; 0 for no limit.
-        memory_gb: physical memory of its process in GB; 0 for no limit.
+        memory_gb: memory of its process and all that it started in GB, with files in memory and temporary files; 0 for no limit.
     """
 
     seconds: float = 0.0
@@ -67,10 +66,15 @@ class Worker:
         self.limits = limits
         self.busy = self.ready = self.spent = False
         self.heard, self.printed = True, b""
+        self.known: set[tree.Identity] = set()
         self.connection, far = multiprocessing.Pipe()
         self.output, end = multiprocessing.Pipe(duplex=False)
+        # Temporary files are counted, and deleted with the worker.
+        self.scratch = ExitStack()
+        self.folder = self.scratch.enter_context(files.scratch())
+        environment = dict(os.environ) | {"TMPDIR": str(self.folder)}
         # Not daemonic: components may start processes of their own.
-        self.process = own.Process(target=_serve, args=(far, end, dict(os.environ)), daemon=False)  # type: ignore[attr-defined]
+        self.process = own.Process(target=_serve, args=(far, end, environment), daemon=False)  # type: ignore[attr-defined]
         self.process.start()
         self.born = time.monotonic()
         far.close()
@@ -107,6 +111,9 @@ class Worker:
         except (EOFError, OSError):
             died = True
         self._listen()
+        if self.busy:
+            # If the worker ends, they are nobody's.
+            self.known |= tree.identities(self.process.pid or 0)
         if READY in found:
             # Its imports do not count.
             found.remove(READY)
@@ -128,7 +135,11 @@ class Worker:
         return [line.rstrip() for line in text.splitlines() if line.strip()]
 
     def kill(self) -> None:
-        """End the process, and those that its components started in its group."""
+        """End the process, and those that its components started, also in sessions of their own."""
+        if self.process.is_alive():
+            tree.kill(self.process.pid or 0)
+        for one in self.known:
+            one.kill()
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid or 0, signal.SIGKILL)
         self.process.kill()
@@ -139,6 +150,9 @@ class Worker:
         self.kill()
         self.connection.close()
         self.output.close()
+        # Something may still write to it; the next command deletes what is left.
+        with suppress(OSError):
+            self.scratch.close()
 
     def _listen(self) -> None:
         """Read what was printed, and forget what is too much."""
@@ -165,7 +179,7 @@ class Worker:
             return f"its worker process did not start within {START_S:g} seconds" if late else ""
         if self.limits.seconds and time.monotonic() - self.started > self.limits.seconds:
             return f"it took longer than unit_timeout={self.limits.seconds:g} seconds"
-        used = resident_bytes(self.process.pid or 0) / GB if self.limits.memory_gb else 0
+        used = tree.used_bytes(self.process.pid or 0, self.folder) / GB if self.limits.memory_gb else 0
         if used > self.limits.memory_gb:
             return f"it used {used:.1f} GB of memory, more than unit_memory={self.limits.memory_gb:.3g} GB"
         return ""
@@ -189,9 +203,11 @@ def packed(task: Task) -> bytes | Failure:
 def _serve(connection: Connection, output: Connection, environment: dict[str, str]) -> None:
     """The worker process: carry out tasks until the parent hangs up."""
     follow_parent()
+    tree.adopt()
     # A fork server has the environment of its own start.
     os.environ.clear()
     os.environ.update(environment)
+    tempfile.tempdir = environment["TMPDIR"]
     # Components may start processes of their own: the group ends with the worker.
     with suppress(OSError):
         os.setpgid(0, 0)
@@ -204,7 +220,7 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
         importlib.import_module(module)
     # Before any plug-in is imported.
     before = Snapshot()
-    settings = _settings()
+    settings, started = Settings(alone=True), _running()
     connection.send_bytes(pickle.dumps(READY))
 
     def tell(work: str, share: float, text: str, episodes: int = 0) -> None:
@@ -221,21 +237,24 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
                 os.killpg(0, signal.SIGKILL)
             return
         outcome = _carried_out(content, tell, before)
-        if isinstance(outcome, Outcome) and _settings() != settings:
+        if isinstance(outcome, Outcome) and (_left(started) or settings.changed()):
             outcome = replace(outcome, last=True)
         connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
 
 
-def _settings() -> tuple[object, ...]:
-    """Settings of this process, and processes that it started: what a component may change or leave to the tasks after it."""
-    kinds = {number for name, number in vars(resource).items() if name.startswith("RLIMIT_")} if resource else set()
-    limits = {kind: resource.getrlimit(kind) for kind in kinds}
-    signals = {number: signal.getsignal(number) for number in signal.valid_signals()}
+def _running() -> tuple[frozenset[int], int]:
+    """The processes that this one started, and the number of its threads."""
+    return children(), _thread._count()
+
+
+def _left(before: tuple[frozenset[int], int]) -> bool:
+    """Whether a task left a process, which could disturb the next component, or a thread, which would count against it."""
     try:
-        folder = os.getcwd()
+        processes, threads = _running()
+    # With a low limit of open files, nothing can be read.
     except OSError:
-        folder = ""
-    return folder, limits, signals, sys.getrecursionlimit(), sys.gettrace(), sys.getprofile(), children()
+        return True
+    return processes != before[0] or threads > before[1]
 
 
 @cache

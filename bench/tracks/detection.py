@@ -189,7 +189,7 @@ class DetectionTrack(Track):
     run: ClassVar[str] = "patch seed"
     artefact: ClassVar[tuple[str, str] | None] = ("patch", "patches")
 
-    unrepeatable: ClassVar[tuple[str, ...]] = ("patch",)
+    unrepeatable: ClassVar[tuple[str, ...]] = ("patch", "crafting_s")
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
     probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP, *CERTIFIED, NAN_GRADIENTS)
     of_older: ClassVar[Mapping[str, str]] = {"stop_score": "confidence_mean"}

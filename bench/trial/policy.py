@@ -17,6 +17,8 @@ from bench.scenarios import Cell, SeedBlock
 from bench.trial.memory import changed, kept
 from bench.trust.streams import Stream
 
+CONTROLS = 2
+"""Size of a continuous action: acceleration and steering."""
 EPISODES, STEPS = 8, 30
 """The observations are of so many episodes, and of so many decisions with random actions."""
 COPIES = 3
@@ -100,7 +102,7 @@ def _observed(world: DrivingWorld, cells: Sequence[Cell], action_type: str) -> t
             action = (
                 torch.randint(len(world.actions), (EPISODES,), generator=generator)
                 if action_type == "discrete"
-                else torch.rand(EPISODES, 2, generator=generator) * 0.2 - 0.1
+                else torch.rand(EPISODES, CONTROLS, generator=generator) * 0.2 - 0.1
             )
             td = env.step(td.set("action", action))["next"]
     finally:
@@ -133,11 +135,14 @@ def _answer(policy: Policy, moment: Moment) -> Tensor:
 def _try_answer(policy: Policy, world: DrivingWorld, moment: Moment) -> None:
     """Raise UserError if an answer is no tensor of finite numbers, one for each action."""
     scores = _answer(policy, moment)
-    width = len(world.facts.actions) if policy.action_type == "discrete" else 2
+    actions = world.facts.actions
+    width = len(actions) if policy.action_type == "discrete" else CONTROLS
     if type(scores) is not Tensor or not scores.is_floating_point():
         raise UserError(
             f"answers {getattr(scores, 'dtype', type(scores).__name__)}; scores are a tensor of real numbers"
         )
+    if scores.shape[:-1] == (EPISODES,) and policy.action_type == "discrete" and scores.shape[-1] != width:
+        raise UserError(f"has {scores.shape[-1]} actions, the world has {width}: {', '.join(actions)}")
     if list(scores.shape) != [EPISODES, width]:
         raise UserError(
             f"answers {list(scores.shape)} for {list(moment.observation.shape)}; {policy.action_type} actions need "

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
+from bench import bounded
 from bench.archive import Archive
 from bench.errors import UserError
 from bench.files import scratch, whole
@@ -101,7 +102,7 @@ def place(name: str) -> Path:
 def cached(name: str) -> bool:
     """Whether a file is in the cache, complete and unchanged."""
     path = place(name)
-    return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == DOWNLOADS[name].sha256
+    return path.is_file() and bounded.sha256(path, most=bounded.WEIGHTS) == DOWNLOADS[name].sha256
 
 
 def weights(name: str) -> Path:

@@ -303,6 +303,11 @@ def test_not_a_number_is_refused() -> None:
         drive(lambda observation, oracle: observation * torch.nan)
 
 
+def test_a_complex_answer_is_refused() -> None:
+    with pytest.raises(UserError, match="perturb returned complex numbers"):
+        drive(lambda observation, oracle: observation + 0j)
+
+
 def test_changing_the_settings_of_torch_reaches_nobody() -> None:
     class Sees(Victim):
         kinds: set[tuple[torch.dtype, bool]] = set()  # noqa: RUF012

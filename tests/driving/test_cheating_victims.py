@@ -172,6 +172,15 @@ def test_a_victim_that_answers_no_number_is_refused(value: float) -> None:
         drive(policy=Broken())
 
 
+def test_a_victim_that_answers_complex_numbers_is_refused() -> None:
+    class Broken(Victim):
+        def forward(self, observation: Tensor) -> Tensor:
+            return super().forward(observation) + 0j
+
+    with pytest.raises(UserError, match=r"the victim \(Broken\) answered complex scores"):
+        drive(policy=Broken())
+
+
 def test_a_victim_that_answers_no_number_to_queries_alone_is_refused() -> None:
     class Broken(Victim):
         def forward(self, observation: Tensor) -> Tensor:

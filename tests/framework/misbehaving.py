@@ -7,7 +7,10 @@ import gc
 import os
 import random
 import resource
+import subprocess
 import sys
+import tempfile
+import threading
 import time
 from dataclasses import dataclass
 from functools import cache
@@ -45,6 +48,10 @@ Deed = Literal[
     "print much",
     "fork",
     "fork and stay",
+    "leak in a session",
+    "leak in memory files",
+    "leak in temporary files",
+    "leave a thread",
 ]
 
 
@@ -115,6 +122,20 @@ class Rogue(DrivingAttack):
                 if (copy := forked()) == 0:
                     time.sleep(600)
                 print(f"copy {copy}")  # noqa: T201
+            case "leak in a session":
+                orphan()
+                time.sleep(60)
+            case "leak in memory files":
+                for _ in range(40):
+                    os.write(memory_file(), bytes(1 << 26))
+                time.sleep(60)
+            case "leak in temporary files":
+                with tempfile.TemporaryFile() as unnamed, tempfile.NamedTemporaryFile() as named:
+                    for file in (unnamed, named):
+                        os.posix_fallocate(file.fileno(), 0, 1 << 30)
+                    time.sleep(60)
+            case "leave a thread":
+                leave_a_thread()
         return observation + 0.1 * oracle.radius
 
 
@@ -122,6 +143,42 @@ class Rogue(DrivingAttack):
 def forked() -> int:
     """Copy this process, once."""
     return os.fork()
+
+
+@cache
+def memory_file() -> int:
+    return os.memfd_create("rogue")
+
+
+ORPHAN = """
+import os, time
+kept = []
+print("orphan", os.getpid(), flush=True)
+while len(kept) < 40:
+    kept.append(os.urandom(1 << 20) * 64)
+    time.sleep(0.02)
+time.sleep(60)
+"""
+
+
+@cache
+def orphan() -> None:
+    """Start a process whose parent ends, in a session of its own, that fills the memory."""
+    between = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', sys.argv[1]], start_new_session=True)"
+    subprocess.run([sys.executable, "-c", between, ORPHAN], start_new_session=True, check=True)
+
+
+@cache
+def leave_a_thread() -> None:
+    """A thread that fills memory when the unit is over."""
+
+    def fill() -> None:
+        time.sleep(2)
+        kept = []
+        while True:
+            kept.append(bytearray(os.urandom(1 << 20) * 64))
+
+    threading.Thread(target=fill, daemon=True).start()
 
 
 class UnprintableError(Exception):

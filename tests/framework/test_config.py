@@ -138,6 +138,8 @@ BAD = {
     "world.vehicles=0": "world 'highway': vehicles must be between 1",
     "executor=dask": "unknown executor 'dask'; known: serial, processes, ray",
     "workers=0": "workers must be at least 1, got 0",
+    "ray.address=auto": "ray.address is of executor=ray: add executor=ray, or leave it out",
+    "executor=serial ray.address=local": "ray.address is of executor=ray",
     "seeds=-1": "seeds must be distinct whole numbers of at least 0, got -1",
     "record=31": "record must be between 0 and the 30 episodes, got 31",
     "attack=zo attack=pgd": "attack is given twice; separate its values with commas: attack=a,b",

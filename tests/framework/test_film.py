@@ -123,7 +123,12 @@ def test_records_and_recordings_are_saved_side_by_side(bench: Bench, results: Pa
 
 
 @pytest.mark.slow
-def test_the_web_viewer_is_served_to_this_machine_only(results: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, -signal.SIGTERM), (signal.SIGKILL, -signal.SIGKILL)]
+)
+def test_the_web_viewer_is_served_to_this_machine_only_and_ends_with_the_command(
+    results: Path, tmp_path: Path, number: int, code: int
+) -> None:
     import psutil
 
     (recording,) = results.glob("recordings/noise*/*.rrd")
@@ -138,6 +143,6 @@ def test_the_web_viewer_is_served_to_this_machine_only(results: Path, tmp_path: 
         one.laddr.ip for server in servers for one in server.net_connections() if one.status == psutil.CONN_LISTEN
     }
     assert listening == {"127.0.0.1"}
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 0
+    process.send_signal(number)
+    assert process.wait(timeout=60) == code
     assert not psutil.wait_procs(servers, timeout=30)[1]

@@ -23,6 +23,10 @@ ON_IMPORT = {
     "import_segfault": "import ctypes; ctypes.string_at(0)",
     "import_patch": "import torch; torch.Tensor.tanh = lambda tensor: tensor",
     "import_interrupt": "raise KeyboardInterrupt",
+    "import_recursion": "import inspect, sys; sys.setrecursionlimit(len(inspect.stack()) + 30)",
+    "import_closed": "import os; os.closerange(3, 4096)",
+    "import_thread": "import threading, time; threading.Thread(target=time.sleep, args=(600,)).start()",
+    "import_dtype": "import torch; torch.set_default_dtype(torch.float64)",
 }
 PACKAGE = r"of cavbench-rogue 3.1"
 DEEDS = {
@@ -33,6 +37,9 @@ DEEDS = {
     "segfault": "it ended its worker process (SIGSEGV)",
     "hang": "it took longer than unit_timeout=10 seconds",
     "leak": "it used",
+    "leak in a session": "it used",
+    "leak in memory files": "it used",
+    "leak in temporary files": "it used",
     "memory error": "MemoryError",
     "nan": "Rogue.perturb returned numbers that are NaN or infinite",
     "shape": "Rogue.perturb returned shape (2, 2, 1)",
@@ -44,7 +51,7 @@ DEEDS = {
     "patch bench": "is refused: bench.driving.meter.Meter.columns was replaced",
 }
 """What the line says about each deed that fails a unit."""
-HARMLESS = ("none", "reseed", "print", "print much", "fork", "fork and stay")
+HARMLESS = ("none", "reseed", "print", "print much", "fork", "fork and stay", "leave a thread")
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +105,10 @@ def test_a_sweep_goes_on_and_names_whatever_fails_with_its_package(swept: tuple[
         ("import_segfault", "cannot be imported: its import ends the process (SIGSEGV)"),
         ("import_patch", "cannot be imported: its import replaces torch.Tensor.tanh"),
         ("import_interrupt", "cannot be imported: KeyboardInterrupt"),
+        ("import_recursion", "cannot be imported: its import changes the recursion limit"),
+        ("import_closed", "cannot be imported: its import closes files of the process"),
+        ("import_thread", "cannot be imported: its import changes the threads that hold the end of the process"),
+        ("import_dtype", "cannot be imported: its import changes the default type of torch"),
     ],
 )
 def test_a_plugin_that_misbehaves_on_import_is_left_out(swept: tuple[Said, Path], name: str, why: str) -> None:
@@ -146,17 +157,24 @@ def test_copies_of_a_worker_do_no_work_and_end_with_it(swept: tuple[Said, Path])
 
 
 @pytest.mark.slow
+def test_a_process_in_a_session_of_its_own_ends_with_the_worker(swept: tuple[Said, Path]) -> None:
+    said, _ = swept
+    orphans = re.findall(r"prints: orphan (\d+)", said.err)
+    assert orphans
+    assert not any(Path(f"/proc/{orphan}").exists() for orphan in orphans)
+
+
+@pytest.mark.slow
 def test_a_victim_that_cannot_answer_is_named_and_drives_nothing(site: Path, tmp_path: Path) -> None:
     words = ("victim=toy,bad_answers", "victim.answer=nan,shape", *CELL)
     said = ran(site, "run", "attack=none", *words, "executor=serial", f"out={tmp_path}")
     assert said.code == 2
-    # A probe may ask before the first decision.
     asked = re.search(
-        r"answered NaN or infinite scores (while driving|to a query) \(victim 'bad_answers' (.*)", said.err
+        r"is refused: it answers NaN or infinity on observations of this world \(victim 'bad_answers' (.*)", said.err
     )
     assert asked
-    assert asked[2].startswith(PACKAGE)
-    assert "the victim has 2 actions, the world has 5: LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER" in said.err
+    assert asked[1].startswith(PACKAGE)
+    assert "is refused: it has 2 actions, the world has 5: LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER" in said.err
     assert set(reading.read(tmp_path, track=track("driving"))["victim"].to_pylist()) == {"toy"}
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from bench.errors import Notice, UserError
 from bench.plugins.track import Columns, track
+from bench.records import generations as footers
 from bench.records import reading
 from bench.records import store as results
 from bench.records.finished import finished
@@ -165,6 +166,8 @@ def test_an_invalid_value_is_reported_with_its_record(written: Path, units: list
         ("max_steps", None, "world_facts has no max_steps"),
         ("max_steps", "x", "world_facts has a wrong max_steps: x"),
         ("decision_hz", -1, "world_facts has a wrong decision_hz: -1"),
+        ("decision_hz", 0, "world_facts has a wrong decision_hz: it must be above 0"),
+        ("max_steps", 0, "world_facts has a wrong max_steps: it must be above 0"),
         ("features", 0, "world_facts has a wrong features: 0"),
         ("axes", [1], "not axes: each needs a name, a kind and a meaning"),
         ("axes", [{"name": "lanes"}], "not axes: each needs a name, a kind and a meaning"),
@@ -269,6 +272,30 @@ def test_a_file_that_states_more_rows_than_the_unit_has_is_not_read(
     monkeypatch.setattr(pq, "read_table", None)
     with pytest.warns(Notice, match="it has 3000 rows, the unit has 3 episodes"):
         assert finished(written, {units[0].fingerprint: units[0]}) == set()
+
+
+@pytest.mark.parametrize("compact", [False, True], ids=["show", "report"])
+def test_a_row_or_a_column_twice_is_refused_by_every_reader(written: Path, units: list[Unit], compact: bool) -> None:
+    def all_of_it() -> object:
+        return reading.read_compact(written, MEASURED) if compact else reading.read_all(written)
+
+    path = results.path_of(written, units[0].fingerprint)
+    own = pq.read_table(path)
+    # The names in the footer are found without its types, which is quick: that must not hide a column.
+    assert footers._elements(footers._footer(path)) == footers._wanted(SCHEMA)
+    pq.write_table(own.append_column(own.schema.field("crashed"), own["crashed"]), path)
+    with pytest.raises(UserError, match="has columns that this version does not write"):
+        all_of_it()
+    pq.write_table(own.take([0, 1, 1]), path)
+    with pytest.raises(UserError, match="have an episode twice"):
+        all_of_it()
+
+
+@pytest.mark.parametrize("name", ["recordings", "set_aside", "stops", "patches", "verifying", "episodes"])
+def test_a_file_with_the_name_of_a_folder_is_found_before_any_work(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).touch()
+    with pytest.raises(UserError, match=f"the results folder {tmp_path / name} cannot be written: it is a file"):
+        results.prepare(tmp_path)
 
 
 def test_a_copied_file_counts_once(written: Path, units: list[Unit]) -> None:
@@ -376,3 +403,16 @@ def test_records_of_format_1_are_converted(written: Path, units: list[Unit]) -> 
     assert upgraded["return"].to_pylist() == today["return"].to_pylist()
     assert set(upgraded["world_facts"].to_pylist()) == {json.dumps(TRACK.facts_of_v1, separators=(",", ":"))}
     assert None in upgraded["same_answer"].to_pylist()
+
+
+def test_rows_are_not_hidden_by_what_a_file_says_of_its_values(written: Path, units: list[Unit]) -> None:
+    """A file states the least and the greatest value of each column, and readers skip what cannot match."""
+    key = units[0].fingerprint
+    path = results.path_of(written, key)
+    honest = read(written, [key])
+    content = path.read_bytes()
+    footer = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
+    other = bytes(reversed(key.encode()))
+    assert key.encode() in content[footer:]
+    path.write_bytes(content[:footer] + content[footer:].replace(key.encode(), other))
+    assert read(written, [key]).equals(honest)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from bench.errors import UnfinishedError, UserError
+from bench.errors import Notice, UnfinishedError, UserError
 from bench.plugins import progress, registry
 from bench.plugins.track import track
 from bench.records import reading
@@ -284,3 +287,26 @@ def test_shards_drive_every_unit_once(tmp_path: Path) -> None:
 def test_a_shard_that_there_is_not_is_refused(shard: str) -> None:
     with pytest.raises(UserError, match="shard must be PART/PARTS"):
         run_config([*SMALL.split(), f"shard={shard}"])
+
+
+def test_a_clock_that_jumps_during_a_run_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It jumps before every unit: a day ahead, three years back, a year ahead, and back to the time of day."""
+    steady, _ = run(tmp_path / "steady")
+    jumps = itertools.cycle(timedelta(days=days) for days in (1, -1100, 365, 0))
+
+    class Jumping(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:
+            return datetime.now(tz) + next(jumps)
+
+    known = time.time
+    monkeypatch.setattr("bench.run.unit.datetime", Jumping)
+    monkeypatch.setattr(time, "time", lambda: known() + next(jumps).total_seconds())
+    with pytest.warns(Notice, match="dated in the future"):
+        jumped, _ = run(tmp_path / "jumped")
+    with pytest.warns(Notice, match="dated in the future"):
+        again, watcher = run(tmp_path / "jumped")
+    assert comparable(jumped).drop_columns("unit").equals(comparable(steady).drop_columns("unit"))
+    assert again.equals(jumped)
+    assert watcher.done == []
+    assert watcher.there == watcher.episodes

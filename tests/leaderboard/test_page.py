@@ -358,3 +358,24 @@ def test_text_is_legible_in_light_and_in_dark(opened: Open, scheme: str, width: 
     page.locator("#ranks a").first.click()
     page.locator("#card").wait_for()
     assert page.evaluate(CONTRAST) >= 4.5
+
+
+def test_no_other_script_runs_and_nothing_is_sent(browser: Any, site: Path) -> None:
+    page = browser.new_context(offline=True).new_page()
+    page.goto((site / "leaderboard.html").as_uri())
+    refused = page.evaluate(
+        """async () => {
+            const refused = [];
+            document.addEventListener("securitypolicyviolation", (event) => refused.push(event.effectiveDirective));
+            const script = document.createElement("script");
+            script.textContent = "window.obeyed = true";
+            document.body.append(script);
+            document.body.insertAdjacentHTML("beforeend", "<p id='p' onclick='window.obeyed = true' style='top: 0'>");
+            document.getElementById("p").click();
+            await fetch("https://example.org/").catch(() => {});
+            await new Promise((done) => setTimeout(done, 300));
+            return [window.obeyed === undefined, ...refused];
+        }"""
+    )
+    assert refused[0] is True
+    assert {"script-src-elem", "script-src-attr", "style-src-attr", "connect-src"} <= set(refused[1:])

@@ -7,6 +7,7 @@ None of them starts a run: each is wrong in a way that is seen before any work.
 
 from __future__ import annotations
 
+import os
 import random
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -87,6 +88,7 @@ def bad_inputs(count: int, *, seed: int, folder: Path) -> Iterator[list[str]]:
         _place,
         _other_command,
         _no_option,
+        _submission,
     ]
     for number in range(count):
         yield makers[number % len(makers)](draw, files)
@@ -124,6 +126,7 @@ def _twice(draw: random.Random, files: list[Path]) -> list[str]:
             ["run", "seeds=0,0"],
             ["run", "lanes=3,3"],
             ["run", "lanes=[4,4]"],
+            ["run", "attack=noise", "ray.address=auto"],
             ["train", "victim=dqn", "seeds=1,1"],
             ["train", "seed=1", "seeds=2", "victim=dqn"],
             ["train", "out=a", "out=a", "victim=dqn"],
@@ -161,6 +164,32 @@ def _place(draw: random.Random, files: list[Path]) -> list[str]:
             ["new", "attack", "mine", f"out={file}"],
         ]
     )
+
+
+def _submission(draw: random.Random, files: list[Path]) -> list[str]:
+    """A submission whose description is no file, has no end, or is no description."""
+    folder = files[0].parent / f"submission{draw.randrange(10**9)}"
+    folder.mkdir()
+    path = folder / "submission.json"
+    match draw.randrange(6):
+        case 0:
+            os.mkfifo(path)
+        case 1:
+            path.symlink_to(draw.choice(("/dev/zero", "/etc/passwd", "submission.json")))
+        case 2:
+            path.mkdir()
+        case 3:
+            with path.open("wb") as file:
+                file.truncate(20 * 2**30)
+        case 4:
+            path.write_text(draw.choice(("[", '{"files":', '{"a":[')) * draw.choice((100, 10**5)))
+        case _:
+            path.write_bytes(draw.choice(files[:-2]).read_bytes())
+    return [
+        "verify",
+        str(folder),
+        *draw.choice(([], ["sample=0"], [f"out={files[0]}"], ["sample=2", f"out={folder}/x"])),
+    ]
 
 
 def _other_command(draw: random.Random, files: list[Path]) -> list[str]:

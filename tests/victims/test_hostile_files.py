@@ -464,48 +464,51 @@ def test_a_member_that_states_a_smaller_size_is_not_unpacked_further(tmp_path: P
         Archive(bytes(content), "liar.zip")
 
 
-def test_two_members_of_one_name_are_refused() -> None:
+def zipped(*members: tuple[str, bytes]) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("data", "one")
-        with pytest.warns(UserWarning, match="Duplicate"):
-            archive.writestr("data", "two")
+        for name, content in members:
+            archive.writestr(name, content)
+    return file.getvalue()
+
+
+def with_comment(content: bytes) -> bytes:
+    return content[:-2] + struct.pack("<H", 22) + content[-22:]
+
+
+def renamed(content: bytes) -> bytes:
+    """The list at the end has another name than the member itself."""
+    place = content.rindex(b"data")
+    return content[:place] + b"dbta" + content[place + 4 :]
+
+
+HONEST = zipped(("data", b"one"), ("more", b"two"))
+DAMAGED, ALONE = "it is not a zip archive, or a damaged one", "there is something before or after it"
+READ_OTHERWISE = {
+    "names that differ in case": (zipped(("data", b"one"), ("Data", b"two")), "two of its members have the same name"),
+    "the same in another alphabet": (zipped(("stra\u00dfe", b"1"), ("STRASSE", b"2")), "have the same name"),
+    "bytes before": (b"MZ" + HONEST, ALONE),
+    "an archive before": (HONEST + zipped(("data", b"two")), ALONE),
+    "bytes after": (HONEST + b"more", f"{DAMAGED}|{ALONE}"),
+    "a second end in a comment": (with_comment(HONEST), f"{DAMAGED}|{ALONE}"),
+    "a zero byte in a name": (
+        zipped(("data.x", b"1")).replace(b"data.x", b"data\0x"),
+        "a name that others read otherwise",
+    ),
+    "another name at the member": (renamed(zipped(("data", b"1"))), "or a damaged one"),
+}
+
+
+@pytest.mark.parametrize("what", READ_OTHERWISE)
+def test_an_archive_that_another_reader_reads_otherwise_is_refused(what: str) -> None:
+    assert Archive(HONEST, "honest.zip").members == {"data": b"one", "more": b"two"}
+    content, why = READ_OTHERWISE[what]
+    with pytest.raises(UserError, match=why):
+        Archive(content, "crafted.zip")
+
+
+def test_two_members_of_one_name_are_refused() -> None:
+    with pytest.warns(UserWarning, match="Duplicate"):
+        content = zipped(("data", b"one"), ("data", b"two"))
     with pytest.raises(UserError, match="two of its members have the same name"):
-        Archive(file.getvalue(), "twice.zip")
-
-
-def test_a_model_in_onnx_reads_no_file_of_another_folder(tmp_path: Path) -> None:
-    onnx = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    helper = onnx.helper
-
-    def model(place: str, nested: bool) -> Path:
-        weight = onnx.TensorProto(name="w", dims=[50, 5], data_type=1, data_location=1)
-        weight.external_data.add(key="location", value=place)
-        where = {"initializer": [] if nested else [weight]}
-        constant = [helper.make_node("Constant", [], ["w"], value=weight)] if nested else []
-        nodes = [helper.make_node("Flatten", ["x"], ["f"]), *constant, helper.make_node("MatMul", ["f", "w"], ["y"])]
-        graph = helper.make_graph(
-            nodes,
-            "g",
-            [helper.make_tensor_value_info("x", 1, ["batch", 10, 5])],
-            [helper.make_tensor_value_info("y", 1, ["batch", 5])],
-            **where,
-        )
-        path = tmp_path / "folder" / "policy.onnx"
-        path.parent.mkdir(exist_ok=True)
-        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-        path.write_bytes(made.SerializeToString())
-        return path
-
-    (tmp_path / "secret").write_bytes(torch.rand(250).numpy().tobytes())
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "folder" / "weights").write_bytes(torch.rand(250).numpy().tobytes())
-    (tmp_path / "folder" / "link").symlink_to(tmp_path / "secret")
-    for place in ("../secret", str(tmp_path / "secret"), "link", ".."):
-        for nested in (False, True):
-            line = refusal(model(place, nested), "onnx")
-            assert f"it reads {place!r}; a model may read files in its own folder only" in line
-    before = load(model("weights", nested=False), "onnx").weights_sha256
-    (tmp_path / "folder" / "weights").write_bytes(torch.rand(250).numpy().tobytes())
-    assert load(model("weights", nested=False), "onnx").weights_sha256 != before
+        Archive(content, "twice.zip")

@@ -169,7 +169,7 @@ def test_a_safetensors_file_without_names_is_refused(tmp_path: Path) -> None:
 
 
 def assert_refused(path: Path) -> None:
-    with pytest.raises(UserError, match="cannot be read: ") as error:
+    with pytest.raises(UserError, match=r"cannot be read: |is refused: it is a folder") as error:
         yolov5_file.read(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)

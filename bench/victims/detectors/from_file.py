@@ -14,6 +14,7 @@ from typing import get_args
 import torch
 from torch import Tensor
 
+from bench import bounded
 from bench.detection import STOP_SIGN, DetectorVictim
 from bench.errors import UserError, short
 from bench.plugins.contracts import Facts
@@ -174,9 +175,8 @@ def _listed(given: str) -> tuple[str, ...]:
         path = Path(given).expanduser()
         if not path.is_file():
             return tuple(name.strip() for name in given.split("+"))
-        if path.stat().st_size > LARGEST_NAMES:
-            raise UserError(f"victim.names={short(given)} has more than {LARGEST_NAMES >> 20} MiB")
-        return tuple(line.strip() for line in path.read_text(encoding="utf-8").strip().splitlines())
+        found = bounded.content(path, most=LARGEST_NAMES, name=f"victim.names={short(given)}")
+        return tuple(line.strip() for line in found.decode("utf-8").strip().splitlines())
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"victim.names={short(given)} cannot be read: {type(error).__name__}") from error
 

@@ -6,7 +6,6 @@ restricted unpickler reads it with one inert class in place of all of them, whic
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
+from bench import bounded
 from bench.archive import Archive
 from bench.detection import Detector
 from bench.errors import UserError
@@ -63,8 +63,9 @@ def read(path: Path) -> Weights:
         UserError: if the file cannot be read, or names a class that is not `EXPECTED`.
     """
     try:
+        sha256 = bounded.sha256(path, most=bounded.WEIGHTS, name=f"the weights {path}")
         tensors, names = _safetensors(path) if path.suffix == ".safetensors" else _checkpoint(path)
-        return Weights(tensors, names, hashlib.sha256(path.read_bytes()).hexdigest())
+        return Weights(tensors, names, sha256)
     except UserError:
         raise
     except OSError as error:
@@ -90,7 +91,7 @@ def _safetensors(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
             raise UserError(f"the weights {path} are refused: their header has more than {LARGEST_HEADER >> 20} MiB")
     with safe_open(path, "pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        return tensors, _names(json.loads((file.metadata() or {})["names"]))
+        return tensors, _names(bounded.parsed((file.metadata() or {})["names"]))
 
 
 def _checkpoint(path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:

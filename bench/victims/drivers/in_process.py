@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy
 from bench.errors import UserError, reason
-from bench.plugins.bytecode import code_of, plain_attributes
+from bench.plugins.bytecode import code_of
+from bench.plugins.content import content
 from bench.plugins.fingerprint import digest, state_digest
 from bench.victims.drivers.from_file import FilePolicy, check_trained_in
 from bench.victims.drivers.sb3_model import LIBRARY, critic_of, is_model, is_sampling_part, network_of
@@ -102,9 +103,9 @@ def in_process(
 
 
 def code_of_policies(victim: InProcess) -> str:
-    """Hash of the code and the structure of its networks; the hash of the weights is apart."""
+    """Hash of the code of its networks, and of all that they hold: weights, lists, networks in attributes."""
     parts = [part for policy in victim.policies for part in policy.modules()]
-    return digest([code_of(*parts), [plain_attributes(policy) for policy in victim.policies]])
+    return digest([code_of(*parts), [content(vars(policy)) for policy in victim.policies]])
 
 
 def _policy(given: object, facts: DrivingFacts, observation: Tensor, actions: str | None) -> Policy:

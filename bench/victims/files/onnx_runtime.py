@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.errors import UserError, short
-from bench.victims.files.onnx_file import companions
+from bench.victims.files.onnx_file import whole
 from bench.victims.files.trial import OperationError
 
 LIBRARY = "onnxruntime"
@@ -31,7 +31,7 @@ class Model:
         shape: shape of its input; None for an axis of any size.
         dtype: type of its input.
         outputs: names of its outputs.
-        sha256: hash of the file, and of the files that it reads its tensors from.
+        sha256: hash of the file, and of the bytes that are run (`bench.victims.files.onnx_file.whole`).
     """
 
     session: Any
@@ -66,14 +66,16 @@ def read(path: Path, name: str, sha256: str) -> Model:
         sha256: hash of the file.
 
     Raises:
-        UserError: if ONNX Runtime is missing, the file names files elsewhere, or has other inputs or outputs than tensors.
+        UserError: if ONNX Runtime or the onnx package is missing, the file is refused, or has other inputs or outputs than
+            tensors.
     """
     try:
         import onnxruntime
+
+        content = whole(path, name)
     except ImportError:
         raise UserError(f"{name} needs ONNX Runtime: pip install 'cavbench[onnx]'") from None
-    for file in companions(path, name):
-        sha256 = hashlib.sha256((sha256 + hashlib.sha256(file.read_bytes()).hexdigest()).encode()).hexdigest()
+    sha256 = hashlib.sha256((sha256 + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
     onnxruntime.disable_telemetry_events()
     # Its own complaints would go to standard error beside ours.
     onnxruntime.set_default_logger_severity(4)
@@ -81,7 +83,7 @@ def read(path: Path, name: str, sha256: str) -> Model:
     options.add_session_config_entry("session.load_model_format", "ONNX")
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
-        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:
         if unknown := re.search(r"([\w.]+:\w+)\(-?\d+\) is not a registered", str(error)):
             raise UserError(

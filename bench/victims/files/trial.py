@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import multiprocessing
+import os
 from collections.abc import Callable, Hashable
 from functools import cache, partial
 from pathlib import Path
 
+from bench import bounded
 from bench.errors import UserError
 from bench.plugins.foreign import harm
 
@@ -28,15 +29,12 @@ def hashed(given: str, noun: str) -> str:
         noun: what is in it, for errors.
 
     Raises:
-        UserError: if the file is missing or cannot be read.
+        UserError: if the file is missing, is no regular file, has more than 1 GiB, or cannot be read.
     """
     path = Path(given).expanduser()
-    if not path.is_file():
+    if not os.path.exists(path):
         raise UserError(f"there is no file {given}; set victim.path=… to the {noun}'s file")
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise UserError(f"{given} cannot be read: {error.strerror}") from error
+    return bounded.sha256(path, most=bounded.WEIGHTS, name=given)
 
 
 def refuse_harm(name: str, load: Callable[..., object], *arguments: Hashable) -> None:

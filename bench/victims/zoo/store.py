@@ -26,6 +26,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
+from bench import bounded
 from bench.errors import UserError
 from bench.files import whole
 from bench.plugins.contracts import World
@@ -128,10 +129,10 @@ def card(recipe: Recipe, seed: int) -> dict[str, Any]:
         UserError: if there is no entry (the message has the training command), or its card cannot be read.
     """
     path = _find(recipe, seed).with_suffix(".json")
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"the card {path} cannot be read: {error}") from None
+    entry = bounded.read_json(path, name=f"the card {path}", finite=False)
+    if not isinstance(entry, dict):
+        raise UserError(f"the card {path} cannot be read: it is no JSON object")
+    return entry
 
 
 def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "") -> N:
@@ -155,7 +156,7 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
             f"the zoo's {recipe.name!r} of training seed {seed} was trained against a victim with weights {str(before)[:12]}…, "
             f"and the victim has {against[:12]}… now; `{recipe.train(seed)}` trains it again"
         )
-    blob = path.read_bytes()
+    blob = bounded.content(path, most=bounded.WEIGHTS, name=f"the weights {path}")
     sha256 = hashlib.sha256(blob).hexdigest()
     if sha256 != entry.get("sha256"):
         raise UserError(
@@ -263,7 +264,7 @@ def _variants(recipe: Recipe) -> Iterator[str]:
 def _differences(recipe: Recipe, path: Path) -> str:
     """The differences between the entry of a card and the default, as text."""
     try:
-        made = json.loads(path.read_text())["recipe"]
+        made = bounded.read_json(path, finite=False)["recipe"]
         differences = []
         for part in recipe.parts:
             trained = made[part.kind]
@@ -271,7 +272,7 @@ def _differences(recipe: Recipe, path: Path) -> str:
             if trained["training"] != part.training:
                 differences.append(f"training version {trained['training']} of {part.kind}, now {part.training}")
         return ", ".join(differences) or "default"
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (UserError, KeyError, TypeError, AttributeError):
         return f"{path.parent.name} with a card that cannot be read"
 
 

@@ -1,0 +1,92 @@
+"""The end of a command: no thread and no hook that a plug-in left holds it, and a line says whose it was."""
+
+from __future__ import annotations
+
+import atexit
+import faulthandler
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from bench.errors import bounded
+
+END_S = 6.0
+"""Seconds that threads and hooks may take after the command has said all."""
+BACKSTOP_S = 2.0
+"""Seconds after that until the process is ended even if no line of Python can run."""
+
+
+def ended(command: Callable[[], None]) -> None:
+    """Carry out a command, and end the process with its exit code.
+
+    A process that imported a plug-in waits for threads and hooks of its end `END_S` seconds. Objects that are left are not
+    deleted one by one: their code could hang, too.
+    """
+    code: object = 0
+    try:
+        command()
+    except SystemExit as error:
+        code = error.code
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+        code = 1
+    # Most commands import no plug-in, some not even what finds them.
+    if "bench.plugins.registry" not in sys.modules or not _foreign():
+        raise SystemExit(code)
+    if isinstance(code, str):
+        sys.stderr.write(f"{code}\n")
+    number = code if isinstance(code, int) else int(code is not None)
+    _flush()
+    _end(number)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        # What reads them may be gone.
+        with suppress(Exception):
+            stream.flush()
+
+
+def _end(code: int) -> None:
+    """Wait for threads and hooks as Python does, but not for ever."""
+    phase = ["threads"]
+    threading.Thread(target=_watch, args=(code, phase), daemon=True).start()
+    with open(os.devnull, "w") as silence, suppress(BaseException):
+        faulthandler.dump_traceback_later(END_S + BACKSTOP_S, exit=True, file=silence)
+        threading._shutdown()  # type: ignore[attr-defined]
+        phase[0] = "hooks"
+        atexit._run_exitfuncs()
+        _flush()
+    os._exit(code)
+
+
+def _watch(code: int, phase: list[str]) -> None:
+    time.sleep(END_S)
+    line = "the command is ended, although something that a plug-in left does not end"
+    with suppress(BaseException):
+        line = f"the command is ended, although {_held(phase[0])}"
+    with suppress(BaseException):
+        os.write(2, f"warning: {bounded(line)}\n".encode())
+    os._exit(code)
+
+
+def _held(phase: str) -> str:
+    """What holds the end, and whose it is."""
+    from bench.plugins.threads import left, owner
+
+    held = left() if phase == "threads" else [threading.main_thread()]
+    what = f"the thread {held[0].name!r}" if len(held) == 1 else f"{len(held)} threads"
+    if phase == "hooks":
+        what = "a hook for the end of the process"
+    owners = dict.fromkeys(filter(None, map(owner, held)))
+    who = " and ".join(owners) if owners else f"one of {', '.join(sorted(set(_foreign().values())))}"
+    return f"{what} of {who} {'do' if len(held) > 1 else 'does'} not end"
+
+
+def _foreign() -> dict[str, str]:
+    from bench.plugins.registry import foreign
+
+    return foreign()
