@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -20,7 +21,26 @@ from bench.run import runner
 from bench.run.audit import AuditConfig, audit_config
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Interval
-from bench.statistics.unpaired import unpaired
+from bench.statistics.unpaired import NOTABLE, POWER, Finds, finds, unpaired
+
+OFTEN = f"{100 * POWER:.0f} %"
+
+
+class Difference(NamedTuple):
+    """What an audit found of a pair.
+
+    Args:
+        public, drawn: its scores on public and on drawn scenarios.
+        gain: their difference.
+        finds: what an audit of this size finds.
+        episodes: scenarios of each cell, on either side.
+    """
+
+    public: float
+    drawn: float
+    gain: Interval
+    finds: Finds
+    episodes: int
 
 
 def audit(words: Sequence[str], console: Console) -> int:
@@ -48,10 +68,11 @@ def audit(words: Sequence[str], console: Console) -> int:
     return int(not verdict(found, track, console))
 
 
-def verdict(found: dict[Pair, tuple[float, float, Interval]], track: Track, console: Console) -> bool:
+def verdict(found: Mapping[Pair, Difference], track: Track, console: Console) -> bool:
     """Print the differences and what follows, and return whether no pair scores significantly higher on public scenarios."""
     console.print(_table(found, track))
-    flagged = [str(pair) for pair, (_, _, gain) in found.items() if gain.low > 0]
+    console.print(Text(reach(found)), soft_wrap=True)
+    flagged = [str(pair) for pair, one in found.items() if one.gain.low > 0]
     line = (
         f"public_only: {'; '.join(flagged)}"
         if flagged
@@ -61,26 +82,48 @@ def verdict(found: dict[Pair, tuple[float, float, Interval]], track: Track, cons
     return not flagged
 
 
-def differences(config: AuditConfig, records: pa.Table, track: Track) -> dict[Pair, tuple[float, float, Interval]]:
-    """Of each pair the public score, the score on drawn scenarios, and their difference (`bench.statistics.unpaired`)."""
+def reach(found: Mapping[Pair, Difference]) -> str:
+    """What the audit could not find, and how large an audit would: of the pair whose scores vary most."""
+    pair, worst = max(found.items(), key=lambda item: item[1].finds.scenarios)
+    chance, smallest, scenarios = 100 * worst.finds.chance, worst.finds.smallest, worst.finds.scenarios
+    line = f"A public score of {pair} that is {NOTABLE:g} too high is found in {chance:.0f} % of audits of this size"
+    if worst.finds.chance >= POWER:
+        return f"{line}, one that is {smallest:.3f} too high in {OFTEN}."
+    larger = f"episodes={scenarios} ({scenarios / worst.episodes:.1f} times as many) finds it in {OFTEN}"
+    return f"{line}; {larger}. In {OFTEN} this size finds one that is {smallest:.3f} too high."
+
+
+def differences(config: AuditConfig, records: pa.Table, track: Track) -> dict[Pair, Difference]:
+    """What the records say of each pair (`bench.statistics.unpaired`)."""
     pairs = {pair.id: pair for pair in (*config.public.pairs, *(pair.clean() for pair in config.public.pairs))}
     found = {}
     for name, pair in pairs.items():
         own = records.filter(pc.equal(records["pair"], name))
         drawn = pc.equal(own["grid"], AUDIT)
         sides = [Episodes.arrange(own.filter(rows)).column(track.metric) for rows in (pc.invert(drawn), drawn)]
-        gain = unpaired(sides[0], sides[1], comparisons=len(pairs))
-        found[pair] = float(sides[0].mean()), float(sides[1].mean()), gain
+        found[pair] = Difference(
+            public=float(sides[0].mean()),
+            drawn=float(sides[1].mean()),
+            gain=unpaired(sides[0], sides[1], comparisons=len(pairs)),
+            finds=finds(sides[0], sides[1], comparisons=len(pairs)),
+            episodes=sides[0].shape[2],
+        )
     return found
 
 
-def _table(found: dict[Pair, tuple[float, float, Interval]], track: Track) -> Table:
+def _table(found: Mapping[Pair, Difference], track: Track) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0))
     table.add_column("pair", overflow="fold")
-    for heading in (f"{track.metric_title}\npublic", "\ndrawn", "\npublic - drawn"):
+    for heading in (f"{track.metric_title}\npublic", "\ndrawn", "\npublic - drawn", f"found in\n{OFTEN} from"):
         table.add_column(heading, justify="right")
-    for pair, (public, drawn, gain) in found.items():
+    for pair, (public, drawn, gain, found_from, _) in found.items():
         style = "bold red" if gain.low > 0 else ""
         difference = f"{gain.estimate:+.3f} [{gain.low:+.3f}, {gain.high:+.3f}]"
-        table.add_row(Text(str(pair)), f"{public:.3f}", f"{drawn:.3f}", Text(difference, style=style))
+        table.add_row(
+            Text(str(pair)),
+            f"{public:.3f}",
+            f"{drawn:.3f}",
+            Text(difference, style=style),
+            f"+{found_from.smallest:.3f}",
+        )
     return table

@@ -28,6 +28,10 @@ OF_GRADIENTS = ("zero_gradients", "nan_gradients")
 """Counts of a crafting that are recorded as shares of its gradients."""
 SAME_CONFIDENCE = 0.01
 """Two confidences count as the same answer if they differ by at most this."""
+REPEATS = 3
+"""How often a random detector is asked again."""
+LARGEST_BATCH = 5
+"""Most images in the batch of a probe."""
 SAME_MEAN = 0.1
 """Largest difference of an approach's mean confidence from that which attacks optimise. Fusion over frames has up to .01."""
 
@@ -172,8 +176,8 @@ def probed(
     """Probes on a frame that the detector cannot foresee (`bench.records.schema.PROBES`).
 
     `redrawn`: another answer when asked again. `same_answer`: the same on a grey image. `inconsistent`: asked as an oracle asks,
-    alone, in another batch or with gradients, the answer is not the one that was scored; or, on any approach, what it reports on
-    average is not what its `aggregate` makes of the frames' scores, which attacks optimise.
+    in batches of other sizes and with gradients, an answer is not the one that was scored; or, on any approach, what it reports
+    on average is not what its `aggregate` makes of the frames' scores, which attacks optimise.
     """
     chance = random.Random(entropy)
     place = chance.randrange(len(approaches))
@@ -186,6 +190,12 @@ def probed(
         detector.index(STOP_SIGN),
     )
 
+    def batched() -> tuple[Tensor, int]:
+        """The image in a batch of a size and at a place that nobody can foresee."""
+        size = chance.randint(1, LARGEST_BATCH)
+        at = chance.randrange(size)
+        return torch.full_like(image, 0.5).repeat(size, 1, 1, 1).index_copy(0, torch.tensor([at]), image), at
+
     def ask(pictures: Tensor, at: int = 0, gradients: bool = False) -> float:
         with torch.set_grad_enabled(gradients):
             output = detector(pictures.clone().requires_grad_(gradients))
@@ -195,17 +205,17 @@ def probed(
     with Stream("probe", entropy).in_use():
         first, again = ask(image), ask(image)
         grey = ask(torch.full_like(image, 0.5))
-        at = chance.randrange(3)
-        path = chance.choice(("alone", "batch", "gradients"))
-        batch = torch.full_like(image, 0.5).repeat(3, 1, 1, 1).index_copy(0, torch.tensor([at]), image)
-        answer = ask(batch, at) if path == "batch" else ask(image, gradients=path == "gradients")
+        # A random detector must not look like a decoy.
+        repeated = [first, again, *(ask(image) for _ in range(REPEATS if first != again else 0))]
+        answers = [first, ask(*batched()), ask(*batched(), gradients=True)]
     scored = float(seen[place].by_frame[frame])
-    spread = max(first, again, scored) - min(first, again, scored) if first != again else 0.0
+    spread = max(*repeated, scored) - min(*repeated, scored) if first != again else 0.0
     return {
         "redrawn": float(first != again),
         "same_answer": float(abs(first - grey) <= SAME_CONFIDENCE),
         "inconsistent": float(
-            abs(answer - scored) > SAME_CONFIDENCE + 4 * spread or any(misled(detector, sight) for sight in seen)
+            any(abs(answer - scored) > SAME_CONFIDENCE + 4 * spread for answer in answers)
+            or any(misled(detector, sight) for sight in seen)
         ),
         "entropy": entropy,
     }
@@ -213,7 +223,7 @@ def probed(
 
 def misled(detector: Detector, sight: Sight) -> bool:
     """Whether what attacks optimise, `Detector.aggregate` of the frames' scores, is not what was reported."""
-    optimised = detector.aggregate(torch.from_numpy(sight.by_frame))
+    optimised = detector.aggregate(torch.from_numpy(sight.by_frame.copy()))
     return not abs(float(optimised.mean()) - float(sight.confidence.mean())) <= SAME_MEAN
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from copy import deepcopy
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from bench.detection.threat import PatchThreat
 from bench.errors import UserError
 from bench.plugins.contracts import Progress
 from bench.plugins.track import Job
+from bench.trust.kept import unchanged
 from bench.trust.streams import Stream
 from bench.trust.watch import Watch
 
@@ -44,12 +46,17 @@ def craft(
         UserError: if the attack exceeds the threat model, or returns no valid patch.
         TamperError: if it changes the detector, or asks it past the oracle.
     """
-    generator = torch.Generator().manual_seed(attack_seed)
-    with Stream("victim", attack_seed).in_use(), Watch(detector, "detector") as watch:
+    generator, threat = torch.Generator().manual_seed(attack_seed), deepcopy(threat)
+    with (
+        Stream("victim", attack_seed).in_use(),
+        unchanged({type(attack).__name__: attack}, "attack"),
+        unchanged({"the training scenes": scenes}, "attack", arrays=True),
+        Watch(detector, "detector") as watch,
+    ):
         enforcer = PatchEnforcer(detector, threat, attack.access, generator, watch, Stream("attack", attack_seed))
         start = time.perf_counter()
         with enforcer.turn():
-            answer = attack.craft(enforcer.oracle, scenes, progress)
+            answer = attack.craft(enforcer.oracle, scenes.apart(), progress)
         seconds = time.perf_counter() - start
     if answer is not None and type(answer) is not Tensor:
         raise UserError(f"the attack returned a {type(answer).__name__}, not a torch.Tensor")
@@ -74,7 +81,7 @@ def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
     assert isinstance(world, CameraWorld)
     assert isinstance(threat, PatchThreat)
     with Stream("load", job.attack_seed).in_use():
-        detector = placed(pair.load(job.training_seed), job.device)
         scenes = world.training_scenes()
+        detector = placed(pair.load(job.training_seed), job.device)
         patch = craft(attack, detector, scenes, threat, attack_seed=job.attack_seed, progress=progress)
     return patch.written(made_by)

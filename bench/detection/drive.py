@@ -92,9 +92,10 @@ def _carried_out(jobs: Sequence[Job], artefacts: Mapping[str, bytes], traced: Se
     patches = [_patch(artefacts[job.artefact], job.artefact) if job.artefact in artefacts else None for job in jobs]
     SEAL.check()
     with Stream("load", first.attack_seed).in_use():
-        detector = placed(pair.load(first.training_seed), first.device)
+        # Before any code of the defence runs, which could change what these are made from.
         approaches = world.approaches(first.cell, first.seeds)
         check_approaches(approaches, first.seeds, type(world).__name__)
+        detector = placed(pair.load(first.training_seed), first.device)
     with Watch(detector, "detector", "defense", listens=False):
         with Stream("unpatched", first.attack_seed).in_use():
             unpatched = Unpatched.of(detector, approaches, pair.threat.budget)

@@ -45,8 +45,14 @@ class PatchEnforcer:
         self.threat = deepcopy(threat)
         self.watch, self.stream = watch, stream
         self.spent = self.backwards = self.zeros = self.nans = self._evaluated = 0
+        # What the attack is given is its own: what it does to it changes nothing for the run.
         self.oracle = PatchOracle(
-            self, threat, generator, label=detector.index(STOP_SIGN), stride=detector.stride, names=detector.names
+            self,
+            deepcopy(threat),
+            generator,
+            label=detector.index(STOP_SIGN),
+            stride=detector.stride,
+            names=detector.names,
         )
 
     @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -44,6 +45,16 @@ class Scenes(ABC):
 
     def __len__(self) -> int:
         return len(self.boxes)
+
+    def apart(self) -> Scenes:
+        """The same frames for foreign code: what it writes to the boxes or to what these scenes cache does not reach these."""
+        other = copy(self)
+        for name, value in vars(other).items():
+            if isinstance(value, Tensor):
+                setattr(other, name, value.clone())
+            elif isinstance(value, dict | list):
+                setattr(other, name, copy(value))
+        return other
 
     def objects(self, frame: int) -> Objects:
         """The objects in a frame, as training targets: the sign, unless a world overrides it."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from itertools import accumulate, pairwise
 
-from bench.driving import attacker, enforcer, meter, oracle, probes, threat, victim
+from bench.driving import attacker, enforcer, meter, oracle, probes, shadows, threat, victim
 from bench.driving import rollout as rollouts
 from bench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
 from bench.driving.meter import Columns
@@ -19,7 +20,7 @@ from bench.plugins.track import Driven, Job
 from bench.trust.seal import Seal
 from bench.trust.streams import Stream
 
-SEAL = Seal(attacker, enforcer, meter, oracle, probes, rollouts, threat, victim)
+SEAL = Seal(attacker, enforcer, meter, oracle, probes, rollouts, shadows, threat, victim)
 
 
 def drive(job: Job, traced: Sequence[int]) -> Driven:
@@ -66,20 +67,23 @@ def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
     assert isinstance(pair.threat, ObservationThreat)
     SEAL.check()
     with Stream("load", first.attack_seed).in_use():
-        policy, attack = _checked(pair.load(first.training_seed), pair), pair.armed(first.training_seed)
-        policy = placed(policy, first.device)
         cells = [job.cell for job in jobs for _ in job.seeds]
-        env = world.make(cells, action_type=policy.action_type, driver=policy.driver)
+        # Before any code of the attack or the defence runs, which could change what these are made from.
+        facts, threat, declared = deepcopy(world.facts), deepcopy(pair.threat), _declared(pair)
+        env = world.make(cells, action_type=declared.action_type, driver=declared.driver)
         try:
+            dynamics = world.dynamics(cells, declared.action_type)
+            policy, attack = _checked(pair.load(first.training_seed), pair), pair.armed(first.training_seed)
+            policy = placed(policy, first.device)
             columns = rollout(
                 env,
                 policy,
                 attack if isinstance(attack, DrivingAttack) else None,
-                pair.threat,
+                threat,
                 [seed for job in jobs for seed in job.seeds],
-                facts=world.facts,
+                facts=facts,
                 attack_seed=[job.attack_seed for job in jobs for _ in job.seeds],
-                dynamics=world.dynamics(cells, policy.action_type),
+                dynamics=dynamics,
                 entropy=first.entropy,
                 trace=trace,
             )
@@ -89,14 +93,19 @@ def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
     return columns
 
 
+def _declared(pair: Pair) -> DrivingVictim:
+    declared = pair.victim.component
+    assert isinstance(declared, DrivingVictim)
+    return declared
+
+
 def _checked(policy: Policy, pair: Pair) -> Policy:
     """The policy, if what it says of itself is what its victim says.
 
     Raises:
         UserError: if its driver or its kind of actions is another.
     """
-    declared = pair.victim.component
-    assert isinstance(declared, DrivingVictim)
+    declared = _declared(pair)
     for name, wanted in (("driver", declared.driver), ("action_type", declared.action_type)):
         if (found := getattr(policy, name)) != wanted:
             raise UserError(

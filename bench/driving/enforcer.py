@@ -29,7 +29,8 @@ class Enforcer:
 
     `begin` gives the attack an oracle for one step. `project` brings its answer into the perturbation set, from copies of the
     truth and the bounds that cannot be written to. `counts` are the queries and gradients of the step; `close` compares them
-    with the evaluations that the victim itself was seen to make. `asked`, if it is a list, collects the queries.
+    with the evaluations that the victim itself was seen to make. `asked`, if it is a list, collects the queries. `rehearsed`
+    has the copies and the episodes of the last rehearsal.
 
     Args:
         subject: the victim.
@@ -54,10 +55,13 @@ class Enforcer:
     ) -> None:
         if not threat.allows(access):
             raise UserError(f"the attack needs access {access!r}, the threat model allows {threat.access!r} at most")
-        self.subject, self.access, self.generator, self.dynamics = subject, access, generator, dynamics
+        self.subject, self.access, self.generator = subject, access, generator
         self.threat, self.features = deepcopy(threat), deepcopy(features)
-        self._shown = threat, features
+        # What the attack is given is its own: what it does to it reaches neither the run, nor the world, nor the victim.
+        self._shown = deepcopy(threat), deepcopy(features)
+        self.dynamics = deepcopy(dynamics)
         self.asked: list[tuple[Tensor | None, Tensor]] | None = None
+        self.rehearsed: tuple[int, Tensor | None] | None = None
         self._step = 0
         self.spent = self.gradients = self.zero_gradients = self.nan_gradients = torch.empty(0, dtype=torch.int64)
 
@@ -119,24 +123,33 @@ class Enforcer:
 
     def remembered(self, observation: Tensor, rows: Tensor | None) -> State:
         """The victim's state for each observation of [..., B, V, F], flattened to [N]."""
+        if rows is None and self._state is not None and observation.ndim == 3:
+            # A policy that writes to its state in a query would drive on with it.
+            return self._state.clone()
         state = self._state if rows is None else rows_of(self._state, rows)
         return repeated(state, observation.shape[:-3])
 
-    def imagined(self, copies: int) -> State:
-        """The victim's state for `copies` of each episode, batch size [copies * B]."""
-        return repeated(self._state, torch.Size([copies]))
+    def imagined(self, copies: int, rows: Tensor | None) -> State:
+        """The victim's state for `copies` of each episode (or of `rows`), batch size [copies * B]."""
+        return repeated(self._state if rows is None else rows_of(self._state, rows), torch.Size([copies]))
 
     def spend(self, access: Access, step: int, observation: Tensor, rows: Tensor | None) -> None:
         """Count queries [..., B, V, F] before they are answered.
 
         Raises:
-            UserError: if the attack declares less access.
+            UserError: if the attack declares less access, or the observations are of another number of episodes.
             QueryBudgetError: if an episode has too few queries left.
             TamperError: if the step is over.
         """
         permit(access, self.access)
         if step != self._step:
             raise TamperError("the attack used the oracle of another step", "attack")
+        asked, there = observation.shape[-3], len(self.spent if rows is None else rows)
+        if asked != there:
+            which = "episodes that run" if rows is None else "rows"
+            raise UserError(
+                f"the attack asked about {asked} episodes, there are {there} {which}: give their numbers as rows="
+            )
         if self.asked is not None:
             self.asked.append((rows, observation.detach()))
         queries, spent = observation.shape[:-3].numel(), self.spent.numpy()
@@ -197,18 +210,23 @@ class _Door:
             raise UserError("the attack needs the dynamics of the world, which this world does not offer")
         return self._enforcer.dynamics
 
-    def imagined(self, copies: int) -> State:
+    def imagined(self, copies: int, rows: Tensor | None) -> State:
         permit("dynamics", self._enforcer.access)
-        state = self._enforcer.imagined(copies)
+        state = self._enforcer.imagined(copies, rows)
         return None if state is None else state.clone()
 
-    def rehearse(self, observation: Tensor, state: State) -> tuple[Tensor, State]:
+    def rehearse(self, observation: Tensor, state: State, rows: Tensor | None) -> tuple[Tensor, State]:
         enforcer = self._enforcer
-        enforcer.spend("dynamics", self._step, observation, None)
+        enforcer.spend("dynamics", self._step, observation, rows)
+        enforcer.rehearsed = len(observation), rows
         flat, subject = observation.flatten(0, -3), enforcer.subject
+        if state is not None and len(state) != len(flat):
+            raise UserError(
+                f"the attack rehearsed {len(flat)} episodes with the state of {len(state)}: `imagined` takes copies and rows"
+            )
         with subject.asked(), torch.no_grad():
             action = subject.policy.choose(subject.answered(flat, state))
-            after = subject.advance(flat.clone(), action, state)
+            after = subject.advance(flat, action, state)
         return action.unflatten(0, observation.shape[:-2]).clone(), after
 
     def decide(self, observation: Tensor, rows: Tensor | None) -> Tensor:

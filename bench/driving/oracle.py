@@ -57,10 +57,10 @@ class Door(Protocol):
     def dynamics(self) -> Dynamics:
         """As `Oracle.dynamics`."""
 
-    def imagined(self, copies: int) -> State:
+    def imagined(self, copies: int, rows: Tensor | None) -> State:
         """As `Oracle.imagined`."""
 
-    def rehearse(self, observation: Tensor, state: State) -> tuple[Tensor, State]:
+    def rehearse(self, observation: Tensor, state: State, rows: Tensor | None) -> tuple[Tensor, State]:
         """As `Oracle.rehearse`."""
 
 
@@ -133,21 +133,30 @@ class Oracle:
         """
         return self._door.dynamics()
 
-    def imagined(self, copies: int) -> State:
+    def imagined(self, copies: int, rows: Tensor | None = None) -> State:
         """A copy of the victim's state of this step for simulated episodes, batch size [K * B]; needs access `dynamics`.
 
         None if the victim has no state. It belongs to the victim: an attack passes it to `rehearse`.
-        """
-        return self._door.imagined(copies)
 
-    def rehearse(self, observation: Tensor, state: State) -> tuple[Tensor, State]:
+        Args:
+            copies: K, copies of each episode.
+            rows: int64 [R], the episodes to simulate; the batch size is then [K * R]. None for all.
+        """
+        return self._door.imagined(copies, rows)
+
+    def rehearse(self, observation: Tensor, state: State, rows: Tensor | None = None) -> tuple[Tensor, State]:
         """What the victim does in simulated episodes, and its state after that; needs access `dynamics`.
 
         Args:
-            observation: what it is shown there, [K, B, V, F]. Each is a query.
-            state: from `imagined`, or from the last call.
+            observation: what it is shown there, [K, B, V, F] (of all episodes) or [K, R, V, F] (of `rows`). Each is a query of
+                its episode.
+            state: from `imagined`, or from the last call, for the same copies and rows.
+            rows: as in `imagined`.
+
+        Raises:
+            UserError: if there are more or fewer observations than episodes, or the state is of others.
         """
-        return self._door.rehearse(observation, state)
+        return self._door.rehearse(observation, state, rows)
 
     def project(self, perturbed: Tensor, rows: Tensor | None = None) -> Tensor:
         """Project `perturbed` [..., B, V, F] (of all episodes, or of `rows`) onto the perturbation set. Costs no query."""

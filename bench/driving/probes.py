@@ -9,7 +9,6 @@ from __future__ import annotations
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.driving.policy import State, repeated, rows_of
+from bench.driving.shadows import REPEATS, ROUNDING, Shadow, differ, near
 from bench.driving.victim import CHUNK, CountedPolicy
 from bench.trust.streams import Stream
 
@@ -24,15 +24,18 @@ EVERY = 15
 """Mean number of steps between two probes: a second of driving."""
 SAME = 1e-6
 """Two scores count as the same answer if they differ by at most this."""
-ROUNDING = 1e-3
-"""Scores may differ by this share of their largest value between batches of different sizes."""
-SPREAD = 4.0
-"""An answer of a random victim is another one if it is this many times farther away than repeated answers are from each other."""
-REPEATS = 4
-"""How often an answer that differs is asked again: a victim that is random now and then must not look like a decoy."""
+NEAR = 0.02
+"""Width of the noise on the other points of a question, on the normalised scale."""
 PATH_WEIGHTS = (4, 4, 4, 1, 4)
 PATHS = ("some", "one", "many", "chunks", "gradient")
 """How an oracle asks: some episodes in any order, one, many points each, more than a batch holds, with gradients."""
+SHADOWS = 0.25
+"""Share of the probed steps at which a shadow begins (`bench.driving.shadows`)."""
+SHADOWS_IF_REHEARSED = 0.5
+"""The same under an attack that may rehearse."""
+SHORT, LONG = 4, 64
+"""Most steps of a shadow; every second one may be long under an attack that may rehearse."""
+MOST_COPIES = 12
 
 
 @dataclass(frozen=True)
@@ -61,15 +64,20 @@ class Probe:
         batch: B.
         subject: the victim.
         entropy: seed of the choice of steps, episodes and questions.
+        rehearsed: whether the attack may rehearse (access `dynamics`).
     """
 
-    def __init__(self, batch: int, subject: CountedPolicy, entropy: int) -> None:
-        self.subject, self.entropy = subject, entropy
+    def __init__(self, batch: int, subject: CountedPolicy, entropy: int, rehearsed: bool = False) -> None:
+        self.subject, self.entropy, self.rehearsed = subject, entropy, rehearsed
         self.chance = random.Random(entropy)
         self.stream = Stream("probe", entropy)
+        # Shadows change nothing in the order of the questions.
+        self.shadows = random.Random(~entropy)
         self.redrawn, self.same, self.probed = (np.zeros(batch) for _ in range(3))
         self.otherwise, self.compared = np.zeros(batch), np.zeros(batch)
         self.draws, self.drawn = np.zeros(batch), np.zeros(batch)
+        self.shadow: Shadow | None = None
+        self.random = False
 
     def due(self) -> bool:
         """Whether to probe the coming step."""
@@ -81,7 +89,8 @@ class Probe:
         truth: Tensor,
         running: Tensor,
         state: State,
-        asked: Sequence[tuple[Tensor | None, Tensor]],
+        asked: Sequence[tuple[Tensor | None, Tensor]] | None,
+        rehearsal: tuple[int, Tensor | None] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The scores and actions of a step, as `CountedPolicy.driven`, and probes before or after it.
 
@@ -90,35 +99,73 @@ class Probe:
             truth: the true observation, [B, V, F].
             running: bool [B].
             state: the victim's state.
-            asked: the attack's queries of this step, as in `count_draws`.
+            asked: the attack's queries of this step, as in `count_draws`; None if no probe is due.
+            rehearsal: the copies and the episodes, by index among the running ones, of the attack's last rehearsal.
         """
-        first = self.chance.random() < 0.5
-        before = self._ask(shown, running, state) if first else None
+        due = asked is not None
+        if due and self.shadow is None:
+            self.shadow = self._begun(running, state, rehearsal)
+        before = self._ask(shown, running, state) if due and self.chance.random() < 0.5 else None
+        first = self.shadows.random() < 0.5
+        if self.shadow and first:
+            self.shadow.ask(shown)
         scores, action = self.subject.driven(shown, state)
-        question, answer = before or self._ask(shown, running, state)
-        if len(question.rows):
-            self._compare(shown, scores, action, question, answer, state)
-        if self._look(truth, running, state) and asked:
+        if due:
+            question, answer = before or self._ask(shown, running, state)
+            if len(question.rows):
+                self._compare(shown, scores, action, question, answer, state)
+        if self.shadow:
+            if not first:
+                self.shadow.ask(shown)
+            self._follow(self.shadow, shown, running, scores, action)
+        if asked is not None and self._look(truth, running, state) and asked:
             self.count_draws(asked, running)
         return scores, action
+
+    def _begun(self, running: Tensor, state: State, rehearsal: tuple[int, Tensor | None] | None) -> Shadow | None:
+        """A shadow that begins at this step; None for none."""
+        rows = running.nonzero().squeeze(-1)
+        share = SHADOWS_IF_REHEARSED if self.rehearsed else SHADOWS
+        if self.shadows.random() >= share or not len(rows):
+            return None
+        steps = self.shadows.randint(1, SHORT)
+        if self.rehearsed and self.shadows.random() < 0.5:
+            steps = self.shadows.randint(SHORT, LONG)
+        if self.random or state is None:
+            # A random victim goes another way at once, and one without a state goes none.
+            steps = min(steps, 2)
+        if rehearsal and self.shadows.random() < 0.5:
+            copies, chosen = rehearsal
+            rows = rows if chosen is None else rows[chosen[chosen < len(rows)]]
+        else:
+            copies, rows = self.shadows.randint(1, MOST_COPIES), _some(rows, self.shadows)
+        return Shadow(self.subject, self.stream, self.shadows, state, rows, copies, steps) if len(rows) else None
+
+    def _follow(self, shadow: Shadow, shown: Tensor, running: Tensor, scores: Tensor, action: Tensor) -> None:
+        """Take a shadow one step on."""
+        shadow.follow(shown, running, scores, action)
+        if shadow.ended:
+            self.end()
+
+    def end(self) -> None:
+        """Count the episodes of a shadow, which ends here."""
+        shadow, self.shadow = self.shadow, None
+        if shadow is None or not shadow.begun:
+            return
+        places = shadow.rows.numpy()
+        self.compared[places] += 1
+        self.otherwise[places] += shadow.otherwise().numpy()
 
     def _ask(self, observation: Tensor, running: Tensor, state: State) -> tuple[_Question, Tensor]:
         """Ask about some running episodes along one of the oracle's paths."""
         rows = running.nonzero().squeeze(-1)
         path = self.chance.choices(PATHS, PATH_WEIGHTS)[0]
-        order = list(range(len(rows)))
-        self.chance.shuffle(order)
-        rows = rows[order[: 1 if path == "one" else self.chance.randint(1, len(order)) if order else 0]]
-        copies = {"many": self.chance.randint(2, 12), "chunks": CHUNK // max(len(rows), 1) + 2}.get(path, 1)
+        rows = _some(rows, self.chance, 1 if path == "one" else None)
+        copies = {"many": self.chance.randint(2, MOST_COPIES), "chunks": CHUNK // max(len(rows), 1) + 2}.get(path, 1)
         place = self.chance.randrange(copies)
-        points = observation[rows]
-        noise = torch.rand(
-            (copies, *points.shape), generator=torch.Generator().manual_seed(self.chance.getrandbits(62))
-        )
-        points = points + 0.02 * (noise.to(points) - 0.5) * (points[..., :1] > 0)
-        points[..., 0] = observation[rows][..., 0]
-        points[place] = observation[rows]
-        question = _Question(path, rows, place, points.flatten(0, 1), repeated(rows_of(state, rows), points.shape[:1]))
+        noise = torch.Generator().manual_seed(self.chance.getrandbits(62))
+        points = near(observation[rows], copies, place, NEAR, noise)
+        question = _Question(path, rows, place, points, repeated(rows_of(state, rows), torch.Size([copies])))
         return question, self._answer(question)
 
     def _answer(self, question: _Question) -> Tensor:
@@ -149,10 +196,7 @@ class Probe:
         if bool(other.any()):
             with self.stream.in_use():
                 again = [driven, *(self.subject.driven(shown, state)[0][rows] for _ in range(REPEATS))]
-            spread = torch.stack([_apart(*two) for two in combinations(again, 2)]).amax(0)
-            for one in (answer, *(self._answer(question) for _ in range(REPEATS - 1))):
-                nearest = torch.stack([_apart(one, each) for each in again]).amin(0)
-                other &= nearest > tolerance + SPREAD * spread
+            other &= differ([answer, *(self._answer(question) for _ in range(REPEATS - 1))], again, tolerance)
         if self.subject.action_type == "discrete":
             other |= driven.gather(-1, taken.unsqueeze(-1)).squeeze(-1) < driven.amax(-1)
         else:
@@ -173,6 +217,7 @@ class Probe:
             first, again = (self.subject.aside(observation, state)[rows], self._once(observation, state)[rows])
             other = self._once(others, state)[rows]
         redrawn = (first != again).flatten(1).any(1)
+        self.random = self.random or bool((_apart(first, again) > ROUNDING * first.abs().amax(-1)).any())
         same = ((first - other).abs() <= SAME).flatten(1).all(1)
         places = rows.numpy()
         self.probed[places] += 1
@@ -212,6 +257,13 @@ class Probe:
                 "inconsistent": self.otherwise / self.compared,
                 "entropy": np.full(len(self.probed), self.entropy, np.int64),
             }
+
+
+def _some(rows: Tensor, chance: random.Random, count: int | None = None) -> Tensor:
+    """Some of the rows, in any order: so many, or any number from 1."""
+    order = list(range(len(rows)))
+    chance.shuffle(order)
+    return rows[order[: count or (chance.randint(1, len(order)) if order else 0)]]
 
 
 def _apart(first: Tensor, second: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +26,7 @@ from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
 from bench.plugins.progress import share_done
 from bench.trust.identifiers import opaque
+from bench.trust.kept import unchanged
 from bench.trust.streams import Stream
 from bench.trust.watch import Watch
 
@@ -94,6 +96,8 @@ def rollout(
         NotJointError: if there are several units, and the victim's answers depend on the rest of the batch, or anything was
             drawn from the random generators of the process, which the units share.
     """
+    # The run's own: the objects that it was given may be reached by an attack or a victim.
+    facts, threat = deepcopy(facts), deepcopy(threat)
     frames = threat.frames(facts.max_steps)
     episodes = torch.as_tensor(list(seeds), dtype=torch.int64)
     salts = [attack_seed] * len(seeds) if isinstance(attack_seed, int) else list(attack_seed)
@@ -102,13 +106,15 @@ def rollout(
     with (
         torch.no_grad(),
         victims_draws.in_use(),
+        unchanged({type(attack).__name__: attack} if attack else {}, "attack"),
         Watch(policy, "victim", listens=attack is not None) as watch,
     ):
         subject = CountedPolicy(policy, watch, attacks_draws)
         attacker = Attacker(attack, subject, threat, facts.features, seed=attack_seed, dynamics=dynamics, frames=frames)
         td = env.reset(TensorDict({"seed": episodes}, batch_size=env.batch_size))
         state = subject.initial(torch.cat([opaque([seed], salt) for seed, salt in zip(seeds, salts, strict=True)]))
-        meter, probe = Meter(subject, facts, td["info", "x"].squeeze(-1)), Probe(len(seeds), subject, entropy)
+        meter = Meter(subject, facts, td["info", "x"].squeeze(-1))
+        probe = Probe(len(seeds), subject, entropy, rehearsed=attack is not None and attack.access == "dynamics")
         _check_actions(subject, td["observation"], state, facts)
         if several:
             gradients = attack is not None and attack.access in ("gradients", "dynamics")
@@ -117,10 +123,11 @@ def rollout(
             share_done(step / facts.max_steps)
             truth, running = td["observation"], ~td["done"].squeeze(-1)
             probing = probe.due()
-            attacker.enforcer.asked = [] if probing else None
+            asked = attacker.enforcer.asked = [] if probing else None
             shown = attacker.show(truth, running, state)
-            if probing:
-                scores, action = probe.driven(shown.observation, truth, running, state, attacker.enforcer.asked or [])
+            if probing or probe.shadow:
+                rehearsal = attacker.enforcer.rehearsed
+                scores, action = probe.driven(shown.observation, truth, running, state, asked, rehearsal)
             else:
                 scores, action = subject.driven(shown.observation, state)
             td = env.step(td.set("action", action))["next"]
@@ -130,6 +137,7 @@ def rollout(
             state = subject.advance(shown.observation, action, state)
             if bool(td["done"].all()):
                 break
+        probe.end()
     if several and (victims_draws.used() or attacks_draws.used()):
         raise NotJointError
     reach = threat.reach(td["observation"].shape[-2], facts.features, facts.max_steps)

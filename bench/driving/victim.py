@@ -17,6 +17,11 @@ CHUNK = 1024
 """Queries per batch: a larger batch does not fit into the processor's cache and takes twice as long per query."""
 
 
+def plain(observation: Tensor) -> Tensor:
+    """A copy in one layout, whoever asks: neither strides nor storage tell a query from driving."""
+    return observation.clone(memory_format=torch.contiguous_format)
+
+
 class CountedPolicy:
     """A victim as the run holds it; neither attacks nor policies are given this object.
 
@@ -83,15 +88,16 @@ class CountedPolicy:
         return self.policy.initial(episodes)
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
-        """The policy's state after a step."""
-        return self.policy.advance(observation, action, state)
+        """The policy's state after a step, as a copy that nobody else has."""
+        after = self.policy.advance(plain(observation), action.clone(), state)
+        return None if after is None else after.clone()
 
     def aside(self, observation: Tensor, state: State) -> Tensor:
         """The scores [B, A], from random numbers of their own; notes in `draws` whether they took any."""
         own = Stream("aside")
         with own.in_use():
             before = own.marks()
-            scores = self._scores(observation, state, "while driving")
+            scores = self._scores(plain(observation), state, "while driving")
             self.draws = self.draws or own.marks() != before
         return scores
 
@@ -101,18 +107,18 @@ class CountedPolicy:
         Raises:
             UserError: if the scores are NaN, infinite or complex.
         """
-        scores = self._scores(observation, state, "while driving")
+        scores = self._scores(plain(observation), state, "while driving")
         return scores, self.policy.choose(scores)
 
     def decided(self, observation: Tensor, state: State) -> Tensor:
         """The actions [B] for observations [B, V, F], as in `driven`."""
-        return self.policy.choose(self._scores(observation, state))
+        return self.policy.choose(self._scores(plain(observation), state))
 
     @torch.no_grad()
     def answered(self, observation: Tensor, state: State) -> Tensor:
         """The scores of observations [N, V, F], evaluated in batches of at most `CHUNK`."""
         # The policy gets a copy: one that writes to its input would change the attack's points.
-        flat = observation.clone()
+        flat = plain(observation)
         if len(flat) <= CHUNK:
             return self._scores(flat, state).clone()
         # Parts of the same size: a small rest would cost almost as much as a full batch.

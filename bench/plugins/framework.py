@@ -1,4 +1,4 @@
-"""The functions that score and enforce, as they should be: notices a plug-in that replaces one of them."""
+"""The functions and data that score and enforce, as they should be: notices a plug-in that replaces one of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import CodeType, FunctionType, ModuleType
+
+from bench.plugins.custody import Custody, listed
 
 OWN = ("bench", "attacks", "defenses", "envs", "leaderboard")
 """Top-level packages of the framework."""
@@ -36,28 +38,45 @@ BUILTINS = (
 
 
 class Snapshot:
-    """The functions and methods of the framework, of all its modules that are imported when the snapshot is made."""
+    """The functions, methods and data of the framework, of all its modules that are imported when the snapshot is made.
+
+    Data are the constants of its modules, the attributes of its classes, and what can be reached from them.
+    """
 
     def __init__(self) -> None:
         self._functions: list[_Function] = []
         self._classes: list[tuple[str, type, frozenset[str]]] = []
-        for name, module in sorted(sys.modules.items()):
-            if name.partition(".")[0] in OWN and isinstance(module, ModuleType):
-                self._add_module(module)
+        self._known: set[str] = set()
+        self._data = Custody({}, OWN, functions=False)
+        self.extend()
         for name, owners in LIBRARIES.items():
             if name in sys.modules:
                 self._add_library(name, sys.modules[name], owners)
         self._functions += [_Function.of("builtins", vars(builtins), name) for name in BUILTINS]
 
+    def extend(self) -> None:
+        """Take in the modules of the framework that were imported since."""
+        new = [name for name in sys.modules if name.partition(".")[0] in OWN and name not in self._known]
+        self._known.update(new)
+        modules = {name: sys.modules[name] for name in sorted(new) if isinstance(sys.modules[name], ModuleType)}
+        for module in modules.values():
+            self._add_module(module)
+        self._data.add(modules)
+
     def changed(self) -> str:
-        """The names of at most three functions that were replaced or removed since, or added to a class; empty for none."""
+        """The names of at most three functions or data that were replaced, changed or removed since, or added to a class.
+
+        Empty for none.
+        """
         names = [known.name for known in self._functions if known.is_other()]
         for name, owner, keys in self._classes:
             if len(vars(owner)) != len(keys):
                 names += _added(name, owner, keys)
-        names = sorted(set(names))
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        return ", ".join(names[:3]) + more
+        return listed([*names, *self._data.changed()])
+
+    def restore(self) -> None:
+        """Put the data back as they were; functions stay as they are."""
+        self._data.restore()
 
     def _add_module(self, module: ModuleType) -> None:
         for name, value in list(vars(module).items()):

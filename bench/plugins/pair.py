@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -165,16 +166,18 @@ class Pair:
 
     def load(self, training_seed: int) -> Any:
         """The defended network of a training seed."""
-        facts = self.world.component.facts
-        return self.defense.component.load(self.victim.component, training_seed, facts)
+        # Plug-ins get copies: what they do to them reaches neither the run nor the world.
+        facts = copy.deepcopy(self.world.component.facts)
+        return self.defense.component.load(copy.copy(self.victim.component), training_seed, facts)
 
     def armed(self, training_seed: int) -> Attack:
         """The attack, with its network of a training seed if it learns."""
         attack = self.attack.component
         if not attack.learns:
             return attack
-        facts = self.world.component.facts
-        return attack.armed(attack.load(self.victim.component, self.defense.component, training_seed, facts))
+        facts = copy.deepcopy(self.world.component.facts)
+        victim, defense = copy.copy(self.victim.component), copy.copy(self.defense.component)
+        return attack.armed(attack.load(victim, defense, training_seed, facts))
 
     def adversary_sha256(self, training_seed: int) -> str:
         """The hash of the weights of an attack that learns; otherwise empty.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Sequence
 from typing import Any
 
 from bench.errors import RefusedNetworkError
@@ -28,11 +29,16 @@ def blamed(pair: Pair, error: BaseException | None = None) -> str:
         parts = [part for part in (pair.defense, pair.victim) if is_foreign(part) and not part.code]
     else:
         parts = parts or (_raised_by(pair, error) if error else []) or [part for part in pair.parts if is_foreign(part)]
+    return named(parts)
+
+
+def named(parts: Sequence[Chosen[Any]]) -> str:
+    """Some components in parentheses, with their packages; empty for none."""
     packages: dict[str, list[str]] = {}
     for part in parts:
         packages.setdefault(part.shipped_by, []).append(f"{part.kind} {part.name!r}")
-    named = " and ".join(f"{', '.join(components)} of {package}" for package, components in packages.items())
-    return f" ({named})" if named else ""
+    found = " and ".join(f"{', '.join(components)} of {package}" for package, components in packages.items())
+    return f" ({found})" if found else ""
 
 
 def _raised_by(pair: Pair, error: BaseException) -> list[Chosen[Any]]:

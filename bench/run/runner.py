@@ -159,6 +159,7 @@ class _Driving:
         self.out, self.recorded, self.back_end, self.watcher, self.failures = out, recorded, back_end, watcher, failures
         self.finished: set[str] = set()
         self.unpacked = 0
+        self._warned: set[str] = set()
         self._read = cache(artefacts.read)
 
     def carry_out(self, units: Sequence[Unit]) -> set[str]:
@@ -216,7 +217,9 @@ class _Driving:
             self.finished.add(work.fingerprint)
             self.watcher.finished(work, one.wall_s)
             for warning in one.warnings:
-                self.watcher.warn(warning)
+                if warning not in self._warned:
+                    self._warned.add(warning)
+                    self.watcher.warn(warning)
 
     def _keep(self, kept: Sequence[tuple[Unit | Preparation, Outcome]]) -> None:
         """Write the outcomes of tasks: the records last, because they mark a unit as finished."""

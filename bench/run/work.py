@@ -15,12 +15,15 @@ import pyarrow as pa
 
 from bench import files
 from bench.errors import PluginError, RefusedNetworkError, UserError, message, reason
+from bench.plugins.custody import listed
 from bench.plugins.fingerprint import canonical
 from bench.plugins.foreign import contained
 from bench.plugins.framework import Snapshot
 from bench.plugins.progress import listening
 from bench.records.store import table
-from bench.run.blame import blamed
+from bench.run.blame import blamed, named
+from bench.run.keeping import Keeping
+from bench.run.reach import within_reach
 from bench.run.unit import Loading, Preparation, Unit
 from bench.trust.watch import TamperError
 
@@ -132,22 +135,27 @@ def attempt(task: Task, tell: Tell, framework: Snapshot) -> Outcome | Failure:
         tell: called with the progress.
         framework: the functions of the framework as they should be.
     """
-    outcome = _together(task, tell) if task.others else _alone(task, tell)
+    framework.extend()
+    outcome = _together(task, tell) if task.others else _kept(task, tell)
     if changed := framework.changed():
+        framework.restore()
         return Failure(why=f"is refused: {changed} was replaced{blamed(task.work.pair)}", tampered=True)
     return outcome
 
 
 def _together(task: Task, tell: Tell) -> Outcome | Failure:
     """The outcomes of a task with several units: one after the other, if one batch gives no results."""
+    keeping = Keeping([task.work.pair, *(unit.pair for unit in task.others)])
     try:
-        with contained():
+        with contained(), within_reach([task.work.pair, *(unit.pair for unit in task.others)]):
             outcomes: Sequence[Outcome | Failure] = _in_one_batch(task, tell)
     # Each unit alone says what is wrong with it.
     except Exception:
         outcomes = []
-    first, *others = outcomes or [_alone(part, tell) for part in task.parts()]
-    return replace(first, others=others)
+    if keeping.end().refused:
+        outcomes = []
+    first, *others = outcomes or [_kept(part, tell) for part in task.parts()]
+    return replace(_noted(first, keeping), others=others)
 
 
 def _in_one_batch(task: Task, tell: Tell) -> list[Outcome]:
@@ -174,10 +182,28 @@ def _heard(units: Sequence[Unit], tell: Tell) -> AbstractContextManager[None]:
     return listening(lambda share: tell(name, share, "", episodes))
 
 
+def _kept(task: Task, tell: Tell) -> Outcome | Failure:
+    """The outcome of a task with a single work; a `Failure` if a component remembers something that is not its own."""
+    keeping = Keeping([task.work.pair])
+    outcome = _alone(task, tell)
+    if (found := keeping.end().refused) and isinstance(outcome, Outcome):
+        why, parts = found
+        return Failure(why=f"is refused: {why}{named(parts) or blamed(task.work.pair)}")
+    return _noted(outcome, keeping)
+
+
+def _noted(outcome: Outcome | Failure, keeping: Keeping) -> Outcome | Failure:
+    """The outcome, with a line about what plug-ins kept; their process does no other work."""
+    if not keeping.forgotten or not isinstance(outcome, Outcome):
+        return outcome
+    line = f"{keeping.origin} kept {listed(keeping.forgotten)} after a unit: it was put back, so that no unit depends on another"
+    return replace(outcome, last=True, warnings=(*outcome.warnings, line))
+
+
 def _alone(task: Task, tell: Tell) -> Outcome | Failure:
     work = task.work
     try:
-        with contained():
+        with contained(), within_reach([work.pair]):
             return _performed(task, tell)
     except TamperError as error:
         return Failure(why=f"is refused: {message(error)}{blamed(work.pair, error)}", trace=traceback.format_exc())

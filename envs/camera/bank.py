@@ -139,6 +139,13 @@ class BankScenes(Scenes):
     def redrawn(self, number: int) -> BankScenes:
         return self
 
+    def apart(self) -> Scenes:
+        other = super().apart()
+        assert isinstance(other, BankScenes)
+        # Opened plates are written to like any image.
+        other._plates = {}
+        return other
+
     def objects(self, frame: int) -> Objects:
         found = objects(self.poses[frame])
         boxes = np.array([box for _, box in found]).reshape(-1, 4)

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
-from bench.driving import Oracle, enforcer
+from bench.driving import DrivingAttack, ObservationThreat, Oracle, enforcer
 from bench.driving.drive import SEAL
+from bench.driving.enforcer import Enforcer
+from bench.driving.rollout import rollout
+from bench.driving.victim import CountedPolicy
 from bench.errors import UserError
-from bench.plugins.contracts import QueryBudgetError
+from bench.plugins.contracts import Access, QueryBudgetError
+from bench.plugins.pair import choose
 from bench.trust.watch import TamperError
-from tests.driving.cheats import Noisy, Victim, drive
+from tests.driving.cheats import CELL, SEEDS, WORLD, Noisy, Victim, drive
 
 FAR = 5.0
+FEATURES = WORLD.features
 
 
 def widen(observation: Tensor, oracle: Oracle) -> Tensor:
@@ -32,6 +38,77 @@ def widen(observation: Tensor, oracle: Oracle) -> Tensor:
 
 def test_widening_everything_on_the_oracle_leaves_the_perturbation_set_as_it_is() -> None:
     assert drive(widen)["linf_max"].max() <= 0.1 + 1e-6
+
+
+def blind(observation: Tensor, oracle: Oracle) -> None:
+    for name in ("low", "high", "floors"):
+        object.__setattr__(oracle.features, name, tuple(1.6 * value for value in getattr(oracle.features, name)))
+
+
+def loosen(observation: Tensor, oracle: Oracle) -> None:
+    object.__setattr__(oracle.threat, "norm", "relative")
+    object.__setattr__(oracle.threat, "budget", 0.0)
+
+
+def reseed(observation: Tensor, oracle: Oracle) -> None:
+    for part in oracle.parts:
+        part.generator.manual_seed(0)
+
+
+@pytest.mark.parametrize("deed", [blind, loosen, reseed])
+def test_what_an_attack_does_to_what_it_is_given_reaches_neither_the_victim_nor_the_world(
+    deed: Callable[[Tensor, Oracle], None],
+) -> None:
+    before = repr(WORLD.facts)
+    found, honest = drive(deed, Reads()), drive(lambda observation, oracle: None, Reads())
+    for name in ("action_counts", "linf_max", "linf_m", "safe_progress"):
+        assert np.array_equal(found[name], honest[name])
+    assert repr(WORLD.facts) == before
+
+
+class Reads(Victim):
+    """A victim that reads the features of the world at every step."""
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return super().forward(torch.cat((observation[..., :1], WORLD.features.physical(observation)), -1))
+
+
+def test_the_dynamics_of_an_attack_are_its_own() -> None:
+    world = choose("world", "highway").component
+    dynamics = world.dynamics([CELL], "discrete")
+    policy = Victim()
+    threat = ObservationThreat(access="dynamics")
+    enforcer = Enforcer(CountedPolicy(policy), threat, "dynamics", FEATURES, torch.Generator(), dynamics)
+    given = enforcer.begin(torch.zeros(1, 2, 3)).dynamics
+    object.__setattr__(given.config.features, "low", (0.0,) * 4)
+    given.parameters.low[:] = 0.0
+    assert world.features.low == (-100.0, -20.0, -40.0, -20.0)
+    assert dynamics.parameters.low.tolist() == [-100.0, -20.0, -40.0, -20.0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hoards(DrivingAttack):
+    """Remembers on itself, not in its state."""
+
+    access: ClassVar[Access] = "oblivious"
+    kept: list[int] = field(default_factory=list)
+    hidden: bool
+
+    def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
+        if self.hidden:
+            object.__setattr__(self, "_memo", 1)
+        else:
+            self.kept.append(1)
+        return observation
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+def test_an_attack_that_remembers_on_itself_is_refused_and_forgets(hidden: bool) -> None:
+    attack = Hoards(hidden=hidden)
+    env = WORLD.make([CELL] * len(SEEDS))
+    with pytest.raises(TamperError, match=r"Hoards\.(_memo|kept) changed while it was measured: keep .* in the state"):
+        rollout(env, Victim(), attack, ObservationThreat(), SEEDS, facts=WORLD.facts, attack_seed=7)
+    assert vars(attack) == {"hidden": hidden, "kept": []}
 
 
 def test_the_oracle_cannot_begin_a_step() -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from bench.records import reading
 from bench.records.schema import AUDIT, IDENTITY
 from bench.run.audit import SALTS, audit_config
 from bench.scenarios import SeedBlock
-from bench.statistics.unpaired import unpaired
+from bench.statistics.estimates import Array
+from bench.statistics.unpaired import NOTABLE, POWER, Finds, finds, unpaired
 from leaderboard.ranking.boards import read_boards
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
@@ -51,7 +53,10 @@ def test_a_defence_that_knows_the_public_scenarios_is_caught_and_the_honest_vict
     said = bench("audit", *ROW, f"out={out}", "salt=7")
     assert said.code == 1, said.err
     assert "salt=7 repeats or continues this audit" in said.out
-    verdict = said.out.strip().splitlines()[-1]
+    *_, reach, verdict = said.out.strip().splitlines()
+    assert re.search(
+        r"A public score of .* that is 0\.05 too high is found in \d+ % of audits of this size; episodes=\d+ \(", reach
+    )
     assert verdict.startswith("public_only: ")
     assert "knows" in verdict
     assert "none + dqn" not in verdict
@@ -102,6 +107,41 @@ def test_honest_scores_raise_a_false_alarm_in_2_5_percent_of_audits(comparisons:
         score = np.clip(0.5 + 0.3 * (traffic + own), 0, 1) * (traffic + own > 0)
         alarms.append(unpaired(score[..., :100], score[..., 100:], comparisons=comparisons).low > 0)
     assert np.mean(alarms) == pytest.approx(0.025 / comparisons, abs=0.008)
+
+
+def studies(size: int, inflation: float, count: int = 4000) -> Iterator[tuple[Array, Array]]:
+    """Public and drawn scores as on the highway, [3, 2, size] each; the public ones are higher by `inflation`."""
+    generator = np.random.default_rng(1)
+    for _ in range(count):
+        traffic = generator.normal(size=(1, 1, 2 * size))
+        own = generator.normal(size=(3, 2, 2 * size))
+        score = np.clip(0.5 + 0.3 * (traffic + own), 0, 1) * (traffic + own > 0)
+        yield score[..., :size] + inflation, score[..., size:]
+
+
+@pytest.mark.parametrize(("size", "comparisons"), [(10, 1), (30, 1), (60, 6)])
+def test_an_audit_says_truly_how_often_it_finds_an_inflation(size: int, comparisons: int) -> None:
+    said, found = [], []
+    for public, drawn in studies(size, NOTABLE, 2000):
+        said.append(finds(public, drawn, comparisons=comparisons).chance)
+        found.append(unpaired(public, drawn, comparisons=comparisons).low > 0)
+    assert np.mean(said) == pytest.approx(np.mean(found), abs=0.025)
+
+
+def test_an_audit_of_the_size_that_it_asks_for_finds_it_in_80_percent() -> None:
+    asked = [finds(*study) for study in studies(40, 0.0, 300)]
+    size = int(np.median([one.scenarios for one in asked]))
+    assert size > 200
+    larger = [unpaired(*study).low > 0 for study in studies(size, NOTABLE, 600)]
+    assert np.mean(larger) == pytest.approx(POWER, abs=0.06)
+    smallest = float(np.median([one.smallest for one in asked]))
+    assert smallest > NOTABLE
+    same = [unpaired(*study).low > 0 for study in studies(40, smallest, 1000)]
+    assert np.mean(same) == pytest.approx(POWER, abs=0.06)
+
+
+def test_scores_that_do_not_vary_hide_no_inflation() -> None:
+    assert finds(np.ones((1, 1, 10)), np.ones((1, 1, 12))) == Finds(smallest=0.0, chance=1.0, scenarios=12)
 
 
 def test_a_difference_needs_the_same_cells_and_enough_scenarios() -> None:
