@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import UserDict
 from math import prod
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from bench.gym.world import GymWorld
 
 CONTROLS = 2
-_shapes: dict[tuple[type, str], tuple[int, ...]] = {}
+# Not among the data that no unit may change (`bench.plugins.framework.Snapshot`): a world is asked when it is needed.
+_shapes: UserDict[tuple[type, str], tuple[int, ...]] = UserDict()
 """Shapes of the observations of environments that were asked, by class and parameters of the world."""
 
 

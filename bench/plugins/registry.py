@@ -10,6 +10,7 @@ import difflib
 import importlib
 import inspect
 import sys
+from collections import UserDict
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, partial
@@ -199,8 +200,9 @@ def foreign() -> dict[str, str]:
     return dict(_FOREIGN)
 
 
-_FOREIGN: dict[str, str] = {}
-_REFUSED: dict[str, str] = {}
+# Plug-ins are imported during a run, too, so these are not among the data that no unit may change (`framework.Snapshot`).
+_FOREIGN: UserDict[str, str] = UserDict()
+_REFUSED: UserDict[str, str] = UserDict()
 """Foreign modules that are imported and must not be used, with the reason."""
 
 
