@@ -13,15 +13,16 @@ from tensordict import TensorDict
 from bench.driving import DrivingWorld
 from bench.errors import UserError
 from bench.plugins import registry, suites
-from bench.plugins.bytecode import code_of
+from bench.plugins.bytecode import code_of, plain_attributes
 from bench.plugins.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
+from bench.plugins.fingerprint import digest
 from bench.plugins.pair import Chosen, Pair, choose
 from bench.plugins.registry import GROUPS, Kind
 from bench.plugins.suites import Suite
 from bench.plugins.track import track
 from bench.run.config import combined, grid_of
 from bench.scenarios import Grid, SeedBlock, Value
-from bench.victims.drivers.in_process import code_of_policies, in_process
+from bench.victims.drivers.in_process import InProcess, code_of_policies, in_process
 
 BASES: dict[str, type[Component]] = {"attack": Attack, "defense": Defense, "victim": Victim, "world": World}
 TRIED = 4
@@ -98,9 +99,30 @@ def victim_of(given: Any, world: Chosen[Any], grid: Grid, *, name: str | None, a
     if not objects:
         raise UserError("an empty list of victims")
     victim = in_process(objects, world.component.facts, _observations(world.component, grid), actions)
+    _refuse_twice(victim)
     code = code_of_policies(victim)
     label = name or f"{type(objects[0]).__name__}-{victim.policies[0].weights_sha256[:HASH_DIGITS]}"
     return Chosen(kind="victim", name=label, component=victim, code=code)
+
+
+def _refuse_twice(victim: InProcess) -> None:
+    """Refuse a network that stands twice in a list: it would count as two trainings.
+
+    Raises:
+        UserError: names its places.
+    """
+    places: dict[str, list[int]] = {}
+    for place, policy in enumerate(victim.policies, 1):
+        # Policies without weights differ in their code and attributes.
+        told = [] if policy.state_dict() else [plain_attributes(policy)]
+        places.setdefault(digest([policy.weights_sha256, *told]), []).append(place)
+    for same in places.values():
+        if len(same) > 1:
+            listed = f"{', '.join(map(str, same[:-1]))} and {same[-1]}"
+            raise UserError(
+                f"the victims {listed} of the list are the same network, which is one training; a list holds different "
+                "trainings of one policy: leave out the others"
+            )
 
 
 def pairs_of(

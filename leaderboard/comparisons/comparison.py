@@ -191,6 +191,17 @@ class Comparison:
             return "nothing"
         return "unknown" if np.isnan(gradients) else "answers"
 
+    @cached_property
+    def trained(self) -> bool:
+        """Whether its runs are trainings, or patches, of which there could be others; a driver without weights learns nothing."""
+        weights = set(pc.unique(self.own.table["weights_sha256"]).to_pylist())
+        return self.track.artefact is not None or bool(weights - {""})
+
+    @property
+    def content(self) -> tuple[str, ...]:
+        """What it is, as text: an order that no order of files, records or arguments changes."""
+        return tuple(str(self.identity[name]) for name in IDENTITY)
+
     @property
     def stands_for_all(self) -> bool:
         """Whether its one run counts for every run of others: a baseline attack that depends on no seed."""

@@ -77,7 +77,7 @@ class Subject:
         tables = [attack.own.table for attack in self.attacks]
         tables += [attack.clean.table for attack in self.attacks if attack.clean]
         found = [value for table in tables if not math.isnan(value := mean(table, name))]
-        return sum(found) / len(found) if found else math.nan
+        return math.fsum(found) / len(found) if found else math.nan
 
 
 Finding = tuple[bool | None, str]
@@ -92,18 +92,21 @@ def unattacked(of: Subject) -> Finding:
 
 def left_out(of: Subject) -> Finding:
     """Fires where an attack that does not count, because it lacks seeds or scenarios of the row, lowers the score more."""
-    found = {}
+    found: list[tuple[str, tuple[int, ...], Interval]] = []
     for attack in of.worst.panel.left_out:
         alone = Panel.of([attack]).strongest()
         if alone is None or len(set(alone.cells) & set(of.worst.cells)) < min(ENOUGH_CELLS, len(of.worst.cells)):
             continue
         change = margin(of.worst, alone)
         if change:
-            found[alone.name] = change
+            found.append((alone.name, alone.runs, change))
     if not found:
         return False, "No attack that is left out shares enough cells with the row."
-    name, largest = max(found.items(), key=lambda item: item[1].low)
-    return largest.low > 0, f"The score minus that under {name}, which is left out: {_signed(largest)}."
+    # An interval of one run and one scenario has no bounds, and shows nothing.
+    name, runs, largest = max(found, key=lambda one: (np.nan_to_num(one[2].low, nan=-np.inf), one[0]))
+    seeds = sorted(set(runs) & set(of.worst.runs))
+    where = f" (with {of.track.run} {', '.join(map(str, seeds))})" if 0 < len(seeds) < len(of.worst.runs) else ""
+    return largest.low > 0, f"The score minus that under {name}, which is left out: {_signed(largest)}{where}."
 
 
 def masked_gradients(of: Subject) -> Finding:

@@ -45,8 +45,9 @@ function interval(one, places) {
   const freedom = parts.reduce((sum, [part, df]) => sum + part ** 2 / df, 0);
   const joint = variance > 0 ? tQuantile(variance ** 2 / freedom) ** 2 * variance : 0;
   const apart = parts.reduce((sum, [part, df]) => sum + tQuantile(df) ** 2 * part, 0);
-  const spread = share * (1 - share), alone = data.t[data.t.length - 1][1] ** 2 / (runs * scenarios * places.length);
-  const ratio = spread > 0 ? (joint + apart) / 2 / spread : alone;
+  const spread = share * (1 - share), square = data.t[data.t.length - 1][1] ** 2, alone = square / (runs * scenarios * places.length);
+  const unseen = runs > 1 ? (square / runs) * 0.2 * Math.max(0, 1 - share / 0.1) : 0;
+  const ratio = Math.max(spread > 0 ? (joint + apart) / 2 / spread : alone, unseen);
   const centre = (share + ratio / 2) / (1 + ratio), half = Math.sqrt(ratio * spread + ratio ** 2 / 4) / (1 + ratio);
   return { estimate: share, low: Math.max(0, Math.min(centre - half, share)), high: Math.min(1, Math.max(centre + half, share)) };
 }
