@@ -12,11 +12,13 @@ import pyarrow as pa
 from bench.plugins import registry
 from bench.plugins.contracts import Access
 from bench.plugins.track import Track, track
+from bench.statistics.doubts import Remark
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Interval
 from leaderboard.comparisons.comparison import THREAT, Comparison
 from leaderboard.comparisons.reading import comparable, read_tracks
 from leaderboard.ranking.flags import Flag, Subject, flags
+from leaderboard.ranking.remarks import row_remarks
 from leaderboard.ranking.worst import Panel, Worst, margin
 
 
@@ -49,6 +51,11 @@ class Row:
     def flagged(self) -> bool:
         """Whether any flag has fired."""
         return any(flag.fired for flag in self.flags)
+
+    @property
+    def remarks(self) -> list[Remark]:
+        """What a reader must know of its score besides the flags."""
+        return row_remarks(self.worst)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,11 +190,14 @@ def _baselines(attacks: Sequence[Comparison]) -> dict[str, Episodes]:
             kind = one.track.baseline_kinds.get(name)
             kinds = found.setdefault(kind.title if kind else name, {})
             kinds.setdefault(str(one.identity["action_type"]), drive.only(runs=drive.runs[:1]))
-    return {
-        f"{name}, {actions}" if len({drive.table["unit"][0] for drive in drives.values()}) > 1 else name: drive
-        for name, drives in found.items()
-        for actions, drive in sorted(drives.items(), reverse=True)
-    }
+    named: dict[str, Episodes] = {}
+    for name, drives in found.items():
+        if len({drive.table["unit"][0] for drive in drives.values()}) > 1:
+            named |= {f"{name}, {actions}": drive for actions, drive in sorted(drives.items(), reverse=True)}
+        else:
+            # The same driver for every type of action: on the most-driven scenarios.
+            named[name] = min(drives.items(), key=lambda item: (-item[1].table.num_rows, item[0]))[1]
+    return named
 
 
 def read_boards(records: Mapping[str, pa.Table]) -> tuple[list[Board], list[Comparison]]:

@@ -12,11 +12,12 @@ import numpy as np
 
 from bench.scenarios import Cell
 from bench.statistics.certificate import certificate
+from bench.statistics.doubts import mean
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
 from bench.statistics.independent import independent
 from bench.statistics.strongest import strongest_of, under
-from leaderboard.comparisons.comparison import Comparison, mean
+from leaderboard.comparisons.comparison import Comparison
 
 
 @dataclass(frozen=True, eq=False)

@@ -287,11 +287,13 @@ function render() {
   const total = new Set(board.rows.flatMap((row) => row.cells.map(({ cell }) => place(cell)))).size;
   const left = new Set(board.rows.flatMap((row) => kept(row.cells).map(({ cell }) => place(cell)))).size;
   at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, mean with its 95 % interval.` + (left === total ? "" : " Ranks and flags refer to all cells.") +
+    (rows.some((one) => one.row.flagged) ? " ⚑ A flag casts doubt on the row: it ranks below all rows without one, whatever its score." : "") +
+    " Rows of one rank are not told apart from its first." +
     (rows.length ? "" : " No row was driven in the selected cells.");
 
   const whole = left === total;
   const columns = [
-    { name: "Rank", show: (one) => (one.row ? String(one.row.group) : ""), value: (one) => one.row?.group ?? null },
+    { name: "Rank", show: (one) => (one.row ? `${one.row.flagged ? "⚑ " : ""}${one.row.group}` : ""), value: (one) => one.row?.group ?? null },
     { name: "Defence", class: "name", show: (one) => (one.row ? el("a", { href: address({ row: one.row, pair: null }) }, one.row.defense.label) : one.baseline.name), value: (one) => one.row?.defense.label ?? one.baseline.name },
     { name: "Victim", show: (one) => one.row?.victim.label ?? "", value: (one) => one.row?.victim.label ?? "" },
     { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, interval: (one) => one.score, best: (one) => one.row?.group === 1, number: true },
@@ -308,7 +310,7 @@ function render() {
     { name: "Flags", class: "doubts", show: (one) => (one.row ? doubts(one.row) : ""), value: (one) => (one.row ? one.row.flags.filter((flag) => flag.fired).map((flag) => flag.name).join(" ") : "") },
   ];
   draw("ranks", columns, [...rows, ...baselines], (one, before, unsorted) =>
-    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", one.row?.group === 1 ? "best" : "", unsorted && before && one.row?.group !== before.row?.group ? "group" : ""].filter(Boolean).join(" "));
+    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", one.row?.group === 1 ? "best" : "", unsorted && before && one.row?.group !== before.row?.group ? "group" : "", unsorted && before?.row && one.row && one.row.flagged !== before.row.flagged ? "divided" : ""].filter(Boolean).join(" "));
 
   drawPairs(board, metric);
   drawMatrix(board);
@@ -358,10 +360,14 @@ function worstCell(one) {
 function doubts(row) {
   const fired = row.flags.filter((flag) => flag.fired);
   const unmeasured = row.flags.filter((flag) => flag.fired === null).length;
-  const summary = fired.length ? `⚑ ${fired.map((flag) => flag.title).join("; ")}` : `none of ${row.flags.length - unmeasured}`;
+  const notes = row.remarks.length ? ` ⚠ ${row.remarks.map(remarkName).join(", ")}` : "";
+  const summary = (fired.length ? `⚑ ${fired.map((flag) => flag.title).join("; ")}` : `none of ${row.flags.length - unmeasured}`) + notes;
   return el("details", {}, el("summary", { class: fired.length ? null : "quiet" }, summary), el("ul", {}, ...row.flags.map((flag) =>
-    el("li", {}, el("b", {}, `${flag.fired ? "⚑ " : ""}${flag.name.replaceAll("_", " ")}: `), flag.reason))));
+    el("li", {}, el("b", {}, `${flag.fired ? "⚑ " : ""}${flag.name.replaceAll("_", " ")}: `), flag.reason)), ...remarksOf(row)));
 }
+/* What a reader must know before trusting a number. */
+const remarkName = (remark) => remark.name.replaceAll("_", " ");
+const remarksOf = (one) => one.remarks.map((remark) => el("li", {}, el("b", {}, `⚠ ${remarkName(remark)}: `), remark.text));
 /* By how much an attack lowers the score of its row further than all the others do. */
 function added(pair, row) {
   const place = row ? row.pairs.indexOf(pair.key) : -1;
@@ -387,6 +393,7 @@ function drawPairs(board, metric) {
     { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
     { name: "Queries", show: (one) => fixed(queries(one), 0), value: queries, number: true },
     { name: "Adds", show: ({ pair }) => adds(pair, rowOf(pair)), value: ({ pair }) => added(pair, rowOf(pair))?.estimate ?? null, interval: ({ pair }) => added(pair, rowOf(pair)), number: true },
+    ...(rows.some(({ pair }) => pair.remarks.length) ? [{ name: "Doubts", class: "doubts", show: ({ pair }) => (pair.remarks.length ? el("details", {}, el("summary", {}, `⚠ ${pair.remarks.map(remarkName).join(", ")}`), el("ul", {}, ...remarksOf(pair))) : ""), value: ({ pair }) => pair.remarks.map(remarkName).join(" ") }] : []),
     { name: "Recording", show: ({ pair }) => (pair.card.recording ? el("a", { href: data.recordings + pair.card.recording }, "rrd") : "") },
   ], rows);
 }
@@ -558,7 +565,7 @@ function rowCard(row) {
   const name = `${row.defense.label} · ${row.victim.label}`, strongest = pairs.get(row.strongest);
   const film = row.clip ? el("figure", { class: "film" }, el("img", { src: row.clip, alt: `The same scenario without an attack, and under ${strongest.attack.name}`, onerror: (event) => event.target.closest("figure").remove() }), el("figcaption", {}, "The same scenario without an attack (above), and attacked (below)")) : null;
   return [name, el("p", { class: "quiet" }, threatText(current().threat)), film, el("dl", {},
-    ...fact("score", ...estimate(row.score), `, rank ${row.group}`),
+    ...fact("score", ...estimate(row.score), `, rank ${row.group}${row.flagged ? ", flagged" : ""}`),
     ...(row.failed ? fact(said().failure_title, `${percent(row.failed.estimate)} (${bounds(row.failed)})`) : []),
     ...fact("worst cell", ...worstCell({ row })),
     ...(row.clean ? fact("without an attack", ...estimate(row.clean)) : []),
@@ -575,6 +582,7 @@ function pairCard(pair) {
   const card = pair.card;
   return [card.pair, null, null, el("dl", {},
     ...fact("score", ...estimate(pair.score)),
+    ...(pair.remarks.length ? fact("doubts", el("ul", {}, ...remarksOf(pair))) : []),
     ...works(card, ["attack", "defense", "victim", "world"]),
     ...fact("threat model", pair.threat.budget ? threatName(pair.threat) : "nothing is attacked"),
     ...provenance(pair),
