@@ -30,6 +30,10 @@ NOT_PRINTED = ("worst_cell", "worst_score", "queries", "episodes", "pair")
 """Columns that `print(scores)` leaves out, besides the intervals of the failure rate."""
 
 
+NOT_SAID = ("one_training",)
+"""Remarks that `print(scores)` leaves out: they make no number wrong."""
+
+
 class Scores(pd.DataFrame):
     """A DataFrame of scores; a part of it, such as `scores[scores.role == "attacked"]`, is a plain DataFrame."""
 
@@ -42,12 +46,12 @@ class Scores(pd.DataFrame):
         if "defense" in told and self["defense"].nunique() < 2:
             told.remove("defense")
         shown = str(pd.DataFrame(self)[told].to_string(index=False, float_format="%.2f", na_rep=""))
-        return "\n".join([shown, *(f"! {remark}" for remark in self.remarks)])
+        return "\n".join([shown, *(f"! {remark}" for remark in self.remarks if remark.name not in NOT_SAID)])
 
     def _repr_html_(self) -> str:
         """The table of a notebook, with the remarks below."""
         shown = str(pd.DataFrame(self)._repr_html_())
-        return shown + "".join(f"<p>⚠ {escape(str(remark))}</p>" for remark in self.remarks)
+        return shown + "".join(f"<p>⚠ {escape(str(one))}</p>" for one in self.remarks if one.name not in NOT_SAID)
 
     @property
     def remarks(self) -> list[Remark]:
@@ -163,7 +167,8 @@ def _said_against(rows: Sequence[_Row], track: Track) -> Iterator[Remark]:
         victim = _victim(row.pair)
         if row.role == "attacked" and control:
             members.setdefault(row.pair.clean().id, {})[row.attack] = float(row.scores.mean())
-            yield from doubts.remarks(row.table, control.table, track, f"{row.attack} on {victim}")
+            found = doubts.remarks(row.table, control.table, track, f"{row.attack} on {victim}")
+            yield from (one for one in found if one.name not in doubts.OF_VICTIM)
         elif row.role == "clean":
             yield from doubts.remarks(None, row.table, track, victim)
             weights = row.table is not None and bool(set(row.table["weights_sha256"].unique().to_pylist()) - {""})

@@ -33,6 +33,8 @@ TITLES = {
     "one_draw": "random, but attacked with one draw",
 }
 """What each measurement says where it fires."""
+OF_VICTIM = ("provenance", "trained_elsewhere", "hopeless")
+"""Remarks that are about the victim under every attack, and without one."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 from bench.statistics import doubts
-from bench.statistics.doubts import Remark
+from bench.statistics.doubts import OF_VICTIM, Remark
 from bench.statistics.episodes import Episodes
 from leaderboard.comparisons.comparison import THREAT, Comparison
 from leaderboard.comparisons.naming import Varying, component, defended, varying
@@ -28,9 +28,8 @@ def run_remarks(comparisons: Sequence[Comparison]) -> list[Remark]:
         for one in members:
             victim = defended(one, shown)
             attack = f"{component(one, 'attack', shown['attack'])} on " if one.is_attacked else ""
-            of_victim = {text.text for text in comparison_remarks(one) if text.name in OF_VICTIM}
             for remark in comparison_remarks(one):
-                about = victim if remark.text in of_victim else f"{attack}{victim}"
+                about = victim if remark.name in OF_VICTIM else f"{attack}{victim}"
                 found[Remark(remark.name, about, remark.text)] = None
         if members:
             one = members[0]
@@ -41,10 +40,6 @@ def run_remarks(comparisons: Sequence[Comparison]) -> list[Remark]:
     tables = {id(each): each.table for one in comparisons for name, each in one.baselines.items() if not _attack(each)}
     found |= dict.fromkeys(doubts.of_baselines(list(tables.values()), comparisons[0].track))
     return list(found)
-
-
-OF_VICTIM = ("provenance", "trained_elsewhere", "hopeless")
-"""Remarks that are about the victim under every attack."""
 
 
 def above_members(attacks: Sequence[Comparison], shown: dict[str, Varying]) -> Iterator[Remark]:

@@ -287,13 +287,13 @@ function render() {
   const total = new Set(board.rows.flatMap((row) => row.cells.map(({ cell }) => place(cell)))).size;
   const left = new Set(board.rows.flatMap((row) => kept(row.cells).map(({ cell }) => place(cell)))).size;
   at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, mean with its 95 % interval.` + (left === total ? "" : " Ranks and flags refer to all cells.") +
-    (rows.some((one) => one.row.flagged) ? " ⚑ A flag casts doubt on the row: it ranks below all rows without one, whatever its score." : "") +
+    (rows.some((one) => one.row.flagged) ? " Below the double line, a flag (⚑) casts doubt on each row: it ranks below all rows without one, whatever its score." : "") +
     " Rows of one rank are not told apart from its first." +
     (rows.length ? "" : " No row was driven in the selected cells.");
 
   const whole = left === total;
   const columns = [
-    { name: "Rank", show: (one) => (one.row ? `${one.row.flagged ? "⚑ " : ""}${one.row.group}` : ""), value: (one) => one.row?.group ?? null },
+    { name: "Rank", show: (one) => (one.row ? String(one.row.group) : ""), value: (one) => one.row?.group ?? null },
     { name: "Defence", class: "name", show: (one) => (one.row ? el("a", { href: address({ row: one.row, pair: null }) }, one.row.defense.label) : one.baseline.name), value: (one) => one.row?.defense.label ?? one.baseline.name },
     { name: "Victim", show: (one) => one.row?.victim.label ?? "", value: (one) => one.row?.victim.label ?? "" },
     { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, interval: (one) => one.score, best: (one) => one.row?.group === 1, number: true },
