@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from io import StringIO
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -41,7 +43,7 @@ def said(tables: list[pa.Table]) -> tuple[object, str]:
     found, comparisons = read_boards({"driving": pa.concat_tables(tables)})
     made = document(found, comparisons, None)
     del made["made"]
-    console = Console(width=200, record=True, quiet=True)
+    console = Console(width=200, record=True, file=StringIO())
     print_boards(found, console)
     run_report({"driving": pa.concat_tables(tables)}, console)
     return made, console.export_text()
