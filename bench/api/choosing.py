@@ -21,7 +21,7 @@ from bench.plugins.suites import Suite
 from bench.plugins.track import track
 from bench.run.config import combined, grid_of
 from bench.scenarios import Grid, SeedBlock, Value
-from bench.victims.drivers.in_process import code_of_policies, in_process
+from bench.victims.drivers.in_process import InProcess, code_of_policies, in_process
 from bench.victims.drivers.sb3_environment import training_of
 from bench.victims.drivers.sb3_model import is_model
 from bench.victims.drivers.spaces import UNKNOWN
@@ -120,6 +120,7 @@ def victim_of(
         )
     except ValueError as error:
         raise UserError(str(error)) from error
+    _refuse_twice(victim)
     code = code_of_policies(victim)
     label = name or f"{type(objects[0]).__name__}-{victim.policies[0].weights_sha256[:HASH_DIGITS]}"
     return Chosen(kind="victim", name=label, component=victim, code=code)
@@ -139,6 +140,24 @@ def _trained_in(objects: Sequence[object], world: Chosen[Any], grid: Grid, state
     if stated is not None:
         return stated
     return found.pop() if len(found) == 1 else UNKNOWN
+
+
+def _refuse_twice(victim: InProcess) -> None:
+    """Refuse a network that stands twice in a list: it would count as two trainings.
+
+    Raises:
+        UserError: names its places.
+    """
+    places: dict[str, list[int]] = {}
+    for place, policy in enumerate(victim.policies, 1):
+        places.setdefault(content_of(policy), []).append(place)
+    for same in places.values():
+        if len(same) > 1:
+            listed = f"{', '.join(map(str, same[:-1]))} and {same[-1]}"
+            raise UserError(
+                f"the victims {listed} of the list are the same network, which is one training; a list holds different "
+                "trainings of one policy: leave out the others"
+            )
 
 
 def pairs_of(

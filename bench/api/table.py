@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,11 @@ from bench.plugins.pair import Pair
 from bench.plugins.track import Track, track_of
 from bench.run.config import RunConfig
 from bench.scenarios import Cell
+from bench.statistics import doubts
+from bench.statistics.doubts import Remark
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Array, Interval, share_interval
-from bench.statistics.strongest import strongest_of
+from bench.statistics.strongest import strongest_of, under
 
 STRONGEST = "strongest"
 """Name of the row in which the strongest attack of each cell counts."""
@@ -27,17 +30,33 @@ NOT_PRINTED = ("worst_cell", "worst_score", "queries", "episodes", "pair")
 """Columns that `print(scores)` leaves out, besides the intervals of the failure rate."""
 
 
+NOT_SAID = ("one_training",)
+"""Remarks that `print(scores)` leaves out: they make no number wrong."""
+
+
 class Scores(pd.DataFrame):
     """A DataFrame of scores; a part of it, such as `scores[scores.role == "attacked"]`, is a plain DataFrame."""
 
-    _metadata = ["_episodes"]  # noqa: RUF012 - pandas reads a list
+    _metadata = ["_episodes", "_remarks"]  # noqa: RUF012 - pandas reads a list
+    _remarks: tuple[Remark, ...] = ()
 
     def __repr__(self) -> str:
-        """The main columns as text, rounded; pandas would cut out the columns in the middle, which are the scores."""
+        """The main columns as text, rounded, and the remarks; pandas would cut out the columns in the middle: the scores."""
         told = [name for name in self.columns if name not in NOT_PRINTED and not name.endswith(("_low", "_high"))]
         if "defense" in told and self["defense"].nunique() < 2:
             told.remove("defense")
-        return str(pd.DataFrame(self)[told].to_string(index=False, float_format="%.2f", na_rep=""))
+        shown = str(pd.DataFrame(self)[told].to_string(index=False, float_format="%.2f", na_rep=""))
+        return "\n".join([shown, *(f"! {remark}" for remark in self.remarks if remark.name not in NOT_SAID)])
+
+    def _repr_html_(self) -> str:
+        """The table of a notebook, with the remarks below."""
+        shown = str(pd.DataFrame(self)._repr_html_())
+        return shown + "".join(f"<p>⚠ {escape(str(one))}</p>" for one in self.remarks if one.name not in NOT_SAID)
+
+    @property
+    def remarks(self) -> list[Remark]:
+        """What a reader must know before trusting the numbers, each with `name`, `about` and `text`."""
+        return list(self._remarks)
 
     @property
     def records(self) -> pd.DataFrame:
@@ -58,6 +77,7 @@ class _Row:
         failed: [R, C, E] whether the episode failed; None if the track has no failure.
         queries: mean number of queries of the attack; NaN for none.
         clean: [R, C, E] of the same victim without an attack; None for baselines and the clean control itself.
+        table: the records; None for the strongest attack.
     """
 
     role: str
@@ -68,6 +88,7 @@ class _Row:
     failed: Array | None
     queries: float = np.nan
     clean: Array | None = None
+    table: pa.Table | None = None
 
 
 def scores_of(config: RunConfig, records: pa.Table, by: str = "pair") -> Scores:
@@ -84,9 +105,10 @@ def scores_of(config: RunConfig, records: pa.Table, by: str = "pair") -> Scores:
         by: `pair` or `cell`.
     """
     track = track_of(config.pairs[0])
-    found = [line for row in _rows(config, records, track) for line in _lines(row, track, by)]
-    table = Scores(found)
+    rows = list(_rows(config, records, track))
+    table = Scores([line for row in rows for line in _lines(row, track, by)])
     table._episodes = records
+    table._remarks = tuple(dict.fromkeys(_said_against(rows, track)))
     return table
 
 
@@ -94,7 +116,7 @@ def _rows(config: RunConfig, records: pa.Table, track: Track) -> Iterator[_Row]:
     groups: dict[str, list[Pair]] = {}
     for pair in config.pairs:
         groups.setdefault(pair.clean().id, []).append(pair)
-    for pairs in groups.values():
+    for pairs in sorted(groups.values(), key=lambda pairs: _place(pairs[0])):
         control = pairs[0].clean()
         clean = _episodes(records, control)
         attacked = []
@@ -104,20 +126,64 @@ def _rows(config: RunConfig, records: pa.Table, track: Track) -> Iterator[_Row]:
             beside = _like(clean, own.shape, track.metric)
             attacked.append(
                 _Row("attacked", pair, str(pair.attack), own.cells, own.column(track.metric), _failed(own, track),
-                     _queries(own, track), beside)
+                     _queries(own, track), beside, own.table)
             )  # fmt: skip
+        attacked.sort(key=lambda row: (round(float(row.scores.mean()), 9), row.attack, row.pair.id))
         if len(attacked) > 1:
             yield _strongest(attacked)
-        yield from sorted(attacked, key=lambda row: float(row.scores.mean()))
-        yield _Row("clean", control, "none", clean.cells, clean.column(track.metric), _failed(clean, track))
+        yield from attacked
+        yield _Row(
+            "clean", control, "none", clean.cells, clean.column(track.metric), _failed(clean, track), table=clean.table
+        )
     others = {other.id: other for pair in config.pairs for other in track.baselines(pair)} if config.reference else {}
     baselines = []
     for pair in others.values():
         own = _episodes(records, pair)
         baselines.append(
-            _Row("baseline", pair, str(pair.attack), own.cells, own.column(track.metric), _failed(own, track))
+            _Row(
+                "baseline",
+                pair,
+                str(pair.attack),
+                own.cells,
+                own.column(track.metric),
+                _failed(own, track),
+                table=own.table,
+            )
         )
-    yield from sorted(baselines, key=lambda row: -float(row.scores.mean()))
+    yield from sorted(baselines, key=lambda row: (-round(float(row.scores.mean()), 9), row.pair.id))
+
+
+def _place(pair: Pair) -> tuple[object, ...]:
+    """Where a defended victim stands: by victim, then without a defence first; the order of the arguments changes nothing."""
+    return str(pair.victim), pair.defense.name != "none", str(pair.defense), pair.id
+
+
+def _said_against(rows: Sequence[_Row], track: Track) -> Iterator[Remark]:
+    """What stands under the table: of each row, and of the baselines together."""
+    clean = {row.pair.id: row for row in rows if row.role == "clean"}
+    members: dict[str, dict[str, float]] = {}
+    for row in rows:
+        control = clean.get(row.pair.clean().id)
+        victim = _victim(row.pair)
+        if row.role == "attacked" and control:
+            members.setdefault(row.pair.clean().id, {})[row.attack] = float(row.scores.mean())
+            found = doubts.remarks(row.table, control.table, track, f"{row.attack} on {victim}")
+            yield from (one for one in found if one.name not in doubts.OF_VICTIM)
+        elif row.role == "clean":
+            yield from doubts.remarks(None, row.table, track, victim)
+            weights = row.table is not None and bool(set(row.table["weights_sha256"].unique().to_pylist()) - {""})
+            yield from doubts.of_runs(len(row.scores), track, victim, trained=weights or track.artefact is not None)
+    for row in rows:
+        if row.role == STRONGEST:
+            yield from doubts.above_members(
+                float(row.scores.mean()), members[row.pair.clean().id], f"{row.attack} on {_victim(row.pair)}"
+            )
+    baselines = [row.table for row in rows if row.role == "baseline" and row.table is not None]
+    yield from doubts.of_baselines(baselines, track)
+
+
+def _victim(pair: Pair) -> str:
+    return f"{pair.victim} + {pair.defense}" if pair.defense.name != "none" else str(pair.victim)
 
 
 def _strongest(rows: list[_Row]) -> _Row:
@@ -125,14 +191,13 @@ def _strongest(rows: list[_Row]) -> _Row:
     runs = max(len(row.scores) for row in rows)
     shape = (runs, *rows[0].scores.shape[1:])
     scores = np.stack([np.broadcast_to(row.scores, shape) for row in rows])
-    choice = strongest_of(scores)
-    pick = (choice[None], np.arange(runs)[:, None, None], np.arange(shape[1])[:, None], np.arange(shape[2]))
+    weights = strongest_of(scores)
     failed = None
     if rows[0].failed is not None:
-        failed = np.stack([np.broadcast_to(np.asarray(row.failed), shape) for row in rows])[pick]
+        failed = under(weights, np.stack([np.broadcast_to(np.asarray(row.failed, float), shape) for row in rows]))
     clean = None if rows[0].clean is None else np.broadcast_to(rows[0].clean, shape)
     text = f"{STRONGEST} of {len(rows)}"
-    return _Row(STRONGEST, rows[0].pair, text, rows[0].cells, scores[pick], failed, np.nan, clean)
+    return _Row(STRONGEST, rows[0].pair, text, rows[0].cells, under(weights, scores), failed, np.nan, clean)
 
 
 def _episodes(records: pa.Table, pair: Pair) -> Episodes:
@@ -163,7 +228,7 @@ def _lines(row: _Row, track: Track, by: str) -> Iterator[dict[str, Any]]:
         for place, cell in enumerate(row.cells):
             yield names | dict(cell) | _aggregated(row, track, [place]) | _last(row)
         return
-    means = row.scores.mean((0, 2))
+    means = row.scores.mean((0, 2)).round(9)
     worst = {"worst_cell": str(row.cells[int(means.argmin())]), "worst_score": float(means.min())}
     yield names | _aggregated(row, track, list(range(len(row.cells)))) | worst | _last(row)
 

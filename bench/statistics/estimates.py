@@ -7,6 +7,7 @@ table of their coverage (`python -m tests.leaderboard.simulated_studies`).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -18,6 +19,9 @@ Array = NDArray[np.float64]
 CONFIDENCE = 0.95
 _TAIL = (1 + CONFIDENCE) / 2
 _Z2 = NormalDist().inv_cdf(_TAIL) ** 2
+RARE, OF_RARE = 0.1, 0.2
+"""Below `RARE`, a few trainings tell too little of how much trainings differ: those that crash may all be among the unseen ones.
+There the intraclass correlation of trainings counts as at least `OF_RARE`, in proportion less towards `RARE`."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +62,21 @@ class Components:
         own = max(self.runs - 1, 0), max(self.scenarios - 1, 0)
         if not any(own):
             return np.full_like(self.training, np.nan)
-        parts = [(part, df) for part, df in zip((self.training, self.scenario), own, strict=True) if df]
-        variance = np.asarray(sum(part for part, _ in parts))
-        freedom = np.asarray(sum(np.square(part) / df for part, df in parts))
-        effective = np.divide(np.square(variance), freedom, out=np.ones_like(variance), where=freedom > 0)
-        joint = np.square(t_quantile(effective)) * variance
-        apart = sum(np.square(t_quantile(df)) * part for part, df in parts)
-        return np.asarray(np.sqrt((joint + apart) / 2))
+        return margin_of([(part, df) for part, df in zip((self.training, self.scenario), own, strict=True) if df])
+
+
+def margin_of(parts: Sequence[tuple[Array, int]]) -> Array:
+    """Half the width of the 95 % interval of a mean whose variance is a sum (`Components.margin`).
+
+    Args:
+        parts: each part of the variance with its degrees of freedom.
+    """
+    variance = np.asarray(sum(part for part, _ in parts))
+    freedom = np.asarray(sum(np.square(part) / df for part, df in parts))
+    effective = np.divide(np.square(variance), freedom, out=np.ones_like(variance), where=freedom > 0)
+    joint = np.square(t_quantile(effective)) * variance
+    apart = sum(np.square(t_quantile(df)) * part for part, df in parts)
+    return np.asarray(np.sqrt((joint + apart) / 2))
 
 
 def t_quantile(freedom: Array | float, tail: float = 1 - _TAIL) -> Array:
@@ -81,13 +93,20 @@ def components(means: Array) -> Components:
         means: [..., R, E], finite.
     """
     runs, scenarios = means.shape[-2:]
+    of_runs, of_scenarios, rest = mean_squares(means)
+    episodes = runs * scenarios
+    return Components(of_runs / episodes, np.maximum(of_scenarios - rest, 0.0) / episodes, runs, scenarios)
+
+
+def mean_squares(means: Array) -> tuple[Array, Array, Array]:
+    """The mean squares of the runs, of the scenarios and of the rest of means [..., R, E]; 0 for what there is one of."""
+    runs, scenarios = means.shape[-2:]
     grand = means.mean((-2, -1), keepdims=True)
     by_run, by_scenario = means.mean(-1, keepdims=True), means.mean(-2, keepdims=True)
-    episodes = runs * scenarios
     of_runs = scenarios * np.square(by_run - grand).sum((-2, -1)) / max(runs - 1, 1)
     of_scenarios = runs * np.square(by_scenario - grand).sum((-2, -1)) / max(scenarios - 1, 1)
     rest = np.square(means - by_run - by_scenario + grand).sum((-2, -1)) / max((runs - 1) * (scenarios - 1), 1)
-    return Components(of_runs / episodes, np.maximum(of_scenarios - rest, 0.0) / episodes, runs, scenarios)
+    return of_runs, of_scenarios, rest
 
 
 def interval(scores: Array) -> Interval:
@@ -110,14 +129,15 @@ def interval(scores: Array) -> Interval:
 def share_interval(scores: Array) -> Interval:
     """`interval` for scores in [0, 1], such as rates: within [0, 1], and with a width where all scores are 0 or 1.
 
-    Wilson's score interval (1927), with the variance of the mean in place of the binomial one.
+    Wilson's score interval (1927), with the variance of the mean in place of the binomial one. Near 0 it is wider than several
+    runs say (`RARE`): a few trainings that hardly crash do not show that there are no others.
 
     Args:
         scores: [R, C, E], as in `interval`, in [0, 1].
     """
     _check(scores)
     means = scores.mean(1)
-    return _wilson(float(means.mean()), float(components(means).margin()), scores.size)
+    return _wilson(float(means.mean()), float(components(means).margin()), scores.size, len(scores))
 
 
 def task_intervals(scores: Array, *, share: bool) -> list[Interval]:
@@ -130,9 +150,9 @@ def task_intervals(scores: Array, *, share: bool) -> list[Interval]:
     _check(scores)
     means = np.moveaxis(scores, 1, 0)
     estimates, margins = means.mean((1, 2)).tolist(), components(means).margin().tolist()
-    episodes = means[0].size
+    episodes, runs = means[0].size, len(scores)
     return [
-        _wilson(estimate, margin, episodes) if share else _symmetric(estimate, margin)
+        _wilson(estimate, margin, episodes, runs) if share else _symmetric(estimate, margin)
         for estimate, margin in zip(estimates, margins, strict=True)
     ]
 
@@ -158,13 +178,15 @@ def _symmetric(estimate: float, margin: float) -> Interval:
     return Interval(estimate, estimate - margin, estimate + margin)
 
 
-def _wilson(share: float, margin: float, episodes: int) -> Interval:
+def _wilson(share: float, margin: float, episodes: int, runs: int) -> Interval:
     """Wilson's interval of a share whose symmetric interval is share +- margin; of independent episodes if all are 0 or 1."""
     if math.isnan(margin):
         return Interval(share, np.nan, np.nan)
     share = min(max(share, 0.0), 1.0)
     spread = share * (1 - share)
     ratio = margin**2 / spread if spread > 0 else _Z2 / episodes
+    if runs > 1:
+        ratio = max(ratio, _Z2 / runs * OF_RARE * max(0.0, 1 - share / RARE))
     centre = (share + ratio / 2) / (1 + ratio)
     half = math.sqrt(ratio * spread + ratio**2 / 4) / (1 + ratio)
     return Interval(share, min(max(centre - half, 0.0), share), max(min(centre + half, 1.0), share))

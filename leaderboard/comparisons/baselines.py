@@ -24,6 +24,8 @@ class Baselines:
     def __init__(self, track: Track, candidates: Sequence[Episodes]) -> None:
         self.track = track
         both = [(identity_of(one), one) for one in candidates]
+        # Of equally good candidates the first counts, so their order is that of what they are.
+        both.sort(key=lambda one: [str(value) for value in one[0].values()])
         self.candidates = [(identity, one) for identity, one in both if track.baseline_of(identity, identity)]
         self._known: dict[tuple[object, ...], dict[str, Episodes]] = {}
 

@@ -9,11 +9,11 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from bench.plugins.track import Measure, Track
 from bench.scenarios import Axes, Cell
+from bench.statistics.doubts import mean
 from bench.statistics.episodes import Episodes, difference, measured
 from bench.statistics.estimates import Array, Interval, share_interval
 from leaderboard.comparisons.pairing import beside
@@ -191,6 +191,17 @@ class Comparison:
             return "nothing"
         return "unknown" if np.isnan(gradients) else "answers"
 
+    @cached_property
+    def trained(self) -> bool:
+        """Whether its runs are trainings, or patches, of which there could be others; a driver without weights learns nothing."""
+        weights = set(pc.unique(self.own.table["weights_sha256"]).to_pylist())
+        return self.track.artefact is not None or bool(weights - {""})
+
+    @property
+    def content(self) -> tuple[str, ...]:
+        """What it is, as text: an order that no order of files, records or arguments changes."""
+        return tuple(str(self.identity[name]) for name in IDENTITY)
+
     @property
     def stands_for_all(self) -> bool:
         """Whether its one run counts for every run of others: a baseline attack that depends on no seed."""
@@ -199,14 +210,6 @@ class Comparison:
     def mean(self, name: str) -> float:
         """Mean of a column over all episodes; NaN where nothing was measured."""
         return mean(self.own.table, name)
-
-
-def mean(records: pa.Table, name: str) -> float:
-    """Mean of a column, without nulls; NaN where there is nothing else, or no such column."""
-    if name not in records.column_names:
-        return float("nan")
-    found = pc.mean(records[name].cast(pa.float64())).as_py()
-    return float("nan") if found is None else float(found)
 
 
 def parameters(canonical: object) -> dict[str, object]:

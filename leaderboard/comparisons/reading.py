@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from bench.plugins import registry
 from bench.plugins.track import Measure, Track, track
 from bench.records.reading import times
 from bench.records.schema import AUDIT
@@ -46,7 +49,7 @@ def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:
         records: of one track (`bench.records.schema`); list columns may be missing.
         of: that track.
     """
-    records = newest(records)
+    records = distinct(newest(records), of)
     audits = _audits(records)
     records = records.filter(pc.not_equal(records["grid"], AUDIT))
     attack = (*DEFENDED, *ATTACKER, "grid")
@@ -80,7 +83,7 @@ def _audits(records: pa.Table) -> dict[tuple[object, ...], Episodes]:
 
 def read_tracks(records: Mapping[str, pa.Table]) -> list[Comparison]:
     """The comparisons of several tracks, the one with the most records first; without baselines that nobody attacked."""
-    ordered = sorted(records.items(), key=lambda item: -item[1].num_rows)
+    ordered = sorted(records.items(), key=lambda item: (-item[1].num_rows, item[0]))
     found = [one for name, table in ordered for one in read_comparisons(table, track(name))]
     return [one for one in found if one.is_attacked or not one.is_baseline]
 
@@ -107,7 +110,61 @@ def _rank(one: Comparison) -> tuple[object, ...]:
         text["defense_params"],
         one.is_baseline,
         score,
+        one.content,
     )
+
+
+def distinct(records: pa.Table, of: Track) -> pa.Table:
+    """The records without trainings that are the same network again: of these the first seed counts.
+
+    Trainings are draws of one kind of victim; the same network under a second seed is no second draw. It is the same if the
+    weights are, and all that was measured without an attack. Where each seed has an artefact of its own, or an attack that
+    learns has a network of its own for each, all count.
+    """
+    if of.artefact or not records.num_rows:
+        return records
+    pairs = records.select(["weights_sha256", "training_seed"])
+    several = Counter(pairs.group_by(pairs.column_names).aggregate([])["weights_sha256"].to_pylist())
+    shared = [name for name, count in several.items() if name and count > 1]
+    suspect = pc.is_in(records["weights_sha256"], pa.array(shared, pa.string())).to_numpy()
+    if not suspect.any():
+        return records
+    seed, keep = records["training_seed"].to_numpy(), np.ones(records.num_rows, bool)
+    defended, attacks = (
+        codes_of(records, (*CONTROL, "weights_sha256")),
+        records["attack"].to_numpy(zero_copy_only=False),
+    )
+    for code in np.unique(defended[suspect]):
+        rows = defended == code
+        control = np.flatnonzero(rows & (attacks == NO_ATTACK))
+        again = _the_same(records.take(pa.array(control)), of)
+        taught = [name for name in set(attacks[rows]) if learns(str(name))]
+        keep &= ~(rows & np.isin(seed, again) & ~np.isin(attacks, taught))
+    return records.filter(pa.array(keep))
+
+
+def _the_same(control: pa.Table, of: Track) -> list[int]:
+    """The training seeds of a control whose every measurement is that of an earlier seed."""
+    told = [field.name for field in of.measurements if field.name in control.column_names]
+    told = [name for name in told if name not in of.unrepeatable and not pa.types.is_list(control[name].type)]
+    seen: dict[str, int] = {}
+    again = []
+    for seed in sorted(pc.unique(control["training_seed"]).to_pylist()):
+        drives = control.filter(pc.equal(control["training_seed"], seed)).select(["cell", "seed", *told])
+        content = repr(sorted(map(repr, drives.to_pylist())))
+        if seen.setdefault(content, seed) != seed:
+            again.append(seed)
+    return again
+
+
+@cache
+def learns(attack: str) -> bool:
+    """Whether an attack is trained, so that each training seed has another one; false if it is not installed."""
+    try:
+        return bool(registry.load("attack", attack).learns)
+    # The import of a plug-in may raise anything; a report goes on without it.
+    except Exception:
+        return False
 
 
 def newest(records: pa.Table, identity: Sequence[str] = (*DEFENDED, *ATTACKER, "grid")) -> pa.Table:
@@ -116,9 +173,19 @@ def newest(records: pa.Table, identity: Sequence[str] = (*DEFENDED, *ATTACKER, "
     rising = np.sort(codes)
     if (rising[1:] > rising[:-1]).all():
         return records
-    order = np.lexsort((np.arange(len(codes)), times(records), codes))
+    order = np.lexsort((_by_content(records, codes), times(records), codes))
     last = np.append(codes[order][1:] != codes[order][:-1], True)
     return records.take(pa.array(np.sort(order[last])))
+
+
+def _by_content(records: pa.Table, codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """A rank of each record among those of its code that no order of files changes: of the same time, the last in it counts."""
+    _, where, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    ranks = np.zeros(len(codes), np.int64)
+    again = np.flatnonzero(counts[where] > 1)
+    texts = [repr(row) for row in records.take(pa.array(again)).to_pylist()]
+    ranks[again] = np.argsort(np.argsort(np.array(texts), kind="stable"), kind="stable")
+    return ranks
 
 
 def groups(

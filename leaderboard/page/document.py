@@ -15,6 +15,7 @@ import numpy as np
 
 from bench.plugins.track import Track
 from bench.scenarios import Axes, Cell
+from bench.statistics.doubts import Remark
 from bench.statistics.estimates import Array, Interval, scenario_covariance, t_quantile, task_intervals
 from leaderboard.comparisons.alignment import Aligned, align
 from leaderboard.comparisons.baselines import identity_of
@@ -26,6 +27,7 @@ from leaderboard.ranking.boards import Board, Row
 from leaderboard.ranking.curves import Curve
 from leaderboard.ranking.families import budgets, efforts
 from leaderboard.ranking.flags import FLAGS
+from leaderboard.ranking.remarks import comparison_remarks
 
 VERSION = 3
 """Of the schema; a reader that knows it can read every later document of the same version. Version 1 had the values of three
@@ -222,6 +224,7 @@ def _row(row: Row, keys: Mapping[int, int], called: Labels) -> dict[str, Any]:
             {"name": flag.name, "title": FLAGS[flag.name][0], "fired": flag.fired, "reason": flag.reason}
             for flag in row.flags
         ],
+        "remarks": _remarks(row.remarks),
     }
 
 
@@ -255,8 +258,13 @@ def _pair(one: Comparison, key: int, called: Labels, folder: Path | None) -> dic
         "queries": _number(one.queries),
         "measures": {measure.column: _interval(one.measured(measure)) for measure in headline(one.track)},
         **scored,
+        "remarks": _remarks(comparison_remarks(one)),
         "card": card(one, folder),
     }
+
+
+def _remarks(found: Sequence[Remark]) -> list[dict[str, str]]:
+    return [{"name": one.name, "text": one.text} for one in found]
 
 
 def _cells(cells: Sequence[Cell], scores: Array) -> dict[str, Any]:

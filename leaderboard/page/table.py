@@ -16,6 +16,7 @@ CSV = (
     "defense", "defense_params", "victim", "victim_params", "score", "low", "high", "failed", "failed_low", "failed_high",
     "worst_cell", "worst_cell_score", "worst_cell_low", "worst_cell_high", "clean", "clean_low", "clean_high", "certified",
     "lead", "lead_low", "lead_high", "strongest_attack", "strongest_attack_params", "training_seeds", "cells", "scenarios",
+    "remarks",
 )  # fmt: skip
 """The columns of `leaderboard.csv`, a line a ranked row."""
 
@@ -45,6 +46,7 @@ def table(made: Mapping[str, Any]) -> str:
                 "certified": row["certified"],
                 "cells": len(row["cells"]),
                 "scenarios": row["scenarios"],
+                "remarks": " ".join(one["name"] for one in row["remarks"]),
             }
             for kind in ("defense", "victim"):
                 line |= {kind: row[kind]["name"], f"{kind}_params": json.dumps(row[kind]["params"], sort_keys=True)}

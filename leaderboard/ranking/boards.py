@@ -12,11 +12,13 @@ import pyarrow as pa
 from bench.plugins import registry
 from bench.plugins.contracts import Access
 from bench.plugins.track import Track, track
+from bench.statistics.doubts import Remark
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Interval
 from leaderboard.comparisons.comparison import THREAT, Comparison
 from leaderboard.comparisons.reading import comparable, read_tracks
 from leaderboard.ranking.flags import Flag, Subject, flags
+from leaderboard.ranking.remarks import row_remarks
 from leaderboard.ranking.worst import Panel, Worst, margin
 
 
@@ -50,6 +52,11 @@ class Row:
         """Whether any flag has fired."""
         return any(flag.fired for flag in self.flags)
 
+    @property
+    def remarks(self) -> list[Remark]:
+        """What a reader must know of its score besides the flags."""
+        return row_remarks(self.worst)
+
 
 @dataclass(frozen=True, eq=False)
 class Board:
@@ -82,7 +89,7 @@ def boards(comparisons: Sequence[Comparison]) -> list[Board]:
     The track with the most episodes comes first; then by world, the newest grid (custom ones last), the norm with the most
     episodes, the largest budget, the most access.
     """
-    attacked = [one for one in comparisons if one.is_attacked]
+    attacked = sorted((one for one in comparisons if one.is_attacked), key=lambda one: one.content)
     episodes: Counter[tuple[str, ...]] = Counter()
     for one in attacked:
         for key in ((one.track.name,), (one.track.name, str(one.identity["threat_norm"]))):
@@ -123,15 +130,14 @@ def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
     allowed = [one for one in attacked if _within(one, key)]
     rows = []
     for defended in dict.fromkeys(one.defended for one in attacked if _key(one) == key):
-        own = [one for one in allowed if one.defended == defended]
-        panel = Panel.of(own)
+        panel = Panel.of([one for one in allowed if one.defended == defended])
         found = panel.strongest()
         assert found is not None, "the attack whose seeds the panel has has a cell"
-        own = sorted(panel.attacks, key=lambda one: (-found.attacks.count(one), one.score.estimate))
+        own = found.order
         same = [one for one in attacked if one.defended == defended and one.identity["grid"] == grid]
         others = [one for one in same if one.identity["threat_norm"] == threat[0]]
         doubts = tuple(flags(Subject(track, own, others, found)))
-        rows.append(Row(tuple(own), found, panel.marginal(found), panel.left_out, doubts))
+        rows.append(Row(own, found, panel.marginal(found), panel.left_out, doubts))
     return Board(track, (world, world_params), grid, tuple(threat), tuple(ranked(rows)), _baselines(allowed))
 
 
@@ -151,7 +157,7 @@ def _within(one: Comparison, key: Key) -> bool:
 
 def ranked(rows: Iterable[Row]) -> Iterator[Row]:
     """Best first, flagged ones last, in groups: a group's rows are not significantly below its first."""
-    ordered = sorted(rows, key=lambda row: (row.flagged, -row.worst.score.estimate))
+    ordered = sorted(rows, key=lambda row: (row.flagged, -round(row.worst.score.estimate, 9), row.attacks[0].defended))
     group, leader = 0, None
     for row in ordered:
         if leader is None or row.flagged != leader.flagged or _below(row.worst, leader.worst):
@@ -160,9 +166,14 @@ def ranked(rows: Iterable[Row]) -> Iterator[Row]:
 
 
 def _below(row: Worst, leader: Worst) -> bool:
-    """Whether a score is significantly lower, paired on what both have; by their intervals where that is nothing."""
-    lead = margin(leader, row)
-    return lead.low > 0 if lead else row.score.high < leader.score.low
+    """Whether a score is significantly lower, paired on what both have; by their intervals where that is nothing.
+
+    The interval of one training says nothing about others, so it tells no rows apart.
+    """
+    if lead := margin(leader, row):
+        return lead.low > 0
+    alone = any(one.trained and len(one.runs) == 1 for one in (row, leader))
+    return not alone and row.score.high < leader.score.low
 
 
 def _baselines(attacks: Sequence[Comparison]) -> dict[str, Episodes]:
@@ -171,7 +182,7 @@ def _baselines(attacks: Sequence[Comparison]) -> dict[str, Episodes]:
     They have no training seeds, so one run counts.
     """
     found: dict[str, dict[str, Episodes]] = {}
-    for one in sorted(attacks, key=lambda one: -one.own.table.num_rows):
+    for one in sorted(attacks, key=lambda one: (-one.own.table.num_rows, one.content)):
         contrast = one.track.contrast
         if contrast is None or contrast.side != "victim":
             continue
@@ -179,11 +190,14 @@ def _baselines(attacks: Sequence[Comparison]) -> dict[str, Episodes]:
             kind = one.track.baseline_kinds.get(name)
             kinds = found.setdefault(kind.title if kind else name, {})
             kinds.setdefault(str(one.identity["action_type"]), drive.only(runs=drive.runs[:1]))
-    return {
-        f"{name}, {actions}" if len({drive.table["unit"][0] for drive in drives.values()}) > 1 else name: drive
-        for name, drives in found.items()
-        for actions, drive in sorted(drives.items(), reverse=True)
-    }
+    named: dict[str, Episodes] = {}
+    for name, drives in found.items():
+        if len({drive.table["unit"][0] for drive in drives.values()}) > 1:
+            named |= {f"{name}, {actions}": drive for actions, drive in sorted(drives.items(), reverse=True)}
+        else:
+            # The same driver for every type of action: on the most-driven scenarios.
+            named[name] = min(drives.items(), key=lambda item: (-item[1].table.num_rows, item[0]))[1]
+    return named
 
 
 def read_boards(records: Mapping[str, pa.Table]) -> tuple[list[Board], list[Comparison]]:

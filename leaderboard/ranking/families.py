@@ -13,7 +13,7 @@ def efforts(attacks: Sequence[Comparison]) -> list[list[Comparison]]:
     names = sorted({name for attack in attacks for name in _numbers(attack)})
     for name in names:
         for family in _families(attacks, name):
-            ordered = sorted(family, key=lambda attack: attack.queries)
+            ordered = sorted(family, key=lambda attack: (attack.queries, attack.content))
             if ordered[0].queries < ordered[-1].queries:
                 found.append(ordered)
     return [*found, *_families(attacks, "threat_queries")]
@@ -31,8 +31,8 @@ def _families(attacks: Sequence[Comparison], vary: str) -> list[list[Comparison]
         others = frozenset((name, repr(value)) for name, value in attack.settings.items() if name != vary)
         found.setdefault(others, []).append(attack)
 
-    def value(attack: Comparison) -> float:
-        return float(str(attack.settings[vary]))
+    def value(attack: Comparison) -> tuple[float, tuple[str, ...]]:
+        return float(str(attack.settings[vary])), attack.content
 
     return [sorted(family, key=value) for family in found.values() if len(family) > 1]
 

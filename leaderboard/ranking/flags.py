@@ -11,15 +11,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from bench.plugins import registry
 from bench.plugins.track import Track
 from bench.scenarios import Grid
+from bench.statistics import doubts
+from bench.statistics.doubts import TITLES, Finding
 from bench.statistics.estimates import Interval
 from bench.statistics.unpaired import ENOUGH_SCENARIOS, unpaired
 from leaderboard.comparisons.alignment import align
-from leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison, mean
+from leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison
 from leaderboard.ranking.curves import ENOUGH_CELLS, Curve
 from leaderboard.ranking.families import budgets, efforts
 from leaderboard.ranking.worst import Panel, Worst, margin
@@ -32,9 +35,6 @@ STILL_FALLING = 0.02
 """A curve that falls by more than this with its last increase has not flattened."""
 FOOLED = 0.5
 """Share of decoys with the outline of the stop sign from which on a detector that takes them for it does not know the sign."""
-SAME, MASKED, DRAWN, ONE_DRAW = 0.99, 0.5, 0.01, 2.0
-"""Thresholds: the share of probes above which the answer depends on no input, gradients are masked, a victim is random; and the
-questions a point below which a random victim was attacked with one draw."""
 
 
 @dataclass(frozen=True)
@@ -72,15 +72,15 @@ class Subject:
         """The score under the attacks that asked so much, the strongest in each cell."""
         return self.worst.panel.strongest([one for one in self.attacks if one.knowledge in knowledge])
 
-    def shares(self, name: str) -> float:
-        """Mean of a probe over all its episodes, under attack and without; NaN where none was measured."""
-        tables = [attack.own.table for attack in self.attacks]
-        tables += [attack.clean.table for attack in self.attacks if attack.clean]
-        found = [value for table in tables if not math.isnan(value := mean(table, name))]
-        return sum(found) / len(found) if found else math.nan
+    @property
+    def attacked(self) -> list[pa.Table]:
+        """The records under each attack that counts."""
+        return [attack.own.table for attack in self.attacks]
 
-
-Finding = tuple[bool | None, str]
+    @property
+    def tables(self) -> list[pa.Table]:
+        """All its records, under attack and without."""
+        return [*self.attacked, *(attack.clean.table for attack in self.attacks if attack.clean)]
 
 
 def unattacked(of: Subject) -> Finding:
@@ -92,18 +92,21 @@ def unattacked(of: Subject) -> Finding:
 
 def left_out(of: Subject) -> Finding:
     """Fires where an attack that does not count, because it lacks seeds or scenarios of the row, lowers the score more."""
-    found = {}
+    found: list[tuple[str, tuple[int, ...], Interval]] = []
     for attack in of.worst.panel.left_out:
         alone = Panel.of([attack]).strongest()
         if alone is None or len(set(alone.cells) & set(of.worst.cells)) < min(ENOUGH_CELLS, len(of.worst.cells)):
             continue
         change = margin(of.worst, alone)
         if change:
-            found[alone.name] = change
+            found.append((alone.name, alone.runs, change))
     if not found:
         return False, "No attack that is left out shares enough cells with the row."
-    name, largest = max(found.items(), key=lambda item: item[1].low)
-    return largest.low > 0, f"The score minus that under {name}, which is left out: {_signed(largest)}."
+    # An interval of one run and one scenario has no bounds, and shows nothing.
+    name, runs, largest = max(found, key=lambda one: (np.nan_to_num(one[2].low, nan=-np.inf), one[0]))
+    seeds = sorted(set(runs) & set(of.worst.runs))
+    where = f" (with {of.track.run} {', '.join(map(str, seeds))})" if 0 < len(seeds) < len(of.worst.runs) else ""
+    return largest.low > 0, f"The score minus that under {name}, which is left out: {_signed(largest)}{where}."
 
 
 def masked_gradients(of: Subject) -> Finding:
@@ -164,41 +167,6 @@ def unsafe(of: Subject) -> Finding:
     )
 
 
-def ignores_input(of: Subject) -> Finding:
-    """Fires where the victim gives the same answer on another input in at least 99 % of probes."""
-    share = of.shares("same_answer")
-    if math.isnan(share):
-        return None, "Not measured: the records have no probes of the input."
-    return share >= SAME, f"On {of.track.other_input} it gave the same answer in {100 * share:.1f} % of probes."
-
-
-def zero_gradients(of: Subject) -> Finding:
-    """Fires where at least half of the gradients that an attack used were zero everywhere."""
-    shares = [share for attack in of.attacks if not math.isnan(share := attack.mean("zero_gradients"))]
-    if not shares:
-        return None, "Not measured: no attack used gradients, or the records do not count them."
-    return max(
-        shares
-    ) >= MASKED, f"{100 * max(shares):.0f} % of the gradients that an attack used were zero everywhere."
-
-
-def one_draw(of: Subject) -> Finding:
-    """Fires where the victim gives another answer when asked again, and no attack asked about each observation twice."""
-    redrawn = of.shares("redrawn")
-    if math.isnan(redrawn):
-        return None, "Not measured: the records have no probes of randomness."
-    if redrawn < DRAWN:
-        return False, "Asked the same twice, it gave the same answer: it is not random."
-    if of.track.many_draws:
-        return False, of.track.many_draws
-    draws = max((value for attack in of.attacks if not math.isnan(value := attack.mean("draws"))), default=0.0)
-    asked = f"the attack with the most draws asked {draws:.1f} times about each observation"
-    return (
-        draws < ONE_DRAW,
-        f"Asked the same twice, it gave another answer in {100 * redrawn:.0f} % of probes; {asked}.",
-    )
-
-
 def no_fall(of: Subject) -> Finding:
     """Fires where the same attack lowers the score no more with the largest perturbation budget than with the smallest."""
     found = _curves(of, budgets(of.others))
@@ -249,20 +217,9 @@ def too_little(of: Subject) -> Finding:
     return few, f"It was driven with {runs} seed{'s' * (runs != 1)}, {driven}, {episodes} scenarios each{asked}."
 
 
-def decoy(of: Subject) -> Finding:
-    """Fires where at least 1 % of the answers to probes, asked as an attack asks, differ from the victim's actions."""
-    share = of.shares("inconsistent")
-    if math.isnan(share):
-        return None, "Not measured: the records have no probes of an attack's paths."
-    return (
-        share >= DRAWN,
-        f"In {100 * share:.1f} % of probes its answer to an attack's query differs from its action.",
-    )
-
-
 def octagon(of: Subject) -> Finding:
     """Fires where at least half of the decoys on an octagon are taken for a stop sign: it knows the outline, not the sign."""
-    share = of.shares("octagons")
+    share = doubts.share(of.tables, "octagons")
     if math.isnan(share):
         return None, "Not measured: the records have no decoys on an octagon."
     return (
@@ -299,19 +256,32 @@ def public_gain(one: Comparison, comparisons: int = 1) -> Interval | None:
     return unpaired(sides[0], sides[1], comparisons=comparisons)
 
 
+def _alone(measure: Callable[[Subject], Finding], words: Callable[..., Finding]) -> Callable[[Subject], Finding]:
+    """A measurement on the records of a defended victim alone (`bench.statistics.doubts`), with its words."""
+    measure.__doc__ = words.__doc__
+    return measure
+
+
+ignores_input = _alone(lambda of: doubts.ignores_input(of.tables, of.track), doubts.ignores_input)
+decoy = _alone(lambda of: doubts.decoy(of.tables), doubts.decoy)
+zero_gradients = _alone(lambda of: doubts.zero_gradients(of.attacked), doubts.zero_gradients)
+nan_gradients = _alone(lambda of: doubts.nan_gradients(of.attacked), doubts.nan_gradients)
+one_draw = _alone(lambda of: doubts.one_draw(of.tables, of.attacked, of.track), doubts.one_draw)
+
 FLAGS: dict[str, tuple[str, Callable[[Subject], Finding]]] = {
     "unattacked": ("attacked by noise alone", unattacked),
     "blind": ("no better than a blind policy", blind),
     "unsafe": ("crashes far more often than the traffic's own driver", unsafe),
-    "ignores_input": ("the answer does not depend on the input", ignores_input),
+    "ignores_input": (TITLES["ignores_input"], ignores_input),
     "public_only": ("higher on the public scenarios than on new ones", public_only),
     "octagon": ("takes other faces on an octagon for the stop sign", octagon),
-    "decoy": ("its answers to attacks differ from its actions", decoy),
+    "decoy": (TITLES["decoy"], decoy),
     "left_out": ("an attack that is left out lowers the score more", left_out),
     "masked_gradients": ("an attack without gradients beats those with them", masked_gradients),
-    "zero_gradients": ("gradients are zero", zero_gradients),
+    "zero_gradients": (TITLES["zero_gradients"], zero_gradients),
+    "nan_gradients": (TITLES["nan_gradients"], nan_gradients),
     "noise": ("random noise lowers the score as much as the attack", noise),
-    "one_draw": ("random, but attacked with one draw", one_draw),
+    "one_draw": (TITLES["one_draw"], one_draw),
     "no_fall": ("the score does not fall as the budget grows", no_fall),
     "not_flattened": ("more effort would still lower the score", not_flattened),
     "too_little": ("too few seeds, scenarios or cells", too_little),

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.scenarios import Cell
 from bench.statistics.certificate import certificate
+from bench.statistics.doubts import mean
 from bench.statistics.episodes import Episodes
 from bench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
-from bench.statistics.strongest import strongest_of
-from leaderboard.comparisons.comparison import Comparison, mean
+from bench.statistics.independent import independent
+from bench.statistics.strongest import strongest_of, under
+from leaderboard.comparisons.comparison import Comparison
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,7 @@ class Panel:
     """The attacks on a defended victim that were driven on the same scenarios.
 
     Args:
-        attacks: [A], those that have at least one whole cell.
+        attacks: [A], those that have at least one whole cell, in the order of their names and parameters.
         runs: training or patch seeds [R].
         cells: [C], those that at least one attack has.
         seeds: scenario seeds [E].
@@ -50,8 +51,8 @@ class Panel:
         """
         designs = [(one.own.runs, one.own.seeds) for one in attacks if not one.stands_for_all]
         designs = designs or [(one.own.runs, one.own.seeds) for one in attacks]
-        runs, seeds = max(designs, key=lambda design: (_episodes(attacks, *design), -len(design[0])))
-        whole = [one for one in attacks if _covers(one, runs, seeds)]
+        runs, seeds = min(designs, key=lambda design: (-_episodes(attacks, *design), len(design[0]), design))
+        whole = sorted((one for one in attacks if _covers(one, runs, seeds)), key=lambda one: one.content)
         cells = sorted({cell for one in whole for cell in one.cells}, key=whole[0].axes.place)
         shape = (len(whole), len(runs), len(cells), len(seeds))
         scores, failed = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -61,7 +62,7 @@ class Panel:
             scores[number][:, there] = one.scores[places]
             if one.track.failure:
                 failed[number][:, there] = one.own.column(one.track.failure)[places]
-        left_out = tuple(one for one in attacks if one not in whole)
+        left_out = tuple(sorted((one for one in attacks if one not in whole), key=lambda one: one.content))
         return cls(tuple(whole), runs, tuple(cells), seeds, scores, failed, left_out)
 
     def strongest(self, attacks: Collection[Comparison] | None = None) -> Worst | None:
@@ -75,14 +76,11 @@ class Panel:
         cells = np.flatnonzero(known.any(0))
         if not len(cells):
             return None
-        choice = np.array(some)[strongest_of(self.scores[some][:, :, cells])]
-        pick = (
-            choice[None],
-            np.arange(len(self.runs))[:, None, None],
-            cells[None, :, None],
-            np.arange(len(self.seeds)),
-        )
-        return Worst(self, tuple(cells.tolist()), choice, self.scores[pick], self.failed[pick])
+        scores, failed = (values[some][:, :, cells] for values in (self.scores, self.failed))
+        own = strongest_of(scores)
+        weights = np.zeros((len(self.attacks), *own.shape[1:]))
+        weights[some] = own
+        return Worst(self, tuple(cells.tolist()), weights, under(own, scores), under(own, failed), tuple(some))
 
     def marginal(self, worst: Worst) -> dict[Comparison, Interval]:
         """By how much each attack lowers the score further than all the others do together; `worst` is that of all."""
@@ -112,16 +110,18 @@ class Worst:
     Args:
         panel: the attacks that it was chosen from.
         places: [C'] the cells, as indices of the panel's.
-        choice: [C', E] the attack of each cell and scenario, as an index of the panel's.
-        scores: [R, C', E] of the metric, under that attack.
-        failed: [R, C', E] whether the episode failed under it.
+        weights: [A, C', E] how much each attack of the panel counts: 1 for the strongest, equal parts of 1 for equals.
+        scores: [R, C', E] of the metric, under the strongest attack of each cell and scenario; the mean of equals.
+        failed: [R, C', E] whether the episode failed under it; of equals the share.
+        some: the attacks that could count, as indices of the panel's.
     """
 
     panel: Panel
     places: tuple[int, ...]
-    choice: NDArray[np.int64]
+    weights: Array
     scores: Array
     failed: Array
+    some: tuple[int, ...]
 
     @property
     def runs(self) -> tuple[int, ...]:
@@ -135,18 +135,48 @@ class Worst:
 
     @cached_property
     def attacks(self) -> tuple[Comparison, ...]:
-        """The attack of most scenarios of each cell [C']."""
-        return tuple(self.panel.attacks[np.bincount(row).argmax()] for row in self.choice)
+        """The attack of each cell [C'] that counts in most of its scenarios; of equals the first by `_by_weight`."""
+        counts = self.weights.sum(2).round(9)
+        best = counts == counts.max(0)
+        first = {id(one): place for place, one in enumerate(self._by_weight)}
+        return tuple(
+            min((self.panel.attacks[n] for n in np.flatnonzero(best[:, cell])), key=lambda one: first[id(one)])
+            for cell in range(best.shape[1])
+        )
+
+    @cached_property
+    def _by_weight(self) -> tuple[Comparison, ...]:
+        """The attacks of the panel: those that count in most scenarios first, then those with the lowest score."""
+        weight = dict(zip(map(id, self.panel.attacks), self.weights.sum((1, 2)).round(6).tolist(), strict=True))
+        return tuple(
+            sorted(self.panel.attacks, key=lambda one: (-weight[id(one)], round(one.score.estimate, 9), one.content))
+        )
+
+    @cached_property
+    def order(self) -> tuple[Comparison, ...]:
+        """The attacks of the panel: those that are the strongest in most cells first, then those that count in most scenarios."""
+        cells = Counter(map(id, self.attacks))
+        return tuple(sorted(self._by_weight, key=lambda one: -cells[id(one)]))
 
     @cached_property
     def name(self) -> str:
         """The attack that is the strongest in most cells."""
         return str(self.most.identity["attack"])
 
-    @cached_property
+    @property
     def most(self) -> Comparison:
         """The attack that is the strongest in most cells."""
-        return Counter(self.attacks).most_common(1)[0][0]
+        return self.order[0]
+
+    @property
+    def trained(self) -> bool:
+        """Whether its runs are trainings, or patches, of which there could be others."""
+        return any(one.trained for one in self.panel.attacks)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of cells and of scenarios."""
+        return len(self.places), len(self.panel.seeds)
 
     @cached_property
     def score(self) -> Interval:
@@ -159,9 +189,31 @@ class Worst:
         return share_interval(self.failed) if self.most.track.failure else None
 
     @cached_property
+    def by_run(self) -> Array:
+        """[R, C', E] of the metric, each run under the attack that is the strongest against this run.
+
+        An attack is chosen less well on few runs than on many, so the score of few is too high by what wrong choices leave. By
+        run, all numbers of runs have this alike, and can be compared.
+        """
+        return np.concatenate([under(strongest_of(one), one) for one in np.split(self._scores, len(self.runs), axis=1)])
+
+    @cached_property
+    def missed(self) -> Array:
+        """[C'] by how much `by_run` is above the score under the attack that looks strongest on the same scenarios.
+
+        The first is too high where the choice was wrong, the second too low by luck: the truth lies between.
+        """
+        return np.asarray((self.by_run.mean(2) - np.nanmin(self._scores.mean(3), axis=0)).mean(0))
+
+    @property
+    def _scores(self) -> Array:
+        """[A', R, C', E] of the metric under each attack that could count."""
+        return self.panel.scores[np.ix_(self.some, range(len(self.runs)), self.places)]
+
+    @cached_property
     def worst_cell(self) -> tuple[Cell, Interval]:
-        """The cell with the lowest score."""
-        place = int(self.scores.mean((0, 2)).argmin())
+        """The cell with the lowest score; of equals the first in the order of tables."""
+        place = int(self.scores.mean((0, 2)).round(9).argmin())
         return self.cells[place], task_intervals(self.scores[:, [place]], share=True)[0]
 
     @cached_property
@@ -188,7 +240,7 @@ class Worst:
         """[C', E] of the baseline that the victim is compared with, NaN where it was not driven."""
         contrast = self.most.track.contrast
         if contrast is None or contrast.side != "victim":
-            return np.full(self.choice.shape, np.nan)
+            return np.full(self.shape, np.nan)
         return self.beside(self.most.rival, self._metric)
 
     @cached_property
@@ -200,17 +252,20 @@ class Worst:
     def beside(self, baseline: str, column: str) -> Array:
         """[C', E] a measurement of a baseline on the same scenarios, NaN where it was not driven."""
         found = self._control(lambda one: one.baselines.get(baseline), column)
-        return np.full(self.choice.shape, np.nan) if found is None else found[0]
+        return np.full(self.shape, np.nan) if found is None else found[0]
 
     @property
     def _metric(self) -> str:
         return self.panel.attacks[0].track.metric
 
     def _control(self, of: Callable[[Comparison], Episodes | None], column: str) -> Array | None:
-        """[R or 1, C', E] of a control of the attacks, from the first that has a cell; NaN in cells that none has."""
+        """[R or 1, C', E] of a control of the attacks, NaN in cells that none has.
+
+        Of a cell that several have, that with the most runs counts, then that of the first attack: they are the same episodes.
+        """
         runs, seeds = self.panel.runs, self.panel.seeds
         found = None
-        for control in filter(None, map(of, self.panel.attacks)):
+        for control in sorted(filter(None, map(of, self.panel.attacks)), key=lambda one: -len(one.runs)):
             if not set(seeds) <= set(control.seeds):
                 continue
             alone = len(control.runs) == 1 and control.runs != runs
@@ -218,7 +273,7 @@ class Worst:
                 continue
             of_runs = control.runs if alone else runs
             if found is None:
-                found = np.full((len(of_runs), *self.choice.shape), np.nan)
+                found = np.full((len(of_runs), *self.shape), np.nan)
             missing = [n for n, cell in enumerate(self.cells) if np.isnan(found[:, n]).any() and cell in control.cells]
             if len(of_runs) == len(found) and missing:
                 places = control.places(of_runs, [self.cells[n] for n in missing], seeds)
@@ -227,19 +282,34 @@ class Worst:
 
 
 def margin(first: Worst, second: Worst) -> Interval | None:
-    """`first` minus `second`, paired, in the cells, runs and scenarios that both have; None where they have none.
+    """`first` minus `second`, in the cells and scenarios that both have; None where they have none.
 
-    A side with one run, such as a driver that does not learn, is compared with every run of the other.
+    Of the same defended victim, and of two with the same training seeds, runs are paired. All others were trained apart
+    (`independent`); if their numbers of trainings differ, the attacks are chosen for each training alone.
     """
     cells = [cell for cell in first.cells if cell in second.cells]
     seeds = [seed for seed in first.panel.seeds if seed in second.panel.seeds]
-    several = [set(one.runs) for one in (first, second) if len(one.runs) > 1]
-    runs = sorted(set.intersection(*several)) if several else [0]
-    if not (cells and seeds and runs):
+    if not (cells and seeds):
         return None
-    parts = []
-    for one in (first, second):
-        rows = [one.runs.index(run) for run in runs] if len(one.runs) > 1 else [0]
-        from_ = np.ix_(rows, [one.cells.index(cell) for cell in cells], [one.panel.seeds.index(seed) for seed in seeds])
-        parts.append(one.scores[from_])
-    return interval(parts[0] - parts[1])
+    both = (first, second)
+    places = [
+        np.ix_([one.cells.index(cell) for cell in cells], [one.panel.seeds.index(seed) for seed in seeds])
+        for one in both
+    ]
+    common = sorted(set(first.runs) & set(second.runs))
+    same = first.most.defended == second.most.defended
+    rules = [len(one.runs) == 1 and not one.trained for one in both]
+    if common and (same or all(rules) or (first.runs == second.runs and len(common) > 1)):
+        runs = [[one.runs.index(run) for run in common] for one in both]
+        paired = [one.scores[of][:, place[0], place[1]] for one, of, place in zip(both, runs, places, strict=True)]
+        return interval(paired[0] - paired[1])
+    alike = len(first.runs) == len(second.runs)
+    sides = [
+        (one.scores if alike else one.by_run)[:, place[0], place[1]] for one, place in zip(both, places, strict=True)
+    ]
+    # Without weights, runs differ by the network of an attack, of which the one run of the other side has one, too.
+    learns = [one.trained or not other.trained for one, other in (both, both[::-1])]
+    missed = [
+        0.0 if alike else float(one.missed[place[0].ravel()].mean()) for one, place in zip(both, places, strict=True)
+    ]
+    return independent(sides[0], sides[1], trained=(learns[0], learns[1]), chosen=(missed[0], missed[1]))

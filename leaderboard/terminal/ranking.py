@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import pyarrow as pa
 from rich.console import Console
@@ -52,7 +52,9 @@ def print_boards(boards: Sequence[Board], console: Console) -> None:
         allowed = f"{board.grid}, {norm} {budget:g}, access {access}, {queries} queries{of_frames(frames)}"
         title = Text.assemble((board.track.name, "bold"), f" in {board.world[0]}, {allowed}")
         console.print(Padding(title, (1, 1)))
-        console.print(Padding(fitted(_columns(board), [Section(board.rows)], console), (0, 1)))
+        console.print(Padding(fitted(_columns(board), _sections(board), console), (0, 1)))
+        flagged = BELOW if any(row.flagged for row in board.rows) else ""
+        console.print(Padding(Text(flagged + SHARED, style="dim"), (0, 1)))
         for name, drive in board.baselines.items():
             score = estimate(share_interval(drive.column(board.track.metric)), style=BASELINE)
             console.print(Padding(Text.assemble(f"{name}: ", score), (0, 3)))
@@ -65,7 +67,31 @@ def print_boards(boards: Sequence[Board], console: Console) -> None:
                 titles = "; ".join(FLAGS[flag.name][0] for flag in row.flags if flag.fired)
                 said = Text.assemble(("flagged ", "yellow"), f"{_name(row, board)}: ", (titles, "dim"))
                 console.print(Padding(said, (0, 1)))
+        for line in _notes(board):
+            console.print(Padding(line, (0, 1)))
     console.print()
+
+
+FLAGGED = "⚑"
+BELOW = f"{FLAGGED} flagged: ranks below all rows without a flag, whatever its score; why is said below. "
+SHARED = "Rows of one rank are not told apart from its first."
+"""What stands under a ranking, so that its order is understood."""
+
+
+def _sections(board: Board) -> list[Section[Row]]:
+    """The rows without a flag, then the others."""
+    parts = ([row for row in board.rows if row.flagged is flagged] for flagged in (False, True))
+    return [Section(part) for part in parts if part]
+
+
+def _notes(board: Board) -> Iterator[Text]:
+    """What a reader must know of the scores besides the flags; of several rows in one line."""
+    about: dict[str, list[str]] = {}
+    for row in board.rows:
+        for remark in row.remarks:
+            about.setdefault(remark.text, []).append(_name(row, board))
+    for text, names in about.items():
+        yield Text.assemble(("note ", "yellow"), f"{'; '.join(names)}: ", (text, "dim"))
 
 
 def _name(row: Row, board: Board) -> str:
@@ -89,7 +115,7 @@ def _shown(board: Board) -> dict[str, Varying]:
 def _columns(board: Board) -> list[Column[Row]]:
     shown, measure, contrast = _shown(board), board.track.metric_title, board.track.contrast
     columns: list[Column[Row]] = [
-        Column("rank", lambda row: str(row.group)),
+        Column("rank", lambda row: f"{FLAGGED} {row.group}" if row.flagged else str(row.group)),
         Column("defence", lambda row: component(row.attacks[0], "defense", shown["defense"]), "left", folds=True),
         Column("victim", lambda row: component(row.attacks[0], "victim", shown["victim"]), "left", folds=True),
         Column(f"{measure}\nworst [95 %]", lambda row: estimate(row.worst.score, style=ATTACKED), "left"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -16,12 +16,14 @@ from bench.statistics.episodes import step_mean
 from leaderboard.comparisons.comparison import THREAT, Comparison
 from leaderboard.comparisons.naming import component, defended, varying
 from leaderboard.comparisons.reading import read_comparisons
+from leaderboard.ranking.remarks import comparison_remarks, run_remarks
 from leaderboard.terminal.cells import cell_by_cell
 from leaderboard.terminal.overview import overview
 from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MARKS, counted, of_frames, size, threat
 
 SCREEN, AROUND, NOTES = 24, 7, 2
-"""Lines of a terminal; those for the title, the headings, the gap, the folder and the prompt; and how many notes are shown."""
+"""Lines of a terminal; those for the title, the headings, the gap, the folder and the prompt; and how many notes are shown that
+make no number wrong."""
 OUTSIDE = 1e-5
 """How far outside its set an attack may answer before a note says so: rounding."""
 
@@ -70,18 +72,34 @@ def _below(comparisons: Sequence[Comparison]) -> Iterator[Text]:
     threats = list(dict.fromkeys(_short_threat(one) for one in own))
     if len(threats) == 1:
         yield Text(threats[0], style="dim")
-    notes: dict[str, list[str]] = {}
-    shown = {kind: varying(comparisons, kind) for kind in ("attack", "defense", "victim")}
-    for one in comparisons:
-        for remark in _doubts(one):
-            attack = f"{component(one, 'attack', shown['attack'])} on " if one.is_attacked else ""
-            notes.setdefault(remark, []).append(f"{attack}{defended(one, shown)}")
-    for remark, about in list(notes.items())[:NOTES]:
-        others = f" and {len(about) - 1} more" if len(about) > 1 else ""
-        yield Text(f"{about[0]}{others}: {remark}", style="yellow")
+    for doubt in _together((found.about, found.text) for found in run_remarks(comparisons)):
+        yield Text(doubt, style="bold yellow")
+    said = [(_about(one, comparisons), remark) for one in comparisons for remark in _doubts(one)]
+    notes = _together(said)
+    for note in notes[:NOTES]:
+        yield Text(note, style="yellow")
     if len(notes) > NOTES:
         yield Text(f"{counted(len(notes) - NOTES, 'more note')}: --cells", style="yellow")
     yield Text("`bench show FOLDER --cells` shows more; `bench help TERM` explains a column.", style="dim")
+
+
+def _together(said: Iterable[tuple[str, str]]) -> list[str]:
+    """A line a remark, with whom it is about."""
+    notes: dict[str, list[str]] = {}
+    for about, remark in said:
+        notes.setdefault(remark, []).append(about)
+    lines = []
+    for remark, several in notes.items():
+        others = f" and {len(several) - 1} more" if len(several) > 1 else ""
+        lines.append(f"{several[0]}{others}: {remark}" if several[0] else remark)
+    return lines
+
+
+def _about(one: Comparison, comparisons: Sequence[Comparison]) -> str:
+    """The attack and whom it attacks, as tables call them."""
+    shown = {kind: varying(comparisons, kind) for kind in ("attack", "defense", "victim")}
+    attack = f"{component(one, 'attack', shown['attack'])} on " if one.is_attacked else ""
+    return f"{attack}{defended(one, shown)}"
 
 
 def _short_threat(one: Comparison) -> str:
@@ -110,6 +128,8 @@ def heading(one: Comparison) -> Table:
         lines.add_row("threat", Text(threat(one), style="dim"))
         for name, said in one.track.effort(one.own.column):
             lines.add_row(name, Text(said, style="dim"))
+    for found in comparison_remarks(one):
+        lines.add_row(Text("doubt", style="bold yellow"), Text(found.text, style="bold yellow"))
     for remark in remarks(one):
         lines.add_row(Text("note", style="yellow"), Text(remark, style="yellow"))
     return lines

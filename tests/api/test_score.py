@@ -17,6 +17,7 @@ from torch import Tensor, nn
 import bench
 import cavbench
 from bench.driving import ActionType, DrivingAttack, Oracle, Policy
+from bench.errors import UserError
 from bench.plugins.contracts import Access
 from bench.plugins.pair import choose
 from bench.plugins.track import track
@@ -221,3 +222,26 @@ def test_importing_and_listing_load_no_torch() -> None:
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert said.returncode == 0, said.stderr
     assert bench.score is cavbench.score
+
+
+def test_what_makes_a_number_wrong_is_printed_below_it_and_is_data(tmp_path: Path) -> None:
+    class Rounded(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = nn.Linear(50, 5)
+
+        def forward(self, observation: torch.Tensor) -> torch.Tensor:
+            return torch.round(100 * self.layer(observation.flatten(1)))
+
+    torch.manual_seed(0)
+    where = {"lanes": 3, "density": 1, "weather": "clear", "episodes": 2, "out": tmp_path, "baselines": False}
+    found = cavbench.score(Rounded(), "pgd", **where)
+    assert "zero_gradients" in {one.name for one in found.remarks}
+    assert "gradients are zero" in repr(found)
+    assert "gradients are zero" in found._repr_html_()
+
+
+def test_a_network_that_stands_twice_in_a_list_is_refused(tmp_path: Path) -> None:
+    network = nn.Linear(50, 5)
+    with pytest.raises(UserError, match="the victims 1 and 3 of the list are the same network"):
+        cavbench.score([network, nn.Linear(50, 5), network], "noise", out=tmp_path)

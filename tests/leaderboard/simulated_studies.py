@@ -1,6 +1,7 @@
 """How often the intervals that a leaderboard prints hold the truth, in simulated studies.
 
-    python -m tests.leaderboard.simulated_studies 2000       # the table in docs/metrics.md, with so many studies a line
+    python -m tests.leaderboard.simulated_studies 2000           # the tables in docs/metrics.md, with so many studies a line
+    python -m tests.leaderboard.simulated_studies 2000 unequal   # one of them: coverage, bad or unequal
 
 A study is a set of records: two defended victims under two attacks each, on the clear roads of the standard grid. Each episode
 crashes with a probability that is the sum of a cell, a training, a scenario and their interaction, cut at 0 and 1; one that does
@@ -12,7 +13,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from statistics import NormalDist
 from typing import Any
@@ -39,12 +40,16 @@ class Study:
         scenario: between scenarios, the same for all victims.
         both: of a training seed on a scenario.
         crashes: mean of the first and of the second victim under its strongest attacks.
+        bad: the share of trainings that crash more often, and by how much; `training` comes on top.
+        learns: whether the first victim does; otherwise it has no training effect.
     """
 
     training: float
     scenario: float
     both: float
     crashes: tuple[float, float]
+    bad: tuple[float, float] = (0.0, 0.0)
+    learns: bool = True
 
 
 STUDIES = {
@@ -56,6 +61,25 @@ STUDIES = {
 }
 """The components of pairs in the published records (`safe_progress` and crashes have much the same), and one without a training
 effect."""
+BAD = {
+    "crashes near 0, trainings differ by .15": Study(0.15, 0.05, 0.05, (-0.1, 0.3)),
+    "crashes near 0, trainings differ by .1": Study(0.1, 0.05, 0.05, (0.0, 0.3)),
+    "1 of 10 trainings crashes in 30 % more": Study(0.0, 0.02, 0.02, (0.0, 0.3), (0.1, 0.3)),
+    "1 of 5 trainings crashes in 30 % more": Study(0.0, 0.02, 0.02, (0.0, 0.3), (0.2, 0.3)),
+    "1 of 5 trainings crashes in 10 % more": Study(0.0, 0.02, 0.02, (0.0, 0.3), (0.2, 0.1)),
+    "crashes near 1, trainings differ by .15": Study(0.15, 0.05, 0.05, (1.1, 0.3)),
+}
+"""A few trainings, most of them good: the means are of the normal distribution that is cut at 0."""
+EQUAL = {
+    "dqn + advtrain, pgd": Study(0.04, 0.085, 0.09, (0.58, 0.58)),
+    "ddpg, zo": Study(0.13, 0.03, 0.12, (0.60, 0.60)),
+    "ddpg + advtrain, zo": Study(0.27, 0.05, 0.11, (0.45, 0.45)),
+    "crashes near 0": Study(0.15, 0.05, 0.05, (-0.1, -0.1)),
+    "1 of 5 trainings crashes in 30 % more": Study(0.0, 0.02, 0.02, (0.05, 0.05), (0.2, 0.3)),
+}
+"""Two victims that are equal in truth."""
+DESIGNS = {"1 and 10": (1, 10), "1 and 4": (1, 4), "3 and 10": (3, 10), "1 and 1": (1, 1), "rules and 10": (0, 10)}
+"""Trainings of the first and of the second victim; 0 for a driver that does not learn."""
 CELL_EFFECTS = np.linspace(-0.1, 0.1, len(CLEAR))
 """The second attack is the strongest in every other cell."""
 WEAKER = 0.15
@@ -66,14 +90,19 @@ BLIND = 0.8
 
 
 @cache
-def _records(runs: int) -> tuple[pa.Table, list[tuple[int, int]]]:
+def _records(runs: tuple[int, int]) -> tuple[pa.Table, list[tuple[int, int]]]:
     """The records of a study without its outcomes, and of each part the victim (2: blind) and the attack (0: none)."""
     common: Any = {"cells": CLEAR, "episodes": SCENARIOS}
     parts, kinds = [], []
-    for victim, defense in enumerate(("none", "advtrain")):
+    for victim, (defense, count) in enumerate(zip(("none", "advtrain"), runs, strict=True)):
         for attack, name in enumerate(("none", "zo", "pgd")):
             queries = 40.0 * bool(attack)
-            parts.append(drive(attack=name, defense=defense, runs=range(runs), queries=queries, weights="w", **common))
+            weights = f"{victim + 1}" if count else ""
+            parts.append(
+                drive(
+                    attack=name, defense=defense, runs=range(max(count, 1)), queries=queries, weights=weights, **common
+                )
+            )
             kinds.append((victim, attack))
     parts.append(drive("blind", victim_params={"policy": "slower"}, sees=False, runs=(0,), **common))
     return pa.concat_tables(parts), [*kinds, (2, 0)]
@@ -87,13 +116,17 @@ def _means(study: Study, victim: int, attack: int) -> np.ndarray:
     return study.crashes[victim] + CELL_EFFECTS - WEAKER * weaker
 
 
-def _outcomes(study: Study, runs: int, kinds: list[tuple[int, int]], generator: np.random.Generator) -> np.ndarray:
+def _outcomes(
+    study: Study, runs: tuple[int, int], kinds: list[tuple[int, int]], generator: np.random.Generator
+) -> np.ndarray:
     """Whether each episode crashes, in the order of the records."""
     scenario = study.scenario * generator.standard_normal((1, 1, SCENARIOS))
+    share, more = study.bad
     trained = [
-        study.training * generator.standard_normal((runs, 1, 1))
-        + study.both * generator.standard_normal((runs, 1, SCENARIOS))
-        for _ in range(2)
+        bool(count) * study.training * generator.standard_normal((max(count, 1), 1, 1))
+        + study.both * generator.standard_normal((max(count, 1), 1, SCENARIOS))
+        + bool(count) * more * (generator.random((max(count, 1), 1, 1)) < share)
+        for count in runs
     ]
     alone = study.both * generator.standard_normal((1, 1, SCENARIOS))
     crashed = []
@@ -113,10 +146,11 @@ def expected(study: Study, means: np.ndarray, *, trains: bool = True) -> float:
         inside = normal.cdf(high) - normal.cdf(low)
         return mean * inside + spread * (normal.pdf(low) - normal.pdf(high)) + 1 - normal.cdf(high)
 
-    return float(np.mean([cut(mean) for mean in means]))
+    share, more = study.bad if trains else (0.0, 0.0)
+    return float(np.mean([(1 - share) * cut(mean) + share * cut(mean + more) for mean in means]))
 
 
-def _rows(study: Study, runs: int, generator: np.random.Generator) -> list[Row]:
+def _rows(study: Study, runs: tuple[int, int], generator: np.random.Generator) -> list[Row]:
     """The rows of one simulated study, the undefended victim first."""
     records, kinds = _records(runs)
     crashed = _outcomes(study, runs, kinds, generator)
@@ -130,7 +164,7 @@ def _rows(study: Study, runs: int, generator: np.random.Generator) -> list[Row]:
 
 def printed(study: Study, runs: int, generator: np.random.Generator) -> Iterator[tuple[str, Interval | None, float]]:
     """Every kind of interval of one simulated study, with what it should hold."""
-    first, second = (row.worst for row in _rows(study, runs, generator))
+    first, second = (row.worst for row in _rows(study, (runs, runs), generator))
     rates = [expected(study, study.crashes[victim] + CELL_EFFECTS) for victim in range(2)]
     blind = expected(study, _means(study, 2, 0), trains=False)
     yield "score", first.score, PROGRESS * (1 - rates[0])
@@ -149,14 +183,43 @@ def coverage(study: Study, runs: int, studies: int, seed: int = 0) -> Counter[st
     return Counter(name for name, interval, value in found if interval and value in interval)
 
 
+def called_different(study: Study, design: tuple[int, int], studies: int, seed: int = 0) -> int:
+    """In how many simulated studies of equal victims their rows have different ranks."""
+    generator = np.random.default_rng(seed)
+    # A driver that does not learn is as good as the trainings of the other are in the mean.
+    rules = expected(study, study.crashes[0] + CELL_EFFECTS)
+    if not design[0]:
+        spread = replace(study, training=0.0, bad=(0.0, 0.0))
+        means = np.linspace(-0.5, 1.5, 401)
+        closest = min(means, key=lambda mean: abs(expected(spread, mean + CELL_EFFECTS) - rules))
+        study = replace(study, crashes=(float(closest), study.crashes[1]))
+    return sum(len({row.group for row in _rows(study, design, generator)}) > 1 for _ in range(studies))
+
+
+NAMES = ("score", "crash rate", "difference of rows", "against blind", "effect of an attack")
+
+
+def tables(count: int, only: str = "") -> Iterator[str]:
+    """The tables in docs/metrics.md."""
+    if only in ("", "coverage"):
+        yield f"| variance of | seeds | {' | '.join(NAMES)} |\n|---|---|{'---|' * len(NAMES)}"
+        for title, study in STUDIES.items():
+            for runs in (3, 5, 10):
+                hits = coverage(study, runs, count)
+                yield f"| {title} | {runs} | {' | '.join(f'{100 * hits[name] / count:.1f} %' for name in NAMES)} |"
+    if only in ("", "bad"):
+        yield "| crash rates | 3 seeds | 4 seeds | 10 seeds |\n|---|---|---|---|"
+        for title, study in BAD.items():
+            hits = [coverage(study, runs, count)["crash rate"] for runs in (3, 4, 10)]
+            yield f"| {title} | {' | '.join(f'{100 * one / count:.1f} %' for one in hits)} |"
+    if only in ("", "unequal"):
+        yield f"| equal victims | {' | '.join(DESIGNS)} |\n|---|{'---|' * len(DESIGNS)}"
+        for title, study in EQUAL.items():
+            wrong = [called_different(study, design, count) for design in DESIGNS.values()]
+            yield f"| {title} | {' | '.join(f'{100 * one / count:.1f} %' for one in wrong)} |"
+
+
 if __name__ == "__main__":
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 200
-    names = ("score", "crash rate", "difference of rows", "against blind", "effect of an attack")
     say = Console(width=200, highlight=False).print
-    say(f"| variance of | seeds | {' | '.join(names)} |\n|---|---|{'---|' * len(names)}")
-    for title, study in STUDIES.items():
-        for runs in (3, 5, 10):
-            hits = coverage(study, runs, count)
-            say(
-                f"| {title} | {runs} | {' | '.join(f'{100 * hits[name] / count:.1f} %' for name in names)} |",
-            )
+    for line in tables(int(sys.argv[1]) if len(sys.argv) > 1 else 200, *sys.argv[2:3]):
+        say(line)

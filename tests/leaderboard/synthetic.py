@@ -112,6 +112,8 @@ def drive(
 def probed(records: pa.Table, **columns: float | str) -> pa.Table:
     """The same records with what a run measures for flags; a column it has already is replaced."""
     for name, value in columns.items():
+        if name not in records.column_names:
+            records = records.append_column(name, pa.nulls(records.num_rows, pa.float64()))
         field = records.schema.field(name)
         values = pa.array([value] * records.num_rows, field.type)
         records = records.set_column(records.schema.get_field_index(name), field, values)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.stats import binom
 
-from tests.leaderboard.simulated_studies import STUDIES, coverage
+from bench.statistics.independent import independent
+from tests.leaderboard.simulated_studies import BAD, DESIGNS, EQUAL, STUDIES, called_different, coverage
 
-COUNT = 150
+COUNT, FEWER = 150, 50
 LEAST, MOST = binom.ppf(0.0005, COUNT, 0.94), binom.ppf(0.9995, COUNT, 0.97)
 """Hits that a coverage of 94 to 97 % leaves likely; with 39 %, or with intervals twice as wide, they are out of reach."""
 
@@ -19,3 +23,29 @@ def test_printed_intervals_hold_the_truth(title: str, runs: int) -> None:
     assert len(hits) == 5
     for name, count in hits.items():
         assert LEAST <= count <= MOST, f"{name}: {count} of {COUNT}"
+
+
+@pytest.mark.parametrize("design", ["1 and 10", "1 and 4", "3 and 10", "1 and 1", "rules and 10"])
+@pytest.mark.parametrize("title", ["ddpg, zo"])
+def test_equal_victims_of_unequal_trainings_seldom_have_different_ranks(title: str, design: str) -> None:
+    assert called_different(EQUAL[title], DESIGNS[design], FEWER) <= binom.ppf(0.9995, FEWER, 0.06)
+
+
+@pytest.mark.parametrize("runs", [3, 10])
+@pytest.mark.parametrize("title", ["crashes near 0, trainings differ by .15", "1 of 10 trainings crashes in 30 % more"])
+def test_crash_rates_of_a_few_bad_trainings_are_inside_their_intervals(title: str, runs: int) -> None:
+    assert coverage(BAD[title], runs, FEWER)["crash rate"] >= binom.ppf(0.0005, FEWER, 0.95)
+
+
+@given(st.integers(3, 5), st.floats(0.3, 0.7), st.floats(-0.4, 0.4))
+@settings(max_examples=40, deadline=None)
+def test_few_trainings_that_are_all_alike_do_not_tell_one_training_apart(count: int, score: float, lead: float) -> None:
+    several = np.full((count, 1, 30), score - lead / 2)
+    assert 0 in independent(np.full((1, 1, 30), score + lead / 2), several)
+
+
+def test_ten_alike_trainings_tell_one_apart_that_is_far_off() -> None:
+    generator = np.random.default_rng(0)
+    several = 0.6 + 0.02 * generator.standard_normal((10, 1, 1)) + 0.05 * generator.standard_normal((10, 1, 30))
+    assert independent(several, np.full((1, 1, 30), 0.3)).low > 0
+    assert 0 in independent(several, np.full((1, 1, 30), 0.57))

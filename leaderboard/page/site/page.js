@@ -47,8 +47,9 @@ function interval(one, places) {
   const freedom = parts.reduce((sum, [part, df]) => sum + part ** 2 / df, 0);
   const joint = variance > 0 ? tQuantile(variance ** 2 / freedom) ** 2 * variance : 0;
   const apart = parts.reduce((sum, [part, df]) => sum + tQuantile(df) ** 2 * part, 0);
-  const spread = share * (1 - share), alone = data.t[data.t.length - 1][1] ** 2 / (runs * scenarios * places.length);
-  const ratio = spread > 0 ? (joint + apart) / 2 / spread : alone;
+  const spread = share * (1 - share), square = data.t[data.t.length - 1][1] ** 2, alone = square / (runs * scenarios * places.length);
+  const unseen = runs > 1 ? (square / runs) * 0.2 * Math.max(0, 1 - share / 0.1) : 0;
+  const ratio = Math.max(spread > 0 ? (joint + apart) / 2 / spread : alone, unseen);
   const centre = (share + ratio / 2) / (1 + ratio), half = Math.sqrt(ratio * spread + ratio ** 2 / 4) / (1 + ratio);
   return { estimate: share, low: Math.max(0, Math.min(centre - half, share)), high: Math.min(1, Math.max(centre + half, share)) };
 }
@@ -288,6 +289,8 @@ function render() {
   const total = new Set(board.rows.flatMap((row) => row.cells.map(({ cell }) => place(cell)))).size;
   const left = new Set(board.rows.flatMap((row) => kept(row.cells).map(({ cell }) => place(cell)))).size;
   at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, mean with its 95 % interval.` + (left === total ? "" : " Ranks and flags refer to all cells.") +
+    (rows.some((one) => one.row.flagged) ? " Below the double line, a flag (⚑) casts doubt on each row: it ranks below all rows without one, whatever its score." : "") +
+    " Rows of one rank are not told apart from its first." +
     (rows.length ? "" : " No row was driven in the selected cells.");
 
   const whole = left === total;
@@ -309,7 +312,7 @@ function render() {
     { name: "Flags", class: "doubts", show: (one) => (one.row ? doubts(one.row) : ""), value: (one) => (one.row ? one.row.flags.filter((flag) => flag.fired).map((flag) => flag.name).join(" ") : "") },
   ];
   draw("ranks", columns, [...rows, ...baselines], (one, before, unsorted) =>
-    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", one.row?.group === 1 ? "best" : "", unsorted && before && one.row?.group !== before.row?.group ? "group" : ""].filter(Boolean).join(" "));
+    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", one.row?.group === 1 ? "best" : "", unsorted && before && one.row?.group !== before.row?.group ? "group" : "", unsorted && before?.row && one.row && one.row.flagged !== before.row.flagged ? "divided" : ""].filter(Boolean).join(" "));
 
   drawPairs(board, metric);
   drawMatrix(board);
@@ -359,10 +362,14 @@ function worstCell(one) {
 function doubts(row) {
   const fired = row.flags.filter((flag) => flag.fired);
   const unmeasured = row.flags.filter((flag) => flag.fired === null).length;
-  const summary = fired.length ? `⚑ ${fired.map((flag) => flag.title).join("; ")}` : `none of ${row.flags.length - unmeasured}`;
+  const notes = row.remarks.length ? ` ⚠ ${row.remarks.map(remarkName).join(", ")}` : "";
+  const summary = (fired.length ? `⚑ ${fired.map((flag) => flag.title).join("; ")}` : `none of ${row.flags.length - unmeasured}`) + notes;
   return el("details", {}, el("summary", { class: fired.length ? null : "quiet" }, summary), el("ul", {}, ...row.flags.map((flag) =>
-    el("li", {}, el("b", {}, `${flag.fired ? "⚑ " : ""}${flag.name.replaceAll("_", " ")}: `), flag.reason))));
+    el("li", {}, el("b", {}, `${flag.fired ? "⚑ " : ""}${flag.name.replaceAll("_", " ")}: `), flag.reason)), ...remarksOf(row)));
 }
+/* What a reader must know before trusting a number. */
+const remarkName = (remark) => remark.name.replaceAll("_", " ");
+const remarksOf = (one) => one.remarks.map((remark) => el("li", {}, el("b", {}, `⚠ ${remarkName(remark)}: `), remark.text));
 /* By how much an attack lowers the score of its row further than all the others do. */
 function added(pair, row) {
   const place = row ? row.pairs.indexOf(pair.key) : -1;
@@ -388,6 +395,7 @@ function drawPairs(board, metric) {
     { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
     { name: "Queries", show: (one) => fixed(queries(one), 0), value: queries, number: true },
     { name: "Adds", show: ({ pair }) => adds(pair, rowOf(pair)), value: ({ pair }) => added(pair, rowOf(pair))?.estimate ?? null, interval: ({ pair }) => added(pair, rowOf(pair)), number: true },
+    ...(rows.some(({ pair }) => pair.remarks.length) ? [{ name: "Doubts", class: "doubts", show: ({ pair }) => (pair.remarks.length ? el("details", {}, el("summary", {}, `⚠ ${pair.remarks.map(remarkName).join(", ")}`), el("ul", {}, ...remarksOf(pair))) : ""), value: ({ pair }) => pair.remarks.map(remarkName).join(" ") }] : []),
     { name: "Recording", show: ({ pair }) => (pair.card.recording ? el("a", { href: data.recordings + pair.card.recording }, "rrd") : "") },
   ], rows);
 }
@@ -559,7 +567,7 @@ function rowCard(row) {
   const name = `${row.defense.label} · ${row.victim.label}`, strongest = pairs.get(row.strongest);
   const film = row.clip ? el("figure", { class: "film" }, el("img", { src: row.clip, alt: `The same scenario without an attack, and under ${strongest.attack.name}`, onerror: (event) => event.target.closest("figure").remove() }), el("figcaption", {}, "The same scenario without an attack (above), and attacked (below)")) : null;
   return [name, el("p", { class: "quiet" }, threatText(current().threat)), film, el("dl", {},
-    ...fact("score", ...estimate(row.score), `, rank ${row.group}`),
+    ...fact("score", ...estimate(row.score), `, rank ${row.group}${row.flagged ? ", flagged" : ""}`),
     ...(row.failed ? fact(said().failure_title, `${percent(row.failed.estimate)} (${bounds(row.failed)})`) : []),
     ...fact("worst cell", ...worstCell({ row })),
     ...(row.clean ? fact("without an attack", ...estimate(row.clean)) : []),
@@ -576,6 +584,7 @@ function pairCard(pair) {
   const card = pair.card;
   return [card.pair, null, null, el("dl", {},
     ...fact("score", ...estimate(pair.score)),
+    ...(pair.remarks.length ? fact("doubts", el("ul", {}, ...remarksOf(pair))) : []),
     ...works(card, ["attack", "defense", "victim", "world"]),
     ...fact("threat model", pair.threat.budget ? threatName(pair.threat) : "nothing is attacked"),
     ...provenance(pair),
