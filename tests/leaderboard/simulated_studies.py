@@ -1,7 +1,7 @@
 """How often the intervals that a leaderboard prints hold the truth, in simulated studies.
 
-    python -m tests.leaderboard.simulated_studies 2000           # the tables in docs/metrics.md, with so many studies a line
-    python -m tests.leaderboard.simulated_studies 2000 unequal   # one of them: coverage, bad or unequal
+    python -m tests.leaderboard.simulated_studies 400            # the tables in docs/metrics.md, with so many studies a line
+    python -m tests.leaderboard.simulated_studies 200 unequal   # one of them: coverage, bad or unequal
 
 A study is a set of records: two defended victims under two attacks each, on the clear roads of the standard grid. Each episode
 crashes with a probability that is the sum of a cell, a training, a scenario and their interaction, cut at 0 and 1; one that does
