@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import faulthandler
+import importlib
 import os
 import select
 import signal
@@ -157,6 +158,8 @@ def _act_and_end(act: Callable[[], object], write: int, stays: bool) -> None:
         if "torch" in sys.modules:
             # The threads of the parent are not in the copy: waiting for them would never end.
             sys.modules["torch"].set_num_threads(1)
+            # Its constants can only be compared if they were there before.
+            importlib.import_module("envs.highway.world")
         # A crash is reported in our own words.
         faulthandler.disable()
         # The hooks of this process are not the module's.

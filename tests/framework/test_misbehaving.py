@@ -105,6 +105,7 @@ def test_a_sweep_goes_on_and_names_whatever_fails_with_its_package(swept: tuple[
         ("import_segfault", "cannot be imported: its import ends the process (SIGSEGV)"),
         ("import_patch", "cannot be imported: its import replaces torch.Tensor.tanh"),
         ("import_interrupt", "cannot be imported: KeyboardInterrupt"),
+        ("import_floors", "cannot be imported: its import replaces envs.highway.config.STANDARD_FEATURES.floors"),
         ("import_recursion", "cannot be imported: its import changes the recursion limit"),
         ("import_closed", "cannot be imported: its import closes files of the process"),
         ("import_thread", "cannot be imported: its import changes the threads that hold the end of the process"),
