@@ -155,11 +155,12 @@ def _act_and_end(act: Callable[[], object], write: int, stays: bool) -> None:
         silence = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(silence, stream)
+        if stays:
+            # Its constants can only be compared if they were there before. Plug-ins import most of it, too.
+            importlib.import_module("envs.highway.world")
         if "torch" in sys.modules:
             # The threads of the parent are not in the copy: waiting for them would never end.
             sys.modules["torch"].set_num_threads(1)
-            # Its constants can only be compared if they were there before.
-            importlib.import_module("envs.highway.world")
         # A crash is reported in our own words.
         faulthandler.disable()
         # The hooks of this process are not the module's.

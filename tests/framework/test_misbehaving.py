@@ -23,6 +23,7 @@ ON_IMPORT = {
     "import_segfault": "import ctypes; ctypes.string_at(0)",
     "import_patch": "import torch; torch.Tensor.tanh = lambda tensor: tensor",
     "import_interrupt": "raise KeyboardInterrupt",
+    "import_floors": "from envs.highway import config; object.__setattr__(config.STANDARD_FEATURES, 'floors', (0.0,) * 4)",
     "import_recursion": "import inspect, sys; sys.setrecursionlimit(len(inspect.stack()) + 30)",
     "import_closed": "import os; os.closerange(3, 4096)",
     "import_thread": "import threading, time; threading.Thread(target=time.sleep, args=(600,)).start()",
