@@ -316,8 +316,12 @@ def _globals(module: ModuleType) -> dict[str, Any]:
 
 
 def _constants(module: ModuleType) -> dict[str, Any]:
-    """The names of a module that are no code, and its classes."""
-    return {key: value for key, value in _globals(module).items() if isinstance(value, type) or not _is_code(value)}
+    """The names of a module that are no code, and its classes; `_lower` names are caches, which change."""
+    return {
+        key: value
+        for key, value in _globals(module).items()
+        if isinstance(value, type) or not (_is_code(value) or (key.startswith("_") and key.islower()))
+    }
 
 
 def _put_globals(module: ModuleType, content: dict[str, Any]) -> None:

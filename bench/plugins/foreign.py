@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import faulthandler
+import importlib
 import os
 import select
 import signal
@@ -154,6 +155,9 @@ def _act_and_end(act: Callable[[], object], write: int, stays: bool) -> None:
         silence = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(silence, stream)
+        if stays:
+            # Its constants can only be compared if they were there before. Plug-ins import most of it, too.
+            importlib.import_module("envs.highway.world")
         if "torch" in sys.modules:
             # The threads of the parent are not in the copy: waiting for them would never end.
             sys.modules["torch"].set_num_threads(1)

@@ -12,6 +12,8 @@ from bench.plugins.custody import Custody, listed
 
 OWN = ("bench", "attacks", "defenses", "envs", "leaderboard")
 """Top-level packages of the framework."""
+BOOKS = ("bench.plugins.registry",)
+"""Modules that keep books on what was imported: their data change."""
 LIBRARIES = {
     "torch": ("", "Tensor", "nn.Module"),
     "torch.nn.functional": ("",),
@@ -61,7 +63,7 @@ class Snapshot:
         modules = {name: sys.modules[name] for name in sorted(new) if isinstance(sys.modules[name], ModuleType)}
         for module in modules.values():
             self._add_module(module)
-        self._data.add(modules)
+        self._data.add({name: module for name, module in modules.items() if name not in BOOKS})
 
     def changed(self) -> str:
         """The names of at most three functions or data that were replaced, changed or removed since, or added to a class.

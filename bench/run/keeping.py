@@ -82,9 +82,12 @@ def _package(part: Chosen[Any]) -> str:
 
 
 def _roots(part: Chosen[Any]) -> dict[str, object]:
-    """A component, and its classes; those of the framework are in the custody of `bench.plugins.framework`."""
+    """A component, and its classes; those of the framework are in the custody of `bench.plugins.framework`.
+
+    Classes of a Python program are its own.
+    """
     own = [cls for cls in type(part.component).__mro__ if cls.__module__.partition(".")[0] == _package(part)]
-    foreign = own if is_foreign(part) else []
+    foreign = own if is_foreign(part) and not part.code else []
     return {part.name: part.component, **{cls.__qualname__: cls for cls in foreign}}
 
 

@@ -33,6 +33,7 @@ from bench.run.work import Failure, Outcome, Task, Tell, attempt
 
 GB = 1e9
 READY = "ready"
+RANGES = "envs.highway.world"
 START_S = 600.0
 """Seconds that a worker may take to start: on a busy machine its imports take long."""
 KEPT_BYTES = 8192
@@ -259,11 +260,15 @@ def _left(before: tuple[frozenset[int], int]) -> bool:
 
 @cache
 def work_modules() -> tuple[str, ...]:
-    """The modules that do the work of the built-in tracks."""
+    """The modules that do the work of the built-in tracks, and those with the ranges of the driving world's features.
+
+    What is imported before any plug-in can be compared with what plug-ins leave of it.
+    """
     names = [
         name for name, claims in registry.entries(registry.TRACKS).items() if claims[0].distribution == registry.OWN
     ]
-    return tuple(module for name in names for module in (track(name).work, track(name).preparation) if module)
+    work = [module for name in names for module in (track(name).work, track(name).preparation) if module]
+    return (*work, RANGES)
 
 
 def _carried_out(content: bytes, tell: Tell, before: Snapshot) -> Outcome | Failure:
