@@ -567,6 +567,60 @@ def test_a_trained_off_policy_model_is_scored_in_the_environment_of_its_training
         )
 
 
+class Unseeded(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """Does not pass the seed on."""
+
+    def reset(self, **options: Any) -> Any:
+        return self.env.reset()
+
+
+class SharedWind(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """A wind that all carts share."""
+
+    time: ClassVar[int] = 0
+
+    def reset(self, **options: Any) -> Any:
+        SharedWind.time = 0
+        return self.env.reset(**options)
+
+    def step(self, action: Any) -> Any:
+        SharedWind.time += 1
+        found: Any = self.env.unwrapped
+        found.state = tuple(np.add(found.state, (0, 0.05 * np.sin(SharedWind.time), 0, 0)))
+        return self.env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "line"),
+    [
+        (lambda env: env, ""),
+        (Unseeded, "is reset with the same seed goes on otherwise"),
+        (SharedWind, "are driven in turn change each other"),
+        (gymnasium.wrappers.NormalizeObservation, "depends on those before it in the same environment"),
+    ],
+)
+def test_an_environment_whose_episodes_are_not_the_same_again_is_told(cartpole: Any, wrap: Any, line: str) -> None:
+    class Wrapped(cartpole.CartPole):  # type: ignore[misc]
+        def environment(self, cell: Any) -> Any:
+            return wrap(super().environment(cell))
+
+    told = [one for one in Wrapped().doubts(cartpole.CARTPOLE_V1.cells()) if "Wrapped" in one]
+    assert len(told) == bool(line)
+    assert line in "".join(told)
+
+
+def test_one_environment_for_all_episodes_is_refused(cartpole: Any) -> None:
+    cells = cartpole.CARTPOLE_V1.cells()
+    only = cartpole.CartPole().environment(cells[0])
+
+    class Same(cartpole.CartPole):  # type: ignore[misc]
+        def environment(self, cell: Any) -> Any:
+            return only
+
+    with pytest.raises(cavbench.UserError, match="returned the same environment for two episodes"):
+        Same().make(cells)
+
+
 def test_an_environment_that_is_not_as_declared_is_refused(cartpole: Any) -> None:
     class Other(cartpole.CartPole):  # type: ignore[misc]
         def environment(self, cell: Any) -> Any:
