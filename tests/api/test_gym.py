@@ -534,6 +534,7 @@ def test_the_environment_of_a_model_says_whether_it_was_trained_in_the_world(car
     own = world.environment(cartpole.CARTPOLE_V1.cells()[0])
     assert scored(own) == "cartpole(max_steps=20)"
     assert scored(gymnasium.make("CartPole-v0")) == "CartPole-v0"
+    assert scored(gymnasium.make("CartPole-v1", sutton_barto_reward=True)) == "CartPole-v1(sutton_barto_reward=True)"
     with pytest.raises(cavbench.UserError, match="was trained behind TransformObservation, which the world does not"):
         scored(gymnasium.wrappers.TransformObservation(own, np.tanh, own.observation_space))
     with pytest.raises(

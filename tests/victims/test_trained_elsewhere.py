@@ -159,6 +159,20 @@ def test_a_wrapper_that_skips_frames_or_is_not_known_is_never_said_to_be_the_wor
     assert said(score(trained("ppo", VecMonitor(DummyVecEnv([lambda: plain]))))) == "highway(max_steps=15)"
 
 
+def test_an_environment_with_another_configuration_is_another_world() -> None:
+    pytest.importorskip("highway_env")
+    from bench.victims.drivers.sb3_environment import chain
+
+    own = chain(gymnasium.make("highway-fast-v0"))
+    for options, said in (
+        ({}, []),
+        ({"screen_width": 300}, []),
+        ({"policy_frequency": 5}, ["policy_frequency=5"]),
+        ({"lanes_count": 4, "duration": 9}, ["duration=9", "lanes_count=4"]),
+    ):
+        assert chain(gymnasium.make("highway-fast-v0", config=options))._differences(own) == said
+
+
 def test_a_model_with_a_predict_of_its_own_is_refused() -> None:
     class Shifted(sb3.DQN):  # type: ignore[misc]
         def predict(self, *given: Any, **named: Any) -> Any:

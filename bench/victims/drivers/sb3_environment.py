@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 from bench.driving import DrivingWorld
-from bench.errors import UserError
+from bench.errors import UserError, short
 from bench.plugins.content import content
 from bench.plugins.pair import Chosen
 from bench.scenarios import Grid
@@ -23,6 +23,11 @@ HARMLESS = (
 """Wrappers of `LIBRARIES` that change neither observations, actions nor the rate of decisions."""
 LIBRARIES = ("gymnasium", "stable_baselines3")
 """Their other wrappers change one of these."""
+
+CELLS = 16
+"""So many environments of the world are compared at most: a model may be trained in any cell."""
+DRAWN = ("render", "offscreen", "screen", "show", "scaling", "centering", "real_time", "manual")
+"""Options of an environment that begin so say how it is drawn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,24 +66,37 @@ class Training:
         if isinstance(trained, DrivingWorld) and type(self.inner).__module__ == "bench.gym.environment":
             self._refuse(None)
             return label(trained) if self.known else UNKNOWN
-        own = self._of_gym(world.component, grid)
+        owns = self._of_gym(world.component, grid)
+        own = next(owns, None)
         if own is None or (self.id or type(self.inner)) != (own.id or type(own.inner)):
             return self.id or UNKNOWN
         self._refuse(own)
+        if differs := self._differences(own):
+            # It may have been trained in another cell.
+            differs = min([differs, *map(self._differences, owns)], key=len)
+        if differs:
+            return f"{self.id}({', '.join(differs)})" if self.id else UNKNOWN
         return str(world) if self.known else UNKNOWN
 
-    def _of_gym(self, world: DrivingWorld, grid: Grid) -> Training | None:
-        """The environment of a world that is made of a gymnasium environment."""
+    def _differences(self, own: Training) -> list[str]:
+        """The options of its environment that are others than those of an environment of the world."""
+        found, there = _options(self.inner), _options(own.inner)
+        names = [name for name in sorted({*found, *there}) if content(found.get(name)) != content(there.get(name))]
+        return [f"{name}={short(str(found.get(name)))}" for name in names]
+
+    def _of_gym(self, world: DrivingWorld, grid: Grid) -> Iterator[Training]:
+        """The environments of some cells of a world that is made of a gymnasium environment; none for another world."""
         # A model of Stable-Baselines3 comes with gymnasium; a run without one needs none.
         from bench.gym.world import GymWorld
 
         if not isinstance(world, GymWorld):
-            return None
-        env = world.environment(grid.cells()[0])
-        try:
-            return chain(env)
-        finally:
-            env.close()
+            return
+        for cell in grid.cells()[:CELLS]:
+            env = world.environment(cell)
+            try:
+                yield chain(env)
+            finally:
+                env.close()
 
     def _refuse(self, own: Training | None) -> None:
         """Refuse wrappers that the environment of the world, if it is made of one, does not have."""
@@ -117,6 +135,17 @@ def chain(env: Any) -> Training:
     )
 
 
+def _options(inner: Any) -> dict[str, Any]:
+    """The arguments that a registered environment was made with, and highway-env's configuration, without what is drawn."""
+    made = getattr(getattr(inner, "spec", None), "kwargs", None) or {}
+    config = getattr(inner, "config", None)
+    found = {
+        **{name: value for name, value in made.items() if name != "config"},
+        **(config if isinstance(config, dict) else {}),
+    }
+    return {name: value for name, value in found.items() if not str(name).startswith(DRAWN)}
+
+
 def _settings(wrapper: Any) -> str:
     """A hash of the arguments that gymnasium keeps of a wrapper, and of its statistics."""
     statistics = getattr(wrapper, "obs_rms", None)
@@ -142,8 +171,8 @@ def training_of(model: Any) -> Training | None:
     found = [chain(one) for one in getattr(env, "envs", ())]
     first = found[0] if found else None
     alike = all(
-        (one.id, one.changing, one.known, getattr(one.inner, "world", None))
-        == (first.id, first.changing, first.known, getattr(first.inner, "world", None))
+        (one.id, one.changing, one.known, getattr(one.inner, "world", None), content(_options(one.inner)))
+        == (first.id, first.changing, first.known, getattr(first.inner, "world", None), content(_options(first.inner)))
         for one in found
         if first is not None
     )
