@@ -81,6 +81,7 @@ class DrivingFacts(Facts):
         kinematics: how its cars move; None if the world does not say.
         flat: whether the observation is one row, which the world's own environment gives as an array in physical units.
         shape: shape of that array; empty for [F - 1].
+        limits: the lowest and the highest value of each of its entries, in that environment; empty if nobody asked.
         rows: V, the number of rows in its observations; None if the world does not say.
         environment: the call that makes the world's gymnasium environment, for messages; empty if the world does not say.
     """
@@ -90,6 +91,7 @@ class DrivingFacts(Facts):
     kinematics: Kinematics | None = None
     flat: bool = False
     shape: tuple[int, ...] = ()
+    limits: tuple[tuple[float, float], ...] = ()
     rows: int | None = None
     environment: str = ""
 
@@ -117,6 +119,6 @@ class DrivingFacts(Facts):
             "drivers": list(self.drivers),
         }
         # No report reads them.
-        for name in ("kinematics", "shape", "rows", "environment"):
+        for name in ("kinematics", "shape", "limits", "rows", "environment"):
             del values[name]
         return values

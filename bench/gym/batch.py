@@ -47,7 +47,7 @@ class Batch(EnvBase):
         witness: sees the raw values; None for nobody.
 
     Raises:
-        UserError: if the spaces of an environment are not those that the world declares.
+        UserError: if the spaces of an environment are not those that the world declares, or two episodes have the same one.
     """
 
     batch_locked = True
@@ -59,6 +59,11 @@ class Batch(EnvBase):
         super().__init__(device="cpu", batch_size=torch.Size([size]))
         self.world, self.discrete, self.witness = world, action_type == "discrete", witness
         self.envs = [world.environment(cell) for cell in cells]
+        if len({id(env.unwrapped) for env in self.envs}) < size:
+            raise UserError(
+                f"{type(world).__name__}.environment returned the same environment for two episodes, which are driven in turn: "
+                "make a new one in each call"
+            )
         for env in self.envs:
             check(world, env, action_type)
         features = world.features

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 CONTROLS = 2
 # Not among the data that no unit may change (`bench.plugins.framework.Snapshot`): a world is asked when it is needed.
-_shapes: UserDict[tuple[type, str], tuple[int, ...]] = UserDict()
-"""Shapes of the observations of environments that were asked, by class and parameters of the world."""
+_asked: UserDict[tuple[type, str], spaces.Box | None] = UserDict()
+"""What environments that were asked observe, by class and parameters of the world."""
 
 
 def native_shape(world: GymWorld) -> tuple[int, ...]:
@@ -33,10 +33,19 @@ def native_shape(world: GymWorld) -> tuple[int, ...]:
     """
     if world.shape:
         return world.shape
-    key = (type(world), canonical(world))
-    if key not in _shapes:
-        _shapes[key] = _asked(world)
-    return _shapes[key]
+    space = _space(world)
+    return (len(world.features.names),) if space is None else space.shape
+
+
+def native_limits(world: GymWorld) -> tuple[tuple[float, float], ...]:
+    """The lowest and the highest value of each entry in the space of an environment's observation.
+
+    Empty if `world.shape` is given, so that none is asked, or none can be made without a cell of its grid.
+    """
+    space = None if world.shape else _space(world)
+    if space is None:
+        return ()
+    return tuple(zip(space.low.reshape(-1).tolist(), space.high.reshape(-1).tolist(), strict=True))
 
 
 def check(world: GymWorld, env: gymnasium.Env[Any, Any], action_type: ActionType) -> None:
@@ -60,8 +69,15 @@ def check(world: GymWorld, env: gymnasium.Env[Any, Any], action_type: ActionType
         raise UserError(f"continuous policies have {CONTROLS} controls, the environment of {name} takes {action}")
 
 
-def _asked(world: GymWorld) -> tuple[int, ...]:
-    flat = (len(world.features.names),)
+def _space(world: GymWorld) -> spaces.Box | None:
+    """The space of an environment's observation; None if none can be made, or it is no Box of the declared size."""
+    key = (type(world), canonical(world))
+    if key not in _asked:
+        _asked[key] = _ask(world)
+    return _asked[key]
+
+
+def _ask(world: GymWorld) -> spaces.Box | None:
     try:
         with contained():
             env = world.environment(_any_cell(world))
@@ -69,8 +85,8 @@ def _asked(world: GymWorld) -> tuple[int, ...]:
             env.close()
     # The environment of a plug-in may raise anything; it is made again, and then heard, when it is driven.
     except Exception:
-        return flat
-    return space.shape if isinstance(space, spaces.Box) and prod(space.shape) == prod(flat) else flat
+        return None
+    return space if isinstance(space, spaces.Box) and prod(space.shape) == len(world.features.names) else None
 
 
 def _any_cell(world: GymWorld) -> Cell:

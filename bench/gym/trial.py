@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from bench.driving import ActionType, Features
 from bench.gym.batch import Batch
 from bench.gym.declared import CONTROLS
+from bench.gym.repeats import repeats
 from bench.scenarios import Cell, SeedBlock
 
 if TYPE_CHECKING:
@@ -92,7 +93,8 @@ def doubts(world: GymWorld, cells: Sequence[Cell]) -> list[str]:
         limits = [found for env in batch.envs if (found := time_limit(env)) is not None]
         early = _drive(batch, seen)
     limits += early if len(early) > 1 and len(set(early)) == 1 else []
-    return [*_of_ranges(world, seen), *_of_rewards(world, seen), *_of_length(world, limits)]
+    declared = [*_of_ranges(world, seen), *_of_rewards(world, seen), *_of_length(world, limits)]
+    return [*repeats(world, cells), *declared]
 
 
 def _drive(batch: Batch, seen: Seen) -> list[int]:

@@ -16,7 +16,7 @@ from bench.driving import ActionType, Driver, DrivingFacts, DrivingWorld
 from bench.errors import UserError
 from bench.gym import trial
 from bench.gym.batch import Batch
-from bench.gym.declared import native_shape
+from bench.gym.declared import native_limits, native_shape
 from bench.scenarios import Cell
 
 SUCCESS = ("is_success", "success")
@@ -94,6 +94,7 @@ class GymWorld(DrivingWorld):
             features=self.features,
             flat=True,
             shape=native_shape(self),
+            limits=native_limits(self),
         )
 
     def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:

@@ -29,6 +29,8 @@ TOLERANCE = 1e-3
 """Answers may differ by this share of their largest value between batches of different sizes: rounding."""
 SAME = 1e-6
 """The same for equal batches."""
+NEIGHBOURS, NEAR = 4, 0.02
+"""So many points around an observation are asked, at most so far away on [-1, 1]."""
 LOST = 0.5
 """Share of observations without a usable gradient from which on attacks with gradients say nothing."""
 
@@ -85,7 +87,9 @@ def try_policy(
             for moment in moments:
                 _try_batches(policy, moment)
             _try_rehearsal(policy, moments)
-        return _gradients(policy, moments) if gradients else []
+        told = _gradients(policy, moments) if gradients else []
+        # Controls that are clipped do not change either.
+        return told + (_clipped(policy, moments) or ([] if drew else _steps(policy, moments)))
 
 
 @cache
@@ -239,6 +243,42 @@ def _gradients(policy: Policy, moments: Sequence[Moment]) -> list[str]:
             "division at 0): attacks with gradients count such an entry as 0"
         ]
     return []
+
+
+def _steps(policy: Policy, moments: Sequence[Moment]) -> list[str]:
+    """A warning if the scores do not change around most observations, so that an attack that asks for them sees nothing."""
+    generator = torch.Generator().manual_seed(2)
+    same, asked = 0, 0
+    for moment in moments:
+        scores, still = _answer(policy, moment), torch.ones(EPISODES, dtype=torch.bool)
+        for _ in range(NEIGHBOURS):
+            moved = moment.observation.clone()
+            moved[..., 1:] += (
+                NEAR * (2 * torch.rand(moved[..., 1:].shape, generator=generator) - 1) * (moved[..., :1] > 0)
+            )
+            other = _answer(policy, Moment(moved, moment.state))
+            still &= ((scores - other).abs() <= SAME * scores.abs().amax(-1, keepdim=True).clamp(min=1e-3)).all(-1)
+        asked += EPISODES
+        same += int(still.sum())
+    if same < LOST * asked:
+        return []
+    return [
+        f"answers the same scores at all points around {100 * same / asked:.0f} % of the observations it was tried on (one-hot, "
+        "argmax, a sharp softmax): attacks by scores, zo too, cannot tell how robust it is; give values or logits"
+    ]
+
+
+def _clipped(policy: Policy, moments: Sequence[Moment]) -> list[str]:
+    """A warning if most controls of a policy from outside are clipped, as they are if it answers in units of physics."""
+    if not getattr(policy, "clips", False):
+        return []
+    ends = torch.cat([(_answer(policy, moment).abs() == 1).any(-1) for moment in moments])
+    if float(share := ends.float().mean()) < LOST:
+        return []
+    return [
+        f"answers controls at or beyond an end of [-1, 1] in {100 * share:.0f} % of the observations it was tried on, which are "
+        "clipped: if it answers another range, or m/s2 and rad, give a network that scales them to [-1, 1]"
+    ]
 
 
 def _gradient(policy: Policy, moment: Moment) -> Tensor:

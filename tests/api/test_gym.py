@@ -534,10 +534,92 @@ def test_the_environment_of_a_model_says_whether_it_was_trained_in_the_world(car
     own = world.environment(cartpole.CARTPOLE_V1.cells()[0])
     assert scored(own) == "cartpole(max_steps=20)"
     assert scored(gymnasium.make("CartPole-v0")) == "CartPole-v0"
-    with pytest.raises(cavbench.UserError, match="was trained behind NormalizeObservation, which the world does not"):
+    assert scored(gymnasium.make("CartPole-v1", sutton_barto_reward=True)) == "CartPole-v1(sutton_barto_reward=True)"
+    with pytest.raises(cavbench.UserError, match="was trained behind TransformObservation, which the world does not"):
+        scored(gymnasium.wrappers.TransformObservation(own, np.tanh, own.observation_space))
+    with pytest.raises(
+        cavbench.UserError, match=r"was trained on Box\(-inf, inf, \(4,\)\), this world shows Box\(\[-4.8"
+    ):
         scored(gymnasium.wrappers.NormalizeObservation(own))
     # cavbench.gym.make gives one row on [-1, 1], which such a policy is given, too.
     assert scored(cavbench.gym.make(world, pole=0.5)) == "cartpole(max_steps=20)"
+
+
+def test_a_trained_off_policy_model_is_scored_in_the_environment_of_its_training(cartpole: Any, tmp_path: Path) -> None:
+    # Stable-Baselines3 keeps an observation "before VecNormalize" of these models even if there was none.
+    sb3 = pytest.importorskip("stable_baselines3")
+    world = cartpole.CartPole(max_steps=20)
+    env = world.environment(cartpole.CARTPOLE_V1.cells()[0])
+    model = sb3.DQN("MlpPolicy", env, learning_starts=5, buffer_size=50, seed=0).learn(20)
+    model.save(tmp_path / "model.zip")
+    file = cavbench.component("victim", "sb3", path=str(tmp_path / "model.zip"))
+    for victim, said in (
+        (model, "cartpole(max_steps=20)"),
+        (sb3.DQN.load(tmp_path / "model.zip"), "unknown"),
+        (file, "unknown"),
+    ):
+        found = cavbench.score(victim, "none", world=world, pole=0.5, episodes=1, baselines=False, out=tmp_path)
+        assert json.loads(found.records.victim_params.iloc[0])["trained_in"] == said
+    with pytest.raises(
+        cavbench.UserError, match="nothing tells whether it was trained behind VecNormalize: load it without"
+    ):
+        cavbench.score(
+            sb3.DQN.load(tmp_path / "model.zip", env=env), "none", world=world, pole=0.5, episodes=1, out=tmp_path
+        )
+
+
+class Unseeded(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """Does not pass the seed on."""
+
+    def reset(self, **options: Any) -> Any:
+        return self.env.reset()
+
+
+class SharedWind(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """A wind that all carts share."""
+
+    time: ClassVar[int] = 0
+
+    def reset(self, **options: Any) -> Any:
+        SharedWind.time = 0
+        return self.env.reset(**options)
+
+    def step(self, action: Any) -> Any:
+        SharedWind.time += 1
+        found: Any = self.env.unwrapped
+        found.state = tuple(np.add(found.state, (0, 0.05 * np.sin(SharedWind.time), 0, 0)))
+        return self.env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "line"),
+    [
+        (lambda env: env, ""),
+        (Unseeded, "is reset with the same seed goes on otherwise"),
+        (SharedWind, "are driven in turn change each other"),
+        (gymnasium.wrappers.NormalizeObservation, "depends on those before it in the same environment"),
+    ],
+)
+def test_an_environment_whose_episodes_are_not_the_same_again_is_told(cartpole: Any, wrap: Any, line: str) -> None:
+    class Wrapped(cartpole.CartPole):  # type: ignore[misc]
+        def environment(self, cell: Any) -> Any:
+            return wrap(super().environment(cell))
+
+    told = [one for one in Wrapped().doubts(cartpole.CARTPOLE_V1.cells()) if "Wrapped" in one]
+    assert len(told) == bool(line)
+    assert line in "".join(told)
+
+
+def test_one_environment_for_all_episodes_is_refused(cartpole: Any) -> None:
+    cells = cartpole.CARTPOLE_V1.cells()
+    only = cartpole.CartPole().environment(cells[0])
+
+    class Same(cartpole.CartPole):  # type: ignore[misc]
+        def environment(self, cell: Any) -> Any:
+            return only
+
+    with pytest.raises(cavbench.UserError, match="returned the same environment for two episodes"):
+        Same().make(cells)
 
 
 def test_an_environment_that_is_not_as_declared_is_refused(cartpole: Any) -> None:

@@ -416,6 +416,28 @@ def test_only_tensors_of_a_saved_model_are_unpickled(tmp_path: Path) -> None:
     assert not harm.exists()
 
 
+class TwoOutputs(nn.Module):
+    """A mean and the logarithm of a deviation, as SAC's actors return, or logits and a value."""
+
+    def __init__(self, other: int) -> None:
+        super().__init__()
+        self.first, self.other = nn.Linear(50, 2), nn.Linear(50, other)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        return self.first(observation.flatten(1)), self.other(observation.flatten(1))
+
+
+@pytest.mark.parametrize(("other", "fits"), [(1, True), (2, False)])
+def test_an_onnx_file_with_two_outputs_that_could_drive_is_refused(other: int, fits: bool, tmp_path: Path) -> None:
+    path = onnx_file(tmp_path / "two.onnx", TwoOutputs(other))
+    victim = choose("victim", "onnx", path=path, actions="continuous").component
+    if fits:
+        assert victim.load(0, FACTS).scores(torch.zeros(3, 10, 5)).shape == (3, 2)
+        return
+    with pytest.raises(UserError, match="of 2 numbers each: export the one that drives alone"):
+        victim.load(0, FACTS)
+
+
 def test_without_onnx_runtime_the_error_has_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

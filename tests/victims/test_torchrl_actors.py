@@ -25,6 +25,7 @@ from torchrl.modules import (
     ProbabilisticActor,
     QValueActor,
     QValueModule,
+    TanhModule,
     TanhNormal,
 )
 
@@ -127,6 +128,10 @@ REFUSED: dict[str, tuple[Callable[[], nn.Module], str]] = {
     "another scale": (
         lambda: normal(distribution_kwargs={"low": -2.0, "high": 2.0}),
         r"has actions up to -2, controls are in \[-1, 1\]",
+    ),
+    "another scale in a squashing": (
+        lambda: TensorDictSequential(module(network(2), "action"), TanhModule(in_keys=["action"], low=-5.0, high=5.0)),
+        r"has actions up to -5, controls are in \[-1, 1\]",
     ),
     "another scale in its spec": (
         lambda: Actor(network(2), in_keys=["observation"], spec=Bounded(-3.0, 3.0, (2,))),

@@ -119,6 +119,76 @@ def test_features_in_another_order_are_seen_in_the_last_observation_and_in_the_w
         score(sb3.PPO("MlpPolicy", PresenceLast(make()), seed=0))
 
 
+class Halved(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """Changes observations and does not say so by its class."""
+
+    def reset(self, **options: Any) -> Any:
+        observation, info = self.env.reset(**options)
+        return observation * np.array([1, 0.5, 0.5, 0.5, 0.5], np.float32), info
+
+    def step(self, action: Any) -> Any:
+        observation, *others = self.env.step(action)
+        return observation * np.array([1, 0.5, 0.5, 0.5, 0.5], np.float32), *others
+
+
+def test_a_wrapper_that_skips_frames_or_is_not_known_is_never_said_to_be_the_world(score: Callable[..., Any]) -> None:
+    from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
+
+    class HalvedBatch(VecEnvWrapper):
+        def reset(self) -> Any:
+            return self.venv.reset() * np.array([1, 0.5, 0.5, 0.5, 0.5], np.float32)
+
+        def step_wait(self) -> Any:
+            observation, *others = self.venv.step_wait()
+            return observation * np.array([1, 0.5, 0.5, 0.5, 0.5], np.float32), *others
+
+    def short() -> gymnasium.Env[Any, Any]:
+        return make(max_steps=15)
+
+    for env, name in (
+        (gymnasium.wrappers.MaxAndSkipObservation(short(), skip=4), "MaxAndSkipObservation"),
+        (MaxAndSkipEnv(short(), 4), "MaxAndSkipEnv"),
+        (VecNormalize(VecNormalize(DummyVecEnv([short]))), "VecNormalize"),
+    ):
+        with pytest.raises(UserError, match=f"was trained behind {name}, which the world does not have"):
+            score(trained("ppo", env))
+    assert said(score(trained("ppo", Halved(short())))) == "unknown"
+    assert said(score(trained("ppo", HalvedBatch(DummyVecEnv([short]))))) == "unknown"
+    plain = gymnasium.wrappers.TimeLimit(gymnasium.wrappers.ClipReward(short(), 0, 1), 10)
+    assert said(score(trained("ppo", VecMonitor(DummyVecEnv([lambda: plain]))))) == "highway(max_steps=15)"
+
+
+def test_an_environment_with_another_configuration_is_another_world() -> None:
+    pytest.importorskip("highway_env")
+    from bench.victims.drivers.sb3_environment import chain
+
+    own = chain(gymnasium.make("highway-fast-v0"))
+    for options, said in (
+        ({}, []),
+        ({"screen_width": 300}, []),
+        ({"policy_frequency": 5}, ["policy_frequency=5"]),
+        ({"lanes_count": 4, "duration": 9}, ["duration=9", "lanes_count=4"]),
+    ):
+        assert chain(gymnasium.make("highway-fast-v0", config=options))._differences(own) == said
+
+
+def test_a_model_with_a_predict_of_its_own_is_refused() -> None:
+    class Shifted(sb3.DQN):  # type: ignore[misc]
+        def predict(self, *given: Any, **named: Any) -> Any:
+            action, state = super().predict(*given, **named)
+            return (action + 1) % 5, state
+
+    refused(Shifted("MlpPolicy", make(), buffer_size=10, seed=0), r"Shifted has a predict\(\) of its own")
+
+
+def test_a_file_of_a_model_that_divides_pictures_by_255_is_refused(tmp_path: Path) -> None:
+    env = spaces(continuous=False, shape=(1, 10, 5))
+    env.observation_space = gymnasium.spaces.Box(0, 255, (1, 10, 5), np.uint8)
+    sb3.DQN("MlpPolicy", env, buffer_size=10, seed=0).save(tmp_path / "model.zip")
+    refused(tmp_path / "model.zip", "was trained on pictures of uint8, which Stable-Baselines3 divides by 255")
+
+
 def test_a_stack_of_frames_is_refused(tmp_path: Path) -> None:
     from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 

@@ -50,6 +50,7 @@ class FilePolicy(Policy):
         self.network, self.critic, self.native = network, critic, native
         self.shape, self.width = tuple(shape), width
         self.action_type, self.weights_sha256 = action_type, sha256
+        self.clips = action_type == "continuous"
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> FilePolicy:

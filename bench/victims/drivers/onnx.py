@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from bench.driving import DrivingFacts
@@ -33,8 +35,22 @@ class ONNX(FileDriver):
         if batch is not None:
             raise UserError(f"{self.path} has a fixed batch size of {batch}: export it with a dynamic first axis")
 
+        sizes = [side for side in shape if side is not None]
+        self._check_outputs(model, sizes, self.width(facts))
+
         def network(observation: Tensor) -> Tensor:
             return model.run(observation, model.outputs[:1])[0]
 
-        sizes = [side for side in shape if side is not None]
         return FilePolicy(network, sizes, self.action_type, self.width(facts), model.sha256, native=native)
+
+    def _check_outputs(self, model: onnx_runtime.Model, shape: Sequence[int], width: int) -> None:
+        """Refuse a file that does not say which output drives, such as a mean and a standard deviation, or two critics."""
+        if len(model.outputs) < 2:
+            return
+        answers = model.run(torch.zeros(2, *shape), model.outputs)
+        fitting = [name for name, one in zip(model.outputs, answers, strict=True) if list(one.shape) == [2, width]]
+        if len(fitting) > 1:
+            raise UserError(
+                f"{self.path} returns {' and '.join(fitting)} of {width} numbers each: export the one that drives alone, "
+                "squashed as the policy squashes it"
+            )

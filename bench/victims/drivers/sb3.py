@@ -85,7 +85,7 @@ class StableBaselines3(FileDriver):
             expected,
             saved.last,
             saved.raw,
-            saved.normalised,
+            saved.kept,
             native=native is not None,
             algorithm=saved.algorithm.upper(),
         )

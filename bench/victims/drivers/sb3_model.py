@@ -65,6 +65,11 @@ class ModelNetwork(nn.Module):
                 f"models of {type(model).__module__.partition('.')[0]}'s {type(model).__name__} are not supported; "
                 f"supported: {', '.join(_KNOWN)} of Stable-Baselines3. {INSTEAD}"
             )
+        own = "predict" in vars(model) or type(model).predict.__module__.partition(".")[0] != "stable_baselines3"
+        if own:
+            raise UserError(
+                f"{type(model).__name__} has a predict() of its own, by which it would not be driven. {INSTEAD}"
+            )
         space, actions = model.observation_space, model.action_space
         if type(space).__name__ != "Box":
             raise UserError(f"the model takes observations of {short(str(space))}; the type must be Box. {INSTEAD}")
@@ -182,7 +187,10 @@ def network_of(
     native = expected.fit(name, network.shape, network.bounds)
     if not network.clip:
         last, raw = (_kept(model, key, network.bounds) for key in ("_last_obs", "_last_original_obs"))
-        behind = model.get_vec_normalize_env() is None and getattr(model, "_last_original_obs", None) is not None
+        # A model that still has both is as it was trained; `load(env=...)` and `set_env` drop the last observation.
+        live = model.get_env() is not None and last is not None
+        normaliser = model.get_vec_normalize_env()
+        behind = normaliser is None and not live and getattr(model, "_last_original_obs", None) is not None
         check_traces(name, expected, last, raw, behind, native=native is not None, algorithm=network.algorithm)
     shown = observation if native is None else native(observation)
     network.check(shown.reshape(-1, *network.shape))

@@ -51,7 +51,7 @@ class Saved:
         options: its `policy_kwargs`.
         last: the last observations of the training [n, V * F], if the file has them.
         raw: those before `VecNormalize`, if the file has them.
-        normalised: whether it was trained behind a `VecNormalize`, as far as the file tells.
+        kept: whether it has an observation from before a `VecNormalize` (`check_traces`).
     """
 
     name: str
@@ -63,7 +63,7 @@ class Saved:
     options: Mapping[str, Any]
     last: NDArray[np.float32] | None
     raw: NDArray[np.float32] | None
-    normalised: bool
+    kept: bool
 
     @property
     def activation(self) -> type[nn.Module]:
@@ -114,6 +114,12 @@ def _read(name: str, data: Mapping[str, Any]) -> Saved:
     if not _is(observation, "Box"):
         raise UserError(f"{name} was trained on observations of {_type(observation)}; the type must be Box")
     shown = _bounds(observation)
+    pictures = str(observation.get("dtype")) == "uint8" and len(shown.shape) == 3
+    if pictures and (shown.low, shown.high) == ((0.0,), (255.0,)) and options.get("normalize_images", True):
+        raise UserError(
+            f"{name} was trained on pictures of uint8, which Stable-Baselines3 divides by 255: give cavbench.score the model "
+            "itself, or train it with policy_kwargs={'normalize_images': False}"
+        )
     actions = data["action_space"]
     discrete = _is(actions, "Discrete")
     if not discrete and not _is(actions, "Box"):
@@ -122,8 +128,7 @@ def _read(name: str, data: Mapping[str, Any]) -> Saved:
         raise UserError(f"{name} numbers its actions from {actions['start']}; they must be numbered from 0")
     between = None if discrete else _bounds(actions)
     size = math.prod(shown.shape)
-    kept = ("_last_obs", "_last_original_obs") if str(observation.get("dtype")) == "float32" else ("", "")
-    last, raw = (_array(data.get(key), size) for key in kept)
+    last, raw = (_array(data.get(key), size) for key in ("_last_obs", "_last_original_obs"))
     return Saved(
         name=name,
         algorithm=algorithm,
@@ -134,7 +139,7 @@ def _read(name: str, data: Mapping[str, Any]) -> Saved:
         options=options,
         last=last,
         raw=raw,
-        normalised=data.get("_last_original_obs") is not None,
+        kept=data.get("_last_original_obs") is not None,
     )
 
 

@@ -9,6 +9,9 @@ from bench.errors import UserError
 from bench.victims.drivers.spaces import Expected
 
 EXACT = 1e-6
+BEYOND = 0.01
+"""An observation of the world's own environment may leave a declared range by this share of it."""
+ON_POLICY = ("PPO", "A2C")
 
 
 def check_traces(
@@ -16,7 +19,7 @@ def check_traces(
     expected: Expected,
     last: NDArray[np.float32] | None,
     raw: NDArray[np.float32] | None,
-    normalised: bool,
+    kept: bool,
     *,
     native: bool,
     algorithm: str,
@@ -24,32 +27,54 @@ def check_traces(
     """Refuse a model whose environment changed the world's observations in a way that is not applied here.
 
     Stable-Baselines3 keeps the last observations of a training, also in the file. Those of a model behind `VecNormalize` are
-    normalised; the statistics are with the environment, and in no file of the model.
+    normalised; the statistics are with the environment, and in no file of the model. PPO and A2C keep the observation before
+    `VecNormalize` only behind it. The others always do: without it, the one before the last.
 
     Args:
         name: the model in errors.
         expected: what the world shows.
         last: the last observations of the training [n, V * F]; None if they are not known.
         raw: the same before `VecNormalize`; for PPO and A2C the first ones.
-        normalised: whether there was a `VecNormalize`; its `norm_obs` may be off.
+        kept: whether there is such a `raw`, and no environment that tells.
         native: whether the observations are in the format of the world's own environment.
         algorithm: name of its class.
 
     Raises:
-        UserError: if they are no observations of the world.
+        UserError: if they are no observations of the world, or nothing tells.
     """
     plain = not native and last is not None
-    if normalised and not (_equal(last, raw) or (plain and not _strange(last, expected))):
+    what = _strange(last, expected) if plain else ""
+    whole = f'{algorithm}.load("model.zip", env=VecNormalize.load("statistics.pkl", venv))'
+    if kept and algorithm not in ON_POLICY and last is None:
+        raise UserError(
+            f"{name} has no last observation of its training, so nothing tells whether it was trained behind VecNormalize: load "
+            f'it without env=, {algorithm}.load("model.zip"), or with its statistics, {whole}'
+        )
+    if algorithm in ON_POLICY:
+        normalised = kept and not (_equal(last, raw) or (plain and not what))
+    else:
+        normalised = kept and bool(what or (native and _beyond(last, raw, expected)))
+    if normalised:
         raise UserError(
             f"{name} was trained behind VecNormalize, whose statistics are not in it: give cavbench.score the model with its "
-            f'environment, as in cavbench.score({algorithm}.load("model.zip", env=VecNormalize.load("statistics.pkl", venv))), '
-            "or train it without norm_obs"
+            f"environment, as in cavbench.score({whole}), or train it without norm_obs"
         )
-    if plain and (what := _strange(last, expected)):
+    if what:
         raise UserError(
             f"the last observation of {name} in its training is none of this world: {what}. A wrapper of its environment has "
             "changed them (VecNormalize, another order of features): give cavbench.score a torch.nn.Module that does the same"
         )
+
+
+def _beyond(last: NDArray[np.float32] | None, raw: NDArray[np.float32] | None, expected: Expected) -> bool:
+    """Whether an entry of the last observation leaves its declared range, and the same one before `VecNormalize` does not."""
+    if last is None or raw is None or last.shape != raw.shape:
+        return False
+    features = expected.facts.features
+    low, high = np.array(features.low), np.array(features.high)
+    spare = BEYOND * (high - low)
+    outside, other = ((one < low - spare) | (one > high + spare) for one in (last, raw))
+    return bool((outside & ~other).any())
 
 
 def _equal(last: NDArray[np.float32] | None, raw: NDArray[np.float32] | None) -> bool:

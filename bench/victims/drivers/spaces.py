@@ -105,7 +105,7 @@ class Expected:
         else:
             own = shape in self._both((rows, features)) if rows else _has_rows(shape, features)
         native = self.facts.flat and shape in self._both(self.native)
-        if native and (bounds is None or not self._beyond(bounds)):
+        if native and (bounds is None or not (self._beyond(bounds) or self._other_limits(bounds))):
             return self.facts.native
         if own and (bounds is None or (set(bounds.low), set(bounds.high)) == ({-1.0}, {1.0})):
             return None
@@ -126,12 +126,21 @@ class Expected:
                 return f"{name} from {low:g} to {high:g}"
         return ""
 
+    def _other_limits(self, bounds: Bounds) -> str:
+        """The space of the world's own environment, if it is another one than the policy's; empty otherwise."""
+        own = self.facts.limits
+        if not own or all(map(_alike, own, bounds.limits())):
+            return ""
+        lows, highs = zip(*own, strict=True)
+        return str(Bounds(shape=self.native, low=_short(lows), high=_short(highs)))
+
     def _complaint(self, name: str, shape: tuple[int, ...], bounds: Bounds | None) -> str:
         facts, (rows, features) = self.facts, self.shape
         if facts.flat:
             wanted = f"an array of shape {self.native}"
             if bounds is not None and shape in self._both(self.native):
-                wanted += f" with {self._beyond(bounds)}"
+                beyond = self._beyond(bounds)
+                wanted = f"{wanted} with {beyond}" if beyond else self._other_limits(bounds)
             source = "the world's own `environment(cell)`"
         else:
             own = f"({rows if rows else 'V'}, {features})"
@@ -195,6 +204,14 @@ def _continuous(call: str) -> str:
 def _has_rows(shape: tuple[int, ...], features: int) -> bool:
     """Whether a shape is [V, F] or [V * F] for any V."""
     return (len(shape) == 2 and shape[1] == features) or (len(shape) == 1 and shape[0] % features == 0)
+
+
+def _alike(own: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two ranges are the same, up to the digits that numpy prints; the largest numbers count as infinity."""
+    return all(
+        one == two or (one * two > 0 and min(abs(one), abs(two)) >= UNBOUNDED) or math.isclose(one, two, rel_tol=1e-5)
+        for one, two in zip(own, other, strict=True)
+    )
 
 
 def _short(numbers: Sequence[float]) -> tuple[float, ...]:

@@ -121,6 +121,9 @@ class ActorNetwork(nn.Module):
             space = getattr(action, "space", None)
             if space is not None and getattr(action, "domain", "") == "continuous":
                 ends += [end for end in (getattr(space, "low", None), getattr(space, "high", None)) if end is not None]
+            # `TanhModule` keeps them as buffers, named by the entry.
+            if isinstance(part, TensorDictModuleBase):
+                ends += [end for name, end in part.named_buffers(recurse=False) if name.endswith(("_low", "_high"))]
             for end in ends:
                 numbers = torch.as_tensor(end).float()
                 if bool(((numbers.abs() < UNBOUNDED) & (numbers.abs() != 1)).any()):
