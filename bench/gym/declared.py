@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import UserDict
 from math import prod
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from bench.gym.world import GymWorld
 
 CONTROLS = 2
-_asked: dict[tuple[type, str], spaces.Box | None] = {}
+# Not among the data that no unit may change (`bench.plugins.framework.Snapshot`): a world is asked when it is needed.
+_asked: UserDict[tuple[type, str], spaces.Box | None] = UserDict()
 """What environments that were asked observe, by class and parameters of the world."""
 
 
