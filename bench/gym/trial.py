@@ -32,6 +32,8 @@ NAMED = 2
 """So many features are named in a line."""
 SHARE_OF_RANGE = 1e-6
 """A value may leave its range by this share of it: environments compute in float32."""
+LATE = 3
+"""So many episodes that last to the end, and all fail there, are no chance."""
 ENOUGH = 100
 """In fewer steps nothing is said about a range that is hardly used."""
 
@@ -51,6 +53,8 @@ class Seen:
         self.outside = np.zeros(len(self.low))
         self.observations = 0
         self.rewards: list[float] = []
+        self.late = {"crashed": 0, "truncated": 0}
+        """How many episodes that reached `max_steps` count as failed, and how many were truncated."""
 
     def saw(self, observation: NDArray[np.float64]) -> None:
         self.observations += 1
@@ -93,7 +97,7 @@ def doubts(world: GymWorld, cells: Sequence[Cell]) -> list[str]:
         limits = [found for env in batch.envs if (found := time_limit(env)) is not None]
         early = _drive(batch, seen)
     limits += early if len(early) > 1 and len(set(early)) == 1 else []
-    declared = [*_of_ranges(world, seen), *_of_rewards(world, seen), *_of_length(world, limits)]
+    declared = [*_of_ranges(world, seen), *_of_rewards(world, seen), *_of_length(world, limits), *_of_ends(seen)]
     return [*repeats(world, cells), *declared]
 
 
@@ -111,6 +115,9 @@ def _drive(batch: Batch, seen: Seen) -> list[int]:
             action = torch.from_numpy(generator.uniform(-1, 1, (size, CONTROLS)).astype(np.float32))
         td = batch.step(td.set("action", action))["next"]
         early += batch.time[(td["truncated"][:, 0].numpy()) & (batch.time < batch.world.max_steps)].tolist()
+        last = batch.time >= batch.world.max_steps
+        for name in seen.late:
+            seen.late[name] += int((last & batch.flags[name][:, 0] & td["done"][:, 0].numpy()).sum())
         if td["done"].any():
             seed += size
             asked = {"_reset": td["done"], "seed": torch.arange(seed, seed + size)}
@@ -163,6 +170,14 @@ def _of_length(world: GymWorld, lengths: Sequence[int]) -> Iterator[str]:
         yield (
             f"the environment ends every episode after {shortest} steps, but max_steps is {world.max_steps}: no safe_progress "
             f"can be above {shortest / world.max_steps:.2g}; write max_steps={shortest}"
+        )
+
+
+def _of_ends(seen: Seen) -> Iterator[str]:
+    if seen.late["crashed"] >= LATE and not seen.late["truncated"]:
+        yield (
+            f"all {seen.late['crashed']} episodes that reached max_steps count as failed, as the environment terminates them: at "
+            "a limit of time return truncated=True and terminated=False, or override failed()"
         )
 
 

@@ -390,7 +390,7 @@ NARROW = replace(RoadWorld.features, low=(0.0, -0.5, -1.0) * 2, high=(1.0, 0.5, 
     ],
 )
 def test_random_steps_say_what_is_declared_wrongly(world: RoadWorld, line: str) -> None:
-    said = world.doubts(ROAD_V1.cells())
+    said = replace(world, ends=0).doubts(ROAD_V1.cells())
     assert len(said) == bool(line)
     assert re.search(line, " ".join(said))
 
@@ -608,6 +608,24 @@ def test_an_environment_whose_episodes_are_not_the_same_again_is_told(cartpole: 
     told = [one for one in Wrapped().doubts(cartpole.CARTPOLE_V1.cells()) if "Wrapped" in one]
     assert len(told) == bool(line)
     assert line in "".join(told)
+
+
+class OfOldGym(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """Has one kind of end, as environments of gym 0.21."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated or truncated, False, info
+
+
+@pytest.mark.parametrize(("wrap", "told"), [(lambda env: env, 0), (OfOldGym, 1)])
+def test_an_end_of_time_that_counts_as_a_failure_is_told(cartpole: Any, wrap: Any, told: int) -> None:
+    class Wrapped(cartpole.CartPole):  # type: ignore[misc]
+        def environment(self, cell: Any) -> Any:
+            return wrap(super().environment(cell))
+
+    found = Wrapped(max_steps=20).doubts(cartpole.CARTPOLE_V1.cells())
+    assert sum("that reached max_steps count as failed" in line for line in found) == told
 
 
 def test_one_environment_for_all_episodes_is_refused(cartpole: Any) -> None:
