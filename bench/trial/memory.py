@@ -6,14 +6,16 @@ from collections.abc import Mapping
 
 from torch import nn
 
+from bench.plugins.bytecode import code_of
 from bench.plugins.content import content
 
+GLOBALS = "a global value of its code"
 OF_TORCH = frozenset(vars(nn.Module()))
 """Attributes of every module. Parameters and buffers are looked at by themselves."""
 
 
 def kept(network: nn.Module) -> Mapping[str, str]:
-    """A hash of everything that the modules of a network hold, by its name: parameters, buffers and attributes of Python.
+    """A hash of everything that the modules of a network hold, by its name: parameters, buffers, attributes, and global values.
 
     The same call before and after some queries shows what the queries changed.
     """
@@ -22,7 +24,8 @@ def kept(network: nn.Module) -> Mapping[str, str]:
         for name, value in vars(module).items():
             if name not in OF_TORCH:
                 found[f"{prefix}.{name}" if prefix else name] = content(value)
-    return found
+    # Numbers and lists of the user's modules that the code reads, too.
+    return found | {GLOBALS: code_of(*network.modules())}
 
 
 def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:

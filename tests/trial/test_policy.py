@@ -141,6 +141,17 @@ class Enclosed(Wraps):
         return self.net(shown)
 
 
+CALLS: list[int] = []
+
+
+class Globally(Wraps):
+    """Counts its calls in a global list; what it answers changes much later."""
+
+    def forward(self, shown: Tensor) -> Tensor:
+        CALLS.append(1)
+        return self.net(shown) if len(CALLS) < 10_000 else -self.net(shown)
+
+
 class NaN(Wraps):
     """A number divided by the presence of a car: not a number where it is absent."""
 
@@ -173,6 +184,7 @@ REFUSED: dict[type[Wraps], str] = {
     Counts: "remembers earlier calls in 'network.calls'",
     Inside: "remembers earlier calls in 'network.notes'",
     Enclosed: "remembers earlier calls in 'network.note'",
+    Globally: "remembers earlier calls in 'a global value of its code'",
     NaN: "NaN or infinity",
     Complex: "real numbers",
     InPlace: "asks for its gradient",
