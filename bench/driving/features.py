@@ -98,7 +98,7 @@ class DrivingFacts(Facts):
     def native(self, observation: Tensor) -> Tensor:
         """The observation [..., V, F] in the format of the world's own environment, which policies from outside expect.
 
-        Itself or, if `flat`, the measured values [..., *shape] in physical units, in row-major order.
+        Itself or, if `flat`, the measured values in physical units, in row-major order: [..., F - 1], or [..., and `shape`].
         """
         if not self.flat:
             return observation
