@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
-from bench.plugins.contents import (
+from bench.plugins.held import (
     ARRAY,
     CLASS,
     CONSTANTS,
