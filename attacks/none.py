@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bench.plugins.contracts import Access, Attack
+from cavbench.core.contracts import Access, Attack
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.plugins.suites import Suite
+from cavbench.core.suites import Suite
 
 STANDARD_1 = Suite.read(Path(__file__).with_name("standard-1.toml"))
 STANDARD_2 = Suite.read(Path(__file__).with_name("standard-2.toml"))

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from bench import shadow
+from cavbench import shadow
 
 if TYPE_CHECKING:
-    import bench.gym as gym
-    from bench.api import component, load, score
-    from bench.errors import UserError
+    import cavbench.gym as gym
+    from cavbench.api import component, load, score
+    from cavbench.errors import UserError
 
 __version__ = "0.1.0"
 __all__ = ["UserError", "__version__", "component", "gym", "load", "score"]
 
 shadow.check()
 
-_FROM = {"component": "bench.api", "load": "bench.api", "score": "bench.api", "UserError": "bench.errors"}
+_FROM = {"component": "cavbench.api", "load": "cavbench.api", "score": "cavbench.api", "UserError": "cavbench.errors"}
 
 
 def __getattr__(name: str) -> Any:
@@ -29,7 +29,7 @@ def __getattr__(name: str) -> Any:
     if name in _FROM:
         return getattr(import_module(_FROM[name]), name)
     if name == "gym":
-        return import_module("bench.gym")
+        return import_module("cavbench.gym")
     raise AttributeError(f"module 'bench' has no attribute {name!r}")
 
 

@@ -1,6 +1,6 @@
 """`python -m bench`: the command line."""
 
-from bench.cli.ending import ended
-from bench.cli.main import main
+from cavbench.cli.ending import ended
+from cavbench.cli.main import main
 
 ended(main)

@@ -8,9 +8,9 @@ import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from bench import bounded
-from bench.bounded import spelled
-from bench.errors import UserError
+from cavbench import bounded
+from cavbench.bounded import spelled
+from cavbench.errors import UserError
 
 LARGEST = 2**30
 """Most bytes that an archive may unpack to."""

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from bench.errors import UserError, short
+from cavbench.errors import UserError, short
 
 TEXT = 2**24
 """Most bytes of a text: a description, a card, a list of names."""

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
-from bench.errors import UserError
+from cavbench.errors import UserError
 
 
 def check_folder(folder: Path, what: str, option: str = "out") -> None:

@@ -18,16 +18,16 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from attacks.zo import ZOSignSGD
-from bench.driving import DrivingAttack, ObservationThreat, Policy
-from bench.driving.attacker import Attacker
-from bench.driving.victim import CountedPolicy
-from bench.errors import in_one_line
-from bench.run.process import settle
-from bench.scenarios import SeedBlock
-from bench.victims.drivers.networks import QPolicy
-from envs.highway.axes import AXES
-from envs.highway.world import HighwayWorld
+from cavbench.attacks.driving.zo import ZOSignSGD
+from cavbench.driving import DrivingAttack, ObservationThreat, Policy
+from cavbench.driving.attacker import Attacker
+from cavbench.driving.victim import CountedPolicy
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
+from cavbench.scenarios import SeedBlock
+from cavbench.driving.victims.networks import QPolicy
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.world import HighwayWorld
 
 SMOOTHING, STEP_SIZE, FASTER = 0.01, 0.01, 3
 

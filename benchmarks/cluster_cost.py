@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from bench.run.batches import EPISODES, TASKS
+from cavbench.run.batches import EPISODES, TASKS
 
 MEMBERS_S = {
     "none": 0.4,
@@ -65,7 +65,7 @@ def units() -> Iterator[tuple[str, float]]:
 
 
 def tasks(cores: int) -> list[tuple[float, int]]:
-    """Seconds and number of units of each task, the longest first (`bench.run.batches`)."""
+    """Seconds and number of units of each task, the longest first (`cavbench.run.batches`)."""
     found = []
     counts = Counter(units())
     most = max(1, counts.total() // (TASKS * cores))

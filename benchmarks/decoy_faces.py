@@ -15,15 +15,15 @@ from copy import copy
 import numpy as np
 import torch
 
-from bench.detection import Detector
-from bench.detection.discrimination import discrimination
-from bench.detection.sight import look, look_at_decoys
-from bench.errors import in_one_line
-from bench.plugins import registry
-from bench.run.process import settle
-from envs.camera import training_faces
-from envs.camera.bank import BankScenes
-from envs.camera.world import StopSignApproach
+from cavbench.detection import Detector
+from cavbench.detection.discrimination import discrimination
+from cavbench.detection.sight import look, look_at_decoys
+from cavbench.errors import in_one_line
+from cavbench.core import registry
+from cavbench.run.process import settle
+from cavbench.envs.camera import training_faces
+from cavbench.envs.camera.bank import BankScenes
+from cavbench.envs.camera.world import StopSignApproach
 
 WORLD = StopSignApproach()
 MEASURES = ("decoy_confidence", "octagons", "false_stops", "average_precision")

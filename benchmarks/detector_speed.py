@@ -13,11 +13,11 @@ from collections.abc import Callable
 
 import torch
 
-from bench.detection import Detector
-from bench.run.process import settle
-from bench.victims.detectors.yolo import frozen
-from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
-from bench.victims.detectors.yolov5 import YOLOv5Network
+from cavbench.detection import Detector
+from cavbench.run.process import settle
+from cavbench.detection.victims.yolo import frozen
+from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
+from cavbench.detection.victims.yolov5 import YOLOv5Network
 
 STOP_SIGN = 11
 

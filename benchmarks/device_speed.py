@@ -17,14 +17,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from bench.detection.crafting import prepare
-from bench.detection.drive import drive as score
-from bench.driving.drive import drive
-from bench.errors import in_one_line
-from bench.plugins.pair import Chosen, Pair, choose
-from bench.plugins.track import Job
-from bench.run.process import settle
-from bench.scenarios import SeedBlock
+from cavbench.detection.crafting import prepare
+from cavbench.detection.drive import drive as score
+from cavbench.driving.drive import drive
+from cavbench.errors import in_one_line
+from cavbench.core.pair import Chosen, Pair, choose
+from cavbench.core.track import Job
+from cavbench.run.process import settle
+from cavbench.scenarios import SeedBlock
 
 DEVICES = ("cpu", "cuda")
 

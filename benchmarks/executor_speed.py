@@ -26,19 +26,19 @@ from pathlib import Path
 import psutil
 import pyarrow as pa
 
-from bench.errors import in_one_line
-from bench.plugins.framework import Snapshot
-from bench.plugins.pair import Pair, choose
-from bench.plugins.track import track
-from bench.records import packing, reading, store
-from bench.run import runner
-from bench.run.config import run_config
-from bench.run.executors import EXECUTORS
-from bench.run.process import cores
-from bench.run.unit import Loading
-from bench.run.work import Outcome, Task, attempt
-from bench.run.worker import Limits
-from bench.victims.drivers.reference import Blind
+from cavbench.errors import in_one_line
+from cavbench.isolation.framework import Snapshot
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import track
+from cavbench.records import packing, reading, store
+from cavbench.run import runner
+from cavbench.run.config import run_config
+from cavbench.run.executors import EXECUTORS
+from cavbench.run.process import cores
+from cavbench.run.unit import Loading
+from cavbench.run.work import Outcome, Task, attempt
+from cavbench.run.worker import Limits
+from cavbench.driving.victims.reference import Blind
 
 PAIR = ("defense=none", "victim=dqn", "lanes=3,4", "density=1", "weather=clear,fog", "seeds=0,1")
 QUIET = ("record=0", "reference=false")

@@ -19,16 +19,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection import Detector, Scenes
-from bench.detection.colour import linear
-from bench.detection.sight import look_at_decoys
-from bench.errors import in_one_line
-from bench.plugins import registry
-from bench.run.process import settle
-from envs.camera import sign
-from envs.camera.bank import BankScenes
-from envs.camera.faces import Face
-from envs.camera.world import StopSignApproach
+from cavbench.detection import Detector, Scenes
+from cavbench.detection.colour import linear
+from cavbench.detection.sight import look_at_decoys
+from cavbench.errors import in_one_line
+from cavbench.core import registry
+from cavbench.run.process import settle
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.bank import BankScenes
+from cavbench.envs.camera.faces import Face
+from cavbench.envs.camera.world import StopSignApproach
 
 WORLD = StopSignApproach()
 SIDE = sign.TEXELS

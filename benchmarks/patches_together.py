@@ -15,13 +15,13 @@ from collections.abc import Callable
 
 import torch
 
-from bench.detection.drive import drive, drive_jointly
-from bench.detection.patch import Patch
-from bench.errors import in_one_line
-from bench.plugins.pair import Pair, choose
-from bench.plugins.track import Job
-from bench.run.process import settle
-from envs.camera.axes import APPROACH_V1
+from cavbench.detection.drive import drive, drive_jointly
+from cavbench.detection.patch import Patch
+from cavbench.errors import in_one_line
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import Job
+from cavbench.run.process import settle
+from cavbench.envs.camera.axes import APPROACH_V1
 
 
 def main() -> None:

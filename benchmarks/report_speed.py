@@ -29,14 +29,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bench.plugins.contracts import Facts
-from bench.plugins.track import Track, track
-from bench.records import packing, store
-from bench.records.finished import finished
-from bench.records.schema import schema
-from bench.scenarios import Cell
-from bench.statistics.episodes import as_text
-from envs.highway.axes import STANDARD_V1
+from cavbench.core.contracts import Facts
+from cavbench.core.track import Track, track
+from cavbench.records import packing, store
+from cavbench.records.finished import finished
+from cavbench.records.schema import schema
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import as_text
+from cavbench.envs.highway.axes import STANDARD_V1
 
 SEEDS, ATTACKS = 3, 8
 ROW_GROUP = 100_000
@@ -165,7 +165,7 @@ def write_packed(root: Path, count: int, episodes: int) -> dict[str, Path]:
 
 @dataclass(frozen=True)
 class Named:
-    """What `bench.records.finished` asks of a unit's pair."""
+    """What `cavbench.records.finished` asks of a unit's pair."""
 
     id: str
 

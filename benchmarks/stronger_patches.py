@@ -17,15 +17,15 @@ from typing import Any
 
 import torch
 
-from attacks.eot import EOT
-from bench.detection import PatchThreat
-from bench.detection.crafting import craft
-from bench.detection.placed import placed
-from bench.detection.sight import look
-from bench.errors import in_one_line
-from bench.plugins import registry, suites
-from bench.run.process import settle
-from envs.camera.world import StopSignApproach
+from cavbench.attacks.detection.eot import EOT
+from cavbench.detection import PatchThreat
+from cavbench.detection.crafting import craft
+from cavbench.detection.placed import placed
+from cavbench.detection.sight import look
+from cavbench.errors import in_one_line
+from cavbench.core import registry, suites
+from cavbench.run.process import settle
+from cavbench.envs.camera.world import StopSignApproach
 
 WORLD = StopSignApproach()
 SHIFTED = {"scale": 0.0, "rotation": 0.0}

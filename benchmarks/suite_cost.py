@@ -11,14 +11,14 @@ import time
 
 import torch
 
-from bench.driving import ObservationThreat
-from bench.driving.drive import drive
-from bench.errors import in_one_line
-from bench.plugins.pair import Pair, choose
-from bench.plugins.suites import suite
-from bench.plugins.track import Job
-from bench.scenarios import SeedBlock
-from envs.highway.axes import AXES
+from cavbench.driving import ObservationThreat
+from cavbench.driving.drive import drive
+from cavbench.errors import in_one_line
+from cavbench.core.pair import Pair, choose
+from cavbench.core.suites import suite
+from cavbench.core.track import Job
+from cavbench.scenarios import SeedBlock
+from cavbench.envs.highway.axes import AXES
 
 
 def main(name: str, episodes: int) -> None:

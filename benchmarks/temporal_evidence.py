@@ -17,22 +17,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from attacks.eot import EOT
-from attacks.noise_patch import NoisePatch
-from attacks.suites import STANDARD_DETECTION_1
-from bench.detection import Approach, Detector, PatchAttack, PatchThreat, Predictions, Wrapped
-from bench.detection.approach import measured
-from bench.detection.closed_loop import drive
-from bench.detection.crafting import craft
-from bench.detection.discrimination import discrimination
-from bench.detection.patch import Patch
-from bench.detection.sight import look, look_at_decoys
-from bench.errors import in_one_line
-from bench.plugins import registry
-from bench.run.process import settle
-from defenses.temporal import TemporalFusion
-from envs.camera.crossing import StopSignCrossing
-from envs.camera.world import StopSignApproach
+from cavbench.attacks.detection.eot import EOT
+from cavbench.attacks.detection.noise_patch import NoisePatch
+from cavbench.attacks.suites import STANDARD_DETECTION_1
+from cavbench.detection import Approach, Detector, PatchAttack, PatchThreat, Predictions, Wrapped
+from cavbench.detection.approach import measured
+from cavbench.detection.closed_loop import drive
+from cavbench.detection.crafting import craft
+from cavbench.detection.discrimination import discrimination
+from cavbench.detection.patch import Patch
+from cavbench.detection.sight import look, look_at_decoys
+from cavbench.errors import in_one_line
+from cavbench.core import registry
+from cavbench.run.process import settle
+from cavbench.defenses.detection.temporal import TemporalFusion
+from cavbench.envs.camera.crossing import StopSignCrossing
+from cavbench.envs.camera.world import StopSignApproach
 
 WORLD, LOOP, THREAT = StopSignApproach(), StopSignCrossing(), PatchThreat()
 MEASURES = ("stop_score", "confidence_mean", "average_precision", "decoy_confidence", "false_stops", "ran")

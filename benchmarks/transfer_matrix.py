@@ -14,15 +14,15 @@ import argparse
 
 import numpy as np
 
-from attacks.transfer import BETWEEN, Transfer
-from bench.detection import DetectorDefense, DetectorVictim, PatchThreat
-from bench.detection.approach import score
-from bench.detection.crafting import craft
-from bench.errors import in_one_line
-from bench.plugins import registry
-from bench.plugins.pair import choose
-from bench.run.process import settle
-from envs.camera.world import StopSignApproach
+from cavbench.attacks.detection.transfer import BETWEEN, Transfer
+from cavbench.detection import DetectorDefense, DetectorVictim, PatchThreat
+from cavbench.detection.approach import score
+from cavbench.detection.crafting import craft
+from cavbench.errors import in_one_line
+from cavbench.core import registry
+from cavbench.core.pair import choose
+from cavbench.run.process import settle
+from cavbench.envs.camera.world import StopSignApproach
 
 WORLD = StopSignApproach()
 

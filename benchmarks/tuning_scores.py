@@ -11,12 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.driving.drive import drive
-from bench.errors import in_one_line
-from bench.run.config import run_config
-from bench.run.process import settle
-from bench.run.unit import Unit
-from bench.scenarios import SeedBlock
+from cavbench.driving.drive import drive
+from cavbench.errors import in_one_line
+from cavbench.run.config import run_config
+from cavbench.run.process import settle
+from cavbench.run.unit import Unit
+from cavbench.scenarios import SeedBlock
 
 
 def main() -> None:

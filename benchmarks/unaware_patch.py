@@ -12,14 +12,14 @@ import argparse
 
 import numpy as np
 
-from attacks.eot import EOT
-from bench.detection import PatchThreat
-from bench.detection.approach import score
-from bench.detection.crafting import craft
-from bench.errors import in_one_line
-from bench.plugins import registry
-from bench.run.process import settle
-from envs.camera.world import StopSignApproach
+from cavbench.attacks.detection.eot import EOT
+from cavbench.detection import PatchThreat
+from cavbench.detection.approach import score
+from cavbench.detection.crafting import craft
+from cavbench.errors import in_one_line
+from cavbench.core import registry
+from cavbench.run.process import settle
+from cavbench.envs.camera.world import StopSignApproach
 
 WORLD = StopSignApproach()
 MEASURES = ("stop_score", "confidence_mean", "average_precision", "decoy_confidence", "false_stops", "ran")

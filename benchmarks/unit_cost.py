@@ -20,16 +20,16 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from bench.driving import Policy
-from bench.driving.drive import drive, drive_jointly
-from bench.errors import in_one_line
-from bench.plugins.pair import Pair, choose
-from bench.plugins.track import Driven, Job
-from bench.run.batches import EPISODES
-from bench.run.process import settle
-from bench.scenarios import SeedBlock
-from envs.highway.axes import AXES
-from envs.highway.world import HighwayWorld
+from cavbench.driving import Policy
+from cavbench.driving.drive import drive, drive_jointly
+from cavbench.errors import in_one_line
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import Driven, Job
+from cavbench.run.batches import EPISODES
+from cavbench.run.process import settle
+from cavbench.scenarios import SeedBlock
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.world import HighwayWorld
 
 AT_ONCE = 1000
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bench.plugins.contracts import Defense, Facts, Victim
+from cavbench.core.contracts import Defense, Facts, Victim
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Our own published records, shipped with the package.
 
-    python -m leaderboard.published RESULTS leaderboard/data/NAME.parquet
-    python -m leaderboard.published RESULTS leaderboard/data/NAME.parquet --add
+    python -m cavbench.leaderboard.published RESULTS leaderboard/data/NAME.parquet
+    python -m cavbench.leaderboard.published RESULTS leaderboard/data/NAME.parquet --add
 
 The first publishes the newest records of a results folder, the second adds them to those of the file. A file holds one track.
 """
@@ -17,12 +17,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from bench.errors import UserError
-from bench.files import whole
-from bench.plugins.track import Track, tracks
-from bench.records import reading
-from bench.records.generations import check
-from bench.records.schema import schema
+from cavbench.errors import UserError
+from cavbench.files import whole
+from cavbench.core.track import Track, tracks
+from cavbench.records import reading
+from cavbench.records.generations import check
+from cavbench.records.schema import schema
 
 SERIES = ("pair", "training_seed", "grid")
 """The columns that records are renewed by."""

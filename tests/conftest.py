@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from bench.errors import UserError
-from bench.run.process import settle
-from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
-from envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
+from cavbench.run.process import settle
+from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
+from cavbench.envs.camera.world import StopSignApproach
 
 FACTS = StopSignApproach().facts
 

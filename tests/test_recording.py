@@ -10,12 +10,12 @@ import pytest
 import torch
 from rerun.chunk import Chunk, RrdReader
 
-from bench.driving import DrivingFacts, Features, ObservationThreat
-from bench.driving.rollout import Trace
-from bench.driving.threat import project
-from bench.recording.driving import save
-from bench.recording.driving.episode import Episode
-from envs.highway.axes import AXES
+from cavbench.driving import DrivingFacts, Features, ObservationThreat
+from cavbench.driving.rollout import Trace
+from cavbench.driving.threat import project
+from cavbench.driving.recording import save
+from cavbench.driving.recording.episode import Episode
+from cavbench.envs.highway.axes import AXES
 
 FEATURES = Features(
     names=("x", "y", "vx", "vy"), low=(-100.0, -20.0, -40.0, -20.0), high=(100.0, 20.0, 40.0, 20.0),
@@ -199,7 +199,7 @@ def test_the_file_appears_whole_or_not_at_all(path: Path, monkeypatch: pytest.Mo
     def broken(*_: object) -> None:
         raise RuntimeError("the disk is full")
 
-    monkeypatch.setattr("bench.recording.driving.curves.log", broken)
+    monkeypatch.setattr("cavbench.driving.recording.curves.log", broken)
     with pytest.raises(RuntimeError, match="disk"):
         save(made_up(), facts=FACTS, meta=META, path=path)
     assert list(path.parent.iterdir()) == []

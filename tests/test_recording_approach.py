@@ -13,13 +13,13 @@ from PIL import Image
 from rerun.chunk import Chunk, RrdReader
 from torch import Tensor
 
-from bench.detection import Approach, stopping
-from bench.detection.approach import Sighting, look
-from bench.detection.patch import Evolution, Patch
-from bench.recording.detection import save
-from bench.recording.detection.film import ApproachFilm
-from bench.recording.film import save as save_film
-from bench.recording.film.drawing import BLUE, VERMILLION
+from cavbench.detection import Approach, stopping
+from cavbench.detection.approach import Sighting, look
+from cavbench.detection.patch import Evolution, Patch
+from cavbench.detection.recording import save
+from cavbench.detection.recording.film import ApproachFilm
+from cavbench.recording.film import save as save_film
+from cavbench.recording.film.drawing import BLUE, VERMILLION
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.test_recording import META, read, values
 

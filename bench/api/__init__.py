@@ -1,6 +1,6 @@
 """The benchmark from Python: `score`, `load` and `component`, also as `cavbench.score` and so on."""
 
-from bench.api.choosing import component
-from bench.api.scoring import load, score
+from cavbench.api.choosing import component
+from cavbench.api.scoring import load, score
 
 __all__ = ["component", "load", "score"]

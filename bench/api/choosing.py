@@ -10,21 +10,21 @@ from typing import Any, get_args
 import torch
 from tensordict import TensorDict
 
-from bench.driving import DrivingWorld
-from bench.errors import UserError
-from bench.plugins import budgets, registry, suites
-from bench.plugins.bytecode import content_of
-from bench.plugins.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
-from bench.plugins.pair import Chosen, Pair, choose
-from bench.plugins.registry import GROUPS, Kind
-from bench.plugins.suites import Suite
-from bench.plugins.track import track
-from bench.run.config import combined, grid_of
-from bench.scenarios import Grid, SeedBlock, Value
-from bench.victims.drivers.in_process import InProcess, code_of_policies, in_process
-from bench.victims.drivers.sb3_environment import training_of
-from bench.victims.drivers.sb3_model import is_model
-from bench.victims.drivers.spaces import UNKNOWN
+from cavbench.driving import DrivingWorld
+from cavbench.errors import UserError
+from cavbench.core import budgets, registry, suites
+from cavbench.identity.bytecode import content_of
+from cavbench.core.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
+from cavbench.core.pair import Chosen, Pair, choose
+from cavbench.core.registry import GROUPS, Kind
+from cavbench.core.suites import Suite
+from cavbench.core.track import track
+from cavbench.run.config import combined, grid_of
+from cavbench.scenarios import Grid, SeedBlock, Value
+from cavbench.driving.victims.in_process import InProcess, code_of_policies, in_process
+from cavbench.driving.victims.sb3_environment import training_of
+from cavbench.driving.victims.sb3_model import is_model
+from cavbench.driving.victims.spaces import UNKNOWN
 
 BASES: dict[str, type[Component]] = {"attack": Attack, "defense": Defense, "victim": Victim, "world": World}
 TRIED = 4
@@ -163,7 +163,7 @@ def _refuse_twice(victim: InProcess) -> None:
 def pairs_of(
     attack: Any, defense: Any, victim: Chosen[Any], world: Chosen[Any], threat: ThreatModel | Mapping[str, Any] | None
 ) -> tuple[list[Pair], list[str]]:
-    """Every combination of attacks and defences, as `bench.run.config.combined`."""
+    """Every combination of attacks and defences, as `cavbench.run.config.combined`."""
     own_track = victim.component.tracks()[0]
     names = suites.names()
     chosen_suites = [suites.suite(one, own_track) for one in several(attack) if isinstance(one, str) and one in names]

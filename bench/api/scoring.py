@@ -11,23 +11,23 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from bench.api.choosing import checked_for_workers, chosen, grid_with, pairs_of, victim_of, world_of
-from bench.api.table import Scores, scores_of
-from bench.cli.progress import RunProgress
-from bench.cli.terminal import Console
-from bench.errors import UserError
-from bench.plugins.contracts import Attack, Defense, ThreatModel, Victim, World
-from bench.plugins.pair import Pair
-from bench.plugins.track import track_of
-from bench.records import reading
-from bench.run import runner
-from bench.run.config import RunConfig
-from bench.scenarios import Grid, Value
+from cavbench.api.choosing import checked_for_workers, chosen, grid_with, pairs_of, victim_of, world_of
+from cavbench.api.table import Scores, scores_of
+from cavbench.cli.progress import RunProgress
+from cavbench.cli.terminal import Console
+from cavbench.errors import UserError
+from cavbench.core.contracts import Attack, Defense, ThreatModel, Victim, World
+from cavbench.core.pair import Pair
+from cavbench.core.track import track_of
+from cavbench.records import reading
+from cavbench.run import runner
+from cavbench.run.config import RunConfig
+from cavbench.scenarios import Grid, Value
 
 if TYPE_CHECKING:
     from torch import nn
 
-    from bench.driving import Policy
+    from cavbench.driving import Policy
 
 By = Literal["pair", "cell"]
 
@@ -60,7 +60,7 @@ def score(
         cavbench.score(my_network, lanes=[3, 4], density=1, weather="clear")
 
     Args:
-        victim: a name, as on the command line; or an object: a `bench.driving.Policy`, a `torch.nn.Module` that maps
+        victim: a name, as on the command line; or an object: a `cavbench.driving.Policy`, a `torch.nn.Module` that maps
             observations [N, V, F] or [N, V * F] to values [N, A] of the discrete actions or to actions [N, 2] in [-1, 1], an
             actor of TorchRL, or a model of Stable-Baselines3. A list of objects holds the trainings of one policy, one for each
             training seed.
@@ -86,7 +86,7 @@ def score(
         axes: values on the axes of the world, for instance lanes=3 or weather=["clear", "fog"].
 
     Returns:
-        A DataFrame (`bench.api.table.scores_of` explains the columns); its `records` are the records, one row an episode.
+        A DataFrame (`cavbench.api.table.scores_of` explains the columns); its `records` are the records, one row an episode.
 
     Raises:
         UserError: in one line, if an argument is not allowed or a component fails.
@@ -134,7 +134,7 @@ def _driven(config: RunConfig, progress: bool | None) -> Any:
 
 
 class _Silent:
-    """Watches a run (`bench.run.runner.RunWatcher`) and shows its warnings only."""
+    """Watches a run (`cavbench.run.runner.RunWatcher`) and shows its warnings only."""
 
     def begin(self, *, episodes: int, finished: int) -> None:
         pass
@@ -167,7 +167,7 @@ def load(name: str = "dqn", *, seed: int = 0, world: str | World | None = None) 
         world: the world that it will be used in; by default that of the victim's track.
 
     Returns:
-        The network, in eval mode: of the driving track a `bench.driving.Policy`, which maps observations [B, V, F] to scores.
+        The network, in eval mode: of the driving track a `cavbench.driving.Policy`, which maps observations [B, V, F] to scores.
 
     Raises:
         UserError: if there is no such component, or the zoo has no such policy; the message has the command that trains it.

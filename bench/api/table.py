@@ -12,15 +12,15 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.plugins.pair import Pair
-from bench.plugins.track import Track, track_of
-from bench.run.config import RunConfig
-from bench.scenarios import Cell
-from bench.statistics import doubts
-from bench.statistics.doubts import Remark
-from bench.statistics.episodes import Episodes
-from bench.statistics.estimates import Array, Interval, share_interval
-from bench.statistics.strongest import strongest_of, under
+from cavbench.core.pair import Pair
+from cavbench.core.track import Track, track_of
+from cavbench.run.config import RunConfig
+from cavbench.scenarios import Cell
+from cavbench.statistics import doubts
+from cavbench.statistics.doubts import Remark
+from cavbench.statistics.episodes import Episodes
+from cavbench.statistics.estimates import Array, Interval, share_interval
+from cavbench.statistics.strongest import strongest_of, under
 
 STRONGEST = "strongest"
 """Name of the row in which the strongest attack of each cell counts."""
@@ -60,7 +60,7 @@ class Scores(pd.DataFrame):
 
     @property
     def records(self) -> pd.DataFrame:
-        """The records that the scores are computed from, one row an episode (columns: `bench.records.schema`)."""
+        """The records that the scores are computed from, one row an episode (columns: `cavbench.records.schema`)."""
         return self._episodes.to_pandas()
 
 

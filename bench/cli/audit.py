@@ -10,18 +10,18 @@ import pyarrow.compute as pc
 from rich.table import Table
 from rich.text import Text
 
-from bench.cli.progress import RunProgress, show_downloads
-from bench.cli.terminal import Console
-from bench.errors import UserError
-from bench.plugins.pair import Pair
-from bench.plugins.track import Track, track_of
-from bench.records import reading
-from bench.records.schema import AUDIT
-from bench.run import runner
-from bench.run.audit import AuditConfig, audit_config
-from bench.statistics.episodes import Episodes
-from bench.statistics.estimates import Interval
-from bench.statistics.unpaired import NOTABLE, POWER, Finds, finds, unpaired
+from cavbench.cli.progress import RunProgress, show_downloads
+from cavbench.cli.terminal import Console
+from cavbench.errors import UserError
+from cavbench.core.pair import Pair
+from cavbench.core.track import Track, track_of
+from cavbench.records import reading
+from cavbench.records.schema import AUDIT
+from cavbench.run import runner
+from cavbench.run.audit import AuditConfig, audit_config
+from cavbench.statistics.episodes import Episodes
+from cavbench.statistics.estimates import Interval
+from cavbench.statistics.unpaired import NOTABLE, POWER, Finds, finds, unpaired
 
 OFTEN = f"{100 * POWER:.0f} %"
 
@@ -94,7 +94,7 @@ def reach(found: Mapping[Pair, Difference]) -> str:
 
 
 def differences(config: AuditConfig, records: pa.Table, track: Track) -> dict[Pair, Difference]:
-    """What the records say of each pair (`bench.statistics.unpaired`)."""
+    """What the records say of each pair (`cavbench.statistics.unpaired`)."""
     pairs = {pair.id: pair for pair in (*config.public.pairs, *(pair.clean() for pair in config.public.pairs))}
     found = {}
     for name, pair in pairs.items():

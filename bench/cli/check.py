@@ -10,13 +10,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.cli.listing import heading
-from bench.cli.words import split
-from bench.errors import UserError, short
-from bench.plugins import registry
+from cavbench.cli.listing import heading
+from cavbench.cli.words import split
+from cavbench.errors import UserError, short
+from cavbench.core import registry
 
 if TYPE_CHECKING:
-    from bench.conformance.check import Outcome
+    from cavbench.checks.check import Outcome
 
 TRIED_WITH = ("victim", "world")
 """Keys that choose the victim and the world to check a component with."""
@@ -34,8 +34,8 @@ def print_checks(name: str, words: Sequence[str], console: Console) -> int:
     Raises:
         UserError: if no component has the name, its plug-in is broken, or an option cannot be parsed.
     """
-    from bench.conformance import examine
-    from bench.run.process import settle
+    from cavbench.checks import examine
+    from cavbench.run.process import settle
 
     settle()
     for word in words:

@@ -35,9 +35,9 @@ def _fitting(incomplete: str) -> list[str]:
 
 
 def _keys() -> list[str]:
-    from bench.cli.options_help import settings
-    from bench.plugins import registry
-    from bench.run.options import RunOptions
+    from cavbench.cli.options_help import settings
+    from cavbench.core import registry
+    from cavbench.run.options import RunOptions
 
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     threat = [f"threat.{name}" for name in ("norm", "budget", "access", "queries", "share")]
@@ -45,7 +45,7 @@ def _keys() -> list[str]:
 
 
 def _values(key: str) -> Iterator[str]:
-    from bench.plugins import registry, suites
+    from cavbench.core import registry, suites
 
     for kind in registry.KINDS:
         if key == kind:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 
-from bench.cli.terminal import Console
+from cavbench.cli.terminal import Console
 
 
 def check_names(words: Sequence[str], settings: str) -> None:
@@ -18,9 +18,9 @@ def check_names(words: Sequence[str], settings: str) -> None:
     Raises:
         UserError: if there is one.
     """
-    from bench.plugins import registry, suites
-    from bench.plugins.options import Options
-    from bench.run import options
+    from cavbench.core import registry, suites
+    from cavbench.core.options import Options
+    from cavbench.run import options
 
     axes = list(dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes))
     run = settings == "RunOptions"

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from bench.errors import bounded
+from cavbench.errors import bounded
 
 END_S = 6.0
 """Seconds that threads and hooks may take after the command has said all."""
@@ -34,7 +34,7 @@ def ended(command: Callable[[], None]) -> None:
         sys.excepthook(*sys.exc_info())
         code = 1
     # Most commands import no plug-in, some not even what finds them.
-    if "bench.plugins.registry" not in sys.modules or not _foreign():
+    if "cavbench.core.registry" not in sys.modules or not _foreign():
         raise SystemExit(code)
     if isinstance(code, str):
         sys.stderr.write(f"{code}\n")
@@ -75,7 +75,7 @@ def _watch(code: int, phase: list[str]) -> None:
 
 def _held(phase: str) -> str:
     """What holds the end, and whose it is."""
-    from bench.plugins.threads import left, owner
+    from cavbench.isolation.threads import left, owner
 
     held = left() if phase == "threads" else [threading.main_thread()]
     what = f"the thread {held[0].name!r}" if len(held) == 1 else f"{len(held)} threads"
@@ -87,6 +87,6 @@ def _held(phase: str) -> str:
 
 
 def _foreign() -> dict[str, str]:
-    from bench.plugins.registry import foreign
+    from cavbench.core.registry import foreign
 
     return foreign()

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from rich.text import Text
 
-from bench.cli.terminal import Console
-from bench.errors import UserError
-from bench.plugins import registry, suites
-from bench.plugins.registry import GROUPS, KINDS
-from bench.plugins.track import Measure, tracks
-from bench.records.schema import IDENTITY, PROVENANCE
+from cavbench.cli.terminal import Console
+from cavbench.errors import UserError
+from cavbench.core import registry, suites
+from cavbench.core.registry import GROUPS, KINDS
+from cavbench.core.track import Measure, tracks
+from cavbench.records.schema import IDENTITY, PROVENANCE
 
 GLOSSARY = Path(__file__).with_name("glossary.toml")
 DOCUMENTATION = "docs/{page}.md"
@@ -41,7 +41,7 @@ def print_term(term: str, console: Console) -> None:
         console.print(line, highlight=False)
     kinds = [kind for kind in KINDS if term.partition(":")[0] in registry.entries(GROUPS[kind])]
     if kinds or term in suites.names():
-        from bench.cli.listing import print_component
+        from cavbench.cli.listing import print_component
 
         print_component(term, console)
     elif not found:
@@ -107,7 +107,7 @@ def _spellings(heading: str) -> set[str]:
 
 def _of_a_parameter(term: str) -> list[Text]:
     """`threat.budget` or `attack.steps`: a parameter of the threat models, or of all components of a kind that have it."""
-    from bench.plugins.parameters import parameters
+    from cavbench.core.parameters import parameters
 
     kind, _, name = term.partition(".")
     found = []

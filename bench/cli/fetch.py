@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.cli.progress import show_downloads
-from bench.victims import fetch
+from cavbench.cli.progress import show_downloads
+from cavbench.zoo import fetch
 
 
 def print_downloads(console: Console) -> None:

@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.errors import UserError
-from bench.plugins import registry, suites
-from bench.plugins.contracts import ANY_TRACK
-from bench.plugins.registry import GROUPS, KINDS, Kind
-from bench.plugins.sources import summary, tracks_of
-from bench.plugins.suites import Suite
+from cavbench.errors import UserError
+from cavbench.core import registry, suites
+from cavbench.core.contracts import ANY_TRACK
+from cavbench.core.registry import GROUPS, KINDS, Kind
+from cavbench.core.sources import summary, tracks_of
+from cavbench.core.suites import Suite
 
 SUITE = "suite"
 
@@ -126,7 +126,7 @@ def heading(kind: Kind, name: str) -> Text:
 
 
 def _print_page(kind: Kind, name: str, console: Console) -> None:
-    from bench.plugins.parameters import description, flattened
+    from cavbench.core.parameters import description, flattened
 
     offered = registry.offers(kind, name)
     component = registry.declared(kind, name) if offered else registry.load(kind, name)

@@ -18,16 +18,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from bench import __version__
-from bench.cli.completion import completed
-from bench.cli.options_help import RunHelp, TrainHelp
-from bench.cli.terminal import Console
-from bench.errors import Notice, UnfinishedError, UserError, bounded, short
+from cavbench import __version__
+from cavbench.cli.completion import completed
+from cavbench.cli.options_help import RunHelp, TrainHelp
+from cavbench.cli.terminal import Console
+from cavbench.errors import Notice, UnfinishedError, UserError, bounded, short
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from bench.plugins.track import Track
+    from cavbench.core.track import Track
 
 app = typer.Typer(pretty_exceptions_enable=False)
 
@@ -74,7 +74,7 @@ def explain(
 
     For instance: bench help kept, bench help "min TTC", bench help threat.budget, or bench help run
     """
-    from bench.cli import explain as cli_explain
+    from cavbench.cli import explain as cli_explain
 
     wanted = " ".join(term or [])
     commands = getattr(context.find_root().command, "commands", {})
@@ -96,7 +96,7 @@ def list_components(
     as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
     """List the installed attacks, defences, victims and worlds with a line on each, or describe one."""
-    from bench.cli import listing as cli_list
+    from cavbench.cli import listing as cli_list
 
     if name in ("", "attack", "defense", "victim", "world", "suite"):
         cli_list.print_names(Console(), name, as_json=as_json)
@@ -119,7 +119,7 @@ def new(
 
     For instance: bench new attack my_attack, or bench new defense my_defense track=detection
     """
-    from bench.cli import new as cli_new
+    from cavbench.cli import new as cli_new
 
     cli_new.print_new(kind, name, words or [], Console())
 
@@ -136,7 +136,7 @@ def check(
 
     For instance: bench check my_attack attack.strength=2
     """
-    from bench.cli import check as cli_check
+    from cavbench.cli import check as cli_check
 
     raise typer.Exit(cli_check.print_checks(name, words or [], Console()))
 
@@ -151,7 +151,7 @@ def run(words: Words = None, cells: Cells = False) -> None:
     For instance: bench run attack=zo defense=advtrain
     """
     with _known(words, "RunOptions"):
-        from bench.cli import run as cli_run
+        from cavbench.cli import run as cli_run
 
     cli_run.run(words or [], Console(), partial(_print_report, cells=cells))
 
@@ -163,7 +163,7 @@ def audit(words: Words = None) -> None:
     The options are those of bench run; salt=NUMBER repeats an audit. For instance: bench audit attack=pgd defense=advtrain
     """
     with _known([word for word in words or [] if not word.startswith("salt=")], "RunOptions"):
-        from bench.cli import audit as cli_audit
+        from cavbench.cli import audit as cli_audit
 
     raise typer.Exit(cli_audit.audit(words or [], Console()))
 
@@ -185,7 +185,7 @@ def train(words: TrainWords = None) -> None:
     For instance: bench train victim=dqn seeds=0,1,2, or bench train defense=advtrain defense.skip=0.3 victim=dqn
     """
     with _known(words, "TrainOptions"):
-        from bench.cli import train as cli_train
+        from cavbench.cli import train as cli_train
 
     cli_train.train(words or [], Console())
 
@@ -209,8 +209,8 @@ def render(
 
     It needs the renderer: pip install 'cavbench[render]'. The frames of the standard grid ship with cavbench.
     """
-    from bench.cli import render as cli_render
-    from bench.cli.words import split
+    from cavbench.cli import render as cli_render
+    from cavbench.cli.words import split
 
     _, values = split(words or [], ("out", "world"), names=0)
     cli_render.render(values.get("world", world), _folder(values, out), Console())
@@ -225,8 +225,8 @@ def show(
     cells: Cells = False,
 ) -> None:
     """Show a run: its configuration, provenance, table and recordings. out=FOLDER is the results folder, by default results."""
-    from bench.cli import show as cli_show
-    from bench.cli.words import split
+    from cavbench.cli import show as cli_show
+    from cavbench.cli.words import split
 
     names, values = split(words or [], ("out",), names=1)
     folder = _folder(values, out) or Path("results")
@@ -257,8 +257,8 @@ def view(
     With --save, replay it and write a film. Two pairs are shown one below the other, on the same scenario:
     bench view none-none-dqn pgd-none-dqn --save clip.gif
     """
-    from bench.cli import view as cli_view
-    from bench.cli.words import split
+    from cavbench.cli import view as cli_view
+    from cavbench.cli.words import split
 
     names, values = split(words, (), names=len(words))
     folder = _folder(values, out) or Path("results")
@@ -290,7 +290,7 @@ def submit(
 
     For instance: bench submit pgd-my_defense-dqn out=submission
     """
-    from bench.cli import submit as cli_submit
+    from cavbench.cli import submit as cli_submit
 
     cli_submit.submit(words, Console())
 
@@ -310,7 +310,7 @@ def verify(
 
     Its components must be installed with pip. Nothing in the folder is executed.
     """
-    from bench.cli import submit as cli_submit
+    from cavbench.cli import submit as cli_submit
 
     raise typer.Exit(cli_submit.verify(words, Console(), _print_report))
 
@@ -333,7 +333,7 @@ def report(
     With html=PAGE, write the leaderboards as one HTML file, with JSON and CSV files next to it. Without out=, the folder is
     results; if it does not exist, a report shows the published records that it ships, if any.
     """
-    from bench.cli import report as cli_report
+    from cavbench.cli import report as cli_report
 
     cli_report.print_report(words or [], Console())
 
@@ -346,13 +346,13 @@ def fetch(
 
     Other commands download what they need; use this before you work without a network.
     """
-    from bench.cli import fetch as cli_fetch
+    from cavbench.cli import fetch as cli_fetch
 
     cli_fetch.print_fetched(names, Console()) if names else cli_fetch.print_downloads(Console())
 
 
 def _print_report(track: Track, records: pa.Table, *, cells: bool = False) -> None:
-    from bench.plugins import registry
+    from cavbench.core import registry
 
     for name in ("run", "cells") if cells else ("run",):
         registry.resolve(registry.REPORTS, name, "report")({track.name: records}, Console())
@@ -360,7 +360,7 @@ def _print_report(track: Track, records: pa.Table, *, cells: bool = False) -> No
 
 def _known(words: Sequence[str] | None, settings: str) -> AbstractContextManager[object]:
     """Refuses unknown names at once, and shows that something happens while torch is imported, which takes seconds."""
-    from bench.cli.early import check_names, starting
+    from cavbench.cli.early import check_names, starting
 
     check_names(words or [], settings)
     return starting(Console(stderr=True))
@@ -410,7 +410,7 @@ def _typed(error: typer.TyperException) -> str:
     if found := re.match(
         r"No such command '(.*?)'\.|Got unexpected extra argument\(?s?\)? \((.*)\)", message, re.DOTALL
     ):
-        from bench.plugins.registry import unknown
+        from cavbench.core.registry import unknown
 
         if found[2]:
             return f"cannot read {short(found[2])}: `bench {context.info_name} --help` says what it takes"

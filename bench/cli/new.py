@@ -8,8 +8,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from bench.cli.words import split
-from bench.conformance import scaffold
+from cavbench.cli.words import split
+from cavbench.checks import scaffold
 
 KEYS = ("track", "out")
 

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperCommand
 
-from bench.cli.terminal import Console
+from cavbench.cli.terminal import Console
 
 COMPONENTS = {
     "attack": ("none", "Attacks, or a suite such as standard: bench list attack."),
@@ -53,8 +53,8 @@ class RunHelp(TyperCommand):
     """A command whose help ends with all options of `bench run`, the axes of the installed worlds and the suites of attacks."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        from bench.plugins import registry, suites
-        from bench.run.options import RunOptions
+        from cavbench.core import registry, suites
+        from cavbench.run.options import RunOptions
 
         super().format_help(ctx, formatter)
         console = Console()
@@ -79,7 +79,7 @@ class TrainHelp(TyperCommand):
     """A command whose help ends with all options of `bench train`."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        from bench.run.options import TrainOptions
+        from cavbench.run.options import TrainOptions
 
         super().format_help(ctx, formatter)
         rows = [

@@ -21,17 +21,17 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-from bench.cli.terminal import Console
+from cavbench.cli.terminal import Console
 
 if TYPE_CHECKING:
-    from bench.run.unit import Loading, Preparation, Unit
+    from cavbench.run.unit import Loading, Preparation, Unit
 
 PRINTED_LINES = 5
 """Lines of a unit's output that are shown."""
 
 
 class RunProgress:
-    """Shows the progress of a run (`bench.run.runner.RunWatcher`): a bar on a terminal, one line per finished unit elsewhere.
+    """Shows the progress of a run (`cavbench.run.runner.RunWatcher`): a bar on a terminal, one line per finished unit elsewhere.
 
     Args:
         console: console to draw on; standard error, so that tables can be piped.
@@ -107,7 +107,7 @@ class RunProgress:
 
 
 class TrainingProgress:
-    """Shows the progress of a training (`bench.plugins.contracts.Progress`): a bar on a terminal, a line every 10 % elsewhere."""
+    """Shows the progress of a training (`cavbench.core.contracts.Progress`): a bar on a terminal, a line every 10 % elsewhere."""
 
     def __init__(self, console: Console, label: str) -> None:
         self.console = console
@@ -165,7 +165,7 @@ class DownloadProgress:
 
 def show_downloads() -> None:
     """Show the progress of all later downloads on standard error."""
-    from bench.victims import fetch
+    from cavbench.zoo import fetch
 
     fetch.tell(lambda name: DownloadProgress(Console(stderr=True), name))
 

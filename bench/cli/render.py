@@ -6,11 +6,11 @@ from pathlib import Path
 
 from rich.text import Text
 
-from bench.cli.progress import TrainingProgress
-from bench.cli.terminal import Console
-from bench.errors import UserError
-from bench.files import check_folder
-from bench.run.config import component
+from cavbench.cli.progress import TrainingProgress
+from cavbench.cli.terminal import Console
+from cavbench.errors import UserError
+from cavbench.files import check_folder
+from cavbench.run.config import component
 
 
 def render(world: str, out: Path | None, console: Console) -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.cli.words import split
-from bench.plugins import registry
-from bench.records import reading
+from cavbench.cli.words import split
+from cavbench.core import registry
+from cavbench.records import reading
 
 PAGES = "cavbench.pages"
 KEYS = ("out", "html")

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 import pyarrow as pa
 from rich.text import Text
 
-from bench.cli.progress import RunProgress, show_downloads
-from bench.cli.terminal import Console
-from bench.errors import UnfinishedError, UserError
-from bench.plugins.track import Track, track_of
-from bench.records import reading
-from bench.run import rounds, runner
-from bench.run.config import run_config
+from cavbench.cli.progress import RunProgress, show_downloads
+from cavbench.cli.terminal import Console
+from cavbench.errors import UnfinishedError, UserError
+from cavbench.core.track import Track, track_of
+from cavbench.records import reading
+from cavbench.run import rounds, runner
+from cavbench.run.config import run_config
 
 
 def run(words: Sequence[str], console: Console, report: Callable[[Track, pa.Table], None]) -> None:

@@ -13,14 +13,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.errors import UserError
-from bench.plugins import registry, suites
-from bench.plugins.track import Track, track
-from bench.records import reading
-from bench.records.schema import IDENTITY
-from bench.run import rounds
-from bench.scenarios import Value
-from bench.scenarios.axes import written
+from cavbench.errors import UserError
+from cavbench.core import registry, suites
+from cavbench.core.track import Track, track
+from cavbench.records import reading
+from cavbench.records.schema import IDENTITY
+from cavbench.run import rounds
+from cavbench.scenarios import Value
+from cavbench.scenarios.axes import written
 
 Report = Callable[[Track, pa.Table], None]
 

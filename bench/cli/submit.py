@@ -13,22 +13,22 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from rich.text import Text
 
-from bench.cli.audit import differences, verdict
-from bench.cli.progress import RunProgress
-from bench.cli.show import Report, pair_named, records_of
-from bench.cli.terminal import Console
-from bench.cli.words import split
-from bench.errors import UserError, short
-from bench.files import scratch
-from bench.records import reading
-from bench.records.schema import AUDIT
-from bench.run import claims, received, runner, submission, verification
-from bench.run.audit import SALTS, AuditConfig
-from bench.run.claims import Claim
-from bench.run.submission import Submission
-from bench.run.verification import Verified
-from bench.scenarios import SeedBlock
-from bench.statistics.unpaired import ENOUGH_SCENARIOS
+from cavbench.cli.audit import differences, verdict
+from cavbench.cli.progress import RunProgress
+from cavbench.cli.show import Report, pair_named, records_of
+from cavbench.cli.terminal import Console
+from cavbench.cli.words import split
+from cavbench.errors import UserError, short
+from cavbench.files import scratch
+from cavbench.records import reading
+from cavbench.records.schema import AUDIT
+from cavbench.run import claims, received, runner, submission, verification
+from cavbench.run.audit import SALTS, AuditConfig
+from cavbench.run.claims import Claim
+from cavbench.run.submission import Submission
+from cavbench.run.verification import Verified
+from cavbench.scenarios import SeedBlock
+from cavbench.statistics.unpaired import ENOUGH_SCENARIOS
 
 SAMPLE, EPISODES = 3, 20
 """Units that are replayed, and scenarios in each cell that are drawn, if nothing else is said."""

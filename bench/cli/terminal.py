@@ -8,7 +8,7 @@ from rich.console import Console as RichConsole
 from rich.console import ConsoleOptions, RenderableType
 from rich.segment import Segment
 
-from bench.errors import plain
+from cavbench.errors import plain
 
 
 class Console(RichConsole):

@@ -10,17 +10,17 @@ from typing import Any
 
 from rich.text import Text
 
-from bench.cli.progress import TrainingProgress
-from bench.cli.terminal import Console
-from bench.errors import UserError
-from bench.files import check_folder
-from bench.plugins.chain import Chain
-from bench.plugins.contracts import Trained, World
-from bench.plugins.pair import Chosen, choose
-from bench.plugins.track import track
-from bench.run.config import TrainConfig, train_config
-from bench.run.process import settle
-from bench.victims import zoo
+from cavbench.cli.progress import TrainingProgress
+from cavbench.cli.terminal import Console
+from cavbench.errors import UserError
+from cavbench.files import check_folder
+from cavbench.core.chain import Chain
+from cavbench.core.contracts import Trained, World
+from cavbench.core.pair import Chosen, choose
+from cavbench.core.track import track
+from cavbench.run.config import TrainConfig, train_config
+from cavbench.run.process import settle
+from cavbench import zoo
 
 
 def train(words: Sequence[str], console: Console) -> None:

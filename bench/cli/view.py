@@ -19,11 +19,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from rich.text import Text
 
-from bench.cli.show import located, pair_named, recordings, records_of
-from bench.cli.terminal import Console
-from bench.errors import UserError
-from bench.files import check_folder
-from bench.scenarios.axes import written
+from cavbench.cli.show import located, pair_named, recordings, records_of
+from cavbench.cli.terminal import Console
+from cavbench.errors import UserError
+from cavbench.files import check_folder
+from cavbench.scenarios.axes import written
 
 LOCAL = "127.0.0.1"
 """The web viewer is offered to this machine only."""
@@ -102,8 +102,8 @@ def save_film(
     Raises:
         UserError: if there is no such record, or the film cannot be written.
     """
-    from bench.recording.film import KINDS, save, stacked
-    from bench.run.replay import film
+    from cavbench.recording.film import KINDS, save, stacked
+    from cavbench.run.replay import film
 
     if path.suffix.lower() not in KINDS:
         raise UserError(f"--save {path}: the name must end in {', '.join(KINDS)}")
@@ -123,7 +123,7 @@ def save_film(
 
 def _record(run: str, out: Path, wanted: Mapping[str, str]) -> tuple[Path, dict[str, Any]]:
     """The results folder and the record of a recording, or of a pair's first episode with these values."""
-    from bench.run.replay import find, recorded
+    from cavbench.run.replay import find, recorded
 
     path = Path(run)
     if path.is_file():
@@ -229,7 +229,7 @@ def _example(folder: Path, pair: str | None, records: pa.Table) -> str:
 
 
 def _replayed(folder: Path, beginning: str, where: Sequence[str], console: Console) -> Path:
-    from bench.run.replay import find, replay
+    from cavbench.run.replay import find, replay
 
     (_, records), *_ = records_of(folder, beginning)
     words = dict(word.partition("=")[::2] for word in where)

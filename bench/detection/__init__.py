@@ -1,10 +1,10 @@
 """The detection track: stop-sign detectors, attacked with a patch on the sign. Plug-ins import from here."""
 
-from bench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
-from bench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions, Wrapped
-from bench.detection.oracle import PatchOracle
-from bench.detection.scenes import Approach, Decoy, Scenes
-from bench.detection.threat import PatchThreat
+from cavbench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
+from cavbench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions, Wrapped
+from cavbench.detection.oracle import PatchOracle
+from cavbench.detection.scenes import Approach, Decoy, Scenes
+from cavbench.detection.threat import PatchThreat
 
 __all__ = [
     "STOP_SIGN",

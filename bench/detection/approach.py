@@ -11,16 +11,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection import stopping
-from bench.detection.boxes import confidence, overlap
-from bench.detection.closed_loop import Drives
-from bench.detection.detector import STOP_SIGN, Detections, Detector
-from bench.detection.discrimination import certified, discrimination, if_visible
-from bench.detection.patch import Patch
-from bench.detection.printing import non_printability
-from bench.detection.scenes import Approach, Scenes
-from bench.detection.sight import SAME_IOU, Sight, certain, look, look_at_decoys
-from bench.trust.streams import Stream
+from cavbench.detection import stopping
+from cavbench.detection.boxes import confidence, overlap
+from cavbench.detection.closed_loop import Drives
+from cavbench.detection.detector import STOP_SIGN, Detections, Detector
+from cavbench.detection.discrimination import certified, discrimination, if_visible
+from cavbench.detection.patch import Patch
+from cavbench.detection.printing import non_printability
+from cavbench.detection.scenes import Approach, Scenes
+from cavbench.detection.sight import SAME_IOU, Sight, certain, look, look_at_decoys
+from cavbench.isolation.streams import Stream
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -173,7 +173,7 @@ def probed(
     share: float,
     entropy: int,
 ) -> dict[str, float | int]:
-    """Probes on a frame that the detector cannot foresee (`bench.records.schema.PROBES`).
+    """Probes on a frame that the detector cannot foresee (`cavbench.records.schema.PROBES`).
 
     `redrawn`: another answer when asked again. `same_answer`: the same on a grey image. `inconsistent`: asked as an oracle asks,
     in batches of other sizes and with gradients, an answer is not the one that was scored; or, on any approach, what it reports

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from bench.detection.detector import Detections, Predictions
+from cavbench.detection.detector import Detections, Predictions
 
 MOST = 100
 """Most detections of an image."""

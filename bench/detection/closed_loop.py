@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torchrl.envs import EnvBase
 
-from bench.detection import stopping
-from bench.detection.detector import Detections, Detector
-from bench.detection.driver import Memory
-from bench.detection.sight import glance
+from cavbench.detection import stopping
+from cavbench.detection.detector import Detections, Detector
+from cavbench.detection.driver import Memory
+from cavbench.detection.sight import glance
 
 STANDS_MPS = 1e-3
 """A slower car stands still."""
@@ -45,7 +45,7 @@ class Plan:
 
 
 class DrivingEnv(EnvBase):
-    """An environment of cars that a detector can drive; `envs.camera.environment.ApproachEnv` says what it shows.
+    """An environment of cars that a detector can drive; `cavbench.envs.camera.environment.ApproachEnv` says what it shows.
 
     Args:
         step_s: time of a step in s.
@@ -141,7 +141,7 @@ def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Dri
     """Let a detector drive the car of an environment of one car (`CameraWorld.environment`) until its episode ends.
 
     Each new frame is shown to the detector, with the distance driven since the one before. Its confidence in the sign goes to the
-    driver (`bench.detection.driver`), and the deceleration that the driver asks for goes to the car.
+    driver (`cavbench.detection.driver`), and the deceleration that the driver asks for goes to the car.
 
     Args:
         detector: the (defended) victim.

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor
 
-from bench.detection.detector import STOP_SIGN, Detector
-from bench.detection.oracle import PatchOracle
-from bench.detection.scenes import Approach, Scenes
-from bench.detection.threat import PatchThreat
-from bench.plugins.contracts import Attack, Defense, Facts, Progress, ThreatModel, Trained, Victim, World
-from bench.scenarios import Cell
+from cavbench.detection.detector import STOP_SIGN, Detector
+from cavbench.detection.oracle import PatchOracle
+from cavbench.detection.scenes import Approach, Scenes
+from cavbench.detection.threat import PatchThreat
+from cavbench.core.contracts import Attack, Defense, Facts, Progress, ThreatModel, Trained, Victim, World
+from cavbench.scenarios import Cell
 
 if TYPE_CHECKING:
-    from bench.detection.closed_loop import DrivingEnv
+    from cavbench.detection.closed_loop import DrivingEnv
 
 
 class CameraWorld(World):
@@ -44,7 +44,7 @@ class CameraWorld(World):
         """
 
     def environment(self, cell: Cell, seeds: Sequence[int], patch: Tensor | None, share: float) -> DrivingEnv | None:
-        """One car that drives up to a sign, for the closed loop (`bench.detection.closed_loop`); None if the world has none.
+        """One car that drives up to a sign, for the closed loop (`cavbench.detection.closed_loop`); None if the world has none.
 
         Args:
             cell: the cell.

@@ -8,19 +8,19 @@ from copy import deepcopy
 import torch
 from torch import Tensor
 
-from bench.detection.contracts import CameraWorld, PatchAttack
-from bench.detection.detector import Detector
-from bench.detection.enforcer import PatchEnforcer
-from bench.detection.patch import Patch
-from bench.detection.placed import placed
-from bench.detection.scenes import Scenes
-from bench.detection.threat import PatchThreat
-from bench.errors import UserError
-from bench.plugins.contracts import Progress
-from bench.plugins.track import Job
-from bench.trust.kept import unchanged
-from bench.trust.streams import Stream
-from bench.trust.watch import Watch
+from cavbench.detection.contracts import CameraWorld, PatchAttack
+from cavbench.detection.detector import Detector
+from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.detection.patch import Patch
+from cavbench.detection.placed import placed
+from cavbench.detection.scenes import Scenes
+from cavbench.detection.threat import PatchThreat
+from cavbench.errors import UserError
+from cavbench.core.contracts import Progress
+from cavbench.core.track import Job
+from cavbench.isolation.kept import unchanged
+from cavbench.isolation.streams import Stream
+from cavbench.isolation.watch import Watch
 
 
 def craft(
@@ -74,7 +74,7 @@ def craft(
 
 
 def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
-    """Craft the patch of a job's pair and training seed; return the content of its file (`bench.detection.patch`)."""
+    """Craft the patch of a job's pair and training seed; return the content of its file (`cavbench.detection.patch`)."""
     pair = job.pair
     attack, world, threat = pair.armed(job.training_seed), pair.world.component, pair.threat
     assert isinstance(attack, PatchAttack)

@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
-from bench.errors import UserError
-from bench.plugins.registry import unknown
+from cavbench.errors import UserError
+from cavbench.core.registry import unknown
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Detector(nn.Module, ABC):
     def certified(self, pictures: Tensor, boxes: Tensor, reach: Tensor) -> Tensor | None:
         """A lower bound of what is reported on a stop sign, whatever a patch shows; None for a detector without a certificate.
 
-        It bounds the confidence (`bench.detection.boxes.confidence`), which is taken before non-maximum suppression.
+        It bounds the confidence (`cavbench.detection.boxes.confidence`), which is taken before non-maximum suppression.
 
         Args:
             pictures: float [N, 3, H, W], images without a patch, sRGB in [0, 1].

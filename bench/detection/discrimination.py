@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.detection import stopping
-from bench.detection.precision import VISIBLE, precision_of_approach
-from bench.detection.scenes import Scenes
-from bench.detection.sight import Sight
-from bench.errors import UserError
+from cavbench.detection import stopping
+from cavbench.detection.precision import VISIBLE, precision_of_approach
+from cavbench.detection.scenes import Scenes
+from cavbench.detection.sight import Sight
+from cavbench.errors import UserError
 
 ROUNDING = 1e-3
 """A confidence may be this much below its certificate: sums in another order."""

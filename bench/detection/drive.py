@@ -8,34 +8,20 @@ from dataclasses import replace
 import numpy as np
 from torch import Tensor
 
-from bench.detection import (
-    approach,
-    boxes,
-    closed_loop,
-    crafting,
-    discrimination,
-    driver,
-    enforcer,
-    oracle,
-    precision,
-    printing,
-    sight,
-    stopping,
-    threat,
-)
-from bench.detection.approach import Sighting, Trace, Unpatched, check_approaches, score
-from bench.detection.closed_loop import Drive, Drives
-from bench.detection.contracts import CameraWorld
-from bench.detection.detector import Detector
-from bench.detection.patch import Patch
-from bench.detection.placed import placed
-from bench.detection.scenes import Approach
-from bench.errors import UserError
-from bench.plugins.progress import share_done
-from bench.plugins.track import Driven, Job
-from bench.trust.seal import Seal
-from bench.trust.streams import Stream
-from bench.trust.watch import Watch
+from cavbench.detection import approach, boxes, closed_loop, crafting, discrimination, driver, enforcer, oracle, precision, printing, sight, stopping, threat
+from cavbench.detection.approach import Sighting, Trace, Unpatched, check_approaches, score
+from cavbench.detection.closed_loop import Drive, Drives
+from cavbench.detection.contracts import CameraWorld
+from cavbench.detection.detector import Detector
+from cavbench.detection.patch import Patch
+from cavbench.detection.placed import placed
+from cavbench.detection.scenes import Approach
+from cavbench.errors import UserError
+from cavbench.core.progress import share_done
+from cavbench.core.track import Driven, Job
+from cavbench.isolation.seal import Seal
+from cavbench.isolation.streams import Stream
+from cavbench.isolation.watch import Watch
 
 SEAL = Seal(
     approach,
@@ -55,7 +41,7 @@ SEAL = Seal(
 
 
 def drive(job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
-    """Run a job's approaches and return the measurements, [A] each (`bench.detection.approach.score`).
+    """Run a job's approaches and return the measurements, [A] each (`cavbench.detection.approach.score`).
 
     Args:
         job: the job.

@@ -1,6 +1,6 @@
 """A driver with a memory: it confirms the sign over several frames, reacts, and brakes to stop at the line.
 
-The closed-loop form of `bench.detection.stopping`, with the same constants.
+The closed-loop form of `cavbench.detection.stopping`, with the same constants.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bench.detection import stopping
+from cavbench.detection import stopping
 
 NEAREST_M = 1e-3
 """The driver plans for at least this distance, so that it asks for a finite deceleration at and beyond the line."""

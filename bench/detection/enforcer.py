@@ -9,12 +9,12 @@ from copy import deepcopy
 import torch
 from torch import Tensor
 
-from bench.detection.detector import STOP_SIGN, Detector, Predictions
-from bench.detection.oracle import PatchOracle
-from bench.detection.threat import PatchThreat
-from bench.plugins.contracts import Access, QueryBudgetError, permit
-from bench.trust.streams import Stream
-from bench.trust.watch import TamperError, Watch
+from cavbench.detection.detector import STOP_SIGN, Detector, Predictions
+from cavbench.detection.oracle import PatchOracle
+from cavbench.detection.threat import PatchThreat
+from cavbench.core.contracts import Access, QueryBudgetError, permit
+from cavbench.isolation.streams import Stream
+from cavbench.isolation.watch import TamperError, Watch
 
 
 class PatchEnforcer:

@@ -1,4 +1,4 @@
-"""A patch attack's only access to the detector: a face of the run's enforcer (`bench.detection.enforcer`)."""
+"""A patch attack's only access to the detector: a face of the run's enforcer (`cavbench.detection.enforcer`)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from bench.detection.detector import Predictions, label_of
-from bench.detection.patch import MOMENTS, Evolution
-from bench.detection.threat import PatchThreat
-from bench.errors import UserError
-from bench.plugins.contracts import Access
+from cavbench.detection.detector import Predictions, label_of
+from cavbench.detection.patch import MOMENTS, Evolution
+from cavbench.detection.threat import PatchThreat
+from cavbench.errors import UserError
+from cavbench.core.contracts import Access
 
 
 class Door(Protocol):

@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from bench.errors import UserError
+from cavbench.errors import UserError
 
 MOMENTS = 20
 """Largest number of crafting steps kept in an `Evolution`."""

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection.boxes import overlap
-from bench.detection.detector import Detections
+from cavbench.detection.boxes import overlap
+from cavbench.detection.detector import Detections
 
 MATCH_IOU = 0.5
 """Smallest IoU with the true box at which a detection counts as true (PASCAL VOC, Everingham et al. 2010, section 4.2)."""

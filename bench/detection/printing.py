@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection.colour import linear, srgb
+from cavbench.detection.colour import linear, srgb
 
 Array = NDArray[np.float64]
 

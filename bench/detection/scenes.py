@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.detection.detector import STOP_SIGN, Objects
+from cavbench.detection.detector import STOP_SIGN, Objects
 
 
 @dataclass(frozen=True)

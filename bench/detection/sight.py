@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection import stopping
-from bench.detection.boxes import best_other, confidence, detections
-from bench.detection.detector import STOP_SIGN, Detections, Detector, Predictions
-from bench.detection.scenes import Scenes
-from bench.errors import UserError
+from cavbench.detection import stopping
+from cavbench.detection.boxes import best_other, confidence, detections
+from cavbench.detection.detector import STOP_SIGN, Detections, Detector, Predictions
+from cavbench.detection.scenes import Scenes
+from cavbench.errors import UserError
 
 BATCH = 16
 """Frames per forward pass."""

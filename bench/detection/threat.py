@@ -9,10 +9,10 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from bench.detection.printing import printed
-from bench.errors import UserError
-from bench.plugins.contracts import ThreatModel
-from bench.plugins.ranges import Natural
+from cavbench.detection.printing import printed
+from cavbench.errors import UserError
+from cavbench.core.contracts import ThreatModel
+from cavbench.core.ranges import Natural
 
 SIDES = range(8, 513)
 """Allowed width and height of a patch in texels."""
@@ -30,7 +30,7 @@ class PatchThreat(ThreatModel):
 
     Args:
         norm: `patch`: any texels on a square in the middle of the sign, no change elsewhere. `print`: only colours that a printer
-            can put there (`bench.detection.printing`).
+            can put there (`cavbench.detection.printing`).
         budget: side of the square as a share of the sign's side, in (0, 1]; 0 only with 0 queries, for runs without attack.
         queries: largest number of queries (images) for crafting one patch.
     """

@@ -10,15 +10,15 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from bench.driving.contracts import DrivingAttack
-from bench.driving.dynamics import Dynamics
-from bench.driving.enforcer import Enforcer
-from bench.driving.features import Features
-from bench.driving.oracle import Part, parts_of
-from bench.driving.policy import State, rows_of
-from bench.driving.threat import ObservationThreat
-from bench.driving.victim import CountedPolicy
-from bench.errors import UserError
+from cavbench.driving.contracts import DrivingAttack
+from cavbench.driving.dynamics import Dynamics
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.features import Features
+from cavbench.driving.oracle import Part, parts_of
+from cavbench.driving.policy import State, rows_of
+from cavbench.driving.threat import ObservationThreat
+from cavbench.driving.victim import CountedPolicy
+from cavbench.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
-from bench.driving.dynamics import Dynamics
-from bench.driving.features import ActionType, Driver, DrivingFacts, Features
-from bench.driving.kinematics import Kinematics
-from bench.driving.oracle import Oracle
-from bench.driving.policy import Policy, State
-from bench.driving.threat import ObservationThreat
-from bench.plugins.contracts import Attack, Defense, Progress, ThreatModel, Trained, Victim, World
-from bench.scenarios import Cell
+from cavbench.driving.dynamics import Dynamics
+from cavbench.driving.features import ActionType, Driver, DrivingFacts, Features
+from cavbench.driving.kinematics import Kinematics
+from cavbench.driving.oracle import Oracle
+from cavbench.driving.policy import Policy, State
+from cavbench.driving.threat import ObservationThreat
+from cavbench.core.contracts import Attack, Defense, Progress, ThreatModel, Trained, Victim, World
+from cavbench.scenarios import Cell
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -140,7 +140,7 @@ class DrivingVictim(Victim):
             facts: facts of the world in which it will drive.
 
         Raises:
-            bench.errors.UserError: if the zoo has no such policy; the message has the command that trains it.
+            cavbench.errors.UserError: if the zoo has no such policy; the message has the command that trains it.
         """
 
     def train(

@@ -10,13 +10,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.driving.features import DrivingFacts, Features
-from bench.errors import UserError
-from bench.plugins.chain import Chain
-from bench.plugins.options import configured
-from bench.plugins.pair import Pair
-from bench.plugins.registry import MARK
-from bench.victims import zoo
+from cavbench.driving.features import DrivingFacts, Features
+from cavbench.errors import UserError
+from cavbench.core.chain import Chain
+from cavbench.core.options import configured
+from cavbench.core.pair import Pair
+from cavbench.core.registry import MARK
+from cavbench import zoo
 
 
 def doubts(pair: Pair, default_world: str) -> Iterator[str]:

@@ -6,25 +6,25 @@ from collections.abc import Sequence
 from copy import deepcopy
 from itertools import accumulate, pairwise
 
-from bench.driving import attacker, enforcer, meter, oracle, probes, shadows, threat, victim
-from bench.driving import rollout as rollouts
-from bench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
-from bench.driving.meter import Columns
-from bench.driving.placed import placed
-from bench.driving.policy import Policy
-from bench.driving.rollout import Trace, rollout
-from bench.driving.threat import ObservationThreat
-from bench.errors import UserError
-from bench.plugins.pair import Pair
-from bench.plugins.track import Driven, Job
-from bench.trust.seal import Seal
-from bench.trust.streams import Stream
+from cavbench.driving import attacker, enforcer, meter, oracle, probes, shadows, threat, victim
+from cavbench.driving import rollout as rollouts
+from cavbench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
+from cavbench.driving.meter import Columns
+from cavbench.driving.placed import placed
+from cavbench.driving.policy import Policy
+from cavbench.driving.rollout import Trace, rollout
+from cavbench.driving.threat import ObservationThreat
+from cavbench.errors import UserError
+from cavbench.core.pair import Pair
+from cavbench.core.track import Driven, Job
+from cavbench.isolation.seal import Seal
+from cavbench.isolation.streams import Stream
 
 SEAL = Seal(attacker, enforcer, meter, oracle, probes, rollouts, shadows, threat, victim)
 
 
 def drive(job: Job, traced: Sequence[int]) -> Driven:
-    """Drive a job's episodes and return the measurements, [B] each (`bench.driving.rollout.rollout`).
+    """Drive a job's episodes and return the measurements, [B] each (`cavbench.driving.rollout.rollout`).
 
     Args:
         job: the job.

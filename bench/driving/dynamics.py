@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.driving.features import ActionType
-from bench.errors import UserError
+from cavbench.driving.features import ActionType
+from cavbench.errors import UserError
 
 
 @dataclass(frozen=True)

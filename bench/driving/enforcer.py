@@ -11,15 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.driving.dynamics import Dynamics
-from bench.driving.features import Features
-from bench.driving.oracle import DRAWS, Loss, Oracle, Part
-from bench.driving.policy import State, repeated, rows_of
-from bench.driving.threat import ObservationThreat, bounds
-from bench.driving.victim import CountedPolicy
-from bench.errors import UserError
-from bench.plugins.contracts import Access, QueryBudgetError, permit
-from bench.trust.watch import TamperError
+from cavbench.driving.dynamics import Dynamics
+from cavbench.driving.features import Features
+from cavbench.driving.oracle import DRAWS, Loss, Oracle, Part
+from cavbench.driving.policy import State, repeated, rows_of
+from cavbench.driving.threat import ObservationThreat, bounds
+from cavbench.driving.victim import CountedPolicy
+from cavbench.errors import UserError
+from cavbench.core.contracts import Access, QueryBudgetError, permit
+from cavbench.isolation.watch import TamperError
 
 Array = NDArray[Any]
 
@@ -196,7 +196,7 @@ class Enforcer:
 
 
 class _Door:
-    """The queries of one step (`bench.driving.oracle.Door`)."""
+    """The queries of one step (`cavbench.driving.oracle.Door`)."""
 
     def __init__(self, enforcer: Enforcer, step: int) -> None:
         self._enforcer, self._step = enforcer, step

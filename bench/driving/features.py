@@ -8,8 +8,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from bench.driving.kinematics import Kinematics
-from bench.plugins.contracts import Facts
+from cavbench.driving.kinematics import Kinematics
+from cavbench.core.contracts import Facts
 
 ActionType = Literal["discrete", "continuous"]
 Driver = Literal["agent", "idm", "oracle"]

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from bench.driving.attacker import Shown
-from bench.driving.features import DrivingFacts
-from bench.driving.metrics import safe_progress
-from bench.driving.policy import State, rows_of
-from bench.driving.victim import CountedPolicy
+from cavbench.driving.attacker import Shown
+from cavbench.driving.features import DrivingFacts
+from cavbench.driving.metrics import safe_progress
+from cavbench.driving.policy import State, rows_of
+from cavbench.driving.victim import CountedPolicy
 
 CHANGED = 0.1
 """A continuous action counts as changed if it differs by more than this on its [-1, 1] scale."""

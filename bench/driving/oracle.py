@@ -1,4 +1,4 @@
-"""An attack's only access to the driving policy: a face of the run's enforcer (`bench.driving.enforcer`)."""
+"""An attack's only access to the driving policy: a face of the run's enforcer (`cavbench.driving.enforcer`)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from bench.driving.dynamics import Dynamics
-from bench.driving.features import ActionType, Features
-from bench.driving.policy import State
-from bench.driving.threat import ObservationThreat, within
+from cavbench.driving.dynamics import Dynamics
+from cavbench.driving.features import ActionType, Features
+from cavbench.driving.policy import State
+from cavbench.driving.threat import ObservationThreat, within
 
 Loss = Callable[[Tensor], Tensor]
 

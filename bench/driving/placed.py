@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.driving.policy import Policy, PolicyWrapper, State
-from bench.plugins.device import CPU, move
+from cavbench.driving.policy import Policy, PolicyWrapper, State
+from cavbench.core.device import CPU, move
 
 
 class Placed(PolicyWrapper):

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from bench.driving.features import ActionType, Driver
+from cavbench.driving.features import ActionType, Driver
 
 State: TypeAlias = TensorDictBase | None
 """The state of B episodes: a TensorDict of batch size [B]; None for stateless policies and attacks."""
@@ -41,7 +41,7 @@ class Policy(nn.Module, ABC):
     """Hash of the policy's weights file; empty if there is none."""
     noise: float = 0.0
     """Standard deviation of independent Gaussian noise that it adds to every measured value of each observation, before anything
-    else sees it; 0 if it does not. The certificate of its score follows from it (`bench.statistics.certificate`)."""
+    else sees it; 0 if it does not. The certificate of its score follows from it (`cavbench.statistics.certificate`)."""
 
     def forward(self, observation: Tensor) -> Tensor:
         """The scores of a stateless policy (see `scores`).

@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.driving.policy import State, repeated, rows_of
-from bench.driving.shadows import REPEATS, ROUNDING, Shadow, differ, near
-from bench.driving.victim import CHUNK, CountedPolicy
-from bench.trust.streams import Stream
+from cavbench.driving.policy import State, repeated, rows_of
+from cavbench.driving.shadows import REPEATS, ROUNDING, Shadow, differ, near
+from cavbench.driving.victim import CHUNK, CountedPolicy
+from cavbench.isolation.streams import Stream
 
 EVERY = 15
 """Mean number of steps between two probes: a second of driving."""
@@ -30,7 +30,7 @@ PATH_WEIGHTS = (4, 4, 4, 1, 4)
 PATHS = ("some", "one", "many", "chunks", "gradient")
 """How an oracle asks: some episodes in any order, one, many points each, more than a batch holds, with gradients."""
 SHADOWS = 0.25
-"""Share of the probed steps at which a shadow begins (`bench.driving.shadows`)."""
+"""Share of the probed steps at which a shadow begins (`cavbench.driving.shadows`)."""
 SHADOWS_IF_REHEARSED = 0.5
 """The same under an attack that may rehearse."""
 SHORT, LONG = 4, 64
@@ -248,7 +248,7 @@ class Probe:
         self.drawn[queried] += 1
 
     def columns(self) -> Mapping[str, NDArray[np.generic]]:
-        """The probes of a record (`bench.records.schema.PROBES`), [B] each; shares are NaN if not measured."""
+        """The probes of a record (`cavbench.records.schema.PROBES`), [B] each; shares are NaN if not measured."""
         with np.errstate(invalid="ignore"):
             return {
                 "redrawn": self.redrawn / self.probed,

@@ -14,21 +14,21 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from bench.driving.attacker import Attacker, Shown
-from bench.driving.contracts import DrivingAttack
-from bench.driving.dynamics import Dynamics
-from bench.driving.features import DrivingFacts
-from bench.driving.meter import Columns, Meter
-from bench.driving.policy import Policy, State, rows_of
-from bench.driving.probes import Probe
-from bench.driving.threat import ObservationThreat
-from bench.driving.victim import CountedPolicy
-from bench.errors import UserError
-from bench.plugins.progress import share_done
-from bench.trust.identifiers import opaque
-from bench.trust.kept import unchanged
-from bench.trust.streams import Stream
-from bench.trust.watch import Watch
+from cavbench.driving.attacker import Attacker, Shown
+from cavbench.driving.contracts import DrivingAttack
+from cavbench.driving.dynamics import Dynamics
+from cavbench.driving.features import DrivingFacts
+from cavbench.driving.meter import Columns, Meter
+from cavbench.driving.policy import Policy, State, rows_of
+from cavbench.driving.probes import Probe
+from cavbench.driving.threat import ObservationThreat
+from cavbench.driving.victim import CountedPolicy
+from cavbench.errors import UserError
+from cavbench.core.progress import share_done
+from cavbench.isolation.identifiers import opaque
+from cavbench.isolation.kept import unchanged
+from cavbench.isolation.streams import Stream
+from cavbench.isolation.watch import Watch
 
 
 class NotJointError(Exception):
@@ -88,7 +88,7 @@ def rollout(
         trace: collects every step of its episodes.
 
     Returns:
-        One column [B] for each measurement; `bench.tracks.driving` has the names and units.
+        One column [B] for each measurement; `cavbench.driving.track` has the names and units.
 
     Raises:
         UserError: if the numbers of actions of the victim and the world differ, or the victim answers NaN or infinity.

@@ -1,6 +1,6 @@
 """Shadows: copies of running episodes that go the way of a rehearsal, in which the victim must answer as it drives.
 
-A rehearsal (`bench.driving.oracle.Oracle.rehearse`) clones the victim's state, and advances many copies for many steps. A victim
+A rehearsal (`cavbench.driving.oracle.Oracle.rehearse`) clones the victim's state, and advances many copies for many steps. A victim
 that told this from driving could behave better, or worse, in a rehearsal than on the road. Therefore a shadow clones the state
 at a step that nobody can foresee, shows one of its copies what the victim is shown while it drives, shows others something near,
 and compares the answers to that one copy with the scores that the victim drives by.
@@ -16,9 +16,9 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
-from bench.driving.policy import State, repeated, rows_of
-from bench.driving.victim import CountedPolicy
-from bench.trust.streams import Stream
+from cavbench.driving.policy import State, repeated, rows_of
+from cavbench.driving.victim import CountedPolicy
+from cavbench.isolation.streams import Stream
 
 ROUNDING = 1e-3
 """Scores may differ by this share of their largest value between batches of different sizes."""

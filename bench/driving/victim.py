@@ -8,10 +8,10 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from bench.driving.policy import Policy, State
-from bench.errors import UserError
-from bench.trust.streams import Stream
-from bench.trust.watch import Side, TamperError, Watch
+from cavbench.driving.policy import Policy, State
+from cavbench.errors import UserError
+from cavbench.isolation.streams import Stream
+from cavbench.isolation.watch import Side, TamperError, Watch
 
 CHUNK = 1024
 """Queries per batch: a larger batch does not fit into the processor's cache and takes twice as long per query."""

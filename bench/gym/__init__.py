@@ -8,17 +8,17 @@ try:
 except ImportError as error:
     raise ImportError("cavbench.gym needs gymnasium: pip install 'cavbench[gym]'") from error
 
-from bench.gym.environment import DrivingEnv, make
-from bench.gym.vector import DrivingVectorEnv, make_vec
-from bench.gym.world import GymWorld
-from bench.plugins import sources
+from cavbench.gym.environment import DrivingEnv, make
+from cavbench.gym.vector import DrivingVectorEnv, make_vec
+from cavbench.gym.world import GymWorld
+from cavbench.core import sources
 
 __all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "make", "make_vec"]
 
 for _name in sources.names("world", "driving"):
     gymnasium.register(
         id=f"cavbench/{_name}-v0",
-        entry_point="bench.gym.environment:make",
-        vector_entry_point="bench.gym.vector:make_vec",
+        entry_point="cavbench.gym.environment:make",
+        vector_entry_point="cavbench.gym.vector:make_vec",
         kwargs={"world": _name},
     )

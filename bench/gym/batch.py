@@ -13,14 +13,14 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.driving import ActionType
-from bench.errors import UserError
-from bench.gym.declared import CONTROLS, check
-from bench.gym.environment import drawn_seeds
-from bench.scenarios import Cell
+from cavbench.driving import ActionType
+from cavbench.errors import UserError
+from cavbench.gym.declared import CONTROLS, check
+from cavbench.gym.environment import drawn_seeds
+from cavbench.scenarios import Cell
 
 if TYPE_CHECKING:
-    from bench.gym.world import GymWorld
+    from cavbench.gym.world import GymWorld
 
 ROUNDING = 1e-6
 """A progress may be this far outside [0, 1]."""

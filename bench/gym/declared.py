@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 from gymnasium import spaces
 
-from bench.driving import ActionType
-from bench.errors import UserError
-from bench.plugins import registry
-from bench.plugins.fingerprint import canonical
-from bench.plugins.foreign import contained
-from bench.scenarios import Axes, Cell, Value
+from cavbench.driving import ActionType
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench.identity.fingerprint import canonical
+from cavbench.isolation.foreign import contained
+from cavbench.scenarios import Axes, Cell, Value
 
 if TYPE_CHECKING:
-    from bench.gym.world import GymWorld
+    from cavbench.gym.world import GymWorld
 
 CONTROLS = 2
-# Not among the data that no unit may change (`bench.plugins.framework.Snapshot`): a world is asked when it is needed.
+# Not among the data that no unit may change (`cavbench.isolation.framework.Snapshot`): a world is asked when it is needed.
 _asked: UserDict[tuple[type, str], spaces.Box | None] = UserDict()
 """What environments that were asked observe, by class and parameters of the world."""
 

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from bench.driving import ActionType, DrivingWorld
-from bench.errors import UserError
-from bench.plugins import registry
-from bench.plugins.pair import choose
-from bench.scenarios import Cell, Grid, SeedBlock
+from cavbench.driving import ActionType, DrivingWorld
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench.core.pair import choose
+from cavbench.scenarios import Cell, Grid, SeedBlock
 
 LAST_SEED = 2**31
 CONTROLS = 2
@@ -29,9 +29,9 @@ Observation = NDArray[np.float32]
 class DrivingEnv(gymnasium.Env[Observation, Any]):
     """One episode at a time of a driving world. `reset` draws a cell and a scenario that no score is reported on.
 
-    The observation is float32 [V, F] in [-1, 1], as policies get it in a run (`bench.driving.Features`). The reward is the
+    The observation is float32 [V, F] in [-1, 1], as policies get it in a run (`cavbench.driving.Features`). The reward is the
     world's: on the highway highway-env's, normalised to [0, 1] a step, whose sum is the `return` of records. `info` has the truth
-    for scoring: `progress`, `speed`, `x`, `ttc`, `crashed` and `offroad` (`bench.driving.DrivingWorld`), `cell` and `scenario`.
+    for scoring: `progress`, `speed`, `x`, `ttc`, `crashed` and `offroad` (`cavbench.driving.DrivingWorld`), `cell` and `scenario`.
 
     Args:
         world: the world.
@@ -95,7 +95,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
 
 
 def make(world: str | DrivingWorld = "highway", *, action_type: ActionType = "discrete", **options: Any) -> DrivingEnv:
-    """The environment of a world; `gymnasium.make("cavbench/highway-v0", lanes=3)` after `import bench.gym` is the same.
+    """The environment of a world; `gymnasium.make("cavbench/highway-v0", lanes=3)` after `import cavbench.gym` is the same.
 
     Args:
         world: a name, as on the command line, or a world.

@@ -12,13 +12,13 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
-from bench.driving import ActionType
-from bench.gym.batch import Batch
-from bench.gym.declared import CONTROLS
-from bench.scenarios import Cell, SeedBlock
+from cavbench.driving import ActionType
+from cavbench.gym.batch import Batch
+from cavbench.gym.declared import CONTROLS
+from cavbench.scenarios import Cell, SeedBlock
 
 if TYPE_CHECKING:
-    from bench.gym.world import GymWorld
+    from cavbench.gym.world import GymWorld
 
 STEPS, CPU_S = 30, 1.0
 """Length of an episode that is driven again, and CPU seconds after which a slow environment is left."""

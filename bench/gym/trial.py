@@ -13,14 +13,14 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
-from bench.driving import ActionType, Features
-from bench.gym.batch import Batch
-from bench.gym.declared import CONTROLS
-from bench.gym.repeats import repeats
-from bench.scenarios import Cell, SeedBlock
+from cavbench.driving import ActionType, Features
+from cavbench.gym.batch import Batch
+from cavbench.gym.declared import CONTROLS
+from cavbench.gym.repeats import repeats
+from cavbench.scenarios import Cell, SeedBlock
 
 if TYPE_CHECKING:
-    from bench.gym.world import GymWorld
+    from cavbench.gym.world import GymWorld
 
 STEPS, CELLS = 1000, 4
 """Length of the drive: steps of all episodes together, on so many cells of the grid."""
@@ -151,7 +151,7 @@ def _listed(features: Features, seen: Seen, which: NDArray[np.bool_]) -> str:
 
 
 def _of_rewards(world: GymWorld, seen: Seen) -> Iterator[str]:
-    from bench.gym.world import GymWorld
+    from cavbench.gym.world import GymWorld
 
     if type(world).progress is not GymWorld.progress:
         return

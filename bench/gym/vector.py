@@ -13,10 +13,10 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from bench.driving import ActionType, DrivingWorld
-from bench.errors import UserError
-from bench.gym.environment import Observation, checked_actions, checked_seed, drawn_seeds, spaces_of, world_and_cells
-from bench.scenarios import Cell
+from cavbench.driving import ActionType, DrivingWorld
+from cavbench.errors import UserError
+from cavbench.gym.environment import Observation, checked_actions, checked_seed, drawn_seeds, spaces_of, world_and_cells
+from cavbench.scenarios import Cell
 
 Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
 MASK = "reset_mask"
@@ -26,7 +26,7 @@ MASK = "reset_mask"
 class DrivingVectorEnv(VectorEnv[Observation, Any, NDArray[Any]]):
     """B episodes in one batch of the engine, which on the highway is many times faster than B environments.
 
-    Observations, rewards and `info` are those of `bench.gym.DrivingEnv`, in arrays [B, ...]. Episode b is on cell b, counted
+    Observations, rewards and `info` are those of `cavbench.gym.DrivingEnv`, in arrays [B, ...]. Episode b is on cell b, counted
     around, and draws its scenarios as a `DrivingEnv` of this cell does that was reset with the same seed. An episode that has
     ended is reset in the next step (gymnasium's `NEXT_STEP`): the world must support partial resets.
 
@@ -178,10 +178,10 @@ def _generators(seeds: Sequence[int | None]) -> tuple[list[np.random.Generator],
 def make_vec(
     world: str | DrivingWorld = "highway", *, num_envs: int, action_type: ActionType = "discrete", **options: Any
 ) -> DrivingVectorEnv:
-    """The vector environment of a world; arguments as in `bench.gym.make`.
+    """The vector environment of a world; arguments as in `cavbench.gym.make`.
 
     Raises:
-        UserError: as `bench.gym.make`.
+        UserError: as `cavbench.gym.make`.
     """
     world_, cells = world_and_cells(world, options)
     return DrivingVectorEnv(world_, cells, num_envs, action_type)

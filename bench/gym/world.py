@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torchrl.envs import EnvBase
 
-from bench.driving import ActionType, Driver, DrivingFacts, DrivingWorld
-from bench.errors import UserError
-from bench.gym import trial
-from bench.gym.batch import Batch
-from bench.gym.declared import native_limits, native_shape
-from bench.scenarios import Cell
+from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingWorld
+from cavbench.errors import UserError
+from cavbench.gym import trial
+from cavbench.gym.batch import Batch
+from cavbench.gym.declared import native_limits, native_shape
+from cavbench.scenarios import Cell
 
 SUCCESS = ("is_success", "success")
 """The names by which environments tell in `info` that the goal is reached."""
@@ -98,7 +98,7 @@ class GymWorld(DrivingWorld):
         )
 
     def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
-        """What 1,000 random steps say against the declarations of the world (`bench.gym.trial`)."""
+        """What 1,000 random steps say against the declarations of the world (`cavbench.gym.trial`)."""
         return trial.doubts(self, cells)
 
     def make(
@@ -109,7 +109,7 @@ class GymWorld(DrivingWorld):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        """See `bench.driving.DrivingWorld.make`; an action is never repeated.
+        """See `cavbench.driving.DrivingWorld.make`; an action is never repeated.
 
         Raises:
             UserError: if the spaces of an environment are not those that the world declares.

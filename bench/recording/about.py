@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 
-from bench.scenarios import Cell
+from cavbench.scenarios import Cell
 
 
 def title(meta: Mapping[str, object]) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.recording import about
+from cavbench.recording import about
 
 
 @contextmanager

@@ -15,15 +15,15 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from bench.errors import UserError, notice
-from bench.plugins.track import Track
-from bench.records import validity
-from bench.records.generations import check
-from bench.records.packing import packed_files
-from bench.records.reading import upgraded
-from bench.records.schema import schema
-from bench.records.store import path_of, write_packed
-from bench.scenarios import Cell
+from cavbench.errors import UserError, notice
+from cavbench.core.track import Track
+from cavbench.records import validity
+from cavbench.records.generations import check
+from cavbench.records.packing import packed_files
+from cavbench.records.reading import upgraded
+from cavbench.records.schema import schema
+from cavbench.records.store import path_of, write_packed
+from cavbench.scenarios import Cell
 
 SET_ASIDE = "set_aside"
 WHOSE = ("pair", "training_seed", "cell")
@@ -36,7 +36,7 @@ class _Pair(Protocol):
 
 
 class Wanted(Protocol):
-    """A unit of work, as far as its records must show it (`bench.run.unit.Unit`)."""
+    """A unit of work, as far as its records must show it (`cavbench.run.unit.Unit`)."""
 
     @property
     def pair(self) -> _Pair:

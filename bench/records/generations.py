@@ -14,9 +14,9 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bench.errors import UserError
-from bench.plugins.track import Track, tracks
-from bench.records.schema import FLOAT, IDENTITY, INT, PROVENANCE, TEXT, field, schema
+from cavbench.errors import UserError
+from cavbench.core.track import Track, tracks
+from cavbench.records.schema import FLOAT, IDENTITY, INT, PROVENANCE, TEXT, field, schema
 
 AXES_OF_V1 = (
     field("lanes", pa.int32(), "of the cell"),

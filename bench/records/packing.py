@@ -16,9 +16,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from bench.plugins.track import Track, tracks
-from bench.records.schema import schema
-from bench.records.store import FOLDER, MANY, path_of, write, write_packed
+from cavbench.core.track import Track, tracks
+from cavbench.records.schema import schema
+from cavbench.records.store import FOLDER, MANY, path_of, write, write_packed
 
 UNITS = 256
 """Units in a packed file, and fewest files that are packed."""

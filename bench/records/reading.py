@@ -16,14 +16,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from bench.errors import UserError, notice, short
-from bench.plugins import track as of
-from bench.plugins.track import Track
-from bench.records import validity
-from bench.records.generations import check, glance, selection
-from bench.records.packing import units_in
-from bench.records.schema import IDENTITY, PROVENANCE, schema
-from bench.records.store import FOLDER, MANY, path_of
+from cavbench.errors import UserError, notice, short
+from cavbench.core import track as of
+from cavbench.core.track import Track
+from cavbench.records import validity
+from cavbench.records.generations import check, glance, selection
+from cavbench.records.packing import units_in
+from cavbench.records.schema import IDENTITY, PROVENANCE, schema
+from cavbench.records.store import FOLDER, MANY, path_of
 
 T = TypeVar("T")
 

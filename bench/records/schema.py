@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from bench.plugins.track import Track
+from cavbench.core.track import Track
 
 VERSION = "2"
 """Version of the format. 1 had the columns lanes, density and weather; 2 has `cell` and `world_facts`."""

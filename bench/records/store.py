@@ -1,7 +1,7 @@
 """Episode records: a Parquet data set with one row per episode; a unit of work is in a file of its own, or in one of many units.
 
 Files are written atomically, so a killed run leaves only finished units. Whether a unit is finished is read from its rows
-(`bench.records.finished`).
+(`cavbench.records.finished`).
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bench import files
-from bench.errors import UserError
-from bench.plugins.track import Columns, Track, tracks
-from bench.records import validity
-from bench.records.schema import schema
+from cavbench import files
+from cavbench.errors import UserError
+from cavbench.core.track import Columns, Track, tracks
+from cavbench.records import validity
+from cavbench.records.schema import schema
 
 FOLDER, MANY = "episodes", "packed-"
 """The folder of the records, and the beginning of the names of files with many units."""
@@ -93,7 +93,7 @@ def table(constants: Mapping[str, object], measured: Columns, *, track: Track) -
     """The records of a unit, one row per episode.
 
     Args:
-        constants: values that all rows share (`bench.run.unit.Unit.constants`).
+        constants: values that all rows share (`cavbench.run.unit.Unit.constants`).
         measured: one column for each measurement, and `seed`: [B], or [B, n] for lists.
         track: track of the records.
 

@@ -13,11 +13,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from bench.errors import short
-from bench.plugins.contracts import Access
-from bench.plugins.track import Track
-from bench.records.schema import LARGEST, schema
-from bench.scenarios import Axes
+from cavbench.errors import short
+from cavbench.core.contracts import Access
+from cavbench.core.track import Track
+from cavbench.records.schema import LARGEST, schema
+from cavbench.scenarios import Axes
 
 JSON = ("attack_params", "defense_params", "victim_params", "world_params", "libraries")
 LONGEST_TEXT = 100_000
@@ -30,7 +30,7 @@ def complaint(records: pa.Table, track: Track) -> tuple[int, str] | None:
     """The first row with an invalid value, and why it is invalid; None if all rows are valid.
 
     Args:
-        records: columns of `bench.records.schema`, maybe not all; text may be dictionary-encoded.
+        records: columns of `cavbench.records.schema`, maybe not all; text may be dictionary-encoded.
         track: track of the records.
     """
     problems = [*_out_of_range(records, schema(track)), *_too_long(records), *_not_a_date(records)]
@@ -38,7 +38,7 @@ def complaint(records: pa.Table, track: Track) -> tuple[int, str] | None:
 
 
 def _out_of_range(records: pa.Table, columns: pa.Schema) -> Iterator[tuple[int, str]]:
-    """Problems of numbers: each column says its range (`bench.records.schema.field`)."""
+    """Problems of numbers: each column says its range (`cavbench.records.schema.field`)."""
     for column in columns:
         flat = column.type.value_type if pa.types.is_list(column.type) else column.type
         if column.name not in records.column_names or not (pa.types.is_floating(flat) or pa.types.is_integer(flat)):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench import bounded, files
-from bench.errors import UserError
-from bench.run.unit import Preparation
+from cavbench import bounded, files
+from cavbench.errors import UserError
+from cavbench.run.unit import Preparation
 
 
 def path_of(out: Path, preparation: Preparation) -> Path:

@@ -6,11 +6,11 @@ import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from bench.errors import UserError
-from bench.records.schema import AUDIT
-from bench.run.config import RunConfig, run_config
-from bench.scenarios import SeedBlock
-from bench.statistics.unpaired import ENOUGH_SCENARIOS
+from cavbench.errors import UserError
+from cavbench.records.schema import AUDIT
+from cavbench.run.config import RunConfig, run_config
+from cavbench.scenarios import SeedBlock
+from cavbench.statistics.unpaired import ENOUGH_SCENARIOS
 
 SALTS = 2**50
 

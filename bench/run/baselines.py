@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
-from bench.plugins.track import track_of
-from bench.records import reading
-from bench.run.config import RunConfig
-from bench.run.unit import Unit
+from cavbench.core.track import track_of
+from cavbench.records import reading
+from cavbench.run.config import RunConfig
+from cavbench.run.unit import Unit
 
 
 def hopeless(config: RunConfig, units: Iterable[Unit], finished: Collection[str]) -> str:

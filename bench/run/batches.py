@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from bench.run.unit import Preparation, Unit
+from cavbench.run.unit import Preparation, Unit
 
 EPISODES = 400
 """Most episodes in one batch: an operation on more does not fit into the processor's cache."""

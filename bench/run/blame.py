@@ -6,12 +6,12 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from bench.errors import RefusedNetworkError
-from bench.plugins.pair import Chosen, Pair
-from bench.run.unit import is_foreign
+from cavbench.errors import RefusedNetworkError
+from cavbench.core.pair import Chosen, Pair
+from cavbench.run.unit import is_foreign
 
 SIDES = {"attack": ("attack",), "defense": ("defense", "victim")}
-"""The kinds of component on each side of a `bench.trust.watch.TamperError`."""
+"""The kinds of component on each side of a `cavbench.isolation.watch.TamperError`."""
 
 
 def blamed(pair: Pair, error: BaseException | None = None) -> str:

@@ -18,19 +18,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.errors import UserError, message, short
-from bench.plugins import registry
-from bench.plugins.device import recorded
-from bench.plugins.device import stated as stated_device
-from bench.plugins.fingerprint import canonical
-from bench.plugins.pair import IN_PROCESS, Pair
-from bench.records import reading
-from bench.records.schema import AUDIT, SEQUENTIAL
-from bench.run.config import RunConfig
-from bench.run.plan import cells_of
-from bench.run.replay import pair_of
-from bench.run.unit import Unit
-from bench.scenarios import Cell, Grid, SeedBlock
+from cavbench.errors import UserError, message, short
+from cavbench.core import registry
+from cavbench.core.device import recorded
+from cavbench.core.device import stated as stated_device
+from cavbench.identity.fingerprint import canonical
+from cavbench.core.pair import IN_PROCESS, Pair
+from cavbench.records import reading
+from cavbench.records.schema import AUDIT, SEQUENTIAL
+from cavbench.run.config import RunConfig
+from cavbench.run.plan import cells_of
+from cavbench.run.replay import pair_of
+from cavbench.run.unit import Unit
+from cavbench.scenarios import Cell, Grid, SeedBlock
 
 OF_THE_PAIR = (
     "pair",

@@ -11,16 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.errors import UserError, short
-from bench.plugins import registry
-from bench.plugins.device import CPU, resolved
-from bench.plugins.options import Options, configured
-from bench.plugins.pair import Chosen, Pair, check_track
-from bench.plugins.registry import KINDS, Kind
-from bench.plugins.suites import Suite
-from bench.run.executors import EXECUTORS
-from bench.run.options import RunOptions, TrainOptions, half_of_memory
-from bench.scenarios import Grid
+from cavbench.errors import UserError, short
+from cavbench.core import registry
+from cavbench.core.device import CPU, resolved
+from cavbench.core.options import Options, configured
+from cavbench.core.pair import Chosen, Pair, check_track
+from cavbench.core.registry import KINDS, Kind
+from cavbench.core.suites import Suite
+from cavbench.run.executors import EXECUTORS
+from cavbench.run.options import RunOptions, TrainOptions, half_of_memory
+from cavbench.scenarios import Grid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class RunConfig:
         pairs: pairs to evaluate.
         grid: cells and scenario seeds.
         seeds: training seeds of the victims, and seeds of the patches.
-        executor: back end that carries out the work, a name in `bench.run.executors.EXECUTORS`.
+        executor: back end that carries out the work, a name in `cavbench.run.executors.EXECUTORS`.
         workers: number of worker processes; results do not depend on it. None takes every core, of this machine or of the
             Ray cluster.
         ray_address: of the Ray cluster: `local` starts one on this machine, `auto` finds the running one.
@@ -44,7 +44,7 @@ class RunConfig:
         unit_timeout: seconds that a unit or preparation may take; 0 for no limit.
         unit_memory: GB of memory that a worker process may use; 0 for no limit.
         device: where victims compute: `auto` is a GPU if there is one, and becomes `cpu` or `cuda` here.
-        until: half the width of the interval at which a row has enough scenarios (`bench.run.rounds`); None drives them all.
+        until: half the width of the interval at which a row has enough scenarios (`cavbench.run.rounds`); None drives them all.
 
     Raises:
         ValueError: if a number is out of range.

@@ -15,17 +15,17 @@ from multiprocessing.connection import wait
 from types import FrameType
 from typing import Protocol
 
-from bench.errors import UserError
-from bench.plugins.foreign import StopUnitError
-from bench.plugins.framework import Snapshot
-from bench.plugins.settings import Settings
-from bench.plugins.threads import holders
-from bench.run.blame import blamed
-from bench.run.process import cores, settle
-from bench.run.tree import resident_bytes
-from bench.run.unit import Loading, Preparation, Unit
-from bench.run.work import Failure, Outcome, Task, attempt
-from bench.run.worker import GB, Limits, Worker, packed
+from cavbench.errors import UserError
+from cavbench.isolation.foreign import StopUnitError
+from cavbench.isolation.framework import Snapshot
+from cavbench.isolation.settings import Settings
+from cavbench.isolation.threads import holders
+from cavbench.run.blame import blamed
+from cavbench.run.process import cores, settle
+from cavbench.run.tree import resident_bytes
+from cavbench.run.unit import Loading, Preparation, Unit
+from cavbench.run.work import Failure, Outcome, Task, attempt
+from cavbench.run.worker import GB, Limits, Worker, packed
 
 NEWS_S = 1.0
 """Seconds between two looks at the workers' time and memory."""
@@ -250,7 +250,7 @@ class Retries:
 
 
 def _ray(workers: int | None, limits: Limits, address: str) -> Executor:
-    from bench.run.ray_executor import RayExecutor
+    from cavbench.run.ray_executor import RayExecutor
 
     return RayExecutor(workers, limits, address)
 

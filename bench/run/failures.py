@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from bench.errors import UnfinishedError
-from bench.plugins.pair import Pair
-from bench.run.unit import Loading, Preparation, Unit
-from bench.run.work import Failure
+from cavbench.errors import UnfinishedError
+from cavbench.core.pair import Pair
+from cavbench.run.unit import Loading, Preparation, Unit
+from cavbench.run.work import Failure
 
 ENOUGH = 2
 """A pair is given up when so many of its units hung, ended their process, or used up its memory."""

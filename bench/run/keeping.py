@@ -9,10 +9,10 @@ from contextlib import suppress
 from types import ModuleType
 from typing import Any
 
-from bench.plugins.custody import Custody, forget_computed, listed
-from bench.plugins.framework import OWN
-from bench.plugins.pair import Chosen, Pair
-from bench.run.unit import is_foreign
+from cavbench.isolation.custody import Custody, forget_computed, listed
+from cavbench.isolation.framework import OWN
+from cavbench.core.pair import Chosen, Pair
+from cavbench.run.unit import is_foreign
 
 
 class Keeping:
@@ -82,7 +82,7 @@ def _package(part: Chosen[Any]) -> str:
 
 
 def _roots(part: Chosen[Any]) -> dict[str, object]:
-    """A component, and its classes; those of the framework are in the custody of `bench.plugins.framework`.
+    """A component, and its classes; those of the framework are in the custody of `cavbench.isolation.framework`.
 
     Classes of a Python program are its own.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from bench.run.process import machine_bytes
+from cavbench.run.process import machine_bytes
 
 
 def half_of_memory() -> float:

@@ -7,13 +7,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from bench.plugins.fingerprint import canonical
-from bench.plugins.pair import Chosen, Pair
-from bench.plugins.track import track_of
-from bench.records.schema import SEQUENTIAL
-from bench.run.config import RunConfig
-from bench.run.unit import Loading, Unit
-from bench.scenarios import Axes, Cell
+from cavbench.identity.fingerprint import canonical
+from cavbench.core.pair import Chosen, Pair
+from cavbench.core.track import track_of
+from cavbench.records.schema import SEQUENTIAL
+from cavbench.run.config import RunConfig
+from cavbench.run.unit import Loading, Unit
+from cavbench.scenarios import Axes, Cell
 
 Weights = Mapping[str, tuple[str, str]]
 """The hashes of the networks of each loading (`key_of`)."""

@@ -1,6 +1,6 @@
 """Carries out tasks on the machines of a Ray cluster. Nothing is shared but the cluster: no disk.
 
-On every core a Ray actor keeps one worker process (`bench.run.worker`), so that time and memory limits, what components print,
+On every core a Ray actor keeps one worker process (`cavbench.run.worker`), so that time and memory limits, what components print,
 and plug-ins that end their process are treated as on one machine. cavbench and the plug-ins must be installed on every machine.
 """
 
@@ -16,11 +16,11 @@ from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from bench.errors import UserError, short
-from bench.run.executors import NEWS_S, Finished, Retries, Watcher
-from bench.run.process import cores
-from bench.run.work import Failure, Outcome, Task
-from bench.run.worker import Limits, Worker, packed
+from cavbench.errors import UserError, short
+from cavbench.run.executors import NEWS_S, Finished, Retries, Watcher
+from cavbench.run.process import cores
+from cavbench.run.work import Failure, Outcome, Task
+from cavbench.run.worker import Limits, Worker, packed
 
 NO_CORES_S = 120.0
 """Seconds to wait for a core of the cluster before the run is given up."""

@@ -18,11 +18,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from bench import files
-from bench.plugins.framework import OWN
-from bench.plugins.pair import Chosen, Pair
-from bench.run.unit import is_foreign
-from bench.trust.watch import TamperError
+from cavbench import files
+from cavbench.isolation.framework import OWN
+from cavbench.core.pair import Chosen, Pair
+from cavbench.run.unit import is_foreign
+from cavbench.isolation.watch import TamperError
 
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 CHANGES = frozenset(

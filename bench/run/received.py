@@ -17,17 +17,17 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bench import bounded
-from bench.errors import UserError, short
-from bench.files import scratch
-from bench.plugins import registry
-from bench.plugins.track import Track, track
-from bench.records import validity
-from bench.records.schema import schema
-from bench.records.store import FOLDER
-from bench.run.claims import invalid_floats
-from bench.run.submission import CARD, DESCRIPTION, FORMAT, ZOO, Submission
-from bench.scenarios.grid import MOST_EPISODES
+from cavbench import bounded
+from cavbench.errors import UserError, short
+from cavbench.files import scratch
+from cavbench.core import registry
+from cavbench.core.track import Track, track
+from cavbench.records import validity
+from cavbench.records.schema import schema
+from cavbench.records.store import FOLDER
+from cavbench.run.claims import invalid_floats
+from cavbench.run.submission import CARD, DESCRIPTION, FORMAT, ZOO, Submission
+from cavbench.scenarios.grid import MOST_EPISODES
 
 MOST_FILES, MOST_BYTES = 20_000, 2**32
 """Most files and bytes of a submission."""
@@ -103,7 +103,7 @@ def check_weights(submission: Submission, expected: Mapping[str, object]) -> Non
     Raises:
         UserError: names the file.
     """
-    from bench.victims.zoo.store import SHIPPED
+    from cavbench.zoo.store import SHIPPED
 
     given = {name for name in submission.about["files"] if name.startswith(f"{ZOO}/")}
     for name in sorted(given):

@@ -13,20 +13,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.errors import UserError
-from bench.plugins import registry
-from bench.plugins.device import recorded as recorded_device
-from bench.plugins.framework import Snapshot
-from bench.plugins.pair import IN_PROCESS, Chosen, Pair, choose
-from bench.plugins.track import track
-from bench.records import reading, store
-from bench.records.schema import IDENTITY, SEQUENTIAL
-from bench.run import artefacts
-from bench.run.process import settle
-from bench.run.runner import keep_recording, recording_path, stem
-from bench.run.unit import Unit
-from bench.run.work import Failure, Outcome, Task, attempt
-from bench.scenarios import Cell
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench.core.device import recorded as recorded_device
+from cavbench.isolation.framework import Snapshot
+from cavbench.core.pair import IN_PROCESS, Chosen, Pair, choose
+from cavbench.core.track import track
+from cavbench.records import reading, store
+from cavbench.records.schema import IDENTITY, SEQUENTIAL
+from cavbench.run import artefacts
+from cavbench.run.process import settle
+from cavbench.run.runner import keep_recording, recording_path, stem
+from cavbench.run.unit import Unit
+from cavbench.run.work import Failure, Outcome, Task, attempt
+from cavbench.scenarios import Cell
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def film(out: Path, record: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
         record: one of its records.
 
     Returns:
-        A `bench.recording.film.Film`, and names of measurements.
+        A `cavbench.recording.film.Film`, and names of measurements.
 
     Raises:
         UserError: if a component, the weights or the artefact is missing, or the track makes no films.

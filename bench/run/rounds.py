@@ -17,18 +17,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench import bounded, files
-from bench.errors import UserError
-from bench.plugins.pair import Pair
-from bench.plugins.track import track_of
-from bench.records import reading
-from bench.records.schema import SEQUENTIAL
-from bench.run.config import RunConfig
-from bench.run.plan import Weights, units_of
-from bench.run.unit import Unit
-from bench.statistics.episodes import Episodes
-from bench.statistics.estimates import CONFIDENCE, Array
-from bench.statistics.sequential import confidence_sequence, shown_higher
+from cavbench import bounded, files
+from cavbench.errors import UserError
+from cavbench.core.pair import Pair
+from cavbench.core.track import track_of
+from cavbench.records import reading
+from cavbench.records.schema import SEQUENTIAL
+from cavbench.run.config import RunConfig
+from cavbench.run.plan import Weights, units_of
+from cavbench.run.unit import Unit
+from cavbench.statistics.episodes import Episodes
+from cavbench.statistics.estimates import CONFIDENCE, Array
+from cavbench.statistics.sequential import confidence_sequence, shown_higher
 
 SCENARIOS = 10
 """Scenarios of each cell in a round."""
@@ -100,7 +100,7 @@ def drive_until(config: RunConfig, weights: Weights, drive: Drive) -> list[str]:
 
     Args:
         config: the run, with `until`.
-        weights: of its networks (`bench.run.plan.units_of`).
+        weights: of its networks (`cavbench.run.plan.units_of`).
         drive: carries out units.
     """
     groups: dict[object, list[_Row]] = {}

@@ -1,6 +1,6 @@
 """Carries out a run: passes its units of work to an executor, and writes the outcomes to files.
 
-Finished units are packed as the run goes on (`bench.records.packing`).
+Finished units are packed as the run goes on (`cavbench.records.packing`).
 
 Preparations (patches) are made first and kept as files for their units. A unit is a pure function of its configuration: results
 do not depend on the executor, the number of workers or the order of work.
@@ -17,24 +17,24 @@ from typing import Protocol
 
 import pyarrow as pa
 
-from bench import files
-from bench.errors import RefusedNetworkError, UserError, message
-from bench.plugins.track import Track
-from bench.records import packing, store
-from bench.records.finished import finished as finished_units
-from bench.run import artefacts
-from bench.run.baselines import hopeless
-from bench.run.batches import batches
-from bench.run.config import RunConfig
-from bench.run.executors import EXECUTORS, Executor, Finished, Watcher
-from bench.run.failures import Failures
-from bench.run.plan import Weights, key_of, loadings, units_of
-from bench.run.rounds import drive_until, rounds
-from bench.run.unit import Loading, Preparation, Unit, is_foreign
-from bench.run.work import Outcome, Task
-from bench.run.worker import Limits
-from bench.scenarios import Cell
-from bench.scenarios.axes import written
+from cavbench import files
+from cavbench.errors import RefusedNetworkError, UserError, message
+from cavbench.core.track import Track
+from cavbench.records import packing, store
+from cavbench.records.finished import finished as finished_units
+from cavbench.run import artefacts
+from cavbench.run.baselines import hopeless
+from cavbench.run.batches import batches
+from cavbench.run.config import RunConfig
+from cavbench.run.executors import EXECUTORS, Executor, Finished, Watcher
+from cavbench.run.failures import Failures
+from cavbench.run.plan import Weights, key_of, loadings, units_of
+from cavbench.run.rounds import drive_until, rounds
+from cavbench.run.unit import Loading, Preparation, Unit, is_foreign
+from cavbench.run.work import Outcome, Task
+from cavbench.run.worker import Limits
+from cavbench.scenarios import Cell
+from cavbench.scenarios.axes import written
 
 
 class RunWatcher(Watcher, Protocol):

@@ -16,15 +16,15 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench import bounded, files
-from bench.errors import UserError, short
-from bench.plugins.fingerprint import canonical
-from bench.plugins.pair import Pair
-from bench.plugins.track import Track
-from bench.records import packing, reading
-from bench.records.schema import AUDIT
-from bench.records.store import FOLDER
-from bench.run import claims
+from cavbench import bounded, files
+from cavbench.errors import UserError, short
+from cavbench.identity.fingerprint import canonical
+from cavbench.core.pair import Pair
+from cavbench.core.track import Track
+from cavbench.records import packing, reading
+from cavbench.records.schema import AUDIT
+from cavbench.records.store import FOLDER
+from cavbench.run import claims
 
 FORMAT = 2
 """Version of the format. 1 held the records of controls and baselines, too."""
@@ -163,7 +163,7 @@ def _shown(value: object) -> str:
 
 def weights_of(pair: Pair, training_seeds: Sequence[int]) -> dict[str, Path | None]:
     """The weights and cards that a pair loads from a zoo, by their paths in a submission, with those of the user's zoo."""
-    from bench.victims import zoo
+    from cavbench import zoo
 
     victim, defense, attack = pair.victim.component, pair.defense.component, pair.attack.component
     recipes = [zoo.Recipe.of(victim)] if victim.learns else []
@@ -193,7 +193,7 @@ def _copy_artefacts(results: Path, records: pa.Table, own: Track, out: Path) -> 
 
 def command(records: pa.Table, pair: Pair) -> str:
     """The command that drives a pair as its records say."""
-    from bench.victims.zoo.recipe import Part
+    from cavbench.zoo.recipe import Part
 
     first = records.slice(0, 1).to_pylist()[0]
     words = [f"{part.kind}={part.name}" for part in pair.parts]

@@ -9,15 +9,15 @@ from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any
 
-from bench.errors import RefusedNetworkError, UserError, message, reason
-from bench.plugins import registry
-from bench.plugins.device import CPU, said
-from bench.plugins.fingerprint import canonical, code_digest, digest, libraries, machine
-from bench.plugins.foreign import contained
-from bench.plugins.pair import Chosen, Pair, weights_of
-from bench.plugins.track import Job, Track, track_of
-from bench.records.schema import AUDIT, SEQUENTIAL
-from bench.scenarios import Cell, SeedBlock
+from cavbench.errors import RefusedNetworkError, UserError, message, reason
+from cavbench.core import registry
+from cavbench.core.device import CPU, said
+from cavbench.identity.fingerprint import canonical, code_digest, digest, libraries, machine
+from cavbench.isolation.foreign import contained
+from cavbench.core.pair import Chosen, Pair, weights_of
+from cavbench.core.track import Job, Track, track_of
+from cavbench.records.schema import AUDIT, SEQUENTIAL
+from cavbench.scenarios import Cell, SeedBlock
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,7 +201,7 @@ class Unit(Work):
     """One batch of episodes: a pair on every scenario seed of a cell, with one training seed.
 
     Args:
-        sequential: whether it is part of a round (`bench.run.rounds`).
+        sequential: whether it is part of a round (`cavbench.run.rounds`).
     """
 
     sequential: bool = False
@@ -275,7 +275,7 @@ class Unit(Work):
         )
 
     def constants(self, wall_s: float) -> dict[str, object]:
-        """The columns that all records of the unit share: IDENTITY (without `seed`) and PROVENANCE of `bench.records.schema`.
+        """The columns that all records of the unit share: IDENTITY (without `seed`) and PROVENANCE of `cavbench.records.schema`.
 
         Call it in the process that did the work: it reads machine, code and libraries there.
         """

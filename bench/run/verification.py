@@ -12,15 +12,15 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench import files
-from bench.plugins.track import Track
-from bench.records import reading, store
-from bench.records.finished import finished
-from bench.run import artefacts, claims, runner
-from bench.run.claims import Claim
-from bench.run.replay import differing
-from bench.run.submission import Submission
-from bench.run.unit import Unit
+from cavbench import files
+from cavbench.core.track import Track
+from cavbench.records import reading, store
+from cavbench.records.finished import finished
+from cavbench.run import artefacts, claims, runner
+from cavbench.run.claims import Claim
+from cavbench.run.replay import differing
+from cavbench.run.submission import Submission
+from cavbench.run.unit import Unit
 
 CLOSE = 0.02
 """Largest difference of a unit's score between machines or libraries."""

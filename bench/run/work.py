@@ -13,19 +13,19 @@ from typing import Any, Protocol
 
 import pyarrow as pa
 
-from bench import files
-from bench.errors import PluginError, RefusedNetworkError, UserError, message, reason
-from bench.plugins.custody import listed
-from bench.plugins.fingerprint import canonical
-from bench.plugins.foreign import contained
-from bench.plugins.framework import Snapshot
-from bench.plugins.progress import listening
-from bench.records.store import table
-from bench.run.blame import blamed, named
-from bench.run.keeping import Keeping
-from bench.run.reach import within_reach
-from bench.run.unit import Loading, Preparation, Unit
-from bench.trust.watch import TamperError
+from cavbench import files
+from cavbench.errors import PluginError, RefusedNetworkError, UserError, message, reason
+from cavbench.isolation.custody import listed
+from cavbench.identity.fingerprint import canonical
+from cavbench.isolation.foreign import contained
+from cavbench.isolation.framework import Snapshot
+from cavbench.core.progress import listening
+from cavbench.records.store import table
+from cavbench.run.blame import blamed, named
+from cavbench.run.keeping import Keeping
+from cavbench.run.reach import within_reach
+from cavbench.run.unit import Loading, Preparation, Unit
+from cavbench.isolation.watch import TamperError
 
 
 class Tell(Protocol):
@@ -50,7 +50,7 @@ class Task:
         artefacts: contents of the files of the units' preparations, by `Work.artefact`.
         recorded: scenario seeds of the episodes to record.
         entropy: seed of the probes of a replay; None draws one, which nobody can foresee.
-        others: units to drive in the same batch (`bench.run.batches`).
+        others: units to drive in the same batch (`cavbench.run.batches`).
     """
 
     work: Unit | Preparation | Loading

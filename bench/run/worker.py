@@ -19,21 +19,21 @@ from functools import cache
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from bench import files
-from bench.errors import reason
-from bench.plugins import registry
-from bench.plugins.foreign import contained, ended
-from bench.plugins.framework import Snapshot
-from bench.plugins.settings import Settings
-from bench.plugins.track import track
-from bench.run import tree
-from bench.run.blame import blamed
-from bench.run.process import children, context, follow_parent, settle
-from bench.run.work import Failure, Outcome, Task, Tell, attempt
+from cavbench import files
+from cavbench.errors import reason
+from cavbench.core import registry
+from cavbench.isolation.foreign import contained, ended
+from cavbench.isolation.framework import Snapshot
+from cavbench.isolation.settings import Settings
+from cavbench.core.track import track
+from cavbench.run import tree
+from cavbench.run.blame import blamed
+from cavbench.run.process import children, context, follow_parent, settle
+from cavbench.run.work import Failure, Outcome, Task, Tell, attempt
 
 GB = 1e9
 READY = "ready"
-RANGES = "envs.highway.world"
+RANGES = "cavbench.envs.highway.world"
 START_S = 600.0
 """Seconds that a worker may take to start: on a busy machine its imports take long."""
 KEPT_BYTES = 8192

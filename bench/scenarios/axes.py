@@ -168,7 +168,7 @@ class Axes(Mapping[str, Axis]):
 
     @classmethod
     def read(cls, written: Sequence[Mapping[str, Any]]) -> Axes:
-        """The axes in records (`bench.plugins.contracts.Facts.written`).
+        """The axes in records (`cavbench.core.contracts.Facts.written`).
 
         Raises:
             ValueError: if `written` does not describe axes.

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
-from bench.scenarios.axes import Axes, Cell, Value
+from cavbench.scenarios.axes import Axes, Cell, Value
 
 
 class SeedBlock(IntEnum):

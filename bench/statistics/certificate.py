@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from statistics import NormalDist
 
-from bench.statistics.estimates import Interval
+from cavbench.statistics.estimates import Interval
 
 
 def certificate(clean: Interval, shift: float) -> float:

@@ -1,8 +1,8 @@
 """Arranges the episodes of a pair and computes estimates with intervals, for one cell or a whole grid.
 
-Records come as a `pyarrow.Table`, one row per episode (columns: `bench.records.schema`). `Episodes.arrange` sorts the rows of one
+Records come as a `pyarrow.Table`, one row per episode (columns: `cavbench.records.schema`). `Episodes.arrange` sorts the rows of one
 pair by training seed, cell and scenario seed; `measured` aggregates them; `difference` compares two sets scenario by scenario.
-The statistics are in `bench.statistics.estimates`.
+The statistics are in `cavbench.statistics.estimates`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from bench.plugins.track import Measure
-from bench.scenarios import Axes, Cell
-from bench.statistics.estimates import Array, Interval, interval, share_interval
+from cavbench.core.track import Measure
+from cavbench.scenarios import Axes, Cell
+from cavbench.statistics.estimates import Array, Interval, interval, share_interval
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Means with 95 % intervals over two crossed random factors: the training (runs) and the scenario.
 
-Pure functions on arrays; `bench.statistics.episodes` says what the arrays mean. docs/metrics.md derives the intervals and has the
+Pure functions on arrays; `cavbench.statistics.episodes` says what the arrays mean. docs/metrics.md derives the intervals and has the
 table of their coverage (`python -m tests.leaderboard.simulated_studies`).
 """
 

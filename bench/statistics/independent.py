@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from bench.statistics.estimates import Array, Interval, margin_of, mean_squares, t_quantile
+from cavbench.statistics.estimates import Array, Interval, margin_of, mean_squares, t_quantile
 
 UNSEEN = 0.25
 """Intraclass correlation of trainings that the scores of one training are taken to have: about the largest of the published

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.statistics.estimates import CONFIDENCE, Array
+from cavbench.statistics.estimates import CONFIDENCE, Array
 
 STEP = 0.001
 """Distance of two means that are tested; intervals are a step wider at each end."""

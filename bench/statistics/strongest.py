@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.statistics.estimates import Array
+from cavbench.statistics.estimates import Array
 
 FOLDS = 5
 """Parts of the scenarios. In each, the attack counts that is the strongest in the others."""

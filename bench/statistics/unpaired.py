@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from bench.statistics.estimates import CONFIDENCE, Array, Interval, t_quantile
+from cavbench.statistics.estimates import CONFIDENCE, Array, Interval, t_quantile
 
 ENOUGH_SCENARIOS = 10
 """A side with fewer scenarios is no evidence: where scores hardly vary, its variance says too little."""

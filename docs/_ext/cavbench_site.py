@@ -15,11 +15,11 @@ from sphinx.ext.napoleon import GoogleDocstring
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
-from bench.cli.listing import fits
-from bench.errors import UserError
-from bench.plugins import registry
-from bench.plugins.parameters import parameters
-from bench.plugins.registry import GROUPS, Kind
+from cavbench.cli.listing import fits
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench.core.parameters import parameters
+from cavbench.core.registry import GROUPS, Kind
 
 LEADERBOARD = ("leaderboard/index.html", "leaderboard/index.json", "leaderboard/index.csv")
 """Files of the repository that are copied to the same path in the site, with the films beside them."""

@@ -6,7 +6,7 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from bench.run.process import settle
+from cavbench.run.process import settle
 
 FIGURES = {
     "attack_none.svg": "attacks:none",

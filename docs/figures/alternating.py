@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from bench.victims import zoo
-from bench.victims.drivers.dqn import DQN
-from defenses.atla import AlternatingTraining
+from cavbench import zoo
+from cavbench.driving.victims.dqn import DQN
+from cavbench.defenses.driving.atla import AlternatingTraining
 from docs.figures import style
 
 

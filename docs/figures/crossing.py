@@ -7,17 +7,17 @@ from dataclasses import replace
 import torch
 from matplotlib.figure import Figure
 
-from bench.detection.driver import Memory
-from bench.detection.stopping import SPEED_MPS
+from cavbench.detection.driver import Memory
+from cavbench.detection.stopping import SPEED_MPS
 from docs.figures import style
 from docs.figures.sightings import show
-from envs.camera.braking import Motion, brakes_in
-from envs.camera.crossing import StopSignCrossing
-from envs.camera.crossing_axes import AXES
-from envs.camera.environment import CLEARED_M
-from envs.camera.poses import CLOSED_LOOP_DISTANCES
-from envs.camera.street.layout import CROSSING
-from envs.weather import WEATHERS
+from cavbench.envs.camera.braking import Motion, brakes_in
+from cavbench.envs.camera.crossing import StopSignCrossing
+from cavbench.envs.camera.crossing_axes import AXES
+from cavbench.envs.camera.environment import CLEARED_M
+from cavbench.envs.camera.poses import CLOSED_LOOP_DISTANCES
+from cavbench.envs.camera.street.layout import CROSSING
+from cavbench.envs.weather import WEATHERS
 
 STEP_S = 0.05
 CONFIRMED_M = (29.0, 19.0, 16.0, 13.0)

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from docs.figures import style
 from docs.figures.driving import FEATURES, policy
-from envs.highway.config import ACTIONS
-from envs.highway.dynamics import LANE_WIDTH
+from cavbench.envs.highway.config import ACTIONS
+from cavbench.envs.highway.dynamics import LANE_WIDTH
 
 ROWS = 10
 EGO_SPEED = 25.0

@@ -9,11 +9,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from bench.detection import Detector
-from bench.plugins.pair import choose
+from cavbench.detection import Detector
+from cavbench.core.pair import choose
 from docs.figures import style
 from docs.figures.sightings import approaches, detector, frame_axes, sight
-from envs.camera.world import StopSignApproach
+from cavbench.envs.camera.world import StopSignApproach
 
 SQUARE = 640
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from matplotlib.figure import Figure
 
-from bench.detection.boxes import detections
-from bench.detection.sight import NMS_IOU
-from bench.detection.stopping import THRESHOLD
+from cavbench.detection.boxes import detections
+from cavbench.detection.sight import NMS_IOU
+from cavbench.detection.stopping import THRESHOLD
 from docs.figures import style
 from docs.figures.sightings import FRAME, approaches, box, detector, frame_axes, picture, show, sight
-from envs.weather import WEATHERS
+from cavbench.envs.weather import WEATHERS
 
 COLOURS = {"clear": style.ORANGE, "rain": style.BLUE, "fog": style.GREY, "night": style.INK}
 DASHES = {"clear": "-", "rain": "--", "fog": "-.", "night": ":"}

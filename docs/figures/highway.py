@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from docs.figures import road, style
-from envs.highway.axes import STANDARD_V2
-from envs.highway.batched import BatchedHighway
-from envs.highway.sensor import noise_sigma, sensor_range_m
-from envs.highway.world import HighwayWorld
-from envs.weather import WEATHERS
+from cavbench.envs.highway.axes import STANDARD_V2
+from cavbench.envs.highway.batched import BatchedHighway
+from cavbench.envs.highway.sensor import noise_sigma, sensor_range_m
+from cavbench.envs.highway.world import HighwayWorld
+from cavbench.envs.weather import WEATHERS
 
 GRID = STANDARD_V2
 SEED = GRID.first_seed

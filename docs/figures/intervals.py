@@ -12,21 +12,21 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from tensordict import TensorDict
 
-from attacks.noise import Noise
-from bench.driving import ObservationThreat, Policy
-from bench.driving.enforcer import Enforcer
-from bench.driving.intervals.margins import Margins
-from bench.driving.intervals.rooms import cars_of
-from bench.driving.victim import CountedPolicy
-from bench.victims.drivers.dqn import DQN
-from bench.victims.drivers.planner import IntervalPlanner, Planner
-from defenses.pessimist_q import PessimistQ
-from defenses.tracker import Tracked, Tracker
+from cavbench.attacks.driving.noise import Noise
+from cavbench.driving import ObservationThreat, Policy
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.intervals.margins import Margins
+from cavbench.driving.intervals.rooms import cars_of
+from cavbench.driving.victim import CountedPolicy
+from cavbench.driving.victims.dqn import DQN
+from cavbench.driving.victims.planner import IntervalPlanner, Planner
+from cavbench.defenses.driving.pessimist_q import PessimistQ
+from cavbench.defenses.driving.tracker import Tracked, Tracker
 from docs.figures import style
 from docs.figures.decisions import BLOCKED, CLOSING, DISTANCE, _map, _observations
 from docs.figures.driving import FACTS
-from envs.highway.config import ACTIONS
-from envs.highway.world import HighwayWorld
+from cavbench.envs.highway.config import ACTIONS
+from cavbench.envs.highway.world import HighwayWorld
 
 BUDGETS = (0.0, 0.1)
 SEED, STEPS = 1_000_000, 90

@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import blended_transform_factory
 
-from bench.plugins.track import tracks
-from bench.statistics.estimates import Interval, share_interval
+from cavbench.core.track import tracks
+from cavbench.statistics.estimates import Interval, share_interval
 from docs.figures import style
-from leaderboard.published import published
-from leaderboard.ranking.boards import Board, Row, read_boards
+from cavbench.leaderboard.published import published
+from cavbench.leaderboard.ranking.boards import Board, Row, read_boards
 
 MEASURES = {"driving": "safe progress", "detection": "stop score"}
 MARKS = {

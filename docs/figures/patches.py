@@ -5,15 +5,15 @@ from __future__ import annotations
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from attacks.suites import STANDARD_DETECTION_1
-from bench.detection import PatchThreat
-from bench.detection.crafting import prepare
-from bench.detection.patch import Patch
-from bench.plugins.fingerprint import canonical
-from bench.plugins.pair import Pair, choose
-from bench.run import artefacts
-from bench.run.unit import Preparation
-from envs.camera.axes import APPROACH_V1
+from cavbench.attacks.suites import STANDARD_DETECTION_1
+from cavbench.detection import PatchThreat
+from cavbench.detection.crafting import prepare
+from cavbench.detection.patch import Patch
+from cavbench.identity.fingerprint import canonical
+from cavbench.core.pair import Pair, choose
+from cavbench.run import artefacts
+from cavbench.run.unit import Preparation
+from cavbench.envs.camera.axes import APPROACH_V1
 
 KEPT = user_cache_path("cavbench") / "figures"
 STRONGER = {**STANDARD_DETECTION_1.members[1].params, "restarts": 1}

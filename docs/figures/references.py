@@ -10,14 +10,14 @@ import pyarrow.compute as pc
 import torch
 from matplotlib.figure import Figure
 
-from bench.plugins.pair import choose
-from bench.plugins.track import track
-from bench.scenarios import Cell
+from cavbench.core.pair import choose
+from cavbench.core.track import track
+from cavbench.scenarios import Cell
 from docs.figures import style
 from docs.figures.driving import FACTS, episode, physical
-from envs.highway.axes import AXES
-from envs.highway.dynamics import LANE_WIDTH
-from leaderboard.published import published
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.dynamics import LANE_WIDTH
+from cavbench.leaderboard.published import published
 
 SECONDS = 30
 CELL = AXES.cell(lanes=3, density=1.0, weather="clear")

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
 from docs.figures import style
-from envs.highway.dynamics import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH
+from cavbench.envs.highway.dynamics import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH
 
 Place = tuple[float, float]
 """Position along and across the road in m; the centre of lane i is at 4 i."""

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 from matplotlib.figure import Figure
 
-from bench.driving import ObservationThreat
-from bench.statistics.certificate import certificate
-from bench.statistics.estimates import share_interval
+from cavbench.driving import ObservationThreat
+from cavbench.statistics.certificate import certificate
+from cavbench.statistics.estimates import share_interval
 from docs.figures import style
 from docs.figures.driving import FACTS, FEATURES, Array, scored
 

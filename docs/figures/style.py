@@ -27,7 +27,7 @@ TRUE, SHOWN = BLUE, RED
 """Colours of the measured and of the attacked observation."""
 UNDEFENDED, HARDENED = RED, GREEN
 ACTIONS = {"LANE_LEFT": PURPLE, "IDLE": GREY, "LANE_RIGHT": ORANGE, "FASTER": RED, "SLOWER": BLUE}
-"""Colours by name of the action, in the order of `envs.highway.config.ACTIONS`."""
+"""Colours by name of the action, in the order of `cavbench.envs.highway.config.ACTIONS`."""
 
 WIDTH = 6.0
 """Width of a figure in inches."""

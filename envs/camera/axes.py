@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.scenarios import Axes, Axis, Grid
+from cavbench.scenarios import Axes, Axis, Grid
 
 AXES = Axes(
     (

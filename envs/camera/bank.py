@@ -17,16 +17,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
 
-from bench.detection import Decoy, Objects, Scenes
-from bench.errors import UserError
-from bench.files import whole
-from envs.camera import faces, sign, training_faces
-from envs.camera.frame import Frame, noise_level
-from envs.camera.objects import objects
-from envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
-from envs.camera.poses import Pose
-from envs.camera.street.layout import sign_x
-from envs.weather import WEATHERS
+from cavbench.detection import Decoy, Objects, Scenes
+from cavbench.errors import UserError
+from cavbench.files import whole
+from cavbench.envs.camera import faces, sign, training_faces
+from cavbench.envs.camera.frame import Frame, noise_level
+from cavbench.envs.camera.objects import objects
+from cavbench.envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
+from cavbench.envs.camera.poses import Pose
+from cavbench.envs.camera.street.layout import sign_x
+from cavbench.envs.weather import WEATHERS
 
 SHIPPED = Path(__file__).parent / "data"
 

@@ -10,13 +10,13 @@ from typing import ClassVar
 
 from platformdirs import user_cache_path
 
-from bench.detection import CameraWorld
-from bench.errors import UserError
-from bench.plugins.contracts import Progress
-from envs.camera import bank
-from envs.camera.bank import BankScenes
-from envs.camera.objects import NAMES
-from envs.camera.poses import Pose
+from cavbench.detection import CameraWorld
+from cavbench.errors import UserError
+from cavbench.core.contracts import Progress
+from cavbench.envs.camera import bank
+from cavbench.envs.camera.bank import BankScenes
+from cavbench.envs.camera.objects import NAMES
+from cavbench.envs.camera.poses import Pose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ class BankWorld(CameraWorld):
         Raises:
             UserError: if the renderer is not installed.
         """
-        from envs.camera import rendering
+        from cavbench.envs.camera import rendering
 
         kept = user_cache_path("cavbench") / "street"
         return rendering.make(self.every_pose(), kept=kept, out=out or self.folder, progress=progress)

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.camera import sign
-from envs.camera.camera import Array, Camera
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.camera import Array, Camera
 
 POST_M, POST_TOP_M, POST_Y = 0.035, sign.HEIGHT_M + 0.5, 0.05
 """Radius, height and y of the post in m."""

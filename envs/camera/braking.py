@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.detection.stopping import GREATEST_DECELERATION
-from envs.camera.street.light import light, lighting
-from envs.weather import Weather
+from cavbench.detection.stopping import GREATEST_DECELERATION
+from cavbench.envs.camera.street.light import light, lighting
+from cavbench.envs.weather import Weather
 
 GRAVITY = 9.81
 FRICTION = {"dry": 0.85, "wet": 0.6}

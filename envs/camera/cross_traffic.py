@@ -1,6 +1,6 @@
 """The traffic on the crossing road, which has the right of way.
 
-Coordinates as in `envs.camera.camera`: the line at y = 0, the middle of the ego's lane at x = 0.
+Coordinates as in `cavbench.envs.camera.camera`: the line at y = 0, the middle of the ego's lane at x = 0.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.camera.street.layout import CROSSING
-from envs.camera.street.vehicles import SHARES, Model, footprint
+from cavbench.envs.camera.street.layout import CROSSING
+from cavbench.envs.camera.street.vehicles import SHARES, Model, footprint
 
 SPEED_MPS = 50 / 3.6
 """Speed of the cross traffic."""

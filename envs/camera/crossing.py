@@ -11,21 +11,21 @@ from typing import ClassVar
 import numpy as np
 from torch import Tensor
 
-from bench.detection import Approach, Scenes
-from bench.detection.closed_loop import Plan
-from bench.errors import UserError
-from bench.scenarios import Axes, Cell
-from envs.camera import bank, poses
-from envs.camera.bank import BankScenes
-from envs.camera.bank_world import BankWorld
-from envs.camera.braking import brakes_in
-from envs.camera.crossing_axes import AXES, CROSSING_V1
-from envs.camera.environment import CAR_M, ApproachEnv
-from envs.camera.poses import Pose
-from envs.camera.street import layout
-from envs.camera.street.vehicles import footprint
-from envs.camera.world import StopSignApproach
-from envs.weather import WEATHERS
+from cavbench.detection import Approach, Scenes
+from cavbench.detection.closed_loop import Plan
+from cavbench.errors import UserError
+from cavbench.scenarios import Axes, Cell
+from cavbench.envs.camera import bank, poses
+from cavbench.envs.camera.bank import BankScenes
+from cavbench.envs.camera.bank_world import BankWorld
+from cavbench.envs.camera.braking import brakes_in
+from cavbench.envs.camera.crossing_axes import AXES, CROSSING_V1
+from cavbench.envs.camera.environment import CAR_M, ApproachEnv
+from cavbench.envs.camera.poses import Pose
+from cavbench.envs.camera.street import layout
+from cavbench.envs.camera.street.vehicles import footprint
+from cavbench.envs.camera.world import StopSignApproach
+from cavbench.envs.weather import WEATHERS
 
 PLACE = layout.LOCATIONS["crossing"]
 

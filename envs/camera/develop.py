@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection.colour import linear, srgb
+from cavbench.detection.colour import linear, srgb
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Luminance weights of linear sRGB (ITU-R BT.709)."""

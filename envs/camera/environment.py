@@ -9,13 +9,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
-from bench.detection import Scenes
-from bench.detection.boxes import overlap
-from bench.detection.closed_loop import STANDS_MPS, DrivingEnv, Plan
-from bench.detection.stopping import SPEED_MPS
-from envs.camera.braking import Brakes, Motion
-from envs.camera.cross_traffic import CrossTraffic
-from envs.camera.street.layout import CROSSING
+from cavbench.detection import Scenes
+from cavbench.detection.boxes import overlap
+from cavbench.detection.closed_loop import STANDS_MPS, DrivingEnv, Plan
+from cavbench.detection.stopping import SPEED_MPS
+from cavbench.envs.camera.braking import Brakes, Motion
+from cavbench.envs.camera.cross_traffic import CrossTraffic
+from cavbench.envs.camera.street.layout import CROSSING
 
 TICK_S = 0.01
 """Time between two positions that are tested for a collision, rounded so that a step has a whole number of them."""
@@ -29,9 +29,9 @@ class ApproachEnv(DrivingEnv):
     """B cars that approach a stop sign, and brake or cross the road behind it.
 
     The action is the deceleration that the driver asks for in m/s2, float32 [B, 1]. The brakes build it up
-    (`envs.camera.braking`). A step is the time in which a car at 10 m/s drives from one frame to the next. `observation` is the
+    (`cavbench.envs.camera.braking`). A step is the time in which a car at 10 m/s drives from one frame to the next. `observation` is the
     image of the nearest frame by distance, [B, 3, H, W]; after the last frame it stays the same. The stop line is level with
-    the sign (`bench.detection.stopping`). An episode ends when the car stands still or has left the crossing road; a collision
+    the sign (`cavbench.detection.stopping`). An episode ends when the car stands still or has left the crossing road; a collision
     does not end it, because each car meets K draws of the cross traffic at once. The reward is 1 for stopping before the line,
     else 0.
 

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection import Decoy
-from bench.detection.colour import linear
-from envs.camera import sign, training_faces
+from cavbench.detection import Decoy
+from cavbench.detection.colour import linear
+from cavbench.envs.camera import sign, training_faces
 
 DECOYS = (
     Decoy("fifty", octagonal=True),

@@ -1,6 +1,6 @@
 """One frame of the bank: a developed image, and the light on the sign's crop, which depends on the texture.
 
-On the crop, the light is L = black + gain * texture, with exposure and weather applied (`envs.camera.weather`).
+On the crop, the light is L = black + gain * texture, with exposure and weather applied (`cavbench.envs.camera.weather`).
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bench.detection.stopping import SPEED_MPS
-from envs.camera import develop, sign
-from envs.camera.poses import Pose
-from envs.camera.street.layout import LOCATIONS, sign_x
-from envs.camera.street.light import lighting
-from envs.camera.street.render import Traced
-from envs.camera.weather import air
-from envs.weather import Weather
+from cavbench.detection.stopping import SPEED_MPS
+from cavbench.envs.camera import develop, sign
+from cavbench.envs.camera.poses import Pose
+from cavbench.envs.camera.street.layout import LOCATIONS, sign_x
+from cavbench.envs.camera.street.light import lighting
+from cavbench.envs.camera.street.render import Traced
+from cavbench.envs.camera.weather import air
+from cavbench.envs.weather import Weather
 
 QUALITY, LOWER_QUALITY = 85, 60
 """WebP quality of the image, lower on the closed loop and at the places with one road; the sign's crop is stored separately."""

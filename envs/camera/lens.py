@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, grid_sample, interpolate
 
-from bench.detection.stopping import SPEED_MPS
-from envs.camera.camera import Camera
-from envs.camera.develop import MIDDLE_GREY
-from envs.camera.poses import Pose
-from envs.camera.street.layout import LOCATIONS
-from envs.weather import Weather
+from cavbench.detection.stopping import SPEED_MPS
+from cavbench.envs.camera.camera import Camera
+from cavbench.envs.camera.develop import MIDDLE_GREY
+from cavbench.envs.camera.poses import Pose
+from cavbench.envs.camera.street.layout import LOCATIONS
+from cavbench.envs.weather import Weather
 
 Array = NDArray[np.float64]
 Effect = Callable[[Tensor, Sequence[Pose], Sequence[Weather]], Tensor]
@@ -142,7 +142,7 @@ def _drawn(pose: Pose, rate_mm_h: float) -> tuple[Array, Array]:
     """Middles [K, 2] and half axes [K, 2] in pixels of the drops that are on the windscreen just before the next wipe.
 
     Falling drops have the sizes of Marshall and Palmer (1948) and the speeds of Atlas et al. (1973), as in
-    `envs.camera.weather.streaks`. Each becomes a spherical cap of the same volume.
+    `cavbench.envs.camera.weather.streaks`. Each becomes a spherical cap of the same volume.
     """
     camera, rng = pose.camera, np.random.default_rng([pose.seed, 1])
     per_mm = 4.1 * rate_mm_h**-0.21

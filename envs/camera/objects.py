@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.detection import STOP_SIGN
-from envs.camera import sign
-from envs.camera.camera import Array
-from envs.camera.poses import Pose
-from envs.camera.street.layout import LOCATIONS, OtherSign, other_signs, sign_x, traffic
-from envs.camera.street.vehicles import PAINTS, Model, vehicle
+from cavbench.detection import STOP_SIGN
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.camera import Array
+from cavbench.envs.camera.poses import Pose
+from cavbench.envs.camera.street.layout import LOCATIONS, OtherSign, other_signs, sign_x, traffic
+from cavbench.envs.camera.street.vehicles import PAINTS, Model, vehicle
 
 NAMES = (STOP_SIGN, "car", "truck", "traffic sign")
 """Class names. Vans are trucks; other signs have their own class, so that detectors learn to tell them from stop signs."""

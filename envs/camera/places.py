@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bench.detection import Approach, Scenes
-from bench.scenarios import Axes, Cell
-from envs.camera import poses
-from envs.camera.bank_world import BankWorld
-from envs.camera.places_axes import AXES, PLACES_V1
-from envs.camera.poses import Pose
-from envs.camera.street.layout import LOCATIONS
-from envs.camera.world import StopSignApproach
+from cavbench.detection import Approach, Scenes
+from cavbench.scenarios import Axes, Cell
+from cavbench.envs.camera import poses
+from cavbench.envs.camera.bank_world import BankWorld
+from cavbench.envs.camera.places_axes import AXES, PLACES_V1
+from cavbench.envs.camera.poses import Pose
+from cavbench.envs.camera.street.layout import LOCATIONS
+from cavbench.envs.camera.world import StopSignApproach
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,11 +10,11 @@ from typing import get_args
 
 import numpy as np
 
-from envs.camera.axes import AXES
-from envs.camera.camera import Camera
-from envs.camera.street import occlusion
-from envs.camera.street.layout import DISTANCES, LOCATIONS, sign_x, traffic
-from envs.camera.street.light import Lighting
+from cavbench.envs.camera.axes import AXES
+from cavbench.envs.camera.camera import Camera
+from cavbench.envs.camera.street import occlusion
+from cavbench.envs.camera.street.layout import DISTANCES, LOCATIONS, sign_x, traffic
+from cavbench.envs.camera.street.light import Lighting
 
 LANES = [int(lanes) for lanes in AXES["lanes"].choices]
 DENSITIES = [float(density) for density in AXES["density"].choices]

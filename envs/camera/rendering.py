@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.files import whole
-from envs.camera import bank
-from envs.camera.frame import frame
-from envs.camera.poses import Pose
-from envs.camera.street import layout, render
-from envs.camera.street.light import Light, light, lighting
-from envs.camera.street.render import Traced, load, trace, variant, works
-from envs.weather import WEATHERS
+from cavbench.errors import UserError
+from cavbench.files import whole
+from cavbench.envs.camera import bank
+from cavbench.envs.camera.frame import frame
+from cavbench.envs.camera.poses import Pose
+from cavbench.envs.camera.street import layout, render
+from cavbench.envs.camera.street.light import Light, light, lighting
+from cavbench.envs.camera.street.render import Traced, load, trace, variant, works
+from cavbench.envs.weather import WEATHERS
 
 VERSION = 4
 """Version of the traced scene; raise it when the street or its light change."""

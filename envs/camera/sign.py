@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.detection.colour import linear
-from envs.camera.camera import Array, Camera
+from cavbench.detection.colour import linear
+from cavbench.envs.camera.camera import Array, Camera
 
 Colour = tuple[float, float, float]
 """A number for each of red, green and blue."""

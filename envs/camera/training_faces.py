@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.detection import Decoy
-from envs.camera import sign
+from cavbench.detection import Decoy
+from cavbench.envs.camera import sign
 
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.weather import Weather
+from cavbench.envs.weather import Weather
 
 Image = NDArray[np.float32]
 

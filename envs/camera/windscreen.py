@@ -9,16 +9,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from bench.detection import Approach, Objects, Scenes
-from bench.scenarios import Axes, Cell
-from envs.camera import develop
-from envs.camera.bank import BankScenes
-from envs.camera.bank_world import BankWorld
-from envs.camera.lens import EFFECTS
-from envs.camera.poses import Pose
-from envs.camera.windscreen_axes import AXES, LENSES, WINDSCREEN_V1
-from envs.camera.world import StopSignApproach
-from envs.weather import WEATHERS
+from cavbench.detection import Approach, Objects, Scenes
+from cavbench.scenarios import Axes, Cell
+from cavbench.envs.camera import develop
+from cavbench.envs.camera.bank import BankScenes
+from cavbench.envs.camera.bank_world import BankWorld
+from cavbench.envs.camera.lens import EFFECTS
+from cavbench.envs.camera.poses import Pose
+from cavbench.envs.camera.windscreen_axes import AXES, LENSES, WINDSCREEN_V1
+from cavbench.envs.camera.world import StopSignApproach
+from cavbench.envs.weather import WEATHERS
 
 
 class WindscreenScenes(Scenes):

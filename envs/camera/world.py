@@ -7,14 +7,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
 
-from bench.detection import Approach
-from bench.scenarios import Axes, Cell
-from envs.camera import bank, poses
-from envs.camera.axes import APPROACH_V1, AXES
-from envs.camera.bank import BankScenes, TrainingScenes
-from envs.camera.bank_world import BankWorld
-from envs.camera.poses import Pose
-from envs.camera.street.layout import LOCATIONS
+from cavbench.detection import Approach
+from cavbench.scenarios import Axes, Cell
+from cavbench.envs.camera import bank, poses
+from cavbench.envs.camera.axes import APPROACH_V1, AXES
+from cavbench.envs.camera.bank import BankScenes, TrainingScenes
+from cavbench.envs.camera.bank_world import BankWorld
+from cavbench.envs.camera.poses import Pose
+from cavbench.envs.camera.street.layout import LOCATIONS
 
 TRAINING_WEATHERS = ("clear", "rain", "fog")
 

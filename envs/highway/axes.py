@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bench.scenarios import Axes, Axis, Grid
+from cavbench.scenarios import Axes, Axis, Grid
 
 AXES = Axes(
     (

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.highway.config import HighwayConfig
-from envs.highway.engine import HighwayEngine
-from envs.highway.environment import HighwayEnv
-from envs.highway.oracle import OraclePlanner
+from cavbench.envs.highway.config import HighwayConfig
+from cavbench.envs.highway.engine import HighwayEngine
+from cavbench.envs.highway.environment import HighwayEnv
+from cavbench.envs.highway.oracle import OraclePlanner
 
 
 class BatchedHighway(HighwayEnv):

@@ -11,20 +11,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import entry_point, inner
-from envs.highway.dynamics import (
-    DISCRETE,
-    closest_lane,
-    move,
-    speed_control,
-    steering_control,
-    update_direction,
-)
-from envs.highway.ego import IDLE, apply_meta_action, nearest_target_speed
-from envs.highway.engine import advance
-from envs.highway.spawn import DEFAULT_DELTA, TRAFFIC_SPEED_HIGH, TRAFFIC_SPEED_LOW
-from envs.highway.state import Floats, Integers, Parameters, Vehicle, Vehicles
-from envs.highway.traffic import sort_by_position
+from cavbench.compiled import entry_point, inner
+from cavbench.envs.highway.dynamics import DISCRETE, closest_lane, move, speed_control, steering_control, update_direction
+from cavbench.envs.highway.ego import IDLE, apply_meta_action, nearest_target_speed
+from cavbench.envs.highway.engine import advance
+from cavbench.envs.highway.spawn import DEFAULT_DELTA, TRAFFIC_SPEED_HIGH, TRAFFIC_SPEED_LOW
+from cavbench.envs.highway.state import Floats, Integers, Parameters, Vehicle, Vehicles
+from cavbench.envs.highway.traffic import sort_by_position
 
 EGO_X = 1000.0
 """Assumed position of the ego along the road in m; its true position is outside of the sensor's range."""

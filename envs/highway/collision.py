@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from bench.compiled import inner
-from envs.highway.dynamics import VEHICLE_LENGTH, VEHICLE_WIDTH
-from envs.highway.state import Floats, Integers, Vehicle, Vehicles
+from cavbench.compiled import inner
+from cavbench.envs.highway.dynamics import VEHICLE_LENGTH, VEHICLE_WIDTH
+from cavbench.envs.highway.state import Floats, Integers, Vehicle, Vehicles
 
 DIAGONAL = math.sqrt(VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2)
 SURELY = 1e-6

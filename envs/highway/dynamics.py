@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from bench.compiled import inner
-from envs.highway.state import EgoKind, Vehicle
+from cavbench.compiled import inner
+from cavbench.envs.highway.state import EgoKind, Vehicle
 
 DISCRETE, CONTINUOUS, IDM = int(EgoKind.DISCRETE), int(EgoKind.CONTINUOUS), int(EgoKind.IDM)
 

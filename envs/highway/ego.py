@@ -4,18 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.compiled import inner
-from envs.highway.dynamics import (
-    DISCRETE,
-    IDM,
-    VEHICLE_LENGTH,
-    clip,
-    is_on_lane,
-    is_reachable,
-    linear_map,
-)
-from envs.highway.state import Episode, Floats, Integers, Parameters, Vehicle, Vehicles
-from envs.highway.traffic import front_vehicle
+from cavbench.compiled import inner
+from cavbench.envs.highway.dynamics import DISCRETE, IDM, VEHICLE_LENGTH, clip, is_on_lane, is_reachable, linear_map
+from cavbench.envs.highway.state import Episode, Floats, Integers, Parameters, Vehicle, Vehicles
+from cavbench.envs.highway.traffic import front_vehicle
 
 LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
 PROGRESS_LANE, PROGRESS_SPEED = 0.1, 0.4

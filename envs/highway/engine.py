@@ -10,28 +10,17 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import entry_point, inner
-from envs.highway.collision import find_collisions
-from envs.highway.config import ACTIONS, HighwayConfig
-from envs.highway.dynamics import move
-from envs.highway.ego import apply_action, score, time_to_collision
-from envs.highway.observation import observe
-from envs.highway.sensor import noise_sigma, sensor_range_m
-from envs.highway.spawn import draw_words, lane_spacing, spawn_batch
-from envs.highway.state import (
-    EPISODE,
-    VEHICLE,
-    EgoKind,
-    Episode,
-    Floats,
-    Integers,
-    Parameters,
-    Vehicle,
-    Vehicles,
-    parameters,
-)
-from envs.highway.traffic import act, sort_by_position
-from envs.weather import WEATHERS
+from cavbench.compiled import entry_point, inner
+from cavbench.envs.highway.collision import find_collisions
+from cavbench.envs.highway.config import ACTIONS, HighwayConfig
+from cavbench.envs.highway.dynamics import move
+from cavbench.envs.highway.ego import apply_action, score, time_to_collision
+from cavbench.envs.highway.observation import observe
+from cavbench.envs.highway.sensor import noise_sigma, sensor_range_m
+from cavbench.envs.highway.spawn import draw_words, lane_spacing, spawn_batch
+from cavbench.envs.highway.state import EPISODE, VEHICLE, EgoKind, Episode, Floats, Integers, Parameters, Vehicle, Vehicles, parameters
+from cavbench.envs.highway.traffic import act, sort_by_position
+from cavbench.envs.weather import WEATHERS
 
 
 class Number(IntEnum):

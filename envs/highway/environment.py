@@ -12,9 +12,9 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.scenarios import SeedBlock
-from envs.highway.config import ACTIONS, HighwayConfig
-from envs.highway.engine import Flag, Number
+from cavbench.scenarios import SeedBlock
+from cavbench.envs.highway.config import ACTIONS, HighwayConfig
+from cavbench.envs.highway.engine import Flag, Number
 
 GOLDEN_GAMMA = 0x9E3779B97F4A7C15
 MASK_64 = 0xFFFFFFFFFFFFFFFF
@@ -36,7 +36,7 @@ def drawn_seed(environment_seed: int, episode: int, reset: int) -> int:
 
 
 class HighwayEnv(EnvBase):
-    """B episodes of highway driving as a TorchRL environment (keys and shapes: `bench.driving.contracts.DrivingWorld`).
+    """B episodes of highway driving as a TorchRL environment (keys and shapes: `cavbench.driving.contracts.DrivingWorld`).
 
     Set `seed` (int64 [B]) in the tensordict of `reset` to select the scenarios; otherwise they follow from `set_seed`.
     A finished episode does not change until it is reset; `done` stays set and the reward is 0.

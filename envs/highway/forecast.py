@@ -8,19 +8,19 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.compiled import entry_point
-from bench.driving.dynamics import Dynamics, Forecast
-from envs.highway.belief import track_batch
-from envs.highway.collision import find_collisions
-from envs.highway.config import ACTIONS, HighwayConfig
-from envs.highway.dynamics import is_on_lane, move
-from envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED, apply_action, lane_share, speed_share
-from envs.highway.engine import physical_controls
-from envs.highway.rehearsal import HighwayRehearsal
-from envs.highway.sensor import sensor_range_m
-from envs.highway.state import VEHICLE, EgoKind, Floats, Integers, Parameters, parameters
-from envs.highway.traffic import act, sort_by_position
-from envs.weather import WEATHERS
+from cavbench.compiled import entry_point
+from cavbench.driving.dynamics import Dynamics, Forecast
+from cavbench.envs.highway.belief import track_batch
+from cavbench.envs.highway.collision import find_collisions
+from cavbench.envs.highway.config import ACTIONS, HighwayConfig
+from cavbench.envs.highway.dynamics import is_on_lane, move
+from cavbench.envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED, apply_action, lane_share, speed_share
+from cavbench.envs.highway.engine import physical_controls
+from cavbench.envs.highway.rehearsal import HighwayRehearsal
+from cavbench.envs.highway.sensor import sensor_range_m
+from cavbench.envs.highway.state import VEHICLE, EgoKind, Floats, Integers, Parameters, parameters
+from cavbench.envs.highway.traffic import act, sort_by_position
+from cavbench.envs.weather import WEATHERS
 
 FIELDS = ("x", "y", "heading", "speed", "target_speed", "timer", "delta", "lane", "target_lane")
 """The fields of a vehicle that a belief holds."""

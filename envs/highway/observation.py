@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import inner
-from envs.highway.dynamics import VEHICLE_LENGTH, clip, linear_map
-from envs.highway.sensor import FEATURES, add_noise
-from envs.highway.state import Episode, Floats, Integers, Vehicle, Vehicles
+from cavbench.compiled import inner
+from cavbench.envs.highway.dynamics import VEHICLE_LENGTH, clip, linear_map
+from cavbench.envs.highway.sensor import FEATURES, add_noise
+from cavbench.envs.highway.state import Episode, Floats, Integers, Vehicle, Vehicles
 
 
 @inner

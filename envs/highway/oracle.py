@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.highway.ego import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
-from envs.highway.engine import HighwayEngine
-from envs.highway.forecast import roll_batch
+from cavbench.envs.highway.ego import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
+from cavbench.envs.highway.engine import HighwayEngine
+from cavbench.envs.highway.forecast import roll_batch
 
 HORIZON_S, SEGMENT_S, HELD_S = 4.0, 0.8, 1 / 3
 """Seconds of a plan, of its parts, and for which it is carried out before the next one is chosen."""

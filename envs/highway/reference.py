@@ -14,15 +14,15 @@ from highway_env.envs.highway_env import HighwayEnv as FaramaHighwayEnv
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
-from bench.scenarios import Cell
-from envs.highway.config import ACTIONS, HighwayConfig
-from envs.highway.constants import own_constants
-from envs.highway.dynamics import VEHICLE_LENGTH
-from envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED
-from envs.highway.engine import Flag, Number, check_seeds
-from envs.highway.environment import HighwayEnv
-from envs.highway.sensor import FEATURES, add_noise, noise_sigma, sensor_range_m
-from envs.weather import WEATHERS
+from cavbench.scenarios import Cell
+from cavbench.envs.highway.config import ACTIONS, HighwayConfig
+from cavbench.envs.highway.constants import own_constants
+from cavbench.envs.highway.dynamics import VEHICLE_LENGTH
+from cavbench.envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED
+from cavbench.envs.highway.engine import Flag, Number, check_seeds
+from cavbench.envs.highway.environment import HighwayEnv
+from cavbench.envs.highway.sensor import FEATURES, add_noise, noise_sigma, sensor_range_m
+from cavbench.envs.weather import WEATHERS
 
 IDLE = ACTIONS.index("IDLE")
 LANE_CHANGES = (ACTIONS.index("LANE_LEFT"), ACTIONS.index("LANE_RIGHT"))
@@ -142,7 +142,7 @@ class SensedHighwayEnv(FaramaHighwayEnv):
         return float(earned / (PROGRESS_LANE + PROGRESS_SPEED))
 
     def time_to_collision(self) -> float:
-        """Time to collision in seconds, as in `envs.highway.ego.time_to_collision`."""
+        """Time to collision in seconds, as in `cavbench.envs.highway.ego.time_to_collision`."""
         ego = self.vehicle
         leader, _ = self.road.neighbour_vehicles(ego, ego.lane_index)
         if leader is None:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from bench.driving.dynamics import Rehearsal
-from envs.highway.config import HighwayConfig
-from envs.highway.engine import Flag, HighwayEngine, Number, observe_batch
-from envs.highway.state import Integers
+from cavbench.driving.dynamics import Rehearsal
+from cavbench.envs.highway.config import HighwayConfig
+from cavbench.envs.highway.engine import Flag, HighwayEngine, Number, observe_batch
+from cavbench.envs.highway.state import Integers
 
 FAR_BEHIND, APART = 5000.0, 60.0
 """Cars that were never seen stand so far behind, in m, and so far from each other."""

@@ -13,8 +13,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import entry_point, inner
-from envs.weather import Weather
+from cavbench.compiled import entry_point, inner
+from cavbench.envs.weather import Weather
 
 CLEAR_RANGE_M = 200.0
 """AbstractEnv.PERCEPTION_DISTANCE: 5 times the maximum speed."""

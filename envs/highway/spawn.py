@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import entry_point, inner
-from envs.highway.dynamics import CONTINUOUS, IDM, LANE_WIDTH, SPEED_LIMIT, closest_lane, update_direction
-from envs.highway.ego import nearest_target_speed
-from envs.highway.state import Floats, Integers, Parameters, Vehicle, Vehicles
+from cavbench.compiled import entry_point, inner
+from cavbench.envs.highway.dynamics import CONTINUOUS, IDM, LANE_WIDTH, SPEED_LIMIT, closest_lane, update_direction
+from cavbench.envs.highway.ego import nearest_target_speed
+from cavbench.envs.highway.state import Floats, Integers, Parameters, Vehicle, Vehicles
 
 Words = NDArray[np.uint64]
 

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.highway.config import HighwayConfig
+from cavbench.envs.highway.config import HighwayConfig
 
 
 class Vehicle:

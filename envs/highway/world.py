@@ -7,23 +7,12 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from bench.driving import ActionType, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
-from bench.errors import UserError
-from bench.plugins.parameters import differing
-from bench.scenarios import Axes, Cell
-from envs.highway.axes import AXES, STANDARD_V2
-from envs.highway.config import (
-    ACTIONS,
-    KINEMATICS,
-    STANDARD_FEATURES,
-    STANDARD_TARGET_SPEEDS,
-    THESIS_FEATURES,
-    THESIS_TARGET_SPEEDS,
-    WIDE_FEATURES,
-    HighwayConfig,
-    Preset,
-    lanes_held,
-)
+from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
+from cavbench.errors import UserError
+from cavbench.core.parameters import differing
+from cavbench.scenarios import Axes, Cell
+from cavbench.envs.highway.axes import AXES, STANDARD_V2
+from cavbench.envs.highway.config import ACTIONS, KINEMATICS, STANDARD_FEATURES, STANDARD_TARGET_SPEEDS, THESIS_FEATURES, THESIS_TARGET_SPEEDS, WIDE_FEATURES, HighwayConfig, Preset, lanes_held
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -162,8 +151,8 @@ class HighwayWorld(DrivingWorld):
             )
 
     def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics:
-        """See `bench.driving.DrivingWorld.dynamics`; on the compiled engine for both backends."""
-        from envs.highway.forecast import HighwayDynamics
+        """See `cavbench.driving.DrivingWorld.dynamics`; on the compiled engine for both backends."""
+        from cavbench.envs.highway.forecast import HighwayDynamics
 
         return HighwayDynamics(self.config(tuple(cells), action_type=action_type))
 
@@ -175,7 +164,7 @@ class HighwayWorld(DrivingWorld):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        """See `bench.driving.DrivingWorld.make`.
+        """See `cavbench.driving.DrivingWorld.make`.
 
         Raises:
             UserError: if there are more lanes than the range of y holds.
@@ -184,9 +173,9 @@ class HighwayWorld(DrivingWorld):
         config = self.config(cells, action_type=action_type, driver=driver, action_repeat=action_repeat)
         # Imported here because both load torchrl and numba or pygame, which `bench list` must not load.
         if self.backend == "batched":
-            from envs.highway.batched import BatchedHighway
+            from cavbench.envs.highway.batched import BatchedHighway
 
             return BatchedHighway(config)
-        from envs.highway.reference import ReferenceHighway
+        from cavbench.envs.highway.reference import ReferenceHighway
 
         return ReferenceHighway(config)

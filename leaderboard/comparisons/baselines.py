@@ -7,10 +7,10 @@ from typing import Any
 
 import pyarrow as pa
 
-from bench.plugins.track import Track
-from bench.scenarios import Cell
-from bench.statistics.episodes import Episodes
-from leaderboard.comparisons.comparison import IDENTITY
+from cavbench.core.track import Track
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import Episodes
+from cavbench.leaderboard.comparisons.comparison import IDENTITY
 
 
 class Baselines:

@@ -11,12 +11,12 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow.compute as pc
 
-from bench.plugins.track import Measure, Track
-from bench.scenarios import Axes, Cell
-from bench.statistics.doubts import mean
-from bench.statistics.episodes import Episodes, difference, measured
-from bench.statistics.estimates import Array, Interval, share_interval
-from leaderboard.comparisons.pairing import beside
+from cavbench.core.track import Measure, Track
+from cavbench.scenarios import Axes, Cell
+from cavbench.statistics.doubts import mean
+from cavbench.statistics.episodes import Episodes, difference, measured
+from cavbench.statistics.estimates import Array, Interval, share_interval
+from cavbench.leaderboard.comparisons.pairing import beside
 
 DEFENDED = ("defense", "defense_params", "victim", "victim_params", "world", "world_params")
 """The columns that name what is attacked; a clean control shares them with the attacked episodes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Sequence
 
-from leaderboard.comparisons.comparison import Comparison, parameters
+from cavbench.leaderboard.comparisons.comparison import Comparison, parameters
 
 Varying = dict[object, set[str]]
 """By the name of a component, the parameters that are not the same everywhere."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.statistics.episodes import Episodes, shared
+from cavbench.statistics.episodes import Episodes, shared
 
 
 def beside(own: Episodes, control: Episodes) -> tuple[Episodes, Episodes]:

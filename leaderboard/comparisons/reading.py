@@ -11,14 +11,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from bench.plugins import registry
-from bench.plugins.track import Measure, Track, track
-from bench.records.reading import times
-from bench.records.schema import AUDIT
-from bench.statistics.episodes import Episodes
-from leaderboard.comparisons.baselines import Baselines, identity_of
-from leaderboard.comparisons.comparison import ATTACKER, DEFENDED, NO_ATTACK, Comparison
-from leaderboard.comparisons.pairing import with_control
+from cavbench.core import registry
+from cavbench.core.track import Measure, Track, track
+from cavbench.records.reading import times
+from cavbench.records.schema import AUDIT
+from cavbench.statistics.episodes import Episodes
+from cavbench.leaderboard.comparisons.baselines import Baselines, identity_of
+from cavbench.leaderboard.comparisons.comparison import ATTACKER, DEFENDED, NO_ATTACK, Comparison
+from cavbench.leaderboard.comparisons.pairing import with_control
 
 SCENARIO = ("training_seed", "cell", "seed")
 CONTROL = (*DEFENDED, "grid")
@@ -46,7 +46,7 @@ def read_comparisons(records: pa.Table, of: Track) -> list[Comparison]:
     baseline and there are others. Of a scenario driven twice, the newest record counts.
 
     Args:
-        records: of one track (`bench.records.schema`); list columns may be missing.
+        records: of one track (`cavbench.records.schema`); list columns may be missing.
         of: that track.
     """
     records = distinct(newest(records), of)

@@ -13,11 +13,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.plugins import registry
-from bench.plugins.registry import KINDS, Kind
-from bench.plugins.sources import summary
-from leaderboard.comparisons.comparison import THREAT, Comparison, parameters
-from leaderboard.comparisons.reading import codes_of
+from cavbench.core import registry
+from cavbench.core.registry import KINDS, Kind
+from cavbench.core.sources import summary
+from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison, parameters
+from cavbench.leaderboard.comparisons.reading import codes_of
 
 PLAIN = re.compile(r"[\w./+-]+")
 

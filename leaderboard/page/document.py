@@ -13,21 +13,21 @@ from urllib.parse import quote
 
 import numpy as np
 
-from bench.plugins.track import Track
-from bench.scenarios import Axes, Cell
-from bench.statistics.doubts import Remark
-from bench.statistics.estimates import Array, Interval, scenario_covariance, t_quantile, task_intervals
-from leaderboard.comparisons.alignment import Aligned, align
-from leaderboard.comparisons.baselines import identity_of
-from leaderboard.comparisons.comparison import THREAT, Comparison, parameters
-from leaderboard.comparisons.naming import labels
-from leaderboard.comparisons.reading import headline
-from leaderboard.page.cards import card
-from leaderboard.ranking.boards import Board, Row
-from leaderboard.ranking.curves import Curve
-from leaderboard.ranking.families import budgets, efforts
-from leaderboard.ranking.flags import FLAGS
-from leaderboard.ranking.remarks import comparison_remarks
+from cavbench.core.track import Track
+from cavbench.scenarios import Axes, Cell
+from cavbench.statistics.doubts import Remark
+from cavbench.statistics.estimates import Array, Interval, scenario_covariance, t_quantile, task_intervals
+from cavbench.leaderboard.comparisons.alignment import Aligned, align
+from cavbench.leaderboard.comparisons.baselines import identity_of
+from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison, parameters
+from cavbench.leaderboard.comparisons.naming import labels
+from cavbench.leaderboard.comparisons.reading import headline
+from cavbench.leaderboard.page.cards import card
+from cavbench.leaderboard.ranking.boards import Board, Row
+from cavbench.leaderboard.ranking.curves import Curve
+from cavbench.leaderboard.ranking.families import budgets, efforts
+from cavbench.leaderboard.ranking.flags import FLAGS
+from cavbench.leaderboard.ranking.remarks import comparison_remarks
 
 VERSION = 3
 """Of the schema; a reader that knows it can read every later document of the same version. Version 1 had the values of three

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from bench.errors import plain
+from cavbench.errors import plain
 
 CSV = (
     "track", "world", "grid", "threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share",

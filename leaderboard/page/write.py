@@ -19,19 +19,19 @@ import pyarrow as pa
 from rich.console import Console
 from rich.text import Text
 
-from bench.errors import UserError
-from bench.files import check_folder, whole
-from bench.plugins.track import tracks
-from bench.records import reading
-from bench.run.process import follow_parent
-from leaderboard.comparisons.reading import measurements
-from leaderboard.page.document import document
-from leaderboard.page.table import table
-from leaderboard.published import every_track
-from leaderboard.ranking.boards import read_boards
-from leaderboard.ranking.flags import FLAGS
-from leaderboard.terminal.ranking import print_boards
-from leaderboard.thesis import chapters
+from cavbench.errors import UserError
+from cavbench.files import check_folder, whole
+from cavbench.core.track import tracks
+from cavbench.records import reading
+from cavbench.run.process import follow_parent
+from cavbench.leaderboard.comparisons.reading import measurements
+from cavbench.leaderboard.page.document import document
+from cavbench.leaderboard.page.table import table
+from cavbench.leaderboard.published import every_track
+from cavbench.leaderboard.ranking.boards import read_boards
+from cavbench.leaderboard.ranking.flags import FLAGS
+from cavbench.leaderboard.terminal.ranking import print_boards
+from cavbench.leaderboard.thesis import chapters
 
 NAME = "leaderboard.html"
 

@@ -9,17 +9,17 @@ from typing import Any, get_args
 
 import pyarrow as pa
 
-from bench.plugins import registry
-from bench.plugins.contracts import Access
-from bench.plugins.track import Track, track
-from bench.statistics.doubts import Remark
-from bench.statistics.episodes import Episodes
-from bench.statistics.estimates import Interval
-from leaderboard.comparisons.comparison import THREAT, Comparison
-from leaderboard.comparisons.reading import comparable, read_tracks
-from leaderboard.ranking.flags import Flag, Subject, flags
-from leaderboard.ranking.remarks import row_remarks
-from leaderboard.ranking.worst import Panel, Worst, margin
+from cavbench.core import registry
+from cavbench.core.contracts import Access
+from cavbench.core.track import Track, track
+from cavbench.statistics.doubts import Remark
+from cavbench.statistics.episodes import Episodes
+from cavbench.statistics.estimates import Interval
+from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
+from cavbench.leaderboard.comparisons.reading import comparable, read_tracks
+from cavbench.leaderboard.ranking.flags import Flag, Subject, flags
+from cavbench.leaderboard.ranking.remarks import row_remarks
+from cavbench.leaderboard.ranking.worst import Panel, Worst, margin
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from leaderboard.comparisons.comparison import Comparison
+from cavbench.leaderboard.comparisons.comparison import Comparison
 
 
 def efforts(attacks: Sequence[Comparison]) -> list[list[Comparison]]:

@@ -14,18 +14,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.plugins import registry
-from bench.plugins.track import Track
-from bench.scenarios import Grid
-from bench.statistics import doubts
-from bench.statistics.doubts import TITLES, Finding
-from bench.statistics.estimates import Interval
-from bench.statistics.unpaired import ENOUGH_SCENARIOS, unpaired
-from leaderboard.comparisons.alignment import align
-from leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison
-from leaderboard.ranking.curves import ENOUGH_CELLS, Curve
-from leaderboard.ranking.families import budgets, efforts
-from leaderboard.ranking.worst import Panel, Worst, margin
+from cavbench.core import registry
+from cavbench.core.track import Track
+from cavbench.scenarios import Grid
+from cavbench.statistics import doubts
+from cavbench.statistics.doubts import TITLES, Finding
+from cavbench.statistics.estimates import Interval
+from cavbench.statistics.unpaired import ENOUGH_SCENARIOS, unpaired
+from cavbench.leaderboard.comparisons.alignment import align
+from cavbench.leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison
+from cavbench.leaderboard.ranking.curves import ENOUGH_CELLS, Curve
+from cavbench.leaderboard.ranking.families import budgets, efforts
+from cavbench.leaderboard.ranking.worst import Panel, Worst, margin
 
 NOTHING_LEFT = 0.01
 """A score this low cannot fall further: attacks that reach it are not told apart."""
@@ -257,7 +257,7 @@ def public_gain(one: Comparison, comparisons: int = 1) -> Interval | None:
 
 
 def _alone(measure: Callable[[Subject], Finding], words: Callable[..., Finding]) -> Callable[[Subject], Finding]:
-    """A measurement on the records of a defended victim alone (`bench.statistics.doubts`), with its words."""
+    """A measurement on the records of a defended victim alone (`cavbench.statistics.doubts`), with its words."""
     measure.__doc__ = words.__doc__
     return measure
 

@@ -1,16 +1,16 @@
-"""The remarks of tables, where the records are read as comparisons (`bench.statistics.doubts` has the words and thresholds)."""
+"""The remarks of tables, where the records are read as comparisons (`cavbench.statistics.doubts` has the words and thresholds)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 
-from bench.statistics import doubts
-from bench.statistics.doubts import OF_VICTIM, Remark
-from bench.statistics.episodes import Episodes
-from leaderboard.comparisons.comparison import THREAT, Comparison
-from leaderboard.comparisons.naming import Varying, component, defended, varying
-from leaderboard.ranking.worst import Panel, Worst
+from cavbench.statistics import doubts
+from cavbench.statistics.doubts import OF_VICTIM, Remark
+from cavbench.statistics.episodes import Episodes
+from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
+from cavbench.leaderboard.comparisons.naming import Varying, component, defended, varying
+from cavbench.leaderboard.ranking.worst import Panel, Worst
 
 
 def comparison_remarks(one: Comparison, about: str = "") -> list[Remark]:

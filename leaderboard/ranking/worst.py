@@ -10,14 +10,14 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.scenarios import Cell
-from bench.statistics.certificate import certificate
-from bench.statistics.doubts import mean
-from bench.statistics.episodes import Episodes
-from bench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
-from bench.statistics.independent import independent
-from bench.statistics.strongest import strongest_of, under
-from leaderboard.comparisons.comparison import Comparison
+from cavbench.scenarios import Cell
+from cavbench.statistics.certificate import certificate
+from cavbench.statistics.doubts import mean
+from cavbench.statistics.episodes import Episodes
+from cavbench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
+from cavbench.statistics.independent import independent
+from cavbench.statistics.strongest import strongest_of, under
+from cavbench.leaderboard.comparisons.comparison import Comparison
 
 
 @dataclass(frozen=True, eq=False)

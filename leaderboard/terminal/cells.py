@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.plugins.track import Baseline, Measure
-from bench.statistics.episodes import measured
-from bench.statistics.estimates import Interval
-from leaderboard.comparisons.comparison import Comparison
-from leaderboard.terminal.columns import measure_columns, written
-from leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_heading, cell_rows, fitted
-from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MISSING, arrow, estimate, number, share, strip, verdict
+from cavbench.core.track import Baseline, Measure
+from cavbench.statistics.episodes import measured
+from cavbench.statistics.estimates import Interval
+from cavbench.leaderboard.comparisons.comparison import Comparison
+from cavbench.leaderboard.terminal.columns import measure_columns, written
+from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_heading, cell_rows, fitted
+from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MISSING, arrow, estimate, number, share, strip, verdict
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from typing import TypeVar
 
 from rich.text import Text
 
-from bench.plugins.track import Measure
-from bench.statistics.estimates import Interval
-from leaderboard.comparisons.comparison import Comparison, mean
-from leaderboard.terminal.layout import Column
-from leaderboard.terminal.text import estimate, number, share
+from cavbench.core.track import Measure
+from cavbench.statistics.estimates import Interval
+from cavbench.leaderboard.comparisons.comparison import Comparison, mean
+from cavbench.leaderboard.terminal.layout import Column
+from cavbench.leaderboard.terminal.text import estimate, number, share
 
 Subject = TypeVar("Subject")
 

@@ -13,8 +13,8 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from bench.scenarios import Axes, Cell
-from bench.scenarios.axes import written
+from cavbench.scenarios import Axes, Cell
+from cavbench.scenarios.axes import written
 
 Subject = TypeVar("Subject")
 STRIP = 25

@@ -11,28 +11,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.plugins.track import Measure, Track
-from bench.scenarios import Cell
-from bench.statistics.episodes import Episodes, measured
-from bench.statistics.estimates import Interval
-from leaderboard.comparisons.comparison import THREAT, Comparison
-from leaderboard.comparisons.naming import component, defended, varying
-from leaderboard.ranking.worst import Panel, Worst
-from leaderboard.terminal.columns import measure_columns, written
-from leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
-from leaderboard.terminal.text import (
-    ATTACKED,
-    BASELINE,
-    CLEAN,
-    bounds,
-    change,
-    counted,
-    estimate,
-    number,
-    share,
-    strip,
-    verdict,
-)
+from cavbench.core.track import Measure, Track
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import Episodes, measured
+from cavbench.statistics.estimates import Interval
+from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
+from cavbench.leaderboard.comparisons.naming import component, defended, varying
+from cavbench.leaderboard.ranking.worst import Panel, Worst
+from cavbench.leaderboard.terminal.columns import measure_columns, written
+from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
+from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, bounds, change, counted, estimate, number, share, strip, verdict
 
 
 @dataclass(frozen=True)

@@ -10,26 +10,15 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from bench.plugins.track import Track
-from bench.statistics.estimates import share_interval
-from leaderboard.comparisons.naming import Varying, component, varying
-from leaderboard.published import every_track
-from leaderboard.ranking.boards import Board, Row, read_boards
-from leaderboard.ranking.flags import FLAGS
-from leaderboard.terminal.columns import written
-from leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
-from leaderboard.terminal.text import (
-    ATTACKED,
-    BASELINE,
-    CLEAN,
-    estimate,
-    number,
-    of_frames,
-    share,
-    signed,
-    strip,
-    verdict,
-)
+from cavbench.core.track import Track
+from cavbench.statistics.estimates import share_interval
+from cavbench.leaderboard.comparisons.naming import Varying, component, varying
+from cavbench.leaderboard.published import every_track
+from cavbench.leaderboard.ranking.boards import Board, Row, read_boards
+from cavbench.leaderboard.ranking.flags import FLAGS
+from cavbench.leaderboard.terminal.columns import written
+from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
+from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, estimate, number, of_frames, share, signed, strip, verdict
 
 ADDED = 0.01
 """What an attack must add to be named."""
@@ -39,7 +28,7 @@ def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> Non
     """Print the ranking of every threat model, with the flags that have fired.
 
     Args:
-        records: by track (`bench.records.schema`); where there are none, the published records count.
+        records: by track (`cavbench.records.schema`); where there are none, the published records count.
         console: where to print.
     """
     print_boards(read_boards(records or every_track())[0], console)

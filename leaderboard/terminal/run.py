@@ -11,15 +11,15 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from bench.plugins.track import Track, track
-from bench.statistics.episodes import step_mean
-from leaderboard.comparisons.comparison import THREAT, Comparison
-from leaderboard.comparisons.naming import component, defended, varying
-from leaderboard.comparisons.reading import read_comparisons
-from leaderboard.ranking.remarks import comparison_remarks, run_remarks
-from leaderboard.terminal.cells import cell_by_cell
-from leaderboard.terminal.overview import overview
-from leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MARKS, counted, of_frames, size, threat
+from cavbench.core.track import Track, track
+from cavbench.statistics.episodes import step_mean
+from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
+from cavbench.leaderboard.comparisons.naming import component, defended, varying
+from cavbench.leaderboard.comparisons.reading import read_comparisons
+from cavbench.leaderboard.ranking.remarks import comparison_remarks, run_remarks
+from cavbench.leaderboard.terminal.cells import cell_by_cell
+from cavbench.leaderboard.terminal.overview import overview
+from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MARKS, counted, of_frames, size, threat
 
 SCREEN, AROUND, NOTES = 24, 7, 2
 """Lines of a terminal; those for the title, the headings, the gap, the folder and the prompt; and how many notes are shown that
@@ -32,7 +32,7 @@ def run_report(records: Mapping[str, pa.Table], console: Console) -> None:
     """Print what the records of a run say, in `SCREEN` lines where the pairs are few.
 
     Args:
-        records: by track (`bench.records.schema`), clean controls and baselines among them.
+        records: by track (`cavbench.records.schema`), clean controls and baselines among them.
         console: where to print; readable from 80 columns on; wider ones add columns.
     """
     for name, table in records.items():

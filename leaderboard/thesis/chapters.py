@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.plugins.track import track
-from bench.records.schema import schema
-from bench.tracks.detection import DetectionTrack
-from bench.tracks.driving import DrivingTrack
-from leaderboard.thesis.numbers import THESIS, printed
-from leaderboard.thesis.policy_records import clear
+from cavbench.core.track import track
+from cavbench.records.schema import schema
+from cavbench.detection.track import DetectionTrack
+from cavbench.driving.track import DrivingTrack
+from cavbench.leaderboard.thesis.numbers import THESIS, printed
+from cavbench.leaderboard.thesis.policy_records import clear
 
 Chapter = dict[str, Any]
 """`name`, `heading` and `tables`, each with its `title`, `headings`, `rows` and `notes`."""
@@ -26,7 +26,7 @@ def prepare() -> None:
     """Import what the tables need."""
     from scipy import stats  # noqa: F401
 
-    from leaderboard.thesis import patches, policies  # noqa: F401
+    from cavbench.leaderboard.thesis import patches, policies# noqa: F401
 
 
 def chapters(own: Mapping[str, pa.Table]) -> list[Chapter]:
@@ -35,7 +35,7 @@ def chapters(own: Mapping[str, pa.Table]) -> list[Chapter]:
     Args:
         own: the user's records, by track; where they have none, those published with the package are read.
     """
-    from leaderboard.thesis import patches, policies
+    from cavbench.leaderboard.thesis import patches, policies
 
     numbers = printed()
     detection, driving = (

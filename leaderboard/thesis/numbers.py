@@ -10,7 +10,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from leaderboard.terminal.text import number
+from cavbench.leaderboard.terminal.text import number
 
 THESIS = "magenta"
 """The colour of what the thesis says."""

@@ -13,13 +13,13 @@ from functools import cache
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.plugins.fingerprint import canonical
-from bench.plugins.registry import Kind
-from bench.plugins.track import track
-from bench.tracks.detection import REFERENCE_PATCHES, DetectionTrack
-from leaderboard.comparisons.comparison import IDENTITY, NO_ATTACK, Comparison, parameters
-from leaderboard.comparisons.reading import SCENARIO, groups, read_comparisons
-from leaderboard.published import published
+from cavbench.identity.fingerprint import canonical
+from cavbench.core.registry import Kind
+from cavbench.core.track import track
+from cavbench.detection.track import REFERENCE_PATCHES, DetectionTrack
+from cavbench.leaderboard.comparisons.comparison import IDENTITY, NO_ATTACK, Comparison, parameters
+from cavbench.leaderboard.comparisons.reading import SCENARIO, groups, read_comparisons
+from cavbench.leaderboard.published import published
 
 ATTACK, WORLD, DETECTOR = "eot", "camera", "yolov3_tiny"
 FAMILY = ("yolov3_tiny", "yolov5")
@@ -251,7 +251,7 @@ def _detectors(tables: Iterable[pa.Table]) -> list[Detector]:
 def _standard(kind: Kind, name: str) -> str:
     """The default parameters of a component."""
     # Imported here: torch takes seconds, and whoever has all the records needs no component.
-    from bench.plugins.pair import choose
+    from cavbench.core.pair import choose
 
     return choose(kind, name).params
 

@@ -11,15 +11,15 @@ from typing import Literal
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from bench.plugins.track import track
-from bench.scenarios import Cell
-from bench.statistics.episodes import Episodes
-from bench.statistics.estimates import Interval, interval, share_interval
-from bench.tracks.driving import BEST_BLIND, DrivingTrack
-from leaderboard.comparisons.baselines import Baselines
-from leaderboard.comparisons.comparison import ATTACKER, DEFENDED, IDENTITY, parameters
-from leaderboard.comparisons.reading import SCENARIO, groups, newest
-from leaderboard.published import published
+from cavbench.core.track import track
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import Episodes
+from cavbench.statistics.estimates import Interval, interval, share_interval
+from cavbench.driving.track import BEST_BLIND, DrivingTrack
+from cavbench.leaderboard.comparisons.baselines import Baselines
+from cavbench.leaderboard.comparisons.comparison import ATTACKER, DEFENDED, IDENTITY, parameters
+from cavbench.leaderboard.comparisons.reading import SCENARIO, groups, newest
+from cavbench.leaderboard.published import published
 
 Victim = Literal["dqn", "ddpg"]
 Attack = Literal["none", "zo", "noise"]

@@ -9,12 +9,12 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from bench.plugins.track import track
-from bench.records.schema import schema
-from bench.tracks.detection import DetectionTrack
-from bench.tracks.driving import DrivingTrack
-from leaderboard.thesis import patches, policies
-from leaderboard.thesis.numbers import PUBLISHED, THESIS, Beside, printed
+from cavbench.core.track import track
+from cavbench.records.schema import schema
+from cavbench.detection.track import DetectionTrack
+from cavbench.driving.track import DrivingTrack
+from cavbench.leaderboard.thesis import patches, policies
+from cavbench.leaderboard.thesis.numbers import PUBLISHED, THESIS, Beside, printed
 
 
 def thesis_report(records: Mapping[str, pa.Table], console: Console) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from bench.statistics.estimates import Array
+from cavbench.statistics.estimates import Array
 
 LEVEL = 0.05
 

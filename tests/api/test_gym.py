@@ -18,11 +18,11 @@ from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
 
 import cavbench
-from bench.conformance import complaints
-from bench.driving import DrivingAttack, Features
-from bench.gym import GymWorld
-from bench.plugins import registry
-from bench.scenarios import Axes, Axis, Cell, Grid, SeedBlock
+from cavbench.checks import complaints
+from cavbench.driving import DrivingAttack, Features
+from cavbench.gym import GymWorld
+from cavbench.core import registry
+from cavbench.scenarios import Axes, Axis, Cell, Grid, SeedBlock
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 

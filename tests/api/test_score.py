@@ -14,17 +14,17 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-import bench
 import cavbench
-from bench.driving import ActionType, DrivingAttack, Oracle, Policy
-from bench.errors import UserError
-from bench.plugins.contracts import Access
-from bench.plugins.pair import choose
-from bench.plugins.track import track
-from bench.records import reading
-from bench.run import runner
-from bench.run.config import run_config
-from envs.highway.world import HighwayWorld
+import cavbench
+from cavbench.driving import ActionType, DrivingAttack, Oracle, Policy
+from cavbench.errors import UserError
+from cavbench.core.contracts import Access
+from cavbench.core.pair import choose
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.run import runner
+from cavbench.run.config import run_config
+from cavbench.envs.highway.world import HighwayWorld
 from tests.victims.test_from_file import sb3_model, spaces
 
 SHORT = HighwayWorld(max_steps=15)
@@ -116,7 +116,7 @@ def test_a_torch_network_is_scored_by_cell_and_found_again(
     first = score(network, "noise", by="cell", weather=["clear", "fog"])
     assert list(first.weather) == ["clear", "fog", "clear", "fog"]
     assert network.training, "the caller's network was changed"
-    monkeypatch.setattr("bench.driving.drive.rollout", None)
+    monkeypatch.setattr("cavbench.driving.drive.rollout", None)
     assert score(network, "noise", by="cell", weather=["clear", "fog"]).equals(first)
     with pytest.raises(cavbench.UserError, match="TypeError"):
         score(Brakes(scale=2.0), "noise", weather=["clear", "fog"])
@@ -138,7 +138,7 @@ def test_a_model_of_stable_baselines3_answers_like_predict(algorithm: str, score
     model = sb3_model(algorithm, spaces(continuous=algorithm == "td3"))
     found = score(model, "pgd", record=0)
     assert "stable-baselines3" in found.records["libraries"][0]
-    from bench.victims.drivers.in_process import in_process
+    from cavbench.driving.victims.in_process import in_process
 
     observation = torch.rand(6, 10, 5) * 2 - 1
     policy = in_process([model], SHORT.facts, observation, None).policies[0]
@@ -167,7 +167,7 @@ def test_an_attack_of_the_caller_is_driven_again_when_its_code_changes(score: Ca
     ("changed", "line"),
     [
         ({"victim": "dqnn"}, "unknown victim 'dqnn'; did you mean 'dqn'?"),
-        ({"victim": 3}, "a victim is a name, a bench.driving.Policy, a torch.nn.Module or a model"),
+        ({"victim": 3}, "a victim is a name, a cavbench.driving.Policy, a torch.nn.Module or a model"),
         (
             {"victim": "dqn.zip"},
             r"unknown victim 'dqn.zip'; a file is given as victim=sb3 victim.path=dqn.zip \(from Python",
@@ -221,7 +221,7 @@ def test_importing_and_listing_load_no_torch() -> None:
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert said.returncode == 0, said.stderr
-    assert bench.score is cavbench.score
+    assert cavbench.score is cavbench.score
 
 
 def test_what_makes_a_number_wrong_is_printed_below_it_and_is_data(tmp_path: Path) -> None:

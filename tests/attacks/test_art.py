@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from attacks.art import ATTACKS, _component
-from attacks.noise import Noise
-from attacks.pgd import PGD
-from bench.conformance import complaints
-from bench.driving import DrivingAttack, ObservationThreat
-from bench.errors import UserError
-from bench.plugins.pair import choose
+from cavbench.attacks.driving.art import ATTACKS, _component
+from cavbench.attacks.driving.noise import Noise
+from cavbench.attacks.driving.pgd import PGD
+from cavbench.checks import complaints
+from cavbench.driving import DrivingAttack, ObservationThreat
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
 from tests.attacks.victims import FEATURES, Linear, observations, perturb, victim
 
 THREAT = ObservationThreat(norm="linf", budget=0.4, queries=60)

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from attacks.eot import EOT, total_variation
-from attacks.grey_patch import GreyPatch
-from attacks.noise_patch import NoisePatch
-from attacks.views import corners
-from bench.detection import Detector, PatchOracle, PatchThreat, Predictions, Scenes
-from bench.detection.boxes import confidence
-from bench.detection.enforcer import PatchEnforcer
-from bench.errors import UserError
-from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
+from cavbench.attacks.detection.eot import EOT, total_variation
+from cavbench.attacks.detection.grey_patch import GreyPatch
+from cavbench.attacks.detection.noise_patch import NoisePatch
+from cavbench.attacks.detection.views import corners
+from cavbench.detection import Detector, PatchOracle, PatchThreat, Predictions, Scenes
+from cavbench.detection.boxes import confidence
+from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.errors import UserError
+from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.vision.drawn_street import DrawnStreet
 

@@ -9,12 +9,12 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from attacks.bias import Bias
-from attacks.noise import Noise
-from attacks.pgd import PGD
-from attacks.zo import ZOSignSGD
-from bench.driving import ActionType, DrivingAttack, ObservationThreat
-from bench.driving.threat import Norm
+from cavbench.attacks.driving.bias import Bias
+from cavbench.attacks.driving.noise import Noise
+from cavbench.attacks.driving.pgd import PGD
+from cavbench.attacks.driving.zo import ZOSignSGD
+from cavbench.driving import ActionType, DrivingAttack, ObservationThreat
+from cavbench.driving.threat import Norm
 from tests.attacks.victims import FEATURES, observations, perturb, victim
 
 OBJECTIVES = ("collision", "expected", "margin", "target")

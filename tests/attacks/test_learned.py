@@ -13,30 +13,30 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from attacks.director_training import AdversaryWorld, Victim
-from attacks.objectives import margin
-from attacks.paad import PAAD
-from attacks.pgd import PGD
-from attacks.sarsa import RobustSarsa, Value
-from attacks.targets import Controls, EveryAction
-from attacks.two_stage import TwoStage
-from bench.conformance.check import Subject
-from bench.conformance.driving.attack import AttackSuite
-from bench.driving import DrivingAttack, DrivingWorld, ObservationThreat, Policy
-from bench.driving.enforcer import Enforcer
-from bench.driving.victim import CountedPolicy
-from bench.errors import UserError
-from bench.plugins.contracts import Trained
-from bench.plugins.pair import Pair, choose
-from bench.run.unit import Unit
-from bench.scenarios import SeedBlock
-from bench.victims import zoo
-from bench.victims.drivers.ddpg import DDPG
-from bench.victims.drivers.dqn import DQN
-from bench.victims.drivers.networks import QPolicy
-from bench.victims.drivers.practice import roads
-from defenses.advtrain import AdversarialTraining
-from defenses.none import NoDefense
+from cavbench.attacks.driving.director_training import AdversaryWorld, Victim
+from cavbench.attacks.driving.objectives import margin
+from cavbench.attacks.driving.paad import PAAD
+from cavbench.attacks.driving.pgd import PGD
+from cavbench.attacks.driving.sarsa import RobustSarsa, Value
+from cavbench.attacks.driving.targets import Controls, EveryAction
+from cavbench.attacks.driving.two_stage import TwoStage
+from cavbench.checks.check import Subject
+from cavbench.driving.checks.attack import AttackSuite
+from cavbench.driving import DrivingAttack, DrivingWorld, ObservationThreat, Policy
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.victim import CountedPolicy
+from cavbench.errors import UserError
+from cavbench.core.contracts import Trained
+from cavbench.core.pair import Pair, choose
+from cavbench.run.unit import Unit
+from cavbench.scenarios import SeedBlock
+from cavbench import zoo
+from cavbench.driving.victims.ddpg import DDPG
+from cavbench.driving.victims.dqn import DQN
+from cavbench.driving.victims.networks import QPolicy
+from cavbench.driving.victims.practice import roads
+from cavbench.defenses.driving.advtrain import AdversarialTraining
+from cavbench.defenses.none import NoDefense
 from tests.attacks.victims import observations, perturb, victim
 
 SHORT = {"decisions": 8, "hidden": 8}

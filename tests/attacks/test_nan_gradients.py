@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from attacks.pgd import PGD
-from bench.detection.enforcer import PatchEnforcer
-from bench.detection.threat import PatchThreat
-from bench.driving import ActionType, ObservationThreat, Policy, PolicyWrapper, State
-from bench.driving.enforcer import Enforcer
-from bench.driving.oracle import Oracle
-from bench.driving.victim import CountedPolicy
+from cavbench.attacks.driving.pgd import PGD
+from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.detection.threat import PatchThreat
+from cavbench.driving import ActionType, ObservationThreat, Policy, PolicyWrapper, State
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.oracle import Oracle
+from cavbench.driving.victim import CountedPolicy
 from tests.attacks.victims import FEATURES, observations, perturb, victim
 from tests.framework.toy_camera import RedDetector
 

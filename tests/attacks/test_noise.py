@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from attacks.noise import Distribution, Noise
-from bench.driving import ObservationThreat
+from cavbench.attacks.driving.noise import Distribution, Noise
+from cavbench.driving import ObservationThreat
 from tests.attacks.victims import FEATURES, observations, perturb, victim
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from attacks.pessimist import Outlook, Pessimist
-from bench.driving import Features, ObservationThreat
-from bench.driving.enforcer import Enforcer
-from bench.driving.victim import CountedPolicy
+from cavbench.attacks.driving.pessimist import Outlook, Pessimist
+from cavbench.driving import Features, ObservationThreat
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.victim import CountedPolicy
 from tests.attacks.victims import FEATURES, observations, perturb, victim
 
 THREAT = ObservationThreat(budget=0.1)

@@ -7,11 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from attacks.noise import Noise
-from attacks.objectives import Objective
-from attacks.pgd import PGD, random_starts
-from bench.driving import ActionType, ObservationThreat
-from bench.driving.threat import project
+from cavbench.attacks.driving.noise import Noise
+from cavbench.attacks.driving.objectives import Objective
+from cavbench.attacks.driving.pgd import PGD, random_starts
+from cavbench.driving import ActionType, ObservationThreat
+from cavbench.driving.threat import project
 from tests.attacks.victims import FEATURES, Linear, left, loss_of, observations, open_oracle, perturb, victim
 
 OBJECTIVES: tuple[Objective, ...] = ("collision", "expected", "margin", "target")

@@ -8,17 +8,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from attacks.plan import Plan
-from attacks.rehearse import Rehearse
-from bench.driving import ActionType, DrivingAttack, ObservationThreat, Policy
-from bench.driving.attacker import Attacker
-from bench.driving.victim import CountedPolicy
-from bench.errors import UserError
-from bench.plugins.pair import choose
-from envs.highway.axes import AXES
-from envs.highway.batched import BatchedHighway
-from envs.highway.forecast import FIELDS
-from envs.highway.world import HighwayWorld
+from cavbench.attacks.driving.plan import Plan
+from cavbench.attacks.driving.rehearse import Rehearse
+from cavbench.driving import ActionType, DrivingAttack, ObservationThreat, Policy
+from cavbench.driving.attacker import Attacker
+from cavbench.driving.victim import CountedPolicy
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.batched import BatchedHighway
+from cavbench.envs.highway.forecast import FIELDS
+from cavbench.envs.highway.world import HighwayWorld
 from tests.attacks.victims import victim
 
 WORLD, CELL = HighwayWorld(), AXES.cell(lanes=4, density=1.0)

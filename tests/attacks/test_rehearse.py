@@ -7,18 +7,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from attacks.rehearse import SIGNS, shown
-from bench.driving import ObservationThreat, Oracle, Policy
-from bench.driving.dynamics import Dynamics
-from bench.driving.enforcer import Enforcer
-from bench.driving.rollout import rollout
-from bench.driving.victim import CountedPolicy
-from bench.errors import UserError
-from bench.plugins.pair import choose
-from envs.highway.axes import AXES
-from envs.highway.batched import BatchedHighway
-from envs.highway.forecast import FIELDS
-from envs.highway.world import HighwayWorld
+from cavbench.attacks.driving.rehearse import SIGNS, shown
+from cavbench.driving import ObservationThreat, Oracle, Policy
+from cavbench.driving.dynamics import Dynamics
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.rollout import rollout
+from cavbench.driving.victim import CountedPolicy
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.batched import BatchedHighway
+from cavbench.envs.highway.forecast import FIELDS
+from cavbench.envs.highway.world import HighwayWorld
 
 WORLD, CELL = HighwayWorld(), AXES.cell(lanes=3, density=2.0)
 THREAT = ObservationThreat(access="dynamics")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from attacks.square_patch import SquarePatch
-from bench.detection import Detector, PatchThreat
-from bench.detection.enforcer import PatchEnforcer
-from defenses.temporal import TemporalFusion
+from cavbench.attacks.detection.square_patch import SquarePatch
+from cavbench.detection import Detector, PatchThreat
+from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.defenses.detection.temporal import TemporalFusion
 from tests.attacks.test_eot import SCENES, red
 from tests.framework.toy_camera import RedDetector, RedStreet, RedVictim
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kornia.augmentation import ColorJiggle, RandomAffine, RandomPerspective
 from torch import Tensor, nn
 
-from attacks.transformations import Transformations
+from cavbench.attacks.detection.transformations import Transformations
 
 OFF = dict.fromkeys(
     ["rotation", "scale", "perspective", "brightness", "contrast", "saturation", "hue", "noise"], 0.0

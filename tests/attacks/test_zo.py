@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from attacks.noise import Noise
-from attacks.objectives import Objective, distortion
-from attacks.zo import ZOObjective, ZOSignSGD, _directions, _gradient
-from bench.driving import ActionType, ObservationThreat, Part, Policy
+from cavbench.attacks.driving.noise import Noise
+from cavbench.attacks.driving.objectives import Objective, distortion
+from cavbench.attacks.driving.zo import ZOObjective, ZOSignSGD, _directions, _gradient
+from cavbench.driving import ActionType, ObservationThreat, Part, Policy
 from tests.attacks.victims import Linear, left, loss_of, observations, perturb, victim
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from attacks.objectives import DiscreteLoss, Objective
-from bench.driving import ActionType, DrivingAttack, Features, ObservationThreat, Oracle, Policy
-from bench.driving.enforcer import Enforcer
-from bench.driving.victim import CountedPolicy
-from bench.victims.drivers.networks import ActorPolicy, QPolicy
+from cavbench.attacks.driving.objectives import DiscreteLoss, Objective
+from cavbench.driving import ActionType, DrivingAttack, Features, ObservationThreat, Oracle, Policy
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.victim import CountedPolicy
+from cavbench.driving.victims.networks import ActorPolicy, QPolicy
 
 FEATURES = Features(
     names=("x", "y", "vx", "vy"),

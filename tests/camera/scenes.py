@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from envs.camera import sign
-from envs.camera.bank import BankScenes
-from envs.camera.frame import Frame, frame
-from envs.camera.poses import Pose, approach
-from envs.camera.street.layout import sign_x
-from envs.camera.street.render import Traced
-from envs.weather import WEATHERS
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.bank import BankScenes
+from cavbench.envs.camera.frame import Frame, frame
+from cavbench.envs.camera.poses import Pose, approach
+from cavbench.envs.camera.street.layout import sign_x
+from cavbench.envs.camera.street.render import Traced
+from cavbench.envs.weather import WEATHERS
 
 
 def lit(pose: Pose, level: float = 0.6) -> Traced:

@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.detection import stopping
-from bench.detection.boxes import overlap
-from bench.detection.closed_loop import Drive, drive, measured
-from envs.camera.braking import JERK, Brakes, Motion, brakes_in
-from envs.camera.cross_traffic import LEAST_HEADWAY_S, CrossTraffic
-from envs.camera.environment import CAR_M, ApproachEnv
-from envs.camera.street.layout import CROSSING
-from envs.weather import WEATHERS
+from cavbench.detection import stopping
+from cavbench.detection.boxes import overlap
+from cavbench.detection.closed_loop import Drive, drive, measured
+from cavbench.envs.camera.braking import JERK, Brakes, Motion, brakes_in
+from cavbench.envs.camera.cross_traffic import LEAST_HEADWAY_S, CrossTraffic
+from cavbench.envs.camera.environment import CAR_M, ApproachEnv
+from cavbench.envs.camera.street.layout import CROSSING
+from cavbench.envs.weather import WEATHERS
 from tests.framework.toy_camera import RedDetector, RedScenes
 
 DISTANCES = torch.arange(30.0, 7.9, -0.5)

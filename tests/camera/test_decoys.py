@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from envs.camera import faces, training_faces
-from envs.camera.develop import light_of, tone
-from envs.camera.world import StopSignApproach
+from cavbench.envs.camera import faces, training_faces
+from cavbench.envs.camera.develop import light_of, tone
+from cavbench.envs.camera.world import StopSignApproach
 from tests.camera.scenes import scenes
 
 NEAREST = torch.tensor([9])

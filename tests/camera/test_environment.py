@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from envs.camera.braking import Brakes
-from envs.camera.environment import ApproachEnv
+from cavbench.envs.camera.braking import Brakes
+from cavbench.envs.camera.environment import ApproachEnv
 from tests.camera.scenes import scenes
 
 

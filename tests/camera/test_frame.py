@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from bench.errors import UserError
-from envs.camera import bank, develop, sign
-from envs.camera.bank import BankScenes
-from envs.camera.frame import frame
-from envs.camera.plate import detail, filtered
-from envs.camera.poses import approach
-from envs.camera.weather import air, streaks
-from envs.weather import WEATHERS, Weather
+from cavbench.errors import UserError
+from cavbench.envs.camera import bank, develop, sign
+from cavbench.envs.camera.bank import BankScenes
+from cavbench.envs.camera.frame import frame
+from cavbench.envs.camera.plate import detail, filtered
+from cavbench.envs.camera.poses import approach
+from cavbench.envs.camera.weather import air, streaks
+from cavbench.envs.weather import WEATHERS, Weather
 from tests.camera.scenes import lit, scenes
 
 SCENES = scenes()

@@ -7,17 +7,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.detection import PatchThreat
-from bench.detection.drive import drive
-from bench.detection.patch import Patch
-from bench.plugins.pair import Pair, choose
-from bench.plugins.track import Job
-from envs.camera import lens, poses
-from envs.camera.lens import EFFECTS
-from envs.camera.windscreen import Windscreen, WindscreenScenes
-from envs.camera.windscreen_axes import AXES, LENSES, WINDSCREEN_V1
-from envs.camera.world import StopSignApproach
-from envs.weather import WEATHERS
+from cavbench.detection import PatchThreat
+from cavbench.detection.drive import drive
+from cavbench.detection.patch import Patch
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import Job
+from cavbench.envs.camera import lens, poses
+from cavbench.envs.camera.lens import EFFECTS
+from cavbench.envs.camera.windscreen import Windscreen, WindscreenScenes
+from cavbench.envs.camera.windscreen_axes import AXES, LENSES, WINDSCREEN_V1
+from cavbench.envs.camera.world import StopSignApproach
+from cavbench.envs.weather import WEATHERS
 from tests.camera.scenes import scenes
 
 POSES = poses.approach("sun-behind-ego", 3, 1.0, "sun")

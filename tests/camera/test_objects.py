@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from bench.detection import STOP_SIGN
-from envs.camera import sign
-from envs.camera.objects import NAMES, objects
-from envs.camera.poses import scored, training
-from envs.camera.street.layout import sign_x
+from cavbench.detection import STOP_SIGN
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.objects import NAMES, objects
+from cavbench.envs.camera.poses import scored, training
+from cavbench.envs.camera.street.layout import sign_x
 from tests.camera.scenes import scenes
 
 

@@ -9,11 +9,11 @@ import torch
 pytest.importorskip("mitsuba", reason="the renderer is not installed: pip install 'cavbench[render]'")
 pytest.importorskip("pyoidn", reason="the denoiser is not installed: pip install 'cavbench[render]'")
 
-from envs.camera import sign
-from envs.camera.camera import Camera
-from envs.camera.plate import detail, filtered, texture_mean
-from envs.camera.street import layout, render
-from envs.camera.street.light import light
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.camera import Camera
+from cavbench.envs.camera.plate import detail, filtered, texture_mean
+from cavbench.envs.camera.street import layout, render
+from cavbench.envs.camera.street.light import light
 
 CAMERA = Camera(y=-9.0, width=312, height=96, focal=180.0)
 LANES = 3

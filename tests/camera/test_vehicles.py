@@ -7,8 +7,8 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from envs.camera.street.material import TAIL_LIGHT_LIT
-from envs.camera.street.vehicles import PAINTS, Model, vehicle
+from cavbench.envs.camera.street.material import TAIL_LIGHT_LIT
+from cavbench.envs.camera.street.vehicles import PAINTS, Model, vehicle
 
 
 @pytest.mark.parametrize("model", get_args(Model))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from envs.camera import poses
-from envs.camera.axes import AXES
-from envs.camera.bank import SHIPPED
-from envs.camera.street.layout import LOCATIONS
-from envs.camera.world import StopSignApproach
-from envs.weather import WEATHERS
+from cavbench.envs.camera import poses
+from cavbench.envs.camera.axes import AXES
+from cavbench.envs.camera.bank import SHIPPED
+from cavbench.envs.camera.street.layout import LOCATIONS
+from cavbench.envs.camera.world import StopSignApproach
+from cavbench.envs.weather import WEATHERS
 
 WORLD = StopSignApproach()
 

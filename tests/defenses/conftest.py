@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.detection import STOP_SIGN
-from bench.victims.detectors import yolov5_file
-from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
+from cavbench.detection import STOP_SIGN
+from cavbench.detection.victims import yolov5_file
+from cavbench.detection.victims.yolov5 import YOLOv5, YOLOv5Network
 
 
 @pytest.fixture

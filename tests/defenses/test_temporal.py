@@ -11,25 +11,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from attacks.eot import EOT
-from attacks.views import reported
-from bench.detection import Detector, PatchThreat, Predictions
-from bench.detection.approach import score
-from bench.detection.boxes import overlap
-from bench.detection.closed_loop import Drive, drive
-from bench.detection.enforcer import PatchEnforcer
-from bench.detection.sight import look
-from bench.detection.stopping import THRESHOLD
-from bench.plugins.pair import choose
-from bench.victims.detectors.yolov3_tiny import YOLOv3Tiny
-from defenses.temporal import HIGHEST, MATCH_IOU, SINGLE, Fused, TemporalFusion
-from envs.camera import sign
-from envs.camera.bank import BankScenes
-from envs.camera.crossing import StopSignCrossing
-from envs.camera.environment import ApproachEnv
-from envs.camera.poses import approach
-from envs.camera.street.layout import sign_x
-from envs.camera.world import StopSignApproach
+from cavbench.attacks.detection.eot import EOT
+from cavbench.attacks.detection.views import reported
+from cavbench.detection import Detector, PatchThreat, Predictions
+from cavbench.detection.approach import score
+from cavbench.detection.boxes import overlap
+from cavbench.detection.closed_loop import Drive, drive
+from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.detection.sight import look
+from cavbench.detection.stopping import THRESHOLD
+from cavbench.core.pair import choose
+from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
+from cavbench.defenses.detection.temporal import HIGHEST, MATCH_IOU, SINGLE, Fused, TemporalFusion
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.bank import BankScenes
+from cavbench.envs.camera.crossing import StopSignCrossing
+from cavbench.envs.camera.environment import ApproachEnv
+from cavbench.envs.camera.poses import approach
+from cavbench.envs.camera.street.layout import sign_x
+from cavbench.envs.camera.world import StopSignApproach
 from tests.framework.toy_camera import RED_AXES, RedDetector, RedScenes, RedStreet, RedVictim
 
 SCORES = st.lists(st.floats(0, 1), min_size=1, max_size=12)

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
-from bench.driving.rollout import rollout
-from bench.plugins.contracts import Access
-from bench.plugins.track import Columns
-from bench.scenarios import Cell
+from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
+from cavbench.driving.rollout import rollout
+from cavbench.core.contracts import Access
+from cavbench.core.track import Columns
+from cavbench.scenarios import Cell
 from tests.framework.toy import ToyPolicy, ToyWorld
 
 WORLD = ToyWorld(max_steps=90)

@@ -9,11 +9,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from bench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from bench.victims.drivers.reference import Blind, RandomDriver
-from defenses.frame_stack import FrameStack, Reduction
-from defenses.recurrent import RecurrentPolicy
-from envs.highway.world import HighwayWorld
+from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
+from cavbench.driving.victims.reference import Blind, RandomDriver
+from cavbench.defenses.driving.frame_stack import FrameStack, Reduction
+from cavbench.defenses.driving.recurrent import RecurrentPolicy
+from cavbench.envs.highway.world import HighwayWorld
 from tests.attacks.victims import observations, victim
 
 FACTS = HighwayWorld().facts

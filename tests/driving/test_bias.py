@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from attacks.bias import Bias
-from bench.driving import ObservationThreat
-from bench.driving.attacker import Attacker
-from bench.driving.victim import CountedPolicy
+from cavbench.attacks.driving.bias import Bias
+from cavbench.driving import ObservationThreat
+from cavbench.driving.attacker import Attacker
+from cavbench.driving.victim import CountedPolicy
 from tests.attacks.victims import FEATURES, Linear, observations
 
 EPISODES, STEPS = 5, 6

@@ -11,15 +11,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from bench.driving import DrivingAttack, ObservationThreat, Oracle, enforcer
-from bench.driving.drive import SEAL
-from bench.driving.enforcer import Enforcer
-from bench.driving.rollout import rollout
-from bench.driving.victim import CountedPolicy
-from bench.errors import UserError
-from bench.plugins.contracts import Access, QueryBudgetError
-from bench.plugins.pair import choose
-from bench.trust.watch import TamperError
+from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, enforcer
+from cavbench.driving.drive import SEAL
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.rollout import rollout
+from cavbench.driving.victim import CountedPolicy
+from cavbench.errors import UserError
+from cavbench.core.contracts import Access, QueryBudgetError
+from cavbench.core.pair import choose
+from cavbench.isolation.watch import TamperError
 from tests.driving.cheats import CELL, SEEDS, WORLD, Noisy, Victim, drive
 
 FAR = 5.0

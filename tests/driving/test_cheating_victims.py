@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.driving import Oracle, State
-from bench.driving.drive import _checked
-from bench.errors import UserError
-from bench.plugins.pair import Pair, choose
-from bench.trust.identifiers import opaque
-from bench.trust.watch import TamperError
+from cavbench.driving import Oracle, State
+from cavbench.driving.drive import _checked
+from cavbench.errors import UserError
+from cavbench.core.pair import Pair, choose
+from cavbench.isolation.identifiers import opaque
+from cavbench.isolation.watch import TamperError
 from tests.driving.cheats import SEEDS, Noisy, Victim, drive, inconsistent
 
 EPISODES = len(SEEDS)

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from bench.driving import Policy
-from bench.victims.drivers.reference import Blind
+from cavbench.driving import Policy
+from cavbench.driving.victims.reference import Blind
 from tests.attacks.victims import observations
 from tests.driving.policies import FACTS, Echo
 

@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from attacks.noise import Noise
-from bench.driving import ObservationThreat, Policy
-from bench.driving.rollout import Trace, rollout
-from bench.plugins.pair import choose
-from bench.scenarios import SeedBlock
-from bench.victims.drivers.reference import Blind, RandomDriver
-from defenses.frame_stack import FrameStack, Reduction
-from envs.highway.world import HighwayWorld
+from cavbench.attacks.driving.noise import Noise
+from cavbench.driving import ObservationThreat, Policy
+from cavbench.driving.rollout import Trace, rollout
+from cavbench.core.pair import choose
+from cavbench.scenarios import SeedBlock
+from cavbench.driving.victims.reference import Blind, RandomDriver
+from cavbench.defenses.driving.frame_stack import FrameStack, Reduction
+from cavbench.envs.highway.world import HighwayWorld
 from tests.attacks.victims import observations, victim
 from tests.driving.policies import FACTS, STATEFUL, Echo, Given, stacked
 

@@ -11,26 +11,26 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
-from attacks.noise import Noise
-from attacks.pgd import PGD
-from bench.driving import DrivingVictim, ObservationThreat, Policy
-from bench.driving.intervals.boxes import Assumed
-from bench.driving.intervals.ego import Ego
-from bench.driving.intervals.kernels import LEVELS_PER_UNIT, REAR_BRAKING, used
-from bench.driving.intervals.margins import Judge
-from bench.driving.intervals.policy import reckoning
-from bench.driving.intervals.rooms import Cars, Caution, cars_of
-from bench.driving.rollout import rollout
-from bench.driving.threat import Norm
-from bench.errors import UserError
-from bench.plugins.pair import choose
-from bench.scenarios import SeedBlock
-from bench.victims.drivers.planner import IntervalPlanner, Planner
-from defenses.shield import Shield, Shielded, ShieldedControls
-from defenses.tracker import Tracked, Tracker
-from envs.highway.axes import AXES
-from envs.highway.batched import BatchedHighway
-from envs.highway.world import HighwayWorld
+from cavbench.attacks.driving.noise import Noise
+from cavbench.attacks.driving.pgd import PGD
+from cavbench.driving import DrivingVictim, ObservationThreat, Policy
+from cavbench.driving.intervals.boxes import Assumed
+from cavbench.driving.intervals.ego import Ego
+from cavbench.driving.intervals.kernels import LEVELS_PER_UNIT, REAR_BRAKING, used
+from cavbench.driving.intervals.margins import Judge
+from cavbench.driving.intervals.policy import reckoning
+from cavbench.driving.intervals.rooms import Cars, Caution, cars_of
+from cavbench.driving.rollout import rollout
+from cavbench.driving.threat import Norm
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
+from cavbench.scenarios import SeedBlock
+from cavbench.driving.victims.planner import IntervalPlanner, Planner
+from cavbench.defenses.driving.shield import Shield, Shielded, ShieldedControls
+from cavbench.defenses.driving.tracker import Tracked, Tracker
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.batched import BatchedHighway
+from cavbench.envs.highway.world import HighwayWorld
 from tests.attacks.victims import observations
 from tests.framework.toy import ToyWorld
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from bench.driving import ObservationThreat, Oracle, Policy
-from bench.driving.enforcer import Enforcer
-from bench.driving.victim import CHUNK, CountedPolicy
+from cavbench.driving import ObservationThreat, Oracle, Policy
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.victim import CHUNK, CountedPolicy
 from tests.attacks.victims import FEATURES, observations, victim
 from tests.driving.policies import STATEFUL, remembered, stacked
 

@@ -11,17 +11,17 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.driving import Policy
-from bench.errors import UserError
-from bench.plugins.pair import choose
-from bench.victims import zoo
-from bench.victims.drivers.ddpg import DDPG
-from bench.victims.drivers.dqn import DQN
-from bench.victims.drivers.training import LearningDriver
-from defenses.car import ConsistentAdversarialRobustness
-from defenses.robust_loss import RobustLoss, RobustTraining
-from defenses.sa import StateAdversarial
-from envs.highway.world import HighwayWorld
+from cavbench.driving import Policy
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
+from cavbench import zoo
+from cavbench.driving.victims.ddpg import DDPG
+from cavbench.driving.victims.dqn import DQN
+from cavbench.driving.victims.training import LearningDriver
+from cavbench.defenses.driving.car import ConsistentAdversarialRobustness
+from cavbench.defenses.driving.robust_loss import RobustLoss, RobustTraining
+from cavbench.defenses.driving.sa import StateAdversarial
+from cavbench.envs.highway.world import HighwayWorld
 from tests.attacks.victims import observations
 
 WORLD = HighwayWorld()

@@ -9,12 +9,12 @@ import pyarrow.compute as pc
 import pytest
 from rerun.chunk import RrdReader
 
-from bench.plugins.track import track
-from bench.records import reading
-from bench.run import runner
-from bench.run.config import run_config
-from bench.run.replay import find, replay
-from bench.run.unit import Preparation, Unit
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.run import runner
+from cavbench.run.config import run_config
+from cavbench.run.replay import find, replay
+from cavbench.run.unit import Preparation, Unit
 
 ATTACKS = ("bias", "pgd")
 RUN = (

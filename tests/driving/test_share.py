@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from attacks.noise import Noise
-from attacks.pgd import PGD, preference_gap
-from bench.driving import DrivingAttack, ObservationThreat
-from bench.driving.attacker import Attacker
-from bench.driving.victim import CountedPolicy
+from cavbench.attacks.driving.noise import Noise
+from cavbench.attacks.driving.pgd import PGD, preference_gap
+from cavbench.driving import DrivingAttack, ObservationThreat
+from cavbench.driving.attacker import Attacker
+from cavbench.driving.victim import CountedPolicy
 from tests.attacks.victims import FEATURES, observations, victim
 
 STEPS = 12

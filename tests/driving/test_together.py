@@ -13,27 +13,27 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from attacks.noise import Noise
-from attacks.pgd import PGD
-from attacks.plan import Plan
-from attacks.zo import ZOSignSGD
-from bench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
-from bench.driving.drive import joint
-from bench.driving.rollout import NotJointError, rollout
-from bench.plugins.contracts import Access
-from bench.plugins.framework import Snapshot
-from bench.plugins.pair import Pair, choose
-from bench.plugins.track import Columns
-from bench.run.batches import EPISODES, batches
-from bench.run.config import run_config
-from bench.run.plan import key_of, loadings, units_of
-from bench.run.runner import _recorded
-from bench.run.unit import Unit
-from bench.run.work import Outcome, Task, attempt
-from bench.scenarios import Cell
-from bench.victims.drivers.networks import ActorPolicy, QPolicy
-from envs.highway.axes import AXES
-from envs.highway.world import HighwayWorld
+from cavbench.attacks.driving.noise import Noise
+from cavbench.attacks.driving.pgd import PGD
+from cavbench.attacks.driving.plan import Plan
+from cavbench.attacks.driving.zo import ZOSignSGD
+from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
+from cavbench.driving.drive import joint
+from cavbench.driving.rollout import NotJointError, rollout
+from cavbench.core.contracts import Access
+from cavbench.isolation.framework import Snapshot
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import Columns
+from cavbench.run.batches import EPISODES, batches
+from cavbench.run.config import run_config
+from cavbench.run.plan import key_of, loadings, units_of
+from cavbench.run.runner import _recorded
+from cavbench.run.unit import Unit
+from cavbench.run.work import Outcome, Task, attempt
+from cavbench.scenarios import Cell
+from cavbench.driving.victims.networks import ActorPolicy, QPolicy
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.world import HighwayWorld
 from tests.driving.cheats import WORLD, Noisy, Victim
 
 PROBES = {"redrawn", "same_answer", "inconsistent", "draws"}

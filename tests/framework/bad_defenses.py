@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, PolicyWrapper, State
+from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, PolicyWrapper, State
 
 
 class _Deaf(PolicyWrapper):

@@ -9,17 +9,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from bench.driving import (
-    ActionType,
-    DrivingAttack,
-    DrivingDefense,
-    DrivingFacts,
-    DrivingVictim,
-    Oracle,
-    Policy,
-    State,
-)
-from bench.plugins.contracts import Access
+from cavbench.driving import ActionType, DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, Oracle, Policy, State
+from cavbench.core.contracts import Access
 
 
 class _Mean(Policy):

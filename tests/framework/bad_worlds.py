@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 from torchrl.envs import EnvBase
 from toy_plugin import ToyEnv, ToyWorld  # type: ignore[import-not-found]
 
-from bench.driving import ActionType, Driver, DrivingFacts
-from bench.errors import UserError
-from bench.plugins.contracts import Facts
-from bench.scenarios import Axes, Axis, Cell, Grid
+from cavbench.driving import ActionType, Driver, DrivingFacts
+from cavbench.errors import UserError
+from cavbench.core.contracts import Facts
+from cavbench.scenarios import Axes, Axis, Cell, Grid
 
 
 def axes(**changes: Any) -> Axes:

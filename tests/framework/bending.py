@@ -18,10 +18,10 @@ from tensordict import TensorDict
 from torch import Tensor
 from toy_plugin import ToyWorld  # type: ignore[import-not-found]
 
-import bench.driving.probes
-from bench.driving import DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, Oracle, Policy
-from bench.plugins.contracts import Access
-from bench.plugins.ranges import Natural
+import cavbench.driving.probes
+from cavbench.driving import DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, Oracle, Policy
+from cavbench.core.contracts import Access
+from cavbench.core.ranges import Natural
 
 Deed = Literal[
     "none",
@@ -179,7 +179,7 @@ class Bends(DrivingAttack):
                 if max(ToyWorld.features.high) < 15:
                     scaled(ToyWorld.features)
             case "constant":
-                bench.driving.probes.EVERY = 10**9
+                cavbench.driving.probes.EVERY = 10**9
         return answer, state
 
 

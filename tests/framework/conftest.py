@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.cli import main as cli
-from bench.plugins import registry
-from bench.run import worker
-from bench.run.process import context
+from cavbench.cli import main as cli
+from cavbench.core import registry
+from cavbench.run import worker
+from cavbench.run.process import context
 from tests.framework.distributions import install_toy
 
 BENCH = (sys.executable, "-m", "bench")
@@ -64,7 +64,7 @@ Bench = Callable[..., Said]
 def bench(toy_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
     """The command line in this process: bench("run", "attack=nudge") -> Said."""
     monkeypatch.setenv("COLUMNS", "160")
-    monkeypatch.setattr("bench.cli.view._has_display", lambda: False)
+    monkeypatch.setattr("cavbench.cli.view._has_display", lambda: False)
 
     def call(*words: str) -> Said:
         monkeypatch.setattr(sys, "argv", ["bench", *words])

@@ -9,9 +9,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from bench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, PolicyWrapper, State
-from bench.scenarios import Cell
-from envs.highway.world import HighwayWorld
+from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, PolicyWrapper, State
+from cavbench.scenarios import Cell
+from cavbench.envs.highway.world import HighwayWorld
 
 CELL = Cell(lanes=3, density=1.0, weather="clear")
 SEEDS = torch.arange(1_000_000, 1_000_020)

@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 from toy_plugin import ToyPolicy, ToyVictim
 
-import bench.driving.meter
-from bench.driving import DrivingAttack, DrivingFacts, Oracle, Policy, State
-from bench.plugins.contracts import Access
+import cavbench.driving.meter
+from cavbench.driving import DrivingAttack, DrivingFacts, Oracle, Policy, State
+from cavbench.core.contracts import Access
 
 Deed = Literal[
     "none",
@@ -108,7 +108,7 @@ class Rogue(DrivingAttack):
             case "patch torch":
                 torch.Tensor.tanh = lambda tensor: tensor  # type: ignore[method-assign,assignment]
             case "patch bench":
-                bench.driving.meter.Meter.columns = lambda meter: {}  # type: ignore[method-assign,assignment]
+                cavbench.driving.meter.Meter.columns = lambda meter: {}  # type: ignore[method-assign,assignment]
             case "limit":
                 resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))
             case "unprintable":

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.run.rounds import SCENARIOS
-from bench.statistics.estimates import Array, t_quantile
-from bench.statistics.sequential import confidence_sequence
+from cavbench.run.rounds import SCENARIOS
+from cavbench.statistics.estimates import Array, t_quantile
+from cavbench.statistics.sequential import confidence_sequence
 
 MOST = 100
 PART = 100

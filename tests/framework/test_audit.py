@@ -10,15 +10,15 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from bench.errors import UserError
-from bench.plugins import registry
-from bench.records import reading
-from bench.records.schema import AUDIT, IDENTITY
-from bench.run.audit import SALTS, audit_config
-from bench.scenarios import SeedBlock
-from bench.statistics.estimates import Array
-from bench.statistics.unpaired import NOTABLE, POWER, Finds, finds, unpaired
-from leaderboard.ranking.boards import read_boards
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench.records import reading
+from cavbench.records.schema import AUDIT, IDENTITY
+from cavbench.run.audit import SALTS, audit_config
+from cavbench.scenarios import SeedBlock
+from cavbench.statistics.estimates import Array
+from cavbench.statistics.unpaired import NOTABLE, POWER, Finds, finds, unpaired
+from cavbench.leaderboard.ranking.boards import read_boards
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 

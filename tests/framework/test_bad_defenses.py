@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from bench.plugins import registry
-from bench.plugins.track import track
-from bench.records import reading
-from leaderboard.comparisons.reading import measurements
-from leaderboard.ranking.boards import Row, read_boards
+from cavbench.core import registry
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.leaderboard.comparisons.reading import measurements
+from cavbench.leaderboard.ranking.boards import Row, read_boards
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 

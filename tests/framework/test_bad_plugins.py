@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.plugins.foreign import contained
+from cavbench.isolation.foreign import contained
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.framework.test_check import CROOKED, POINTS
@@ -30,8 +30,8 @@ TOY = ("world=toy", *RUN)
 HEAD = """
 from dataclasses import dataclass
 from typing import ClassVar
-from bench.plugins.contracts import Access, Attack
-from bench.driving import DrivingAttack
+from cavbench.core.contracts import Access, Attack
+from cavbench.driving import DrivingAttack
 """
 GOOD = """
 @dataclass(frozen=True, kw_only=True)
@@ -46,11 +46,11 @@ CANNOT_BE_LOADED = {
     "a syntax error": ("def\n", "cannot be imported: SyntaxError"),
     "one that ends the program": ("import sys; sys.exit(3)\n", "cannot be imported: SystemExit: 3"),
     "no such class": ("class Other: ...\n", "cannot be imported: AttributeError"),
-    "another base class": ("class Plugin: ...\n", "is not a subclass of bench.plugins.contracts.Attack"),
-    "an instance": (f"{HEAD}{GOOD}Plugin = Plugin()\n", "is not a subclass of bench.plugins.contracts.Attack"),
+    "another base class": ("class Plugin: ...\n", "is not a subclass of cavbench.core.contracts.Attack"),
+    "an instance": (f"{HEAD}{GOOD}Plugin = Plugin()\n", "is not a subclass of cavbench.core.contracts.Attack"),
     "another kind": (
-        "from bench.driving.contracts import DrivingDefense\nclass Plugin(DrivingDefense): ...\n",
-        "is not a subclass of bench.plugins.contracts.Attack",
+        "from cavbench.driving.contracts import DrivingDefense\nclass Plugin(DrivingDefense): ...\n",
+        "is not a subclass of cavbench.core.contracts.Attack",
     ),
     "no track": (f"{HEAD}{GOOD}".replace("(DrivingAttack)", "(Attack)"), "belongs to no track"),
     "an abstract method": (f"{HEAD}{GOOD}".replace("def perturb", "def disturb"), "does not implement perturb or step"),

@@ -8,8 +8,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from bench.plugins.track import track
-from bench.records import reading
+from cavbench.core.track import track
+from cavbench.records import reading
 from tests.framework.conftest import Said, ran
 from tests.framework.distributions import install, install_toy
 
@@ -31,7 +31,7 @@ REFUSED = {
     "self": "Bends._memo changed while it was measured",
     "own class": "bending.Bends.visits.here changed while it was measured",
     "world class": "features.low",
-    "constant": "bench.driving.probes.EVERY was replaced",
+    "constant": "cavbench.driving.probes.EVERY was replaced",
 }
 """Deeds that a unit is refused for."""
 FILES = {

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from bench import bounded
-from bench.archive import Archive
-from bench.errors import UserError
-from bench.records import generations
-from bench.victims.detectors import yolov5_file
-from bench.victims.detectors.from_file import _listed
-from bench.victims.files.trial import hashed
+from cavbench import bounded
+from cavbench.archive import Archive
+from cavbench.errors import UserError
+from cavbench.records import generations
+from cavbench.detection.victims import yolov5_file
+from cavbench.detection.victims.from_file import _listed
+from cavbench.formats.trial import hashed
 
 GIB = 2**30
 

@@ -9,22 +9,22 @@ import pytest
 import torch
 from rich.console import Console
 
-from bench.cli.listing import print_component
-from bench.cli.train import train
-from bench.driving.drive import drive
-from bench.errors import UserError
-from bench.plugins.options import configured
-from bench.plugins.pair import choose
-from bench.records import reading
-from bench.run.config import run_config
-from bench.run.plan import plan
-from bench.run.replay import find, replay
-from bench.run.runner import run
-from bench.victims.drivers.dqn import DQN
-from bench.victims.drivers.networks import QPolicy
-from defenses.shield import Shielded
-from defenses.tracker import Tracked
-from envs.highway.world import HighwayWorld
+from cavbench.cli.listing import print_component
+from cavbench.cli.train import train
+from cavbench.driving.drive import drive
+from cavbench.errors import UserError
+from cavbench.core.options import configured
+from cavbench.core.pair import choose
+from cavbench.records import reading
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
+from cavbench.run.replay import find, replay
+from cavbench.run.runner import run
+from cavbench.driving.victims.dqn import DQN
+from cavbench.driving.victims.networks import QPolicy
+from cavbench.defenses.driving.shield import Shielded
+from cavbench.defenses.driving.tracker import Tracked
+from cavbench.envs.highway.world import HighwayWorld
 from tests.framework.test_runner import Silent
 
 FACTS = HighwayWorld().facts
@@ -87,14 +87,14 @@ def test_a_chain_is_listed_with_the_parameters_of_its_links() -> None:
     console = Console(width=200, record=True)
     print_component("tracker+shield", console)
     text = console.export_text()
-    assert "defenses.tracker:Tracker + defenses.shield:Shield" in text
+    assert "cavbench.defenses.driving.tracker:Tracker + cavbench.defenses.driving.shield:Shield" in text
     assert "defense.shield.band" in text
 
 
 def test_a_chain_is_recorded_and_replayed_and_its_code_counts(tmp_path: Path) -> None:
     config = run_config([*WORDS, "defense=tracker+shield", "workers=1", f"out={tmp_path}"])
     (unit,) = plan(config)
-    assert {"defenses.shield", "defenses.tracker"} <= set(unit.modules)
+    assert {"cavbench.defenses.driving.shield", "cavbench.defenses.driving.tracker"} <= set(unit.modules)
     run(config, Silent())
     (records,) = reading.read_all(tmp_path).values()
     assert set(records["defense"].to_pylist()) == {"tracker+shield"}

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from bench.conformance import examine
-from bench.plugins import registry
-from bench.plugins.registry import GROUPS, KINDS, Kind
+from cavbench.checks import examine
+from cavbench.core import registry
+from cavbench.core.registry import GROUPS, KINDS, Kind
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.framework.test_cli import assert_one_line
@@ -49,10 +49,10 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from bench.plugins.contracts import Access
-from bench.driving import DrivingAttack, DrivingDefense, DrivingVictim, Policy
-from bench.detection import PatchOracle
-from bench.detection import PatchAttack
+from cavbench.core.contracts import Access
+from cavbench.driving import DrivingAttack, DrivingDefense, DrivingVictim, Policy
+from cavbench.detection import PatchOracle
+from cavbench.detection import PatchAttack
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,7 +285,7 @@ RULES: list[tuple[Kind, str, str, str, str]] = [
     ("attack", "bad_patch", "progress", "progress", "outside [0, 1]"),
     ("attack", "bad_patch", "weights", "victim left alone", "the detector's weights changed"),
     ("attack", "bad_patch", "scenes", "victim left alone", "the scenes were changed in place"),
-    ("victim", "bad", "nothing", "ready to drive", "load returned a NoneType, not a bench.driving.Policy"),
+    ("victim", "bad", "nothing", "ready to drive", "load returned a NoneType, not a cavbench.driving.Policy"),
     ("victim", "bad", "raise", "behaviour", "ZeroDivisionError: at a loss"),
     ("victim", "bad", "mode", "ready to drive", "load must return policy.eval()"),
     ("victim", "bad", "weights", "ready to drive", "load must return policy.requires_grad_(False)"),

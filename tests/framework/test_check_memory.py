@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.conformance import examine
-from bench.plugins.registry import Kind
+from cavbench.checks import examine
+from cavbench.core.registry import Kind
 from tests.framework.distributions import install
 
 POINTS = {

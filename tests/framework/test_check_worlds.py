@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.conformance import examine
-from bench.conformance.check import BrokenRuleError, NotApplicableError, Subject
-from bench.conformance.detection.camera import CameraSuite
-from bench.detection import Decoy, Scenes
-from bench.plugins.track import track
+from cavbench.checks import examine
+from cavbench.checks.check import BrokenRuleError, NotApplicableError, Subject
+from cavbench.detection.checks.camera import CameraSuite
+from cavbench.detection import Decoy, Scenes
+from cavbench.core.track import track
 from tests.framework.conftest import Bench
 from tests.framework.distributions import install
 from tests.framework.test_third_track import POINTS as LISTENING
@@ -49,7 +49,7 @@ RULES = {
     "borrowing": ("grids", "the grid 'standard-v1' belongs to the world 'highway'"),
     "otheraxes": ("grids", "use the same Axes object for both"),
     "lying": ("facts", "facts.axes differ from the world's axes"),
-    "general": ("features", "facts is a Facts, not a bench.driving.DrivingFacts"),
+    "general": ("features", "facts is a Facts, not a cavbench.driving.DrivingFacts"),
     "unwritten": ("facts", "facts.written() must contain plain JSON values"),
     "timeless": ("decisions", "decision_hz must be above 0, got 0.0"),
     "miscounted": ("decisions", "the environment's action_spec has 5 actions, but facts.actions has 3"),

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from bench.conformance import complaints
-from bench.errors import UserError
-from bench.plugins.track import track
-from bench.records import reading
-from bench.run.config import run_config
+from cavbench.checks import complaints
+from cavbench.errors import UserError
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.run.config import run_config
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 
@@ -20,8 +20,8 @@ ADAPTER = '''
 from dataclasses import dataclass, field, make_dataclass
 from typing import ClassVar
 
-from bench.plugins.contracts import Access
-from bench.driving import DrivingAttack
+from cavbench.core.contracts import Access
+from cavbench.driving import DrivingAttack
 
 
 @dataclass(frozen=True, kw_only=True)

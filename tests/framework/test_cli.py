@@ -12,10 +12,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from bench.plugins import registry
-from bench.plugins.registry import GROUPS, KINDS
-from bench.plugins.track import track
-from bench.records import reading
+from cavbench.core import registry
+from cavbench.core.registry import GROUPS, KINDS
+from cavbench.core.track import track
+from cavbench.records import reading
 from tests.framework.conftest import Said, ran, started
 from tests.framework.test_runner import comparable
 
@@ -195,8 +195,8 @@ def test_without_a_display_view_says_how_to_open_a_recording(
 
 
 def test_debug_shows_the_traceback(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    from bench.cli import main as cli
-    from bench.errors import UserError
+    from cavbench.cli import main as cli
+    from cavbench.errors import UserError
 
     monkeypatch.setattr(sys, "argv", ["bench", "run", "attack=nugde", "--debug"])
     with pytest.raises(UserError):

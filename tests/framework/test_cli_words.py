@@ -15,14 +15,14 @@ import pytest
 from rich.console import Console
 
 import bench as package
-from bench.cli.explain import heading_of, print_term
-from bench.cli.options_help import THREAT, settings
-from bench.cli.progress import RunProgress
-from bench.detection.threat import PatchThreat
-from bench.driving.threat import ObservationThreat
-from bench.plugins.registry import GROUPS, KINDS, entries
-from bench.plugins.track import tracks
-from bench.run.options import RunOptions
+from cavbench.cli.explain import heading_of, print_term
+from cavbench.cli.options_help import THREAT, settings
+from cavbench.cli.progress import RunProgress
+from cavbench.detection.threat import PatchThreat
+from cavbench.driving.threat import ObservationThreat
+from cavbench.core.registry import GROUPS, KINDS, entries
+from cavbench.core.track import tracks
+from cavbench.run.options import RunOptions
 from tests.framework.conftest import Said
 
 Bench = Callable[..., Said]
@@ -77,7 +77,7 @@ def test_a_term_is_explained(term: str, part: str, bench: Bench) -> None:
 
 
 def test_every_heading_of_the_tables_has_an_explanation(bench: Bench) -> None:
-    from bench.plugins.track import tracks
+    from cavbench.core.track import tracks
 
     for track in tracks():
         for measure in track.measures:

@@ -10,22 +10,22 @@ import pyarrow.compute as pc
 import pytest
 from safetensors import safe_open
 
-from bench.cli.show import recordings
-from bench.detection.patch import Patch
-from bench.detection.printing import non_printability
-from bench.detection.threat import PatchThreat
-from bench.errors import UserError
-from bench.plugins import fingerprint
-from bench.plugins.sources import names, tracks_of
-from bench.plugins.track import track
-from bench.records import reading
-from bench.run import runner
-from bench.run.config import RunConfig, component, run_config, train_config
-from bench.run.plan import plan
-from bench.run.replay import find, replay
-from bench.run.unit import Preparation
-from bench.victims import zoo
-from leaderboard.ranking.boards import read_boards
+from cavbench.cli.show import recordings
+from cavbench.detection.patch import Patch
+from cavbench.detection.printing import non_printability
+from cavbench.detection.threat import PatchThreat
+from cavbench.errors import UserError
+from cavbench.identity import fingerprint
+from cavbench.core.sources import names, tracks_of
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.run import runner
+from cavbench.run.config import RunConfig, component, run_config, train_config
+from cavbench.run.plan import plan
+from cavbench.run.replay import find, replay
+from cavbench.run.unit import Preparation
+from cavbench import zoo
+from cavbench.leaderboard.ranking.boards import read_boards
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.framework.test_cli import TOY, assert_one_line
@@ -60,7 +60,7 @@ def patch_path(out: Path, fingerprint: str) -> Path:
 @pytest.fixture(autouse=True)
 def without_reference_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run without baselines, unless a test asks for them."""
-    monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ())
+    monkeypatch.setattr("cavbench.detection.track.REFERENCE_PATCHES", ())
 
 
 def test_the_victim_determines_the_track_and_the_track_the_defaults() -> None:
@@ -96,9 +96,9 @@ def test_components_of_another_track_are_refused_in_one_line(line: str) -> None:
 
 def test_the_track_of_a_component_is_read_from_its_source() -> None:
     assert tracks_of("toy_camera_plugin:Paint") == ["detection"]
-    assert tracks_of("bench.victims.drivers.dqn:DQN") == ["driving"]
-    assert tracks_of("attacks.none:NoAttack") == ["any"]
-    assert tracks_of("bench.victims.detectors.fcos:FCOS") == ["detection"], "through a generic base class"
+    assert tracks_of("cavbench.driving.victims.dqn:DQN") == ["driving"]
+    assert tracks_of("cavbench.attacks.none:NoAttack") == ["any"]
+    assert tracks_of("cavbench.detection.victims.fcos:FCOS") == ["detection"], "through a generic base class"
     assert tracks_of("nowhere:Nothing") == []
     assert {"none", "paint", "blank"} <= set(names("attack", "detection"))
 
@@ -136,7 +136,7 @@ def test_each_scenario_seed_has_a_location_and_every_frame_is_recorded(tmp_path:
 
 
 def test_every_attack_is_compared_with_baseline_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ("blank", "not_installed"))
+    monkeypatch.setattr("cavbench.detection.track.REFERENCE_PATCHES", ("blank", "not_installed"))
     units = plan(read(SMALL))
     blank = [unit for unit in units if unit.pair.attack.name == "blank"]
     assert {unit.training_seed for unit in blank} == {0}
@@ -174,9 +174,9 @@ def test_scoring_and_crafting_have_separate_code_digests() -> None:
     unit = next(unit for unit in plan(read(SMALL)) if unit.preparation)
     assert unit.preparation is not None
     scoring, crafting = (set(fingerprint.sources(work.modules)) for work in (unit, unit.preparation))
-    assert "bench.detection.approach" in scoring
-    assert "bench.detection.crafting" in crafting
-    assert "bench.detection.approach" not in crafting
+    assert "cavbench.detection.approach" in scoring
+    assert "cavbench.detection.crafting" in crafting
+    assert "cavbench.detection.approach" not in crafting
 
 
 @pytest.mark.parametrize(
@@ -305,7 +305,7 @@ def test_the_file_of_a_patch_contains_its_provenance(tmp_path: Path) -> None:
 def test_the_first_approaches_of_each_requested_pair_are_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench
 ) -> None:
-    monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ("blank",))
+    monkeypatch.setattr("cavbench.detection.track.REFERENCE_PATCHES", ("blank",))
     said = bench("run", *SMALL.split(), "executor=serial", f"out={tmp_path}")
     assert said.code == 0, said.err
     assert "was not recorded" not in said.err

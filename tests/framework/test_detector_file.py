@@ -7,8 +7,8 @@ from pathlib import Path
 import pyarrow.compute as pc
 import pytest
 
-from bench.records import reading
-from bench.run.replay import replay
+from cavbench.records import reading
+from cavbench.run.replay import replay
 from tests.framework.test_detection import Bench
 from tests.victims.test_detector_files import NAMES, onnx_file, torch_file
 
@@ -21,7 +21,7 @@ WORDS = (
 
 @pytest.fixture(autouse=True)
 def without_reference_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bench.tracks.detection.REFERENCE_PATCHES", ())
+    monkeypatch.setattr("cavbench.detection.track.REFERENCE_PATCHES", ())
 
 
 def test_a_program_is_attacked_with_gradients_from_the_command_line(tmp_path: Path, bench: Bench) -> None:

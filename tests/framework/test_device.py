@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.errors import UserError
-from bench.plugins import device
-from bench.run.config import run_config
-from bench.run.plan import plan
+from cavbench.errors import UserError
+from cavbench.core import device
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
 from tests.framework import other_device
 from tests.framework.conftest import Said
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.cli.early import check_names
-from bench.cli.explain import GLOSSARY
-from bench.plugins.registry import GROUPS, KINDS, Kind, entries
+from cavbench.cli.early import check_names
+from cavbench.cli.explain import GLOSSARY
+from cavbench.core.registry import GROUPS, KINDS, Kind, entries
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -9,9 +9,9 @@ import pyarrow as pa
 import pytest
 
 import cavbench
-from bench.plugins.pair import Pair, choose
-from bench.plugins.track import track
-from bench.victims import zoo
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import track
+from cavbench import zoo
 from tests.framework.conftest import Bench
 
 FAST = {"target_speeds": (20.0, 25.0, 30.0)}
@@ -111,7 +111,7 @@ def test_all_baselines_fail_or_one_does_not() -> None:
     ("given", "budget"), [("2%", 0.02), ("10%", 0.1), ("0.3 %", 0.003), ("200%", 2.0), (0.5, 0.5), ("29%", 0.29)]
 )
 def test_a_budget_may_be_given_in_per_cent(given: Any, budget: float) -> None:
-    from bench.api.choosing import threat_of
+    from cavbench.api.choosing import threat_of
 
     assert threat_of({"budget": given}, choose("victim", "dqn"), ()).budget == budget
 

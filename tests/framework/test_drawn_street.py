@@ -10,11 +10,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from bench.plugins import registry
-from bench.plugins.track import track
-from bench.records import reading
-from bench.run.replay import find, replay
-from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
+from cavbench.core import registry
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.run.replay import find, replay
+from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.test_recording import read

@@ -12,18 +12,18 @@ from typing import Any
 
 import pytest
 
-from bench.errors import UserError
-from bench.plugins import registry
-from bench.run.executors import ProcessExecutor
-from bench.run.tree import resident_bytes
-from bench.run.worker import Limits
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench.run.executors import ProcessExecutor
+from cavbench.run.tree import resident_bytes
+from cavbench.run.worker import Limits
 from tests.framework.conftest import import_path
 from tests.framework.distributions import install
 
 COMMAND = """
 import sys, threading
-from bench.cli import ending
-from bench.plugins import registry
+from cavbench.cli import ending
+from cavbench.core import registry
 ending.END_S, ending.BACKSTOP_S = 1.0, 0.5
 
 def command():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.errors import UserError, in_one_line
+from cavbench.errors import UserError, in_one_line
 
 
 def test_a_script_ends_in_one_line_where_the_user_is_wrong() -> None:

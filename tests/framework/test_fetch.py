@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.errors import UserError
-from bench.victims import fetch
+from cavbench.errors import UserError
+from cavbench.zoo import fetch
 from tests.framework.conftest import Said
 
 CONTENT = b"weights" * 1000

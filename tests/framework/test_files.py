@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from bench.files import sweep, whole
+from cavbench.files import sweep, whole
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from bench.files import whole
+from cavbench.files import whole
 with whole(Path(sys.argv[1])) as file:
     file.write(b"half")
     file.flush()

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bench.driving.rollout import Trace
-from bench.recording.driving.episode import Episode
-from bench.recording.driving.film import EpisodeFilm
-from bench.recording.film import save, stacked
-from bench.recording.film.drawing import GREEN, SKY, VERMILLION
-from envs.highway.world import HighwayWorld
+from cavbench.driving.rollout import Trace
+from cavbench.driving.recording.episode import Episode
+from cavbench.driving.recording.film import EpisodeFilm
+from cavbench.recording.film import save, stacked
+from cavbench.recording.film.drawing import GREEN, SKY, VERMILLION
+from cavbench.envs.highway.world import HighwayWorld
 from tests.framework.conftest import Said, started
 
 Bench = Callable[..., Said]
@@ -86,7 +86,7 @@ def test_a_film_is_written_and_read_back(ending: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("name", "seconds"), [("clip.avi", None), ("clip.gif", (3, 2))])
 def test_what_cannot_be_written_is_refused(name: str, seconds: Any, tmp_path: Path) -> None:
-    from bench.errors import UserError
+    from cavbench.errors import UserError
 
     with pytest.raises(UserError):
         save(film(), tmp_path / name, seconds=seconds)

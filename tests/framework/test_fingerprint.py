@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.plugins import fingerprint
-from bench.run.config import run_config
-from bench.run.plan import plan
-from bench.run.unit import Unit
+from cavbench.identity import fingerprint
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
+from cavbench.run.unit import Unit
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
@@ -59,7 +59,7 @@ def test_other_weights_or_another_training_seed_are_another_unit() -> None:
 
 def test_other_library_versions_are_another_unit(monkeypatch: pytest.MonkeyPatch) -> None:
     before = first().fingerprint
-    monkeypatch.setattr("bench.run.unit.libraries", lambda more: {"torch": "0.0"})
+    monkeypatch.setattr("cavbench.run.unit.libraries", lambda more: {"torch": "0.0"})
     assert first().fingerprint != before
 
 
@@ -121,19 +121,19 @@ def test_the_code_digest_covers_only_the_code_that_computes_a_unit() -> None:
     counted = set(fingerprint.sources(first("world=highway", "attack=pgd", "victim=ddpg").modules))
     assert counted >= {
         *(
-            f"bench.driving.{name}"
+            f"cavbench.driving.{name}"
             for name in ("contracts", "drive", "attacker", "meter", "metrics", "oracle", "policy", "rollout", "threat")
         ),
-        *("attacks.pgd", "attacks.objectives", "defenses.none", "bench.victims.drivers.ddpg"),
-        *("envs.highway.world", "envs.highway.batched", "envs.highway.engine", "envs.highway.sensor"),
+        *("cavbench.attacks.driving.pgd", "cavbench.attacks.driving.objectives", "cavbench.defenses.none", "cavbench.driving.victims.ddpg"),
+        *("cavbench.envs.highway.world", "cavbench.envs.highway.batched", "cavbench.envs.highway.engine", "cavbench.envs.highway.sensor"),
     }
     assert not counted & {
-        "attacks.zo",
-        "bench.victims.drivers.dqn",
-        "bench.records.store",
-        "bench.cli.main",
-        "bench.detection.approach",
-        "bench.detection.crafting",
+        "cavbench.attacks.driving.zo",
+        "cavbench.driving.victims.dqn",
+        "cavbench.records.store",
+        "cavbench.cli.main",
+        "cavbench.detection.approach",
+        "cavbench.detection.crafting",
         "leaderboard",
     }
 

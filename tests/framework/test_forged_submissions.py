@@ -18,14 +18,14 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from bench.cli import submit as cli
-from bench.cli.terminal import Console
-from bench.errors import UserError
-from bench.plugins.track import track
-from bench.records import reading
-from bench.records.schema import schema
-from bench.run import claims, received, verification
-from bench.run.plan import plan
+from cavbench.cli import submit as cli
+from cavbench.cli.terminal import Console
+from cavbench.errors import UserError
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.records.schema import schema
+from cavbench.run import claims, received, verification
+from cavbench.run.plan import plan
 from tests.framework.conftest import Said
 
 Bench = Callable[..., Said]
@@ -436,7 +436,7 @@ def test_other_weights_do_not_stand_in_for_those_of_a_row(made: Made, tmp_path: 
 
 
 def test_weights_that_ship_are_not_replaced(made: Made, tmp_path: Path) -> None:
-    from bench.victims.zoo.store import SHIPPED
+    from cavbench.zoo.store import SHIPPED
 
     ships = next(SHIPPED.glob("*/seed0.safetensors")).relative_to(SHIPPED).with_suffix("")
     folder = tmp_path / "forged"

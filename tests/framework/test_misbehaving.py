@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from bench.plugins.track import track
-from bench.records import reading
+from cavbench.core.track import track
+from cavbench.records import reading
 from tests.framework.conftest import Said, ran
 from tests.framework.distributions import install, install_toy
 
@@ -23,7 +23,7 @@ ON_IMPORT = {
     "import_segfault": "import ctypes; ctypes.string_at(0)",
     "import_patch": "import torch; torch.Tensor.tanh = lambda tensor: tensor",
     "import_interrupt": "raise KeyboardInterrupt",
-    "import_floors": "from envs.highway import config; object.__setattr__(config.STANDARD_FEATURES, 'floors', (0.0,) * 4)",
+    "import_floors": "from cavbench.envs.highway import config; object.__setattr__(config.STANDARD_FEATURES, 'floors', (0.0,) * 4)",
     "import_recursion": "import inspect, sys; sys.setrecursionlimit(len(inspect.stack()) + 30)",
     "import_closed": "import os; os.closerange(3, 4096)",
     "import_thread": "import threading, time; threading.Thread(target=time.sleep, args=(600,)).start()",
@@ -49,7 +49,7 @@ DEEDS = {
     "limit": "Too many open files",
     "unprintable": "failed: UnprintableError",
     "patch torch": "is refused: torch.Tensor.tanh was replaced",
-    "patch bench": "is refused: bench.driving.meter.Meter.columns was replaced",
+    "patch bench": "is refused: cavbench.driving.meter.Meter.columns was replaced",
 }
 """What the line says about each deed that fails a unit."""
 HARMLESS = ("none", "reseed", "print", "print much", "fork", "fork and stay", "leave a thread")
@@ -106,7 +106,7 @@ def test_a_sweep_goes_on_and_names_whatever_fails_with_its_package(swept: tuple[
         ("import_segfault", "cannot be imported: its import ends the process (SIGSEGV)"),
         ("import_patch", "cannot be imported: its import replaces torch.Tensor.tanh"),
         ("import_interrupt", "cannot be imported: KeyboardInterrupt"),
-        ("import_floors", "cannot be imported: its import replaces envs.highway.config.STANDARD_FEATURES.floors"),
+        ("import_floors", "cannot be imported: its import replaces cavbench.envs.highway.config.STANDARD_FEATURES.floors"),
         ("import_recursion", "cannot be imported: its import changes the recursion limit"),
         ("import_closed", "cannot be imported: its import closes files of the process"),
         ("import_thread", "cannot be imported: its import changes the threads that hold the end of the process"),

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.conformance import scaffold
-from bench.plugins.track import track
-from bench.records import reading
+from cavbench.checks import scaffold
+from cavbench.core.track import track
+from cavbench.records import reading
 from tests.framework.conftest import Said, forked, import_path
 from tests.framework.distributions import install, pip_install
 from tests.framework.test_cli import assert_one_line

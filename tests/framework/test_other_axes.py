@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from bench.plugins.track import track
-from bench.records import reading
+from cavbench.core.track import track
+from cavbench.records import reading
 from tests.framework.conftest import Bench
 
 RUN = ("run", "attack=nudge", "victim=toy", "world=bend", "seeds=0,1", "executor=serial", "record=1")

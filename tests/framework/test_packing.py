@@ -16,15 +16,15 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from bench.errors import Notice
-from bench.plugins.track import Track, track
-from bench.records import packing, reading, store
-from bench.records.finished import finished
-from bench.records.schema import schema
-from bench.run import runner
-from bench.run.config import run_config
-from bench.run.plan import plan
-from bench.scenarios import Cell
+from cavbench.errors import Notice
+from cavbench.core.track import Track, track
+from cavbench.records import packing, reading, store
+from cavbench.records.finished import finished
+from cavbench.records.schema import schema
+from cavbench.run import runner
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
+from cavbench.scenarios import Cell
 from tests.framework.conftest import import_path
 from tests.framework.test_runner import Silent, comparable
 
@@ -240,9 +240,9 @@ def test_units_are_copied_out_of_a_packed_file(folder: Path, tmp_path: Path, som
 
 PACKING = """
 import sys
-from bench.records import packing
+from cavbench.records import packing
 packing.UNITS = 3
-from bench.cli.main import main
+from cavbench.cli.main import main
 sys.argv = ["bench", *sys.argv[1:]]
 main()
 """

@@ -9,16 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.detection import Detector, Predictions
-from bench.detection.patch import Patch
-from bench.plugins.contracts import Facts
-from bench.plugins.framework import Snapshot
-from bench.plugins.pair import Chosen
-from bench.run.batches import batches
-from bench.run.config import run_config
-from bench.run.plan import plan
-from bench.run.unit import Unit
-from bench.run.work import Failure, Outcome, Task, attempt
+from cavbench.detection import Detector, Predictions
+from cavbench.detection.patch import Patch
+from cavbench.core.contracts import Facts
+from cavbench.isolation.framework import Snapshot
+from cavbench.core.pair import Chosen
+from cavbench.run.batches import batches
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
+from cavbench.run.unit import Unit
+from cavbench.run.work import Failure, Outcome, Task, attempt
 from tests.framework.toy_camera import RedDetector, RedScenes, RedStreet, RedVictim
 
 pytestmark = pytest.mark.usefixtures("toy_folder")

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.plugins.track import track
-from bench.records import reading
+from cavbench.core.track import track
+from cavbench.records import reading
 from tests.framework.conftest import forked
 from tests.framework.distributions import pip_install
 

@@ -11,8 +11,8 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from bench.plugins.track import track
-from bench.records import reading
+from cavbench.core.track import track
+from cavbench.records import reading
 from tests.framework.conftest import import_path, ran, started
 from tests.framework.test_runner import comparable
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from bench.errors import UserError
-from bench.plugins import registry
-from bench.plugins.contracts import Attack, Defense, Victim, World
-from bench.plugins.registry import GROUPS, KINDS
-from bench.run.config import run_config
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench.core.contracts import Attack, Defense, Victim, World
+from cavbench.core.registry import GROUPS, KINDS
+from cavbench.run.config import run_config
 from tests.framework.conftest import BENCH
 from tests.framework.distributions import TOY_POINTS, install, install_toy
 
@@ -44,22 +44,22 @@ def test_an_unknown_name_is_reported_with_the_nearest_and_all_known_names() -> N
 
 BROKEN = {
     "cannot be imported: ZeroDivisionError": "1 / 0\n",
-    "is not a subclass of bench.plugins.contracts.Attack": "class Plugin: ...\n",
+    "is not a subclass of cavbench.core.contracts.Attack": "class Plugin: ...\n",
     "cannot be imported: AttributeError": "class Other: ...\n",
     "belongs to no track: derive it from a base class of": (
-        "from dataclasses import dataclass\nfrom bench.plugins.contracts import Attack\n"
+        "from dataclasses import dataclass\nfrom cavbench.core.contracts import Attack\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(Attack): ...\n"
     ),
     "does not implement perturb or step": (
-        "from dataclasses import dataclass\nfrom bench.driving.contracts import DrivingAttack\n"
+        "from dataclasses import dataclass\nfrom cavbench.driving.contracts import DrivingAttack\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Plugin(DrivingAttack): ...\n"
     ),
     "is not a frozen dataclass": (
-        "from bench.driving.contracts import DrivingAttack\n"
+        "from cavbench.driving.contracts import DrivingAttack\n"
         "class Plugin(DrivingAttack):\n    def perturb(self, observation, oracle): ...\n"
     ),
     "has the positional parameters steps": (
-        "from dataclasses import dataclass\nfrom bench.driving.contracts import DrivingAttack\n"
+        "from dataclasses import dataclass\nfrom cavbench.driving.contracts import DrivingAttack\n"
         "@dataclass(frozen=True)\nclass Plugin(DrivingAttack):\n    steps: int = 1\n    def perturb(self, o, oracle): ...\n"
     ),
 }
@@ -82,7 +82,7 @@ def test_a_broken_plugin_is_named_in_one_line_and_breaks_no_other(complaint: str
 def test_a_broken_grid_is_reported_when_it_is_used_and_breaks_no_other(plugins: Path) -> None:
     points = {
         "cavbench.grids": {"rough-v1": "rough:GRID"},
-        "cavbench.worlds": {"rough": "envs.highway.world:HighwayWorld"},
+        "cavbench.worlds": {"rough": "cavbench.envs.highway.world:HighwayWorld"},
     }
     install(plugins, "rough-pack", points, {"rough": "1 / 0\n"})
     assert run_config(["victim=blind"]).grid.name == "standard-v2"
@@ -99,9 +99,9 @@ def test_a_name_that_two_packages_ship_is_refused_with_both_packages(plugins: Pa
 
 def test_listing_names_imports_no_torch() -> None:
     code = (
-        "import sys; from bench.cli import main as cli; sys.argv = ['bench', 'list']\n"
+        "import sys; from cavbench.cli import main as cli; sys.argv = ['bench', 'list']\n"
         "try: cli.main()\nexcept SystemExit: pass\n"
-        "heavy = {'torch', 'hydra', 'numpy', 'duckdb', 'attacks.noise'} & set(sys.modules)\n"
+        "heavy = {'torch', 'hydra', 'numpy', 'duckdb', 'cavbench.attacks.driving.noise'} & set(sys.modules)\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -8,10 +8,10 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from bench.plugins.track import track
-from bench.records import reading, store
-from bench.records.schema import schema
-from bench.run.replay import find, replay
+from cavbench.core.track import track
+from cavbench.records import reading, store
+from cavbench.records.schema import schema
+from cavbench.run.replay import find, replay
 from tests.framework.conftest import Said
 from tests.framework.test_cli import TOY, assert_one_line
 

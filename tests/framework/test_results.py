@@ -14,17 +14,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bench.errors import Notice, UserError
-from bench.plugins.track import Columns, track
-from bench.records import generations as footers
-from bench.records import reading
-from bench.records import store as results
-from bench.records.finished import finished
-from bench.records.generations import AXES_OF_V1, generations
-from bench.records.schema import schema
-from bench.run.config import run_config
-from bench.run.plan import plan
-from bench.run.unit import Unit
+from cavbench.errors import Notice, UserError
+from cavbench.core.track import Columns, track
+from cavbench.records import generations as footers
+from cavbench.records import reading
+from cavbench.records import store as results
+from cavbench.records.finished import finished
+from cavbench.records.generations import AXES_OF_V1, generations
+from cavbench.records.schema import schema
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
+from cavbench.run.unit import Unit
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 

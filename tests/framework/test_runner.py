@@ -14,15 +14,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from bench.errors import Notice, UnfinishedError, UserError
-from bench.plugins import progress, registry
-from bench.plugins.track import track
-from bench.records import reading
-from bench.records.schema import PROBES
-from bench.run import runner
-from bench.run.config import run_config
-from bench.run.plan import plan
-from bench.run.unit import Preparation, Unit
+from cavbench.errors import Notice, UnfinishedError, UserError
+from cavbench.core import progress, registry
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.records.schema import PROBES
+from cavbench.run import runner
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
+from cavbench.run.unit import Preparation, Unit
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 
@@ -238,7 +238,7 @@ import gc
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bench.driving import DrivingAttack, Policy
+from cavbench.driving import DrivingAttack, Policy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -300,7 +300,7 @@ def test_a_clock_that_jumps_during_a_run_loses_nothing(tmp_path: Path, monkeypat
             return datetime.now(tz) + next(jumps)
 
     known = time.time
-    monkeypatch.setattr("bench.run.unit.datetime", Jumping)
+    monkeypatch.setattr("cavbench.run.unit.datetime", Jumping)
     monkeypatch.setattr(time, "time", lambda: known() + next(jumps).total_seconds())
     with pytest.warns(Notice, match="dated in the future"):
         jumped, _ = run(tmp_path / "jumped")

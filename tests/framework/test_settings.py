@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.errors import EscapeError
-from bench.plugins.foreign import harm, unchanged
-from bench.plugins.settings import Settings
+from cavbench.errors import EscapeError
+from cavbench.isolation.foreign import harm, unchanged
+from cavbench.isolation.settings import Settings
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="there is a copy of the process on Linux only")
 PUT_BACK = {
@@ -31,7 +31,7 @@ PUT_BACK = {
     "import sys; del sys.path[0]": "the import path",
     "import sys; sys.path.reverse()": "the import path",
     "import sys; sys.meta_path.clear()": "how Python imports",
-    "import sys, types; sys.modules['bench.errors'] = types.ModuleType('bench.errors')": "modules of the framework",
+    "import sys, types; sys.modules['cavbench.errors'] = types.ModuleType('cavbench.errors')": "modules of the framework",
     "import builtins; builtins.open = print": "functions of Python",
     "import builtins; builtins.__import__ = lambda *_, **__: None": "functions of Python",
     "import sys; sys.stderr = sys.stdout": "standard input or output",
@@ -89,7 +89,7 @@ def test_a_changed_setting_is_named_and_put_back(code: str) -> None:
 def test_what_an_import_would_change_is_noticed_in_a_copy_of_the_process(
     code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bench.plugins.foreign.END_S", 0.5)
+    monkeypatch.setattr("cavbench.isolation.foreign.END_S", 0.5)
     before = Settings(alone=True)
     found = harm(partial(executed, code), stays=True)
     wanted = STAYS.get(code, f"changes {PUT_BACK.get(code)}")

@@ -36,7 +36,7 @@ def write(path: Path, text: str = "") -> Path:
 @pytest.mark.parametrize("name", PACKAGES)
 def test_a_script_gets_an_error_that_names_the_shadowing_file(name: str, shape: str, tmp_path: Path) -> None:
     write(tmp_path / shape.format(name))
-    said = python(tmp_path, write(tmp_path / "script.py", "from bench.driving.contracts import DrivingAttack\n"))
+    said = python(tmp_path, write(tmp_path / "script.py", "from cavbench.driving.contracts import DrivingAttack\n"))
     assert said.returncode == 1
     shadowing = tmp_path / shape.format(name).removesuffix("/__init__.py")
     assert said.stderr.splitlines()[-1] == (
@@ -58,7 +58,7 @@ def test_import_cavbench_reports_a_users_bench_without_running_it(shape: str, tm
 def test_folders_without_modules_and_files_in_other_folders_do_not_shadow(name: str, tmp_path: Path) -> None:
     write(tmp_path / name / "mine.py")
     write(tmp_path / "lower" / f"{name}.py")
-    said = python(tmp_path, "-c", "import bench, cavbench; print(cavbench.__version__ == bench.__version__)")
+    said = python(tmp_path, "-c", "import bench, cavbench; print(cavbench.__version__ == cavbench.__version__)")
     assert (said.stdout, said.stderr) == ("True\n", "")
 
 

@@ -13,12 +13,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from bench.plugins import registry
-from bench.plugins.track import track
-from bench.records import reading
-from bench.run.claims import _names_a_file
-from bench.run.config import run_config
-from bench.run.submission import weights_of
+from cavbench.core import registry
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.run.claims import _names_a_file
+from cavbench.run.config import run_config
+from cavbench.run.submission import weights_of
 from tests.framework.conftest import Said
 
 Bench = Callable[..., Said]

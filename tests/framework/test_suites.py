@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.errors import UserError
-from bench.plugins import suites
-from bench.plugins.suites import Suite
-from bench.run.config import run_config
+from cavbench.errors import UserError
+from cavbench.core import suites
+from cavbench.core.suites import Suite
+from cavbench.run.config import run_config
 
 SMALL = ["lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0"]
 
@@ -84,7 +84,7 @@ def test_a_file_that_is_no_suite_is_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_another_draw_is_the_same_attack_with_other_random_numbers() -> None:
-    from bench.run.plan import plan
+    from cavbench.run.plan import plan
 
     config = run_config(["attack=noise", "attack.draw=0,1", "reference=false", *SMALL])
     seeds = {unit.pair.attack.component.draw: unit.attack_seed for unit in plan(config) if not unit.pair.is_clean}  # type: ignore[attr-defined]
@@ -94,7 +94,7 @@ def test_another_draw_is_the_same_attack_with_other_random_numbers() -> None:
 def test_the_command_line_lists_and_helps_with_suites(capsys: pytest.CaptureFixture[str]) -> None:
     from typer.testing import CliRunner
 
-    from bench.cli.main import app
+    from cavbench.cli.main import app
 
     listed, page, helped = (
         CliRunner().invoke(app, words).output for words in (["list"], ["list", "standard"], ["run", "--help"])
@@ -110,9 +110,9 @@ def test_a_suite_runs_end_to_end(tmp_path: Path) -> None:
     """Members are recorded as ordinary pairs, skipped ones are named, and `bench show` counts them."""
     from rich.console import Console
 
-    from bench.cli.run import run
-    from bench.cli.show import print_run
-    from bench.records import reading
+    from cavbench.cli.run import run
+    from cavbench.cli.show import print_run
+    from cavbench.records import reading
 
     words = [
         "attack=standard",

@@ -9,8 +9,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from bench.plugins import registry
-from bench.plugins.track import track
+from cavbench.core import registry
+from cavbench.core.track import track
 from tests.framework.conftest import Bench
 from tests.framework.distributions import install
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.plugins.track import track
-from bench.records import reading
-from bench.run.replay import replay
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.run.replay import replay
 from tests.framework.conftest import Bench
 from tests.framework.test_cli import assert_one_line
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.errors import UnfinishedError, UserError
-from bench.plugins.track import track
-from bench.records import reading
-from bench.run import rounds, runner
-from bench.run.audit import audit_config
-from bench.run.config import RunConfig, run_config
-from bench.run.replay import repeat
-from bench.statistics.sequential import confidence_sequence, shown_higher
+from cavbench.errors import UnfinishedError, UserError
+from cavbench.core.track import track
+from cavbench.records import reading
+from cavbench.run import rounds, runner
+from cavbench.run.audit import audit_config
+from cavbench.run.config import RunConfig, run_config
+from cavbench.run.replay import repeat
+from cavbench.statistics.sequential import confidence_sequence, shown_higher
 from tests.framework.simulated_stops import SCORES, studied
 from tests.framework.test_runner import Silent, comparable
 

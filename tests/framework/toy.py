@@ -15,22 +15,9 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bench.driving import (
-    ActionType,
-    Driver,
-    DrivingAttack,
-    DrivingDefense,
-    DrivingFacts,
-    DrivingVictim,
-    DrivingWorld,
-    Features,
-    Oracle,
-    Policy,
-    PolicyWrapper,
-    State,
-)
-from bench.plugins.contracts import Access, Progress, Trained
-from bench.scenarios import Axes, Axis, Cell, Grid
+from cavbench.driving import ActionType, Driver, DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, Features, Oracle, Policy, PolicyWrapper, State
+from cavbench.core.contracts import Access, Progress, Trained
+from cavbench.scenarios import Axes, Axis, Cell, Grid
 
 FLAGS = ("crashed", "offroad")
 MEASURES = ("progress", "speed", "x", "ttc")

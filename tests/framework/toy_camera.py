@@ -11,22 +11,11 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from bench.detection import (
-    Approach,
-    CameraWorld,
-    Decoy,
-    Detector,
-    DetectorDefense,
-    DetectorVictim,
-    PatchAttack,
-    PatchOracle,
-    Predictions,
-    Scenes,
-)
-from bench.plugins.contracts import Access, Facts, Progress, Trained
-from bench.scenarios import Axes, Axis, Cell, Grid
-from bench.victims import zoo
-from envs.weather import WEATHERS
+from cavbench.detection import Approach, CameraWorld, Decoy, Detector, DetectorDefense, DetectorVictim, PatchAttack, PatchOracle, Predictions, Scenes
+from cavbench.core.contracts import Access, Facts, Progress, Trained
+from cavbench.scenarios import Axes, Axis, Cell, Grid
+from cavbench import zoo
+from cavbench.envs.weather import WEATHERS
 
 SIDE, SIGN = 32, slice(8, 24)
 """Side of the images, and the range of the sign in both directions, in pixels."""

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bench.plugins.contracts import Access, Attack, Facts, ThreatModel, Victim, World
-from bench.plugins.ranges import Natural
-from bench.plugins.track import Driven, Job, Measure, Track
-from bench.records.schema import FLOAT, field
-from bench.scenarios import Axes, Axis, Grid
+from cavbench.core.contracts import Access, Attack, Facts, ThreatModel, Victim, World
+from cavbench.core.ranges import Natural
+from cavbench.core.track import Driven, Job, Measure, Track
+from cavbench.records.schema import FLOAT, field
+from cavbench.scenarios import Axes, Axis, Grid
 
 AXES = Axes(
     (

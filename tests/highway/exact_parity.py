@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.highway.axes import AXES
-from envs.highway.config import THESIS_TARGET_SPEEDS, HighwayConfig
-from envs.highway.engine import HighwayEngine
-from envs.highway.reference import SensedHighwayEnv
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.config import THESIS_TARGET_SPEEDS, HighwayConfig
+from cavbench.envs.highway.engine import HighwayEngine
+from cavbench.envs.highway.reference import SensedHighwayEnv
 from tests.highway.side_by_side import STATE, Case, Chooser, compare, continuous, differences, discrete, state_of
 
 ANY = discrete(0, 1, 2, 3, 4)

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from bench.driving import DrivingWorld, Features
-from envs.highway.axes import AXES
-from envs.highway.config import STANDARD_FEATURES, THESIS_FEATURES, HighwayConfig
-from envs.highway.world import HighwayWorld
+from cavbench.driving import DrivingWorld, Features
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.config import STANDARD_FEATURES, THESIS_FEATURES, HighwayConfig
+from cavbench.envs.highway.world import HighwayWorld
 
 ROOT = Path(__file__).parents[2]
 
@@ -83,8 +83,8 @@ def test_the_engine_runs_without_a_writable_cache() -> None:
         "import numba.core.caching as caching\n"
         # As on a read-only installation without a home: numba finds nowhere to write.
         "for locator in caching.CacheImpl._locator_classes: locator.from_function = classmethod(lambda *a: None)\n"
-        "from envs.highway.world import HighwayWorld\n"
-        "from envs.highway.axes import AXES\n"
+        "from cavbench.envs.highway.world import HighwayWorld\n"
+        "from cavbench.envs.highway.axes import AXES\n"
         "env = HighwayWorld().make([AXES.cell(lanes=3, density=1.0)])\n"
         "print(env.rollout(3)['next', 'reward'].shape)\n"
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from numpy._core._multiarray_umath import __cpu_dispatch__ as numpy_kernels  # type: ignore[attr-defined]
 
-from envs.highway.axes import AXES
+from cavbench.envs.highway.axes import AXES
 from tests.highway.side_by_side import Case, compare, differences, discrete
 
 ROOT = Path(__file__).parents[2]

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from envs.highway.axes import AXES
-from envs.highway.config import HighwayConfig
-from envs.highway.engine import HighwayEngine
-from envs.highway.sensor import add_noise, noise_sigma, sensor_range_m
-from envs.weather import WEATHERS, Weather
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.config import HighwayConfig
+from cavbench.envs.highway.engine import HighwayEngine
+from cavbench.envs.highway.sensor import add_noise, noise_sigma, sensor_range_m
+from cavbench.envs.weather import WEATHERS, Weather
 
 visibilities = st.floats(10, 1e6)
 rains = st.floats(0, 150)

@@ -10,7 +10,7 @@ import pytest
 from full_house import write as write_records
 from rich.console import Console
 
-from leaderboard.page.write import write as write_page
+from cavbench.leaderboard.page.write import write as write_page
 
 
 @pytest.fixture(scope="session")

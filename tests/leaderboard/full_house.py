@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from synthetic import CLEAR, approach, baseline_drivers, drive, probed
 
-from bench.records.store import FOLDER
+from cavbench.records.store import FOLDER
 
 SEEN = {"redrawn": 0.0, "same_answer": 0.2}
 PGD = {"queries": 45.0, "gradient_queries": 44.0, "zero_gradients": 0.0}

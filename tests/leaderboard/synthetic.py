@@ -10,14 +10,14 @@ from datetime import UTC, datetime
 import numpy as np
 import pyarrow as pa
 
-from bench.plugins.contracts import Facts
-from bench.plugins.pair import choose
-from bench.plugins.track import track
-from bench.records.schema import schema
-from bench.scenarios import Cell, Grid
-from bench.statistics.episodes import as_text
-from envs.camera.axes import APPROACH_V1
-from envs.highway.axes import STANDARD_V1
+from cavbench.core.contracts import Facts
+from cavbench.core.pair import choose
+from cavbench.core.track import track
+from cavbench.records.schema import schema
+from cavbench.scenarios import Cell, Grid
+from cavbench.statistics.episodes import as_text
+from cavbench.envs.camera.axes import APPROACH_V1
+from cavbench.envs.highway.axes import STANDARD_V1
 
 FEATURES = {"names": ["x", "vx"], "units": ["m", "m/s"], "floors": [0.5, 0.3]}
 CLEAR = tuple(cell for cell in STANDARD_V1.cells() if cell.weather == "clear")

@@ -11,14 +11,14 @@ import pytest
 from rich.console import Console
 from synthetic import approach, probed
 
-from bench.plugins.pair import choose
-from bench.plugins.track import track
-from envs.camera.axes import APPROACH_V1
-from leaderboard.comparisons.comparison import parameters
-from leaderboard.published import published
-from leaderboard.ranking.boards import read_boards
-from leaderboard.terminal.run import run_report
-from leaderboard.thesis.patch_records import usual_crafting
+from cavbench.core.pair import choose
+from cavbench.core.track import track
+from cavbench.envs.camera.axes import APPROACH_V1
+from cavbench.leaderboard.comparisons.comparison import parameters
+from cavbench.leaderboard.published import published
+from cavbench.leaderboard.ranking.boards import read_boards
+from cavbench.leaderboard.terminal.run import run_report
+from cavbench.leaderboard.thesis.patch_records import usual_crafting
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 160])

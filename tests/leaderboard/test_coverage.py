@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from bench.statistics.independent import independent
+from cavbench.statistics.independent import independent
 from tests.leaderboard.simulated_studies import BAD, DESIGNS, EQUAL, STUDIES, called_different, coverage
 
 COUNT, FEWER = 150, 50

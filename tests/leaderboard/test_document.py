@@ -18,23 +18,23 @@ from full_house import driving
 from synthetic import CLEAR, drive
 from typer.main import get_command
 
-from bench.cli.main import app
-from bench.cli.words import split
-from bench.errors import UserError
-from bench.plugins.pair import choose
-from bench.plugins.track import tracks
-from bench.records import reading
-from bench.run.config import run_config
-from bench.scenarios import Cell
-from bench.statistics.episodes import as_text
-from leaderboard.comparisons.naming import labels, varying
-from leaderboard.comparisons.reading import measurements, read_tracks
-from leaderboard.page.cards import run_command
-from leaderboard.page.document import document, schema
-from leaderboard.page.table import CSV
-from leaderboard.page.write import NAME, write
-from leaderboard.ranking.boards import read_boards
-from leaderboard.ranking.flags import FLAGS
+from cavbench.cli.main import app
+from cavbench.cli.words import split
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
+from cavbench.core.track import tracks
+from cavbench.records import reading
+from cavbench.run.config import run_config
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import as_text
+from cavbench.leaderboard.comparisons.naming import labels, varying
+from cavbench.leaderboard.comparisons.reading import measurements, read_tracks
+from cavbench.leaderboard.page.cards import run_command
+from cavbench.leaderboard.page.document import document, schema
+from cavbench.leaderboard.page.table import CSV
+from cavbench.leaderboard.page.write import NAME, write
+from cavbench.leaderboard.ranking.boards import read_boards
+from cavbench.leaderboard.ranking.flags import FLAGS
 
 
 def test_the_document_keeps_to_its_schema(site: Path) -> None:

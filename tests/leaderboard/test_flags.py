@@ -8,10 +8,10 @@ import pytest
 from full_house import PGD, SEEN
 from synthetic import CLEAR, approach, baseline_drivers, drive, probed
 
-from envs.highway.axes import STANDARD_V1
-from leaderboard.comparisons.reading import read_tracks
-from leaderboard.ranking.boards import Board, boards
-from leaderboard.ranking.flags import FLAGS, Flag
+from cavbench.envs.highway.axes import STANDARD_V1
+from cavbench.leaderboard.comparisons.reading import read_tracks
+from cavbench.leaderboard.ranking.boards import Board, boards
+from cavbench.leaderboard.ranking.flags import FLAGS, Flag
 
 HALF = CLEAR[:3]
 

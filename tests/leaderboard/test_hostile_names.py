@@ -12,14 +12,14 @@ import pytest
 from rich.text import Text
 from synthetic import CLEAR, drive
 
-from bench.cli import main as cli
-from bench.cli.terminal import Console
-from bench.plugins.track import track
-from bench.records import reading, store
-from leaderboard.page.document import document
-from leaderboard.page.table import table
-from leaderboard.page.write import html
-from leaderboard.ranking.boards import read_boards
+from cavbench.cli import main as cli
+from cavbench.cli.terminal import Console
+from cavbench.core.track import track
+from cavbench.records import reading, store
+from cavbench.leaderboard.page.document import document
+from cavbench.leaderboard.page.table import table
+from cavbench.leaderboard.page.write import html
+from cavbench.leaderboard.ranking.boards import read_boards
 
 FORMULA, ESCAPE = "=cmd|' /C calc'!A0", "\x1b[2J\x1b]0;owned\x07\u202egnp\x9b31m<script>alert(1)</script>"
 OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")

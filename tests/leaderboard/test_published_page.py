@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 import leaderboard
-from leaderboard.terminal.ranking import leaderboard_report
+from cavbench.leaderboard.terminal.ranking import leaderboard_report
 
 MADE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d\+00:00)?")
 NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
@@ -23,8 +23,8 @@ NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
 
 SCRIPT = (
     "import sys; from io import StringIO; from pathlib import Path; from rich.console import Console\n"
-    "from bench.plugins.track import track; from leaderboard.published import published\n"
-    "from leaderboard.page.write import write; from leaderboard.terminal.run import run_report\n"
+    "from cavbench.core.track import track; from cavbench.leaderboard.published import published\n"
+    "from cavbench.leaderboard.page.write import write; from cavbench.leaderboard.terminal.run import run_report\n"
     "if __name__ == '__main__':\n"
     "    write(None, Path(sys.argv[1]), Console(quiet=True))\n"
     "    records = published(track('detection'))\n"

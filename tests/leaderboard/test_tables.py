@@ -13,18 +13,18 @@ import pytest
 from rich.console import Console
 from synthetic import CLEAR, baseline_drivers, drive
 
-from bench.plugins.track import track
-from bench.records.schema import schema
-from bench.scenarios import Cell
-from bench.statistics.episodes import as_text
-from bench.statistics.estimates import Interval
-from bench.tracks.driving import BEST_BLIND
-from envs.highway.axes import STANDARD_V1
-from leaderboard.comparisons.comparison import Comparison
-from leaderboard.comparisons.reading import read_comparisons
-from leaderboard.ranking.boards import read_boards
-from leaderboard.terminal.run import SCREEN, cells_report, remarks, run_report
-from leaderboard.terminal.text import CLEAN, estimate, strip, threat
+from cavbench.core.track import track
+from cavbench.records.schema import schema
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import as_text
+from cavbench.statistics.estimates import Interval
+from cavbench.driving.track import BEST_BLIND
+from cavbench.envs.highway.axes import STANDARD_V1
+from cavbench.leaderboard.comparisons.comparison import Comparison
+from cavbench.leaderboard.comparisons.reading import read_comparisons
+from cavbench.leaderboard.ranking.boards import read_boards
+from cavbench.leaderboard.terminal.run import SCREEN, cells_report, remarks, run_report
+from cavbench.leaderboard.terminal.text import CLEAN, estimate, strip, threat
 
 SCHEMA = schema(track("driving"))
 ZO = {"objective": "expected", "steps": 50}

@@ -18,14 +18,14 @@ import pyarrow.parquet as pq
 import pytest
 from synthetic import baseline_drivers, drive, table
 
-from bench.plugins import registry
-from bench.plugins.contracts import Facts
-from bench.plugins.track import track
-from bench.records.schema import schema
-from bench.records.store import FOLDER
-from bench.scenarios import Axes, Axis, Cell, Grid
-from bench.statistics.episodes import as_text
-from leaderboard.page.document import schema as document_schema
+from cavbench.core import registry
+from cavbench.core.contracts import Facts
+from cavbench.core.track import track
+from cavbench.records.schema import schema
+from cavbench.records.store import FOLDER
+from cavbench.scenarios import Axes, Axis, Cell, Grid
+from cavbench.statistics.episodes import as_text
+from cavbench.leaderboard.page.document import schema as document_schema
 from tests.framework.distributions import install
 
 AXES = Axes(
@@ -107,7 +107,7 @@ def results(plugin: Path, tmp_path: Path) -> Path:
 
 def bench(plugin: Path, *words: str) -> str:
     """The command line as a process of its own, with the plug-in installed."""
-    script = "import sys; sys.path.insert(0, sys.argv.pop(1)); from bench.cli.main import main; main()"
+    script = "import sys; sys.path.insert(0, sys.argv.pop(1)); from cavbench.cli.main import main; main()"
     done = subprocess.run(
         [sys.executable, "-c", script, str(plugin), *words], capture_output=True, text=True, timeout=120
     )
@@ -166,7 +166,7 @@ def test_another_world_of_a_known_track_brings_its_axes(tmp_path: Path, capsys: 
     """The baselines stand for every weather only where a world has weather."""
     from rich.console import Console
 
-    from leaderboard.terminal.run import cells_report, run_report
+    from cavbench.leaderboard.terminal.run import cells_report, run_report
 
     cells = [Cell(lanes=3, density=1.0, weather="clear")]
     made = pa.concat_tables([drive(cells=cells), drive(attack="zo", cells=cells), baseline_drivers(cells)])

@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import pyarrow as pa
 
-from bench.plugins.track import Driven, Job, Measure, Track
-from bench.records.schema import FLOAT, field
+from cavbench.core.track import Driven, Job, Measure, Track
+from cavbench.records.schema import FLOAT, field
 
 
 class BalancingTrack(Track):

@@ -19,8 +19,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-import bench
-from bench.cli import main as cli
+import cavbench
+from cavbench.cli import main as cli
 from tests.framework.conftest import Said, ran, started
 from tests.soak.bad_inputs import bad_inputs
 from tests.soak.subjects import RUN, SUBJECTS, Condition
@@ -85,7 +85,7 @@ def bad_input(site: Path, place: Path) -> str:
 
     They run in copies of one process that has imported everything; every twentieth also in a new one, which must say the same.
     """
-    for module in pkgutil.walk_packages(bench.__path__, "bench."):
+    for module in pkgutil.walk_packages(cavbench.__path__, "bench."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     wrong, other = [], 0

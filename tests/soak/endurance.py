@@ -7,7 +7,7 @@ from pathlib import Path
 
 import psutil
 
-from bench.records.packing import units_in
+from cavbench.records.packing import units_in
 from tests.framework.conftest import started
 from tests.soak.subjects import RUN
 

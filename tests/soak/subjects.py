@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from bench.plugins.track import tracks
+from cavbench.core.track import tracks
 
 RUN = (
     *(

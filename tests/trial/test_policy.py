@@ -12,17 +12,17 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 import cavbench
-from bench.api.scoring import _Silent
-from bench.driving import PolicyWrapper, State
-from bench.errors import UserError
-from bench.plugins.pair import choose
-from bench.plugins.track import track
-from bench.run import runner
-from bench.run.config import run_config
-from bench.trial.policy import try_policy
-from bench.victims.drivers.from_file import FilePolicy
-from envs.highway.axes import AXES
-from envs.highway.world import HighwayWorld
+from cavbench.api.scoring import _Silent
+from cavbench.driving import PolicyWrapper, State
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
+from cavbench.core.track import track
+from cavbench.run import runner
+from cavbench.run.config import run_config
+from cavbench.driving.trial import try_policy
+from cavbench.driving.victims.from_file import FilePolicy
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.world import HighwayWorld
 
 WORLD = HighwayWorld()
 CELLS = (AXES.cell(lanes=3, density=1.0, weather="clear"), AXES.cell(lanes=4, density=2.0, weather="fog"))

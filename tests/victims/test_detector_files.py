@@ -13,19 +13,19 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from attacks.square_patch import SquarePatch
-from bench.conformance import complaints
-from bench.detection import Detector, PatchThreat
-from bench.detection.crafting import craft
-from bench.detection.sight import look
-from bench.errors import UserError
-from bench.plugins.pair import choose
-from bench.run.config import component, run_config
-from bench.victims.detectors.file_network import DEVIATION, GREY, MEAN, FileDetector, Input, Order, Output, Scaling
-from bench.victims.detectors.layout import Layout, layout_of, split
-from bench.victims.files.torch_operations import operation
-from bench.victims.files.trial import RefusedError
-from envs.camera.world import StopSignApproach
+from cavbench.attacks.detection.square_patch import SquarePatch
+from cavbench.checks import complaints
+from cavbench.detection import Detector, PatchThreat
+from cavbench.detection.crafting import craft
+from cavbench.detection.sight import look
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
+from cavbench.run.config import component, run_config
+from cavbench.detection.victims.file_network import DEVIATION, GREY, MEAN, FileDetector, Input, Order, Output, Scaling
+from cavbench.detection.victims.layout import Layout, layout_of, split
+from cavbench.formats.torch_operations import operation
+from cavbench.formats.trial import RefusedError
+from cavbench.envs.camera.world import StopSignApproach
 from tests.framework.toy_camera import RedScenes
 
 FACTS = StopSignApproach().facts

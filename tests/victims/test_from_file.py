@@ -18,15 +18,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from bench.conformance import complaints
-from bench.driving.drive import drive
-from bench.driving.rollout import Columns
-from bench.errors import UserError
-from bench.plugins.pair import choose
-from bench.run.config import run_config
-from bench.run.plan import plan
-from bench.victims.drivers.in_process import in_process
-from envs.highway.world import HighwayWorld
+from cavbench.checks import complaints
+from cavbench.driving.drive import drive
+from cavbench.driving.rollout import Columns
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
+from cavbench.driving.victims.in_process import in_process
+from cavbench.envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts
 
@@ -375,7 +375,7 @@ class Softer(nn.ReLU):
 
 @pytest.mark.parametrize("what", BAD)
 def test_a_file_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
-    from bench.run.config import component
+    from cavbench.run.config import component
 
     name, make, part = BAD[what]
     with pytest.raises(UserError) as raised:

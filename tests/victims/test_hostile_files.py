@@ -20,15 +20,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from bench.archive import Archive
-from bench.driving import DrivingFacts
-from bench.errors import UserError
-from bench.run.config import component
-from bench.victims.detectors import yolov5_file
-from bench.victims.drivers.from_file import FileDriver, FilePolicy
-from bench.victims.files.torch_operations import operation
-from bench.victims.files.trial import RefusedError
-from envs.highway.world import HighwayWorld
+from cavbench.archive import Archive
+from cavbench.driving import DrivingFacts
+from cavbench.errors import UserError
+from cavbench.run.config import component
+from cavbench.detection.victims import yolov5_file
+from cavbench.driving.victims.from_file import FileDriver, FilePolicy
+from cavbench.formats.torch_operations import operation
+from cavbench.formats.trial import RefusedError
+from cavbench.envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts
 Members = dict[str, bytes]

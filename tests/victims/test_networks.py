@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.driving import Policy
-from bench.victims.drivers.logits import SoftPolicy
-from bench.victims.drivers.networks import ActorPolicy, QPolicy
+from cavbench.driving import Policy
+from cavbench.driving.victims.logits import SoftPolicy
+from cavbench.driving.victims.networks import ActorPolicy, QPolicy
 
 
 def observation(batch: tuple[int, ...], seed: int = 0) -> Tensor:

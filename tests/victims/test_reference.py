@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.driving import DrivingFacts, ObservationThreat, Policy
-from bench.driving.meter import Columns
-from bench.driving.rollout import rollout
-from bench.errors import UserError
-from bench.scenarios import SeedBlock
-from bench.victims.drivers.reference import Blind, IDMDriver, OracleDriver, RandomDriver
-from envs.highway.world import HighwayWorld
+from cavbench.driving import DrivingFacts, ObservationThreat, Policy
+from cavbench.driving.meter import Columns
+from cavbench.driving.rollout import rollout
+from cavbench.errors import UserError
+from cavbench.scenarios import SeedBlock
+from cavbench.driving.victims.reference import Blind, IDMDriver, OracleDriver, RandomDriver
+from cavbench.envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts
 LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)

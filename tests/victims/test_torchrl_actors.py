@@ -29,9 +29,9 @@ from torchrl.modules import (
     TanhNormal,
 )
 
-from bench.errors import UserError
-from bench.victims.drivers.in_process import in_process
-from envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
+from cavbench.driving.victims.in_process import in_process
+from cavbench.envs.highway.world import HighwayWorld
 
 FACTS = HighwayWorld().facts
 SHOWN = torch.rand(6, 10, 5, generator=torch.Generator().manual_seed(0)) * 2 - 1
@@ -114,7 +114,7 @@ REFUSED: dict[str, tuple[Callable[[], nn.Module], str]] = {
     ),
     "a memory": (
         lambda: LSTMModule(input_size=50, hidden_size=5, in_key="observation", out_key="logits"),
-        "a recurrent policy is a bench.driving.Policy with `initial` and `advance`",
+        "a recurrent policy is a cavbench.driving.Policy with `initial` and `advance`",
     ),
     "nothing of an action": (
         lambda: module(network(4, NormalParamExtractor()), "loc", "scale"),

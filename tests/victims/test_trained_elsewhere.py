@@ -15,14 +15,14 @@ import torch
 from torch import Tensor, nn
 
 import cavbench
-from bench.driving import DrivingFacts
-from bench.errors import UserError
-from bench.plugins.pair import choose
-from bench.plugins.parameters import parameters
-from bench.run import runner
-from bench.run.config import run_config
-from bench.victims.drivers.in_process import in_process
-from envs.highway.world import HighwayWorld
+from cavbench.driving import DrivingFacts
+from cavbench.errors import UserError
+from cavbench.core.pair import choose
+from cavbench.core.parameters import parameters
+from cavbench.run import runner
+from cavbench.run.config import run_config
+from cavbench.driving.victims.in_process import in_process
+from cavbench.envs.highway.world import HighwayWorld
 from tests.victims.test_from_file import saved, sb3_model, spaces
 
 sb3 = pytest.importorskip("stable_baselines3")
@@ -161,7 +161,7 @@ def test_a_wrapper_that_skips_frames_or_is_not_known_is_never_said_to_be_the_wor
 
 def test_an_environment_with_another_configuration_is_another_world() -> None:
     pytest.importorskip("highway_env")
-    from bench.victims.drivers.sb3_environment import chain
+    from cavbench.driving.victims.sb3_environment import chain
 
     own = chain(gymnasium.make("highway-fast-v0"))
     for options, said in (

@@ -12,22 +12,22 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.driving import DrivingWorld, Policy, State, TrainingHooks
-from bench.errors import UserError
-from bench.plugins import registry
-from bench.victims import zoo
-from bench.victims.drivers.attack_mix import AttackMix
-from bench.victims.drivers.behind import Guard, GuardedPractice, defense_of
-from bench.victims.drivers.ddpg import DDPG
-from bench.victims.drivers.dqn import DQN
-from bench.victims.drivers.learner import CHUNK
-from bench.victims.drivers.logits import SoftPolicy
-from bench.victims.drivers.networks import ActorPolicy, QPolicy
-from bench.victims.drivers.ppo import PPO
-from bench.victims.drivers.practice import ALLOWED, Practice, roads
-from bench.victims.drivers.sac import SAC
-from bench.victims.drivers.training import LearningDriver
-from defenses.advtrain import AdversarialTraining, AttackInLoop
+from cavbench.driving import DrivingWorld, Policy, State, TrainingHooks
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench import zoo
+from cavbench.driving.victims.attack_mix import AttackMix
+from cavbench.driving.victims.behind import Guard, GuardedPractice, defense_of
+from cavbench.driving.victims.ddpg import DDPG
+from cavbench.driving.victims.dqn import DQN
+from cavbench.driving.victims.learner import CHUNK
+from cavbench.driving.victims.logits import SoftPolicy
+from cavbench.driving.victims.networks import ActorPolicy, QPolicy
+from cavbench.driving.victims.ppo import PPO
+from cavbench.driving.victims.practice import ALLOWED, Practice, roads
+from cavbench.driving.victims.sac import SAC
+from cavbench.driving.victims.training import LearningDriver
+from cavbench.defenses.driving.advtrain import AdversarialTraining, AttackInLoop
 
 SHORT = {"decisions": 160, "copies": 1, "hidden": 8, "batch": 16, "memory": 2000, "checkpoints": 1}
 VICTIMS = [DQN(**SHORT), DDPG(**SHORT)]

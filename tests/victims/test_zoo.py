@@ -12,20 +12,20 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from bench.detection import CameraWorld
-from bench.driving import DrivingWorld
-from bench.errors import UserError
-from bench.plugins import registry
-from bench.plugins.fingerprint import sources
-from bench.plugins.track import track
-from bench.run.config import run_config, train_config
-from bench.victims import zoo
-from bench.victims.detectors.yolov5 import YOLOv5, YOLOv5Network
-from bench.victims.drivers.ddpg import DDPG
-from bench.victims.drivers.dqn import DQN
-from bench.victims.drivers.networks import QPolicy
-from bench.victims.zoo.store import SHIPPED
-from defenses.advtrain import AdversarialTraining
+from cavbench.detection import CameraWorld
+from cavbench.driving import DrivingWorld
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench.identity.fingerprint import sources
+from cavbench.core.track import track
+from cavbench.run.config import run_config, train_config
+from cavbench import zoo
+from cavbench.detection.victims.yolov5 import YOLOv5, YOLOv5Network
+from cavbench.driving.victims.ddpg import DDPG
+from cavbench.driving.victims.dqn import DQN
+from cavbench.driving.victims.networks import QPolicy
+from cavbench.zoo.store import SHIPPED
+from cavbench.defenses.driving.advtrain import AdversarialTraining
 
 TINY = DQN(hidden=8)
 RECIPE = zoo.Recipe.of(TINY)
@@ -120,7 +120,7 @@ SlowDQN.__qualname__ = "DQN"
 def as_of_bench(recipe: zoo.Recipe) -> zoo.Recipe:
     """The recipe of a test class as if it were part of bench."""
     (part,) = recipe.parts
-    return replace(recipe, parts=(replace(part, source="bench.DQN"),))
+    return replace(recipe, parts=(replace(part, source="cavbench.DQN"),))
 
 
 def test_a_new_parameter_with_a_default_refuses_no_shipped_policy(home: Path) -> None:
@@ -243,8 +243,8 @@ def test_a_card_is_enough_to_train_the_policy_again(home: Path, highway: Driving
 
 
 def test_the_zoo_depends_on_no_track() -> None:
-    found = sources(["bench.victims.zoo.store"])
-    assert not [name for name in found if name.startswith(("bench.driving", "bench.detection"))]
+    found = sources(["cavbench.zoo.store"])
+    assert not [name for name in found if name.startswith(("cavbench.driving", "cavbench.detection"))]
 
 
 def test_a_detector_is_stored_in_half_precision(home: Path) -> None:

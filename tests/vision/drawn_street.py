@@ -8,10 +8,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from bench.detection import Approach, CameraWorld, Scenes
-from bench.scenarios import Axes, Cell, Grid
-from envs.camera.axes import AXES
-from envs.weather import WEATHERS
+from cavbench.detection import Approach, CameraWorld, Scenes
+from cavbench.scenarios import Axes, Cell, Grid
+from cavbench.envs.camera.axes import AXES
+from cavbench.envs.weather import WEATHERS
 from tests.vision.pictures import stop_sign
 
 DRAWN_V1 = Grid(

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from bench.detection import Predictions, stopping
-from bench.detection.approach import false_alarms, measure
-from bench.detection.sight import candidates_of, look
+from cavbench.detection import Predictions, stopping
+from cavbench.detection.approach import false_alarms, measure
+from cavbench.detection.sight import candidates_of, look
 from tests.framework.toy_camera import RedDetector, RedScenes
 
 DISTANCE = np.linspace(30, 8, 10)

@@ -11,14 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.detection import PatchAttack, PatchOracle, Predictions, Scenes
-from bench.detection.approach import probed
-from bench.detection.crafting import craft
-from bench.detection.scenes import Approach
-from bench.detection.sight import look
-from bench.detection.threat import PatchThreat
-from bench.plugins.contracts import Access, Progress
-from bench.trust.watch import TamperError
+from cavbench.detection import PatchAttack, PatchOracle, Predictions, Scenes
+from cavbench.detection.approach import probed
+from cavbench.detection.crafting import craft
+from cavbench.detection.scenes import Approach
+from cavbench.detection.sight import look
+from cavbench.detection.threat import PatchThreat
+from cavbench.core.contracts import Access, Progress
+from cavbench.isolation.watch import TamperError
 from tests.framework.toy_camera import RedDetector, RedScenes
 
 

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import average_precision_score
 
-from bench.detection import Detections, Predictions
-from bench.detection.boxes import best_other
-from bench.detection.discrimination import discrimination, if_visible
-from bench.detection.precision import average_precision, precision_of_approach
-from bench.detection.sight import Sight, look, look_at_decoys
+from cavbench.detection import Detections, Predictions
+from cavbench.detection.boxes import best_other
+from cavbench.detection.discrimination import discrimination, if_visible
+from cavbench.detection.precision import average_precision, precision_of_approach
+from cavbench.detection.sight import Sight, look, look_at_decoys
 from tests.framework.toy_camera import RedDetector, RedScenes, StopEverywhere
 
 DETECTED = st.lists(st.tuples(st.sampled_from(np.linspace(0, 1, 6).tolist()), st.booleans()), max_size=30)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.detection import Predictions
-from bench.detection.boxes import detections
-from bench.victims.detectors.loss import complete_overlap, missed, mistaken, supervised, unlike
+from cavbench.detection import Predictions
+from cavbench.detection.boxes import detections
+from cavbench.detection.victims.loss import complete_overlap, missed, mistaken, supervised, unlike
 
 BOXES = torch.tensor([[10.0, 10.0, 40.0, 40.0], [50.0, 20.0, 70.0, 60.0]])
 LABELS = torch.tensor([1, 0])

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.detection import Detector, Predictions
-from bench.detection.boxes import confidence, detections, overlap
-from bench.errors import UserError
+from cavbench.detection import Detector, Predictions
+from cavbench.detection.boxes import confidence, detections, overlap
+from cavbench.errors import UserError
 
 relaxed = settings(deadline=None)
 LENGTH = st.integers(0, 12)

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.victims.detectors import fcos
-from bench.victims.detectors.fcos import FCOSNetwork, Raw
+from cavbench.detection.victims import fcos
+from cavbench.detection.victims.fcos import FCOSNetwork, Raw
 
 SIDE = 128
 

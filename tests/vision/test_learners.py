@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.detection import STOP_SIGN, Detector
-from bench.detection.approach import score
-from bench.errors import UserError
-from bench.victims import zoo
-from bench.victims.detectors.examples import Examples
-from bench.victims.detectors.fcos import FCOS
-from bench.victims.detectors.learner import Learner
-from bench.victims.detectors.rcnn import RCNN
-from bench.victims.detectors.windows import Windows
-from bench.victims.detectors.yolov5 import YOLOv5
-from envs.camera.axes import AXES
-from envs.camera.world import StopSignApproach
+from cavbench.detection import STOP_SIGN, Detector
+from cavbench.detection.approach import score
+from cavbench.errors import UserError
+from cavbench import zoo
+from cavbench.detection.victims.examples import Examples
+from cavbench.detection.victims.fcos import FCOS
+from cavbench.detection.victims.learner import Learner
+from cavbench.detection.victims.rcnn import RCNN
+from cavbench.detection.victims.windows import Windows
+from cavbench.detection.victims.yolov5 import YOLOv5
+from cavbench.envs.camera.axes import AXES
+from cavbench.envs.camera.world import StopSignApproach
 from tests.vision.drawn_street import DrawnStreet
 
 FACTS = StopSignApproach().facts

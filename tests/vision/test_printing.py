@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from attacks.eot import EOT
-from bench.detection import PatchThreat
-from bench.detection.colour import linear, srgb
-from bench.detection.enforcer import PatchEnforcer
-from bench.detection.printing import LEAST, MOST, inks, non_printability, printed, triplets
+from cavbench.attacks.detection.eot import EOT
+from cavbench.detection import PatchThreat
+from cavbench.detection.colour import linear, srgb
+from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.detection.printing import LEAST, MOST, inks, non_printability, printed, triplets
 from tests.framework.toy_camera import RedDetector, RedScenes
 
 COLOURS = arrays(np.float32, (3, 8, 8), elements=st.floats(0, 1, width=32))

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.victims.detectors import rcnn
-from bench.victims.detectors.examples import Example
-from bench.victims.detectors.rcnn import CROP, LEARNT, LEARNT_OBJECTS, MAPS, PROPOSALS, RCNNNetwork, Seen
+from cavbench.detection.victims import rcnn
+from cavbench.detection.victims.examples import Example
+from cavbench.detection.victims.rcnn import CROP, LEARNT, LEARNT_OBJECTS, MAPS, PROPOSALS, RCNNNetwork, Seen
 
 NAMES = ("stop sign", "car")
 NOTHING = len(NAMES)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bench.detection import STOP_SIGN
-from bench.victims.detectors.windows import Views, Windows
+from cavbench.detection import STOP_SIGN
+from cavbench.detection.victims.windows import Views, Windows
 from tests.vision.drawn_street import DrawnStreet
 
 SIDE = 128

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import nn
 
-from bench.detection import Detector
-from bench.victims.detectors import yolo
-from bench.victims.detectors.yolov3_tiny import YOLOv3TinyNetwork
-from bench.victims.detectors.yolov5 import YOLOv5Network
+from cavbench.detection import Detector
+from cavbench.detection.victims import yolo
+from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
+from cavbench.detection.victims.yolov5 import YOLOv5Network
 
 ANCHORS = {
     "yolov3_tiny": {32: ((81, 82), (135, 169), (344, 319)), 16: ((23, 27), (37, 58), (81, 82))},

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bench.driving.features import Features
-from bench.driving.threat import Norm
+from cavbench.driving.features import Features
+from cavbench.driving.threat import Norm
 
 ALONG = ("x", "vx")
 """The features along the road."""
@@ -34,7 +34,7 @@ class Assumed:
 
     Args:
         features: names, ranges and floors of the measured features.
-        norm: kind of the set, as in `bench.driving.ObservationThreat`.
+        norm: kind of the set, as in `cavbench.driving.ObservationThreat`.
         budget: its size.
         noise: by how much the sensor may besides be wrong about where along the road another car is, and how fast, in m and
             m/s, at least 0.

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bench.driving.intervals.ego import DeadReckoning, Ego
-from bench.driving.intervals.following import FollowingDistance
-from bench.driving.intervals.kernels import FREE
-from bench.driving.intervals.rooms import Cars, Caution, Rooms
+from cavbench.driving.intervals.ego import DeadReckoning, Ego
+from cavbench.driving.intervals.following import FollowingDistance
+from cavbench.driving.intervals.kernels import FREE
+from cavbench.driving.intervals.rooms import Cars, Caution, Rooms
 
 LEVELS = 9
 """Number of accelerations for which margins are computed; between them they are interpolated."""

@@ -8,9 +8,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.driving.features import ActionType
-from bench.driving.intervals.boxes import Boxes
-from bench.driving.kinematics import Kinematics
+from cavbench.driving.features import ActionType
+from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.kinematics import Kinematics
 
 UNKNOWN_EDGE = 64
 """The rightmost lane, as long as the car has not found it by steering towards a lane that does not exist."""

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.driving.intervals.kernels import FASTEST, HARDEST, LEVELS_PER_UNIT, STEP
-from bench.driving.kinematics import Kinematics
+from cavbench.driving.intervals.kernels import FASTEST, HARDEST, LEVELS_PER_UNIT, STEP
+from cavbench.driving.kinematics import Kinematics
 
 LASTING_S = 8.0
 """Seconds after which two cars have the same speed."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import entry_point, inner
+from cavbench.compiled import entry_point, inner
 
 FREE = 200.0
 """The room where there is no car, in m."""
@@ -43,7 +43,7 @@ class Rules(NamedTuple):
         width: of a car, and `CLEARANCE`.
         lane_width: of a lane.
         braking: least rate at which a car ahead may brake.
-        acceleration, jam_distance, time_gap, free_share: of the car-following model, `bench.driving.kinematics.CarFollowing`.
+        acceleration, jam_distance, time_gap, free_share: of the car-following model, `cavbench.driving.kinematics.CarFollowing`.
         scale: the divisor in its desired gap.
         steady: number of the option that keeps the speed.
         delay: time constant in s with which the ego slows down.

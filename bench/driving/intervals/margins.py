@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bench.driving.intervals.ego import UNKNOWN_EDGE, DeadReckoning, Ego
-from bench.driving.intervals.following import Case, FollowingDistance
-from bench.driving.intervals.kernels import FREE
-from bench.driving.intervals.rooms import Cars, Caution, Rooms
+from cavbench.driving.intervals.ego import UNKNOWN_EDGE, DeadReckoning, Ego
+from cavbench.driving.intervals.following import Case, FollowingDistance
+from cavbench.driving.intervals.kernels import FREE
+from cavbench.driving.intervals.rooms import Cars, Caution, Rooms
 
 CLEARING_M, CLEARING_S = 2.4, 0.6
 """The ego has left its lane when it has moved this far to the side, in m, and needs this time for it, in s."""

@@ -9,12 +9,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bench.driving.features import ActionType, DrivingFacts
-from bench.driving.intervals.boxes import Assumed, Boxes
-from bench.driving.intervals.ego import DeadReckoning, Ego
-from bench.driving.policy import Passed, Policy, State
-from bench.driving.threat import Norm
-from bench.errors import UserError
+from cavbench.driving.features import ActionType, DrivingFacts
+from cavbench.driving.intervals.boxes import Assumed, Boxes
+from cavbench.driving.intervals.ego import DeadReckoning, Ego
+from cavbench.driving.policy import Passed, Policy, State
+from cavbench.driving.threat import Norm
+from cavbench.errors import UserError
 
 FEATURES = ("x", "y", "vx", "vy")
 DECISIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from bench.driving.intervals import kernels
-from bench.driving.intervals.boxes import Boxes
-from bench.driving.intervals.ego import DeadReckoning, Ego
-from bench.driving.intervals.following import FollowingDistance
+from cavbench.driving.intervals import kernels
+from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.intervals.ego import DeadReckoning, Ego
+from cavbench.driving.intervals.following import FollowingDistance
 
 
 @dataclass(frozen=True, kw_only=True)

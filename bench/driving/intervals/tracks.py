@@ -6,10 +6,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from bench.driving.intervals.boxes import Boxes
-from bench.driving.intervals.ego import Ego
-from bench.driving.intervals.rooms import met
-from bench.driving.kinematics import Kinematics
+from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.intervals.ego import Ego
+from cavbench.driving.intervals.rooms import met
+from cavbench.driving.kinematics import Kinematics
 
 LONGITUDINAL, LATERAL = 6.0, 40.0
 """Largest accelerations of a car along its direction and across it, in m/s2 (of highway-env's IDMVehicle)."""

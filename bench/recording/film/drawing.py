@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from bench.recording.film.film import PAPER, Picture
+from cavbench.recording.film.film import PAPER, Picture
 
 Colour = tuple[int, int, int]
 

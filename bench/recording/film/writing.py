@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from bench.errors import UserError
-from bench.recording.film.film import Film, Picture
+from cavbench.errors import UserError
+from cavbench.recording.film.film import Film, Picture
 
 COLOURS, COLOURS_OF_PHOTOGRAPHS = 64, 256
 """Colours of a GIF."""

@@ -1,6 +1,6 @@
 """Layout of the street: the road, its surroundings, and the traffic.
 
-Coordinates as in `envs.camera.camera`: the face of the sign at y = 0, the middle of the ego's lane at x = 0.
+Coordinates as in `cavbench.envs.camera.camera`: the face of the sign at y = 0, the middle of the ego's lane at x = 0.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from bench.detection.stopping import SPEED_MPS
-from envs.camera import sign
-from envs.camera.camera import Camera
-from envs.camera.street import material as m
-from envs.camera.street import occlusion, textures
-from envs.camera.street.material import Material
-from envs.camera.street.mesh import Mesh, Rng, block, foliage, ground, join, quad, rod
-from envs.camera.street.vehicles import LENGTH, PAINTS, SHARES, Model, Part, footprint, vehicle
+from cavbench.detection.stopping import SPEED_MPS
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.camera import Camera
+from cavbench.envs.camera.street import material as m
+from cavbench.envs.camera.street import occlusion, textures
+from cavbench.envs.camera.street.material import Material
+from cavbench.envs.camera.street.mesh import Mesh, Rng, block, foliage, ground, join, quad, rod
+from cavbench.envs.camera.street.vehicles import LENGTH, PAINTS, SHARES, Model, Part, footprint, vehicle
 
 LANE_M = 2.75
 LANES_TO_THE_LEFT = 2

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.camera.street.textures import noise
-from envs.weather import Weather
+from cavbench.envs.camera.street.textures import noise
+from cavbench.envs.weather import Weather
 
 HEADLIGHTS_X = (-0.62, 0.62)
 HEADLIGHT_HEIGHT_M = 0.68

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from envs.camera.street.textures import Colour, Texture
+from cavbench.envs.camera.street.textures import Colour, Texture
 
 Kind = Literal["matt", "paving", "road", "paint", "glass", "metal", "lamp", "sign"]
 

@@ -9,9 +9,9 @@ from functools import cache
 import cv2
 import numpy as np
 
-from envs.camera import sign
-from envs.camera.camera import Array, Camera
-from envs.camera.street.vehicles import PAINTS, Model, vehicle
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.camera import Array, Camera
+from cavbench.envs.camera.street.vehicles import PAINTS, Model, vehicle
 
 FINE = 4
 """Samples along the side of a pixel."""

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.errors import notice
-from envs.camera import sign
-from envs.camera.camera import Array, Camera
-from envs.camera.street import light as lights
-from envs.camera.street.layout import lamp_heads
-from envs.camera.street.light import Light
-from envs.camera.street.material import Material
-from envs.camera.street.mesh import Mesh
-from envs.camera.street.textures import noise
-from envs.camera.street.vehicles import Part
+from cavbench.errors import notice
+from cavbench.envs.camera import sign
+from cavbench.envs.camera.camera import Array, Camera
+from cavbench.envs.camera.street import light as lights
+from cavbench.envs.camera.street.layout import lamp_heads
+from cavbench.envs.camera.street.light import Light
+from cavbench.envs.camera.street.material import Material
+from cavbench.envs.camera.street.mesh import Mesh
+from cavbench.envs.camera.street.textures import noise
+from cavbench.envs.camera.street.vehicles import Part
 
 SAMPLES, GUIDE_SAMPLES, SIGN_SAMPLES = 8, 4, 64
 """Paths a pixel for the image, for the guides of the denoiser, and for the crop of the sign."""

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from envs.camera.street import material as m
-from envs.camera.street.material import Material
-from envs.camera.street.mesh import Mesh, block, join, quad, sweep
+from cavbench.envs.camera.street import material as m
+from cavbench.envs.camera.street.material import Material
+from cavbench.envs.camera.street.mesh import Mesh, block, join, quad, sweep
 
 Part = tuple[Mesh, Material]
 Model = Literal["saloon", "hatchback", "van", "lorry"]

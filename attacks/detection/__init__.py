@@ -1,0 +1,1 @@
+"""Attacks on detectors: patches on the sign."""

@@ -1,0 +1,109 @@
+"""Reads from the source of a component which tracks it works on, without importing it."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+from dataclasses import dataclass
+from functools import cache
+
+from cavbench.core import registry
+from cavbench.core.contracts import ANY_TRACK
+from cavbench.identity.fingerprint import file_of
+from cavbench.core.registry import GROUPS, Kind
+
+
+def names(kind: Kind, track: str) -> list[str]:
+    """The components of a kind that work on a track."""
+    return [
+        name
+        for name, claims in registry.entries(GROUPS[kind]).items()
+        if any({track, ANY_TRACK} & set(tracks_of(claim.target)) for claim in claims)
+    ]
+
+
+def tracks_of(target: str) -> list[str]:
+    """The tracks of the class `module:Class` of an entry point; empty if the source does not tell.
+
+    They are the values of `track: ... = "..."` in the bodies of the class and its bases, where these can be followed by name.
+    """
+    module, _, name = target.partition(":")
+    waiting, seen, found = [(module, name)], set(), set[str]()
+    while waiting:
+        module, name = place = waiting.pop()
+        if place in seen:
+            continue
+        seen.add(place)
+        classes, imported = _top_level(module)
+        if name not in classes:
+            waiting += [imported[name]] if name in imported else []
+            continue
+        found |= classes[name].tracks
+        for parent, parent_class in classes[name].bases:
+            origin = ".".join(filter(None, imported.get(parent, (parent, "")))) if parent else module
+            waiting.append((origin, parent_class))
+    return sorted(found)
+
+
+def summary(target: str) -> str:
+    """The first sentence of the docstring of the class `module:Class` of an entry point; empty if the source has none."""
+    module, _, name = target.partition(":")
+    classes, imported = _top_level(module)
+    if name not in classes:
+        return summary(":".join(imported[name])) if name in imported and imported[name] != (module, name) else ""
+    text = " ".join(classes[name].docstring.partition("\n\n")[0].split())
+    # The end of a sentence is no full stop within brackets or of an abbreviation, which a small letter or a number follows.
+    for end in re.finditer(r"\.(?=\s+[A-Z`]|$)", text):
+        if text.count("(", 0, end.start()) == text.count(")", 0, end.start()):
+            return text[: end.start()]
+    return text
+
+
+@dataclass(frozen=True)
+class _Class:
+    """What is read of a class: its docstring, tracks, and bases as (module or alias, name); "" is the class's own module."""
+
+    docstring: str
+    tracks: frozenset[str]
+    bases: tuple[tuple[str, str], ...]
+
+    @classmethod
+    def read(cls, node: ast.ClassDef) -> _Class:
+        tracks, bases = set(), []
+        for line in node.body:
+            match line:
+                case ast.AnnAssign(target=ast.Name(id="track"), value=ast.Constant(value=str(track))):
+                    tracks.add(track)
+        for base in node.bases:
+            match base.value if isinstance(base, ast.Subscript) else base:
+                case ast.Name(id=name):
+                    bases.append(("", name))
+                case ast.Attribute(value=ast.Name(id=parent), attr=name):
+                    bases.append((parent, name))
+        return cls(ast.get_docstring(node) or "", frozenset(tracks), tuple(bases))
+
+
+@cache
+def _top_level(module: str) -> tuple[dict[str, _Class], dict[str, tuple[str, str]]]:
+    """The classes of a module, and the origin (module, name) of each name that it imports."""
+    path = file_of(module)
+    if path is None or path.suffix != ".py":
+        return {}, {}
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    classes: dict[str, _Class] = {}
+    imported: dict[str, tuple[str, str]] = {}
+    try:
+        body = ast.parse(path.read_bytes()).body
+    except (SyntaxError, ValueError):
+        return {}, {}
+    for node in body:
+        match node:
+            case ast.ClassDef():
+                classes[node.name] = _Class.read(node)
+            case ast.Import():
+                imported |= {alias.asname or alias.name: (alias.name, "") for alias in node.names}
+            case ast.ImportFrom():
+                base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+                imported |= {alias.asname or alias.name: (base, alias.name) for alias in node.names}
+    return classes, imported

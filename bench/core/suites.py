@@ -1,0 +1,141 @@
+"""Suites: fixed, versioned lists of attacks, found by their entry points `cavbench.suites` and written as TOML.
+
+`attack=standard` means every member of the newest suite `standard-N`, on another track than driving of the newest
+`standard-TRACK-N`; `attack=standard-1` is fixed. Each member that fits the
+victim is run and recorded as the ordinary pair that it is.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from cavbench.errors import UserError
+from cavbench.core import registry
+from cavbench.core.contracts import Access
+from cavbench.core.pair import Chosen, Pair, choose
+
+VERSIONED = re.compile(r"(?P<family>.+)-(?P<version>\d+)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Member:
+    """An attack of a suite.
+
+    Args:
+        attack: its registered name.
+        params: its parameters; the others keep their defaults.
+        victims: attributes that a victim must have for the member to be meant for it, for instance {"action_type": "discrete"}.
+        purpose: why it is in the suite.
+    """
+
+    attack: str
+    params: Mapping[str, Any] = field(default_factory=dict)
+    victims: Mapping[str, Any] = field(default_factory=dict)
+    purpose: str = ""
+
+    @property
+    def chosen(self) -> Chosen[Any]:
+        """The attack with its parameters.
+
+        Raises:
+            UserError: if it is unknown or broken, or a parameter is not allowed.
+        """
+        return choose("attack", self.attack, **self.params)
+
+    def suits(self, victim: object) -> bool:
+        """Whether it is meant for a victim."""
+        return all(getattr(victim, name, None) == value for name, value in self.victims.items())
+
+    def __str__(self) -> str:
+        values = ", ".join(f"{name}={value}" for name, value in self.params.items())
+        return f"{self.attack}({values})" if values else self.attack
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """A list of attacks with a version; it is never changed, a new list gets a new version.
+
+    Args:
+        name: name of its entry point, such as `standard-1`.
+        track: track of the victims.
+        meaning: one sentence.
+        access: the access that its members need, allowed by default in a run of the suite.
+        members: the attacks.
+    """
+
+    name: str
+    track: str
+    meaning: str
+    access: Access
+    members: tuple[Member, ...]
+
+    @classmethod
+    def read(cls, path: Path) -> Suite:
+        """The suite in a TOML file: `track`, `meaning`, `access` and `[[member]]` tables; its name is the file's.
+
+        Raises:
+            ValueError: if the file is not a suite; the message is one line.
+        """
+        try:
+            found = tomllib.loads(path.read_text())
+            members = tuple(Member(**member) for member in found.pop("member", ()))
+            suite = cls(name=path.stem, members=members, **found)
+        except (tomllib.TOMLDecodeError, TypeError) as error:
+            raise ValueError(f"{path.name} is not a suite: {error}") from None
+        if not VERSIONED.fullmatch(suite.name) or not members:
+            raise ValueError(f"{path.name} is not a suite: it needs a name that ends in -VERSION, and members")
+        return suite
+
+    def pairs(self, **parts: Any) -> tuple[list[Pair], list[str]]:
+        """A pair of every member that is meant for the victim, and why the others of these members cannot attack it.
+
+        Args:
+            parts: `victim`, `defense`, `world` and `threat` of a `Pair`.
+        """
+        made, skipped = [], []
+        for member in self.members:
+            if not member.suits(parts["victim"].component):
+                continue
+            try:
+                made.append(Pair(attack=member.chosen, **parts))
+            except UserError as error:
+                skipped.append(f"{self.name} skips {member}: {error}")
+        return made, skipped
+
+
+def names() -> list[str]:
+    """The names of all suites: `standard-1`, and `standard` for the newest version."""
+    versioned = list(registry.entries(registry.SUITES))
+    return sorted({*versioned, *(_family(name) for name in versioned)})
+
+
+def suite(name: str, track: str = "") -> Suite:
+    """The suite of this name; without a version, the newest: of `NAME-TRACK` if a track is given that has one, else of `NAME`.
+
+    Raises:
+        UserError: if there is no such suite, or its entry point is not a suite of that name.
+    """
+    known = list(registry.entries(registry.SUITES))
+    for family in (f"{name}-{track}", name):
+        if versions := [one for one in known if _family(one) == family != one]:
+            break
+    newest = max(versions, key=_version, default=name)
+    found = registry.resolve(registry.SUITES, newest, "suite")
+    if not isinstance(found, Suite) or found.name != newest:
+        raise UserError(f"suite {newest!r} is not a cavbench.core.suites.Suite with that name")
+    return found
+
+
+def _family(name: str) -> str:
+    match = VERSIONED.fullmatch(name)
+    return match["family"] if match else name
+
+
+def _version(name: str) -> int:
+    match = VERSIONED.fullmatch(name)
+    return int(match["version"]) if match else 0

@@ -1,0 +1,67 @@
+"""The training loop of detectors: one optimiser, one learning-rate schedule, and an average of the weights."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from cavbench.core.contracts import Progress
+
+Network = TypeVar("Network", bound=nn.Module)
+
+REPORT_EVERY = 5
+"""Updates between two progress reports."""
+
+
+def descend(
+    network: Network,
+    loss: Callable[[int], Tensor],
+    *,
+    updates: int,
+    learning_rate: float,
+    warm_up: float = 0.05,
+    decay: float = 0.998,
+    progress: Progress,
+) -> tuple[Network, float]:
+    """Train a network with AdamW and a one-cycle learning rate, and return the exponential moving average of its weights.
+
+    Args:
+        network: the network, in the mode for training; parameters without gradients do not change.
+        loss: returns the loss of an update, given its number from 0.
+        updates: number of updates.
+        learning_rate: the maximum.
+        warm_up: share of the updates in which the learning rate rises; it then falls by a cosine.
+        decay: decay of the average of the weights, per update.
+        progress: called with the finished share and the loss.
+
+    Returns:
+        The averaged network, and the CPU time in seconds.
+
+    Raises:
+        FloatingPointError: if the loss is NaN or infinite.
+    """
+    start = time.process_time()
+    mean = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(decay), use_buffers=True)
+    weights = [weight for weight in network.parameters() if weight.requires_grad]
+    adam = torch.optim.AdamW(weights, lr=learning_rate, weight_decay=5e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(adam, learning_rate, total_steps=updates, pct_start=warm_up)
+    for update in range(updates):
+        now = loss(update)
+        if not math.isfinite(float(now.detach())):
+            raise FloatingPointError(f"the loss is {float(now.detach())} after {update} updates")
+        adam.zero_grad()
+        now.backward()
+        torch.nn.utils.clip_grad_norm_(weights, 10.0)
+        adam.step()
+        schedule.step()
+        mean.update_parameters(network)
+        if update % REPORT_EVERY == 0:
+            progress(update / updates, f"loss {float(now.detach()):.2f}")
+    averaged: Network = mean.module  # type: ignore[assignment]
+    return averaged, time.process_time() - start

@@ -1,0 +1,267 @@
+"""The driving track: driving policies whose observations are attacked at every step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import Baseline, Contrast, Driven, Job, Measure, Track
+from cavbench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, field
+from cavbench.scenarios import Cell
+
+if TYPE_CHECKING:
+    from cavbench.driving import DrivingVictim, DrivingWorld
+    from cavbench.recording.film import Film
+
+FEW = 3
+"""So many fixed features are named in a sentence."""
+BEST_BLIND, IDM, ORACLE, RANDOM = "best blind", "idm", "oracle_planner", "random"
+
+MEASUREMENTS: tuple[pa.Field, ...] = (
+    field("steps", pa.int32(), "decisions until the episode ended", "steps", low=0, at_most="max_steps"),
+    field("return", FLOAT, "reward of the world, summed over the episode", "reward"),
+    field(
+        "safe_progress",
+        FLOAT,
+        "0 if the ego crashed or left the road, otherwise mean progress over the steps of a full episode",
+        "share, 0 to 1",
+    ),
+    field("crashed", pa.bool_(), "the ego hit another vehicle"),
+    field("offroad", pa.bool_(), "the ego left the road"),
+    field("distance_m", FLOAT, "driven along the road", "m"),
+    field(
+        "min_ttc_s", FLOAT, "smallest time to collision with the car ahead; inf if there is none", "s", low=0, high=inf
+    ),
+    field("mean_speed", FLOAT, "mean over the steps", "m/s"),
+    field("queries", FLOAT, "victim evaluations per step, mean", "queries", low=0),
+    field("queries_median", FLOAT, "victim evaluations per step, median", "queries", low=0),
+    field("queries_max", FLOAT, "victim evaluations per step, maximum", "queries", low=0),
+    field("changed", FLOAT, "steps on which the attack changed the decision", "share, 0 to 1"),
+    field("linf", FLOAT, "largest deviation of a step, mean over the steps", "normalised, 2 is the full range", low=0),
+    field("linf_max", FLOAT, "largest deviation of the episode", "normalised, 2 is the full range", low=0),
+    field("l2", FLOAT, "L2 norm of a step's deviation, mean over the steps", "normalised", low=0),
+    field("linf_m", FLOAT, "largest deviation of a position in a step, mean over the steps", "m", low=0),
+    field("linf_mps", FLOAT, "largest deviation of a velocity in a step, mean over the steps", "m/s", low=0),
+    field(
+        "excess_max",
+        FLOAT,
+        "largest distance of the attack's answer outside its perturbation set, before projection",
+        "normalised",
+        low=0,
+    ),
+    field(
+        "attack_ms",
+        FLOAT,
+        "wall time of the attack per step and episode (the time of a batch, divided by its episodes)",
+        "ms",
+        low=0,
+    ),
+    field(
+        "action_counts",
+        pa.list_(pa.int32()),
+        "how often each discrete action was taken; empty for continuous actions",
+        low=0,
+        at_most="max_steps",
+    ),
+)
+
+ASSURED = field(
+    "assured",
+    FLOAT,
+    "frames in which an action was safe under the victim's own assumptions; null if it makes none",
+    "share, 0 to 1",
+    nullable=True,
+    low=0,
+    high=1,
+)
+
+SHIFT = field(
+    "shift",
+    FLOAT,
+    "L2 norm of all that the threat model lets an attack change in an episode, in units of the noise that the victim adds to its "
+    "input; null if it adds none",
+    "standard deviations",
+    nullable=True,
+    low=0,
+    high=inf,
+)
+
+
+class DrivingTrack(Track):
+    """Driving policies on a road, attacked through their observations, ranked by `safe_progress`."""
+
+    name: ClassVar[str] = "driving"
+    world: ClassVar[str] = "highway"
+    victim: ClassVar[str] = "dqn"
+
+    unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
+    measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS)
+    norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
+    metric: ClassVar[str] = "safe_progress"
+    metric_title: ClassVar[str] = "safe progress"
+    failure: ClassVar[str] = "crashed"
+    measures: ClassVar[tuple[Measure, ...]] = (
+        Measure(column="return", heading="return\nof {max_steps}"),
+        Measure(column="crashed", heading="\ncrashed", unit="share"),
+        Measure(column="offroad", heading="off\nroad", unit="share", tables="overview", spare=4),
+        Measure(column="min_ttc_s", heading="min\nTTC s", how="median", digits=1, tables="overview", spare=6),
+        Measure(column="changed", heading="success\n/ step", how="step mean", unit="share", of_attack=True, spare=2),
+        Measure(column="queries", heading="queries\n/ step", how="step mean", of_attack=True),
+        Measure(column="attack_ms", heading="ms\n/ step", how="step mean", digits=1, of_attack=True, spare=3),
+    )
+    legend: ClassVar[str] = (
+        "safe progress: 0 if the car crashes or leaves the road, otherwise its mean progress. success: share of steps in which "
+        "the attack changed the decision. TTC: time to collision with the car ahead. best blind: the best policy that "
+        "ignores its input."
+    )
+    baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
+        BEST_BLIND: Baseline(title="best blind policy", heading="best\nblind", spare=0),
+        RANDOM: Baseline(title="random", heading="ran-\ndom"),
+        IDM: Baseline(title="IDM and MOBIL", heading="\nIDM"),
+        ORACLE: Baseline(title="perfect information", heading="per-\nfect"),
+    }
+    safe_driver: ClassVar[str] = IDM
+    contrast: ClassVar[Contrast | None] = Contrast(
+        side="victim",
+        baseline=BEST_BLIND,
+        title="the best blind policy",
+        heading="against\nbest blind",
+        short="beats\nblind",
+    )
+    queries_title: ClassVar[str] = "queries per step"
+    excess: ClassVar[str] = "excess_max"
+    step_ms: ClassVar[str] = "attack_ms"
+    other_input: ClassVar[str] = "another episode's observation"
+    facts_of_v1: ClassVar[Mapping[str, object]] = {
+        "decision_hz": 15,
+        "max_steps": 450,
+        "actions": ["LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER"],
+        "axes": [
+            {"name": "lanes", "kind": "int", "meaning": "number of lanes", "low": 2, "high": 8},
+            {"name": "density", "kind": "float", "meaning": "traffic density", "above": 0.0, "high": 4.0},
+            {
+                "name": "weather",
+                "kind": "str",
+                "meaning": "how far the ego sees and how noisy it measures",
+                "choices": ["clear", "rain", "fog"],
+                "default": "clear",
+                "perceptual": True,
+            },
+        ],
+        "features": {
+            "names": ["x", "y", "vx", "vy"],
+            "units": ["m", "m", "m/s", "m/s"],
+            "floors": [0.5, 0.2, 0.3, 0.2],
+        },
+    }
+
+    work: ClassVar[str] = "cavbench.driving.drive"
+
+    def baselines(self, pair: Pair) -> Iterator[Pair]:
+        """Input-independent policies with the pair's action type, and the IDM driver if the world has one."""
+        victim, world = _parts(pair)
+        facts, action_type = world.facts, victim.action_type
+        drivers = [("blind", {"policy": policy}) for policy in facts.blind_policies(action_type)]
+        drivers += [("random", {"actions": action_type})]
+        drivers += [(IDM, {})] if IDM in facts.drivers else []
+        for name, params in drivers:
+            none = {"attack": choose("attack", "none"), "defense": choose("defense", "none")}
+            yield replace(pair, **none, victim=choose("victim", name, **params), threat=type(pair.threat).of_nobody())
+
+    def doubts(self, pair: Pair) -> Iterator[str]:
+        from cavbench.driving.doubts import doubts
+
+        return doubts(pair, self.world)
+
+    def hopeless(self, baselines: pa.Table) -> str:
+        from cavbench.driving.doubts import hopeless
+
+        return hopeless(baselines)
+
+    def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
+        same_world = all(own[name] == other[name] for name in ("world", "world_params"))
+        same_actions = own["action_type"] == other["action_type"] or other["victim"] in (IDM, ORACLE)
+        if (
+            other["sees"]
+            or other["defense"] != "none"
+            or other["attack"] != "none"
+            or not (same_world and same_actions)
+        ):
+            return ""
+        return BEST_BLIND if other["victim"] == "blind" else str(other["victim"])
+
+    def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
+        deviation = f"{100 * budget:g} % of itself" if norm == "relative" else f"{budget:g} on the [-1, 1] scale"
+        features = facts.get("features", {})
+        floors = features.get("floors", ()) if norm == "relative" else ()
+        minima = [
+            f"{name} {floor * budget / 0.1:g} {unit}"
+            for name, floor, unit in zip(features.get("names", ()), floors, features.get("units", ()), strict=False)
+        ]
+        by_floor = f", or by its floor ({', '.join(minima)})" if minima else ""
+        fixed = features.get("fixed", ())
+        named = fixed if len(fixed) <= FEW else [f"{len(fixed)} fixed features"]
+        return f"each measured value may be off by {deviation}{by_floor}; {' and '.join(['presence', *named])} cannot be forged"
+
+    def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
+        steps = column("steps")
+        metres, speed = (
+            f"{(column(name) * steps).sum() / max(float(steps.sum()), 1.0):.2f}" for name in ("linf_m", "linf_mps")
+        )
+        yield "moved", f"{metres} m and {speed} m/s: largest deviation per step, on average"
+
+    def identity(self, pair: Pair) -> Mapping[str, object]:
+        return {"action_type": _parts(pair)[0].action_type}
+
+    def try_network(self, network: Any, pair: Pair, cells: Sequence[Cell]) -> list[str]:
+        from cavbench.driving.trial import try_policy
+
+        victim, world = _parts(pair)
+        if not victim.sees:
+            return []
+        gradients = victim.answers == "gradients"
+        return try_policy(
+            network, world, cells, gradients=gradients, random=victim.draws or pair.defense.name != "none"
+        )
+
+    def drive(self, job: Job, artefact: bytes | None, traced: Sequence[int]) -> Driven:
+        from cavbench.driving.drive import drive
+
+        return drive(job, traced)
+
+    def alike(self, job: Job) -> Hashable | None:
+        from cavbench.driving.drive import joint
+
+        return (job.pair.id, job.training_seed, job.seeds) if joint(job.pair) else None
+
+    def drive_jointly(self, jobs: Sequence[Job], artefacts: Mapping[str, bytes]) -> Sequence[Driven] | None:
+        from cavbench.driving.drive import drive_jointly
+
+        return drive_jointly(jobs)
+
+    def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
+        from cavbench.driving.recording import save
+
+        save(trace, facts=_parts(job.pair)[1].facts, meta=meta, path=path)
+
+    def film(self, job: Job, trace: Any, meta: Mapping[str, object]) -> Film:
+        from cavbench.driving.recording.episode import Episode
+        from cavbench.driving.recording.film import EpisodeFilm
+
+        return EpisodeFilm(Episode.of(trace, _parts(job.pair)[1].facts, meta))
+
+
+def _parts(pair: Pair) -> tuple[DrivingVictim, DrivingWorld]:
+    """The victim and the world of a pair, in the types of this track."""
+    victim: Any = pair.victim.component
+    world: Any = pair.world.component
+    return victim, world

@@ -1,0 +1,175 @@
+"""Baseline drivers that ignore the observation; a victim that does not beat them is not worth attacking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingVictim, Policy, State
+from cavbench.driving.features import CONSTANT_CONTROLS, RIGHT_THEN_SLOWER
+from cavbench.errors import UserError
+from cavbench.core.registry import unknown
+
+RIGHT_S = 4.0
+"""Seconds of lane changes to the right: enough to cross four lanes at 25 m/s, one after the other."""
+DRAWS = 1024
+"""Number of random actions drawn for an episode; a longer episode repeats them."""
+
+
+class _Constant(Policy):
+    """The same scores at every step."""
+
+    def __init__(self, scores: Tensor, action_type: ActionType, driver: Driver = "agent") -> None:
+        super().__init__()
+        self.always, self.action_type, self.driver = scores, action_type, driver
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.always.expand(*observation.shape[:-2], len(self.always))
+
+
+class _FirstThen(Policy):
+    """One action for a number of steps, then another; its state counts the steps."""
+
+    action_type = "discrete"
+
+    def __init__(self, first: Tensor, steps: int, then: Tensor) -> None:
+        super().__init__()
+        self.first, self.steps, self.then = first, steps, then
+
+    def initial(self, episodes: Tensor) -> State:
+        return TensorDict({"step": torch.zeros_like(episodes)}, batch_size=episodes.shape)
+
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        assert state is not None
+        return torch.where(state["step"].unsqueeze(-1) < self.steps, self.first, self.then)
+
+    def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
+        assert state is not None
+        return TensorDict({"step": state["step"] + 1}, batch_size=state.batch_size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blind(DrivingVictim):
+    """An input-independent policy: a constant action, or a change to the rightmost lane and then braking.
+
+    The best of these policies in a cell is the baseline under attack: a victim with a lower score would do better without input.
+
+    Args:
+        policy: `throttle`, `coast` and `brake` are continuous. Other values are names of the world's discrete actions, in lower
+            case; `right_then_slower` changes to the rightmost lane, then slows down.
+    """
+
+    sees: ClassVar[bool] = False
+    policy: str = RIGHT_THEN_SLOWER
+
+    @property
+    def action_type(self) -> ActionType:
+        return "continuous" if self.policy in CONSTANT_CONTROLS else "discrete"
+
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        known = facts.blind_policies(self.action_type)
+        if self.policy not in known:
+            raise UserError(unknown(f"victim.policy {self.policy!r}", self.policy, [*known, *CONSTANT_CONTROLS]))
+        if self.action_type == "continuous":
+            return _Constant(torch.tensor(CONSTANT_CONTROLS[self.policy]), "continuous").eval()
+        actions = torch.eye(len(facts.actions))
+        place = [name.lower() for name in facts.actions].index
+        if self.policy == RIGHT_THEN_SLOWER:
+            steps = round(RIGHT_S * facts.decision_hz)
+            return _FirstThen(actions[place("lane_right")], steps, actions[place("slower")]).eval()
+        return _Constant(actions[place(self.policy)], "discrete").eval()
+
+
+class _RandomPolicy(Policy):
+    """Random actions from one generator per episode, so that they do not depend on the rest of the batch."""
+
+    def __init__(self, action_type: ActionType, actions: int) -> None:
+        super().__init__()
+        self.action_type, self.actions = action_type, actions
+
+    def initial(self, episodes: Tensor) -> State:
+        generators = [torch.Generator().manual_seed(int(episode)) for episode in episodes]
+        draws = torch.stack([torch.rand(DRAWS, self.actions, generator=generator) for generator in generators])
+        return TensorDict(
+            {"step": torch.zeros_like(episodes), "draws": draws.to(episodes.device)}, batch_size=episodes.shape
+        )
+
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        assert state is not None
+        step = (state["step"] % DRAWS).view(-1, 1, 1).expand(-1, 1, self.actions)
+        draw = state["draws"].gather(1, step).squeeze(1)
+        return draw if self.action_type == "discrete" else 2 * draw[:, :2] - 1
+
+    def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
+        assert state is not None
+        return TensorDict({"step": state["step"] + 1, "draws": state["draws"]}, batch_size=state.batch_size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomDriver(DrivingVictim):
+    """Uniformly random actions.
+
+    Args:
+        actions: discrete lane-changing decisions, or continuous acceleration and steering.
+    """
+
+    sees: ClassVar[bool] = False
+    actions: Literal["discrete", "continuous"] = "discrete"
+
+    @property
+    def action_type(self) -> ActionType:
+        return self.actions
+
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        return _RandomPolicy(self.actions, max(len(facts.actions), 2)).eval()
+
+
+@dataclass(frozen=True, kw_only=True)
+class IDMDriver(DrivingVictim):
+    """The world's own traffic driver: IDM for speed, MOBIL for lane changes (Treiber et al. 2000, Kesting et al. 2007).
+
+    It reads the simulator's true state instead of the observation, so attacks and weather have no effect on it.
+    """
+
+    sees: ClassVar[bool] = False
+    driver: ClassVar[Driver] = "idm"
+
+    @property
+    def action_type(self) -> ActionType:
+        return "discrete"
+
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        if "idm" not in facts.drivers:
+            raise UserError("the world has no IDM driver")
+        return _driven_by_the_world(facts, "idm")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OracleDriver(DrivingVictim):
+    """A planner with perfect information, a reference above all other drivers (random-shooting model-predictive control).
+
+    Three times a second it tries 64 plans of 4 s in copies of the simulator, hidden state included, and follows the best one. It
+    reads no observation, so attacks and weather have no effect on it.
+    """
+
+    sees: ClassVar[bool] = False
+    driver: ClassVar[Driver] = "oracle"
+
+    @property
+    def action_type(self) -> ActionType:
+        return "discrete"
+
+    def load(self, seed: int, facts: DrivingFacts) -> Policy:
+        if "oracle" not in facts.drivers:
+            raise UserError("the world has no planner with perfect information")
+        return _driven_by_the_world(facts, "oracle")
+
+
+def _driven_by_the_world(facts: DrivingFacts, driver: Driver) -> Policy:
+    """A policy whose actions the world ignores."""
+    idle = facts.actions.index("IDLE") if "IDLE" in facts.actions else 0
+    return _Constant(torch.eye(len(facts.actions))[idle], "discrete", driver=driver).eval()

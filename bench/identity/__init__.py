@@ -1,0 +1,1 @@
+"""Hashes of what a result depends on: configuration, code, content."""

@@ -1,1 +1,0 @@
-"""Victims: the driving policies and object detectors that are attacked, and the baseline drivers."""

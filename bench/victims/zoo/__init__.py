@@ -1,8 +1,0 @@
-"""The zoo: trained policies and detectors, stored by recipe and training seed."""
-
-from __future__ import annotations
-
-from bench.victims.zoo.recipe import Recipe, trained_in, written
-from bench.victims.zoo.store import card, load, missing, own, own_files, save, seeds
-
-__all__ = ["Recipe", "card", "load", "missing", "own", "own_files", "save", "seeds", "trained_in", "written"]

@@ -1,0 +1,8 @@
+"""The zoo: trained policies and detectors, stored by recipe and training seed."""
+
+from __future__ import annotations
+
+from cavbench.zoo.recipe import Recipe, trained_in, written
+from cavbench.zoo.store import card, load, missing, own, own_files, save, seeds
+
+__all__ = ["Recipe", "card", "load", "missing", "own", "own_files", "save", "seeds", "trained_in", "written"]

@@ -1,0 +1,288 @@
+"""Zoo entries on disk: safetensors weights with a JSON card each. Hashes are checked on loading; nothing is unpickled.
+
+An entry is `<name>-<first digits of the recipe's digest>/seed<k>.safetensors`; its card is the `.json` file beside it. If the
+training started from a network that is loaded anyway, such as the victim's, the entry holds only the tensors that the training
+changed. Its card then has the hash of the start's weights and the names of the tensors that are taken from it:
+
+    "start": {"sha256": "dccea06f…", "tensors": ["deep.2.conv.weight", …]}
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import torch
+from platformdirs import user_data_path
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from cavbench import bounded
+from cavbench.errors import UserError
+from cavbench.files import whole
+from cavbench.core.contracts import World
+from cavbench.identity.fingerprint import canonical, code_digest, libraries, machine
+from cavbench.zoo.recipe import DIGITS, Part, Recipe, check_world
+
+SHIPPED = Path(__file__).parents[1] / "policies"
+
+
+class Network(Protocol):
+    """The interface of a network in the zoo: methods of torch.nn.Module, and an attribute for the hash of its weights."""
+
+    weights_sha256: str
+
+    def state_dict(self) -> Mapping[str, Tensor]: ...
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> object: ...
+    def requires_grad_(self, requires_grad: bool) -> Any: ...
+    def eval(self) -> Any: ...
+
+
+class Shaped(Network, Protocol):
+    """A network that can be saved.
+
+    If its attribute `half_precision` is true, tensors with two or more dimensions are stored in half precision.
+    """
+
+    @property
+    def shape(self) -> Mapping[str, object]:
+        """The keyword arguments of its constructor."""
+
+
+N = TypeVar("N", bound=Network)
+
+
+def own() -> Path:
+    """The folder of networks trained on this machine: CAVBENCH_ZOO, or the user's data folder."""
+    return Path(os.environ.get("CAVBENCH_ZOO") or user_data_path("cavbench") / "zoo")
+
+
+def save(
+    network: Shaped,
+    recipe: Recipe,
+    *,
+    seed: int,
+    world: World,
+    card: Mapping[str, object],
+    start: Network | None = None,
+    root: Path | None = None,
+) -> Path:
+    """Write the weights and the card of a trained network, atomically, and return the path of the weights.
+
+    Args:
+        network: the network to save.
+        recipe: its recipe.
+        seed: training seed.
+        world: the training world.
+        card: further facts about the training, for instance the checkpoint selection.
+        start: the network that the training started from, if loading builds it again: only tensors that differ from its are
+            written. A start without `weights_sha256` is ignored, because loading could not recognise it.
+        root: folder of a zoo; by default the user's own, which takes precedence over the shipped one.
+
+    Raises:
+        UserError: if the recipe does not name the non-default parameters of the world.
+    """
+    check_world(recipe, world)
+    folder = (root or own()) / recipe.key
+    folder.mkdir(parents=True, exist_ok=True)
+    state = {key: value.contiguous() for key, value in network.state_dict().items()}
+    if start is not None and start.weights_sha256:
+        taken = _unchanged(state, start)
+        card = {**card, "start": {"sha256": start.weights_sha256, "tensors": taken}}
+        state = {key: value for key, value in state.items() if key not in taken}
+    if getattr(network, "half_precision", False):
+        state = {key: value.half() if value.ndim > 1 else value for key, value in state.items()}
+    blob = save_tensors(state)
+    where = Part.of("world", world)
+    full = {
+        **card,
+        "name": recipe.name,
+        "seed": seed,
+        "recipe": recipe.described(),
+        "world": {"name": where.name, "class": where.source, "parameters": where.parameters},
+        "command": recipe.train(seed),
+        "shape": network.shape,
+        "sha256": hashlib.sha256(blob).hexdigest(),
+        "made": _provenance((*recipe.parts, where)),
+    }
+    path = folder / f"seed{seed}.safetensors"
+    with whole(path) as file:
+        file.write(blob)
+    with whole(path.with_suffix(".json")) as file:
+        file.write(json.dumps(full, indent=1, sort_keys=True, default=str).encode() + b"\n")
+    return path
+
+
+def card(recipe: Recipe, seed: int) -> dict[str, Any]:
+    """The card of an entry.
+
+    Raises:
+        UserError: if there is no entry (the message has the training command), or its card cannot be read.
+    """
+    path = _find(recipe, seed).with_suffix(".json")
+    entry = bounded.read_json(path, name=f"the card {path}", finite=False)
+    if not isinstance(entry, dict):
+        raise UserError(f"the card {path} cannot be read: it is no JSON object")
+    return entry
+
+
+def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "") -> N:
+    """The network of an entry, frozen and in eval mode.
+
+    Args:
+        recipe: its recipe.
+        seed: training seed.
+        build: builds the network from the card's `shape` before the weights are loaded; usually its class. For an entry that
+            holds only what its training changed it must return the network that the training started from.
+        against: for an adversary, the hash of the weights of its victim; empty if they do not matter.
+
+    Raises:
+        UserError: if there is no such entry, a default has changed since, the weights do not match the card, an adversary
+            was trained against other weights, or a training started from others.
+    """
+    path, entry = _find(recipe, seed), card(recipe, seed)
+    _check_parameters(recipe, seed, entry)
+    if against and (before := entry.get("against")) != against:
+        raise UserError(
+            f"the zoo's {recipe.name!r} of training seed {seed} was trained against a victim with weights {str(before)[:12]}…, "
+            f"and the victim has {against[:12]}… now; `{recipe.train(seed)}` trains it again"
+        )
+    blob = bounded.content(path, most=bounded.WEIGHTS, name=f"the weights {path}")
+    sha256 = hashlib.sha256(blob).hexdigest()
+    if sha256 != entry.get("sha256"):
+        raise UserError(
+            f"the weights {path} have sha256 {sha256[:12]}…, their card says {str(entry.get('sha256'))[:12]}…: "
+            "the file was changed; restore it or train it again"
+        )
+    try:
+        network: N = build(**entry["shape"])
+        tensors: Mapping[str, Tensor] = load_tensors(blob)
+        if begun := entry.get("start"):
+            _check_start(recipe, seed, begun, network)
+            tensors = _completed(tensors, begun["tensors"], network)
+        network.load_state_dict(tensors)
+    except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"the weights {path} do not fit {recipe.name!r}: {reason}") from None
+    network.weights_sha256 = sha256
+    network.requires_grad_(False).eval()
+    return network
+
+
+def own_files(recipe: Recipe, seed: int) -> tuple[Path, ...]:
+    """The weights and the card of an entry of the user's zoo; empty if it has none, as for weights that ship in a package."""
+    path = own() / recipe.key / f"seed{seed}.safetensors"
+    return (path, path.with_suffix(".json")) if path.exists() else ()
+
+
+def seeds(recipe: Recipe) -> list[int]:
+    """The training seeds of a recipe in the user's zoo and the shipped one."""
+    return _seeds(recipe.key)
+
+
+def missing(recipe: Recipe, seed: int) -> str:
+    """The error message for a missing entry: the requested recipe, the available variants and seeds, the training command."""
+    asked = " ".join([repr(recipe.name), *(["with", *recipe.options] if recipe.options else [])])
+    variants = "; ".join(_variants(recipe)) or "none"
+    return f"the zoo has no {asked} of training seed {seed}. Variants: {variants}. To train it: `{recipe.train(seed)}`"
+
+
+def _check_parameters(recipe: Recipe, seed: int, entry: Mapping[str, Any]) -> None:
+    """Check the parameters of an entry: the digest does not notice a default that has changed since."""
+    for part in recipe.parts:
+        made = entry.get("recipe", {}).get(part.kind, {}).get("parameters", {})
+        for name, value in part.parameters.items():
+            if name in made and canonical(made[name]) != canonical(value):
+                raise UserError(
+                    f"the zoo's {recipe.name!r} of training seed {seed} was made with {part.kind}.{name}={made[name]}, "
+                    f"and the default is {value} now; `{recipe.train(seed)}` trains it again"
+                )
+
+
+def _unchanged(state: Mapping[str, Tensor], start: Network) -> list[str]:
+    """The names of the tensors that are those of the start, bit for bit."""
+    own = start.state_dict()
+    return [key for key, value in state.items() if key in own and torch.equal(value, own[key])]
+
+
+def _check_start(recipe: Recipe, seed: int, begun: Mapping[str, Any], start: Network) -> None:
+    """Check that the training started from the weights of `start`."""
+    if begun["sha256"] != start.weights_sha256:
+        raise UserError(
+            f"the training of the zoo's {recipe.name!r}, seed {seed}, started from weights {str(begun['sha256'])[:12]}…, and the "
+            f"victim has {start.weights_sha256[:12] or 'unknown ones'}… now; `{recipe.train(seed)}` trains it again"
+        )
+
+
+def _completed(stored: Mapping[str, Tensor], taken: Sequence[str], start: Network) -> dict[str, Tensor]:
+    """The stored tensors and those taken from the start; each tensor comes from one of the two."""
+    own = start.state_dict()
+    if both := stored.keys() & set(taken):
+        raise KeyError(f"{min(both)} is stored, and taken from the start")
+    return {**stored, **{key: own[key] for key in taken}}
+
+
+def _find(recipe: Recipe, seed: int) -> Path:
+    for root in _roots():
+        path = root / recipe.key / f"seed{seed}.safetensors"
+        if path.exists():
+            return path
+    raise UserError(missing(recipe, seed))
+
+
+def _roots() -> tuple[Path, Path]:
+    return own(), SHIPPED
+
+
+def _seeds(key: str) -> list[int]:
+    files = [path for root in _roots() for path in (root / key).glob("seed*.safetensors")]
+    return sorted({int(path.stem.removeprefix("seed")) for path in files})
+
+
+def _variants(recipe: Recipe) -> Iterator[str]:
+    """All recipes of this name in the zoo, with their seeds: `default (seeds 0, 1, 2)`, `victim.hidden=64 (seed 0)`."""
+    keys = {path.name for root in _roots() if root.is_dir() for path in root.iterdir()}
+    for key in sorted(keys):
+        if not re.fullmatch(f"{re.escape(recipe.name)}-[0-9a-f]{{{DIGITS}}}", key):
+            continue
+        cards = (root / key / f"seed{seed}.json" for seed in _seeds(key) for root in _roots())
+        if (path := next((path for path in cards if path.is_file()), None)) is None:
+            continue
+        numbers = ", ".join(map(str, _seeds(key)))
+        yield f"{_differences(recipe, path)} (seed{'s' if len(_seeds(key)) > 1 else ''} {numbers})"
+
+
+def _differences(recipe: Recipe, path: Path) -> str:
+    """The differences between the entry of a card and the default, as text."""
+    try:
+        made = bounded.read_json(path, finite=False)["recipe"]
+        differences = []
+        for part in recipe.parts:
+            trained = made[part.kind]
+            differences += [f"{part.kind}.{name}={value}" for name, value in trained["changed"].items()]
+            if trained["training"] != part.training:
+                differences.append(f"training version {trained['training']} of {part.kind}, now {part.training}")
+        return ", ".join(differences) or "default"
+    except (UserError, KeyError, TypeError, AttributeError):
+        return f"{path.parent.name} with a card that cannot be read"
+
+
+def _provenance(parts: tuple[Part, ...]) -> dict[str, object]:
+    """The versions of the code and libraries, the machine and the time."""
+    modules = sorted({part.module for part in parts} - {"__main__"})
+    return {
+        "cavbench": metadata.version("cavbench"),
+        "code": code_digest(tuple(modules)),
+        "libraries": libraries(tuple(sorted({name for part in parts for name in part.libraries}))),
+        "machine": machine(),
+        "at": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
