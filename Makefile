@@ -8,7 +8,7 @@ HAS_BROWSER := (for name in chromium chromium-browser google-chrome; do command 
 RUN_STAMP := $(VENV)/installed-to-run
 DEV_STAMP := $(VENV)/installed-to-develop
 
-.PHONY: run test lint docs bench soak licences wheel-check install install-dev browser debian-browser clean
+.PHONY: run test lint tree docs bench soak licences wheel-check install install-dev browser debian-browser clean
 
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
@@ -16,10 +16,16 @@ run: install
 test: install-dev browser
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-lint: install-dev
+lint: install-dev tree
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# build/tree/cavbench: the folders as they are installed, by links, for tools that read the source without importing it.
+tree:
+	rm -rf build/tree
+	mkdir -p build/tree/cavbench
+	for name in bench/* attacks defenses envs leaderboard; do ln -s ../../../$$name build/tree/cavbench; done
 
 # The site, in docs/_build/html. A broken link, a page missing from the contents or an unknown component is an error.
 docs: install-dev
@@ -41,7 +47,7 @@ install-dev: $(DEV_STAMP)
 # It comes last, when all that it needs is there; the resolver may otherwise choose a build with gigabytes of CUDA.
 LOCKED := $(BIN)/python -m pip install --quiet --require-hashes --no-deps --no-build-isolation
 
-$(RUN_STAMP): pyproject.toml constraints.txt locks/build.txt locks/run.txt
+$(RUN_STAMP): pyproject.toml setup.py constraints.txt locks/build.txt locks/run.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(LOCKED) -r locks/build.txt
 	$(LOCKED) -r locks/run.txt

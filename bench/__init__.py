@@ -6,9 +6,8 @@ are first used, because torch takes seconds.
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-from cavbench import shadow
 
 if TYPE_CHECKING:
     import cavbench.gym as gym
@@ -18,19 +17,15 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["UserError", "__version__", "component", "gym", "load", "score"]
 
-shadow.check()
-
 _FROM = {"component": "cavbench.api", "load": "cavbench.api", "score": "cavbench.api", "UserError": "cavbench.errors"}
 
 
 def __getattr__(name: str) -> Any:
-    from importlib import import_module
-
     if name in _FROM:
         return getattr(import_module(_FROM[name]), name)
     if name == "gym":
         return import_module("cavbench.gym")
-    raise AttributeError(f"module 'bench' has no attribute {name!r}")
+    raise AttributeError(f"module 'cavbench' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

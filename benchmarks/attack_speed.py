@@ -22,12 +22,12 @@ from cavbench.attacks.driving.zo import ZOSignSGD
 from cavbench.driving import DrivingAttack, ObservationThreat, Policy
 from cavbench.driving.attacker import Attacker
 from cavbench.driving.victim import CountedPolicy
-from cavbench.errors import in_one_line
-from cavbench.run.process import settle
-from cavbench.scenarios import SeedBlock
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
+from cavbench.scenarios import SeedBlock
 
 SMOOTHING, STEP_SIZE, FASTER = 0.01, 0.01, 3
 

@@ -15,15 +15,15 @@ from copy import copy
 import numpy as np
 import torch
 
+from cavbench.core import registry
 from cavbench.detection import Detector
 from cavbench.detection.discrimination import discrimination
 from cavbench.detection.sight import look, look_at_decoys
-from cavbench.errors import in_one_line
-from cavbench.core import registry
-from cavbench.run.process import settle
 from cavbench.envs.camera import training_faces
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
 
 WORLD = StopSignApproach()
 MEASURES = ("decoy_confidence", "octagons", "false_stops", "average_precision")

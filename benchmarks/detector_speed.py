@@ -14,10 +14,10 @@ from collections.abc import Callable
 import torch
 
 from cavbench.detection import Detector
-from cavbench.run.process import settle
 from cavbench.detection.victims.yolo import frozen
 from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
 from cavbench.detection.victims.yolov5 import YOLOv5Network
+from cavbench.run.process import settle
 
 STOP_SIGN = 11
 

@@ -17,12 +17,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from cavbench.core.pair import Chosen, Pair, choose
+from cavbench.core.track import Job
 from cavbench.detection.crafting import prepare
 from cavbench.detection.drive import drive as score
 from cavbench.driving.drive import drive
 from cavbench.errors import in_one_line
-from cavbench.core.pair import Chosen, Pair, choose
-from cavbench.core.track import Job
 from cavbench.run.process import settle
 from cavbench.scenarios import SeedBlock
 

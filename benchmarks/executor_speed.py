@@ -26,10 +26,11 @@ from pathlib import Path
 import psutil
 import pyarrow as pa
 
-from cavbench.errors import in_one_line
-from cavbench.isolation.framework import Snapshot
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import track
+from cavbench.driving.victims.reference import Blind
+from cavbench.errors import in_one_line
+from cavbench.isolation.framework import Snapshot
 from cavbench.records import packing, reading, store
 from cavbench.run import runner
 from cavbench.run.config import run_config
@@ -38,7 +39,6 @@ from cavbench.run.process import cores
 from cavbench.run.unit import Loading
 from cavbench.run.work import Outcome, Task, attempt
 from cavbench.run.worker import Limits
-from cavbench.driving.victims.reference import Blind
 
 PAIR = ("defense=none", "victim=dqn", "lanes=3,4", "density=1", "weather=clear,fog", "seeds=0,1")
 QUIET = ("record=0", "reference=false")

@@ -14,14 +14,14 @@ from collections import Counter
 import torch
 from torch import Tensor
 
+from cavbench.core import registry
 from cavbench.detection import Objects
 from cavbench.detection.boxes import overlap
 from cavbench.detection.sight import look_at_decoys
-from cavbench.errors import in_one_line
-from cavbench.core import registry
-from cavbench.run.process import settle
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
 
 WORLD = StopSignApproach()
 SAME = 0.1

@@ -25,12 +25,12 @@ from rich.console import Console
 from rich.table import Table
 from tensordict import TensorDict
 
-from cavbench.scenarios import SeedBlock
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.batched import BatchedHighway
 from cavbench.envs.highway.config import ACTIONS, HighwayConfig
 from cavbench.envs.highway.engine import HighwayEngine
 from cavbench.envs.highway.reference import SensedHighwayEnv
+from cavbench.scenarios import SeedBlock
 
 CELL = AXES.cell(lanes=3, density=1.0)
 IDLE = ACTIONS.index("IDLE")

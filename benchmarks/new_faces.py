@@ -19,16 +19,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.core import registry
 from cavbench.detection import Detector, Scenes
 from cavbench.detection.colour import linear
 from cavbench.detection.sight import look_at_decoys
-from cavbench.errors import in_one_line
-from cavbench.core import registry
-from cavbench.run.process import settle
 from cavbench.envs.camera import sign
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.faces import Face
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
 
 WORLD = StopSignApproach()
 SIDE = sign.TEXELS

@@ -20,11 +20,11 @@ from cavbench.attacks.detection.eot import EOT
 from cavbench.detection import STOP_SIGN, Detector, PatchThreat, Scenes
 from cavbench.detection.approach import look
 from cavbench.detection.enforcer import PatchEnforcer
-from cavbench.errors import in_one_line
-from cavbench.run.process import settle
 from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
 from cavbench.envs.camera.axes import APPROACH_V1
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
 
 GRID, THREAT, WORKERS = APPROACH_V1, PatchThreat(), 2
 CLOCKS = ("processor", "wall")

@@ -15,13 +15,13 @@ from collections.abc import Callable
 
 import torch
 
-from cavbench.detection.drive import drive, drive_jointly
-from cavbench.detection.patch import Patch
-from cavbench.errors import in_one_line
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Job
-from cavbench.run.process import settle
+from cavbench.detection.drive import drive, drive_jointly
+from cavbench.detection.patch import Patch
 from cavbench.envs.camera.axes import APPROACH_V1
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
 
 
 def main() -> None:

@@ -31,12 +31,12 @@ import pyarrow.parquet as pq
 
 from cavbench.core.contracts import Facts
 from cavbench.core.track import Track, track
+from cavbench.envs.highway.axes import STANDARD_V1
 from cavbench.records import packing, store
 from cavbench.records.finished import finished
 from cavbench.records.schema import schema
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import as_text
-from cavbench.envs.highway.axes import STANDARD_V1
 
 SEEDS, ATTACKS = 3, 8
 ROW_GROUP = 100_000
@@ -46,7 +46,7 @@ POLICY = {f"parameter_{number}": 0.125 for number in range(15)}
 MEASURE = """
 import resource, subprocess, sys, time
 start = time.perf_counter()
-code = subprocess.run([sys.executable, "-m", "bench", "report", *sys.argv[1:]], stdout=subprocess.DEVNULL).returncode
+code = subprocess.run([sys.executable, "-m", "cavbench", "report", *sys.argv[1:]], stdout=subprocess.DEVNULL).returncode
 used = resource.getrusage(resource.RUSAGE_CHILDREN)
 print(code, time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss / 1e6)
 """

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from cavbench.driving.intervals.rooms import cars_of
 from cavbench.driving.metrics import safe_progress
-from cavbench.errors import in_one_line
-from cavbench.run.process import settle
-from cavbench.scenarios import Cell, SeedBlock
 from cavbench.driving.victims.planner import IntervalPlanner, Planner
 from cavbench.envs.highway.ego import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from cavbench.envs.highway.engine import Flag, HighwayEngine, Number
 from cavbench.envs.highway.oracle import LIBRARY, PLANS, OraclePlanner
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
+from cavbench.scenarios import Cell, SeedBlock
 
 WORLD = HighwayWorld()
 FORBIDDEN = -1e6

@@ -18,14 +18,14 @@ from typing import Any
 import torch
 
 from cavbench.attacks.detection.eot import EOT
+from cavbench.core import registry, suites
 from cavbench.detection import PatchThreat
 from cavbench.detection.crafting import craft
 from cavbench.detection.placed import placed
 from cavbench.detection.sight import look
-from cavbench.errors import in_one_line
-from cavbench.core import registry, suites
-from cavbench.run.process import settle
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
 
 WORLD = StopSignApproach()
 SHIFTED = {"scale": 0.0, "rotation": 0.0}

@@ -11,14 +11,14 @@ import time
 
 import torch
 
-from cavbench.driving import ObservationThreat
-from cavbench.driving.drive import drive
-from cavbench.errors import in_one_line
 from cavbench.core.pair import Pair, choose
 from cavbench.core.suites import suite
 from cavbench.core.track import Job
-from cavbench.scenarios import SeedBlock
+from cavbench.driving import ObservationThreat
+from cavbench.driving.drive import drive
 from cavbench.envs.highway.axes import AXES
+from cavbench.errors import in_one_line
+from cavbench.scenarios import SeedBlock
 
 
 def main(name: str, episodes: int) -> None:

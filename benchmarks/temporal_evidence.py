@@ -19,7 +19,9 @@ from torch import Tensor
 
 from cavbench.attacks.detection.eot import EOT
 from cavbench.attacks.detection.noise_patch import NoisePatch
-from cavbench.attacks.suites import STANDARD_DETECTION_1
+from cavbench.attacks.detection.suites import STANDARD_DETECTION_1
+from cavbench.core import registry
+from cavbench.defenses.detection.temporal import TemporalFusion
 from cavbench.detection import Approach, Detector, PatchAttack, PatchThreat, Predictions, Wrapped
 from cavbench.detection.approach import measured
 from cavbench.detection.closed_loop import drive
@@ -27,12 +29,10 @@ from cavbench.detection.crafting import craft
 from cavbench.detection.discrimination import discrimination
 from cavbench.detection.patch import Patch
 from cavbench.detection.sight import look, look_at_decoys
-from cavbench.errors import in_one_line
-from cavbench.core import registry
-from cavbench.run.process import settle
-from cavbench.defenses.detection.temporal import TemporalFusion
 from cavbench.envs.camera.crossing import StopSignCrossing
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
 
 WORLD, LOOP, THREAT = StopSignApproach(), StopSignCrossing(), PatchThreat()
 MEASURES = ("stop_score", "confidence_mean", "average_precision", "decoy_confidence", "false_stops", "ran")

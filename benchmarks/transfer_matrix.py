@@ -15,14 +15,14 @@ import argparse
 import numpy as np
 
 from cavbench.attacks.detection.transfer import BETWEEN, Transfer
+from cavbench.core import registry
+from cavbench.core.pair import choose
 from cavbench.detection import DetectorDefense, DetectorVictim, PatchThreat
 from cavbench.detection.approach import score
 from cavbench.detection.crafting import craft
-from cavbench.errors import in_one_line
-from cavbench.core import registry
-from cavbench.core.pair import choose
-from cavbench.run.process import settle
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
 
 WORLD = StopSignApproach()
 

@@ -13,13 +13,13 @@ import argparse
 import numpy as np
 
 from cavbench.attacks.detection.eot import EOT
+from cavbench.core import registry
 from cavbench.detection import PatchThreat
 from cavbench.detection.approach import score
 from cavbench.detection.crafting import craft
-from cavbench.errors import in_one_line
-from cavbench.core import registry
-from cavbench.run.process import settle
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import in_one_line
+from cavbench.run.process import settle
 
 WORLD = StopSignApproach()
 MEASURES = ("stop_score", "confidence_mean", "average_precision", "decoy_confidence", "false_stops", "ran")

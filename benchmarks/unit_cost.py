@@ -20,16 +20,16 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from cavbench.driving import Policy
-from cavbench.driving.drive import drive, drive_jointly
-from cavbench.errors import in_one_line
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Driven, Job
+from cavbench.driving import Policy
+from cavbench.driving.drive import drive, drive_jointly
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import in_one_line
 from cavbench.run.batches import EPISODES
 from cavbench.run.process import settle
 from cavbench.scenarios import SeedBlock
-from cavbench.envs.highway.axes import AXES
-from cavbench.envs.highway.world import HighwayWorld
 
 AT_ONCE = 1000
 

@@ -17,9 +17,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import Console
 
+from cavbench.core.track import Track, tracks
 from cavbench.errors import UserError
 from cavbench.files import whole
-from cavbench.core.track import Track, tracks
 from cavbench.records import reading
 from cavbench.records.generations import check
 from cavbench.records.schema import schema
@@ -37,7 +37,7 @@ SINGLE = ("linf", "l2", "linf_m", "linf_mps", "mean_speed")
 
 def published(track: Track) -> pa.Table:
     """Every record of a track in `leaderboard/data/*.parquet`, an empty table if none is shipped."""
-    with as_file(files("leaderboard") / "data") as folder:
+    with as_file(files("cavbench.leaderboard") / "data") as folder:
         paths = [path for path in sorted(folder.glob("*.parquet")) if check(path)[0].name == track.name]
         tables = [reading.upgraded(path) for path in paths]
     return pa.concat_tables([schema(track).empty_table(), *tables])

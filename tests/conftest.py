@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from cavbench.errors import UserError
-from cavbench.run.process import settle
 from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
+from cavbench.run.process import settle
 
 FACTS = StopSignApproach().facts
 

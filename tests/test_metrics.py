@@ -14,10 +14,10 @@ from scipy.stats import binomtest, ttest_1samp
 
 from cavbench.core.contracts import Facts
 from cavbench.core.track import Measure
+from cavbench.envs.highway.axes import AXES
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import Episodes, as_text, difference, measured, shared
 from cavbench.statistics.estimates import components, interval, scenario_covariance, share_interval, task_intervals
-from cavbench.envs.highway.axes import AXES
 
 quick = settings(max_examples=40, deadline=None)
 shapes = st.tuples(st.integers(1, 5), st.integers(1, 6), st.integers(1, 8))

@@ -11,10 +11,10 @@ import torch
 from rerun.chunk import Chunk, RrdReader
 
 from cavbench.driving import DrivingFacts, Features, ObservationThreat
-from cavbench.driving.rollout import Trace
-from cavbench.driving.threat import project
 from cavbench.driving.recording import save
 from cavbench.driving.recording.episode import Episode
+from cavbench.driving.rollout import Trace
+from cavbench.driving.threat import project
 from cavbench.envs.highway.axes import AXES
 
 FEATURES = Features(

@@ -12,12 +12,12 @@ from annotated_types import Interval
 from torch import Tensor
 
 from cavbench.attacks.detection.views import Views
+from cavbench.core.contracts import Access, Progress
+from cavbench.core.ranges import Count, NotNegative, Positive, Share
 from cavbench.detection import PatchAttack, PatchOracle, Predictions, Scenes
 from cavbench.detection.evidence import log_odds
 from cavbench.detection.printing import non_printability
 from cavbench.detection.threat import Texels
-from cavbench.core.contracts import Access, Progress
-from cavbench.core.ranges import Count, NotNegative, Positive, Share
 
 Loss = Literal["probability", "log_odds"]
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from cavbench.detection import PatchAttack, Scenes
 from cavbench.core.contracts import Access, Progress
 from cavbench.core.ranges import Share
+from cavbench.detection import PatchAttack, Scenes
 
 if TYPE_CHECKING:
     from cavbench.detection import PatchOracle

@@ -8,9 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from cavbench.core.contracts import Access, Progress
 from cavbench.detection import PatchAttack, PatchOracle, Scenes
 from cavbench.detection.threat import Texels
-from cavbench.core.contracts import Access, Progress
 
 
 @dataclass(frozen=True, kw_only=True)

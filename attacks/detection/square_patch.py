@@ -11,11 +11,11 @@ from annotated_types import Interval
 from torch import Tensor
 
 from cavbench.attacks.detection.views import Views
+from cavbench.core.contracts import Access, Progress
+from cavbench.core.ranges import Count
 from cavbench.detection import PatchAttack, PatchOracle, Scenes
 from cavbench.detection.evidence import log_odds
 from cavbench.detection.threat import Texels
-from cavbench.core.contracts import Access, Progress
-from cavbench.core.ranges import Count
 
 REPORT_EVERY = 10
 """Steps between two progress reports."""

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from cavbench.attacks.detection.eot import EOT, Loss
 from cavbench.attacks.detection.shake_drop import shake
-from cavbench.detection import STOP_SIGN, Detector, DetectorVictim, PatchOracle, Predictions, Scenes
-from cavbench.errors import UserError
 from cavbench.core.contracts import Access, Facts, Progress
 from cavbench.core.pair import choose
 from cavbench.core.ranges import Count, NotNegative, Share
+from cavbench.detection import STOP_SIGN, Detector, DetectorVictim, PatchOracle, Predictions, Scenes
+from cavbench.errors import UserError
 from cavbench.scenarios.axes import Axes
 
 BETWEEN = "+"

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cavbench.core.contracts import Access
 from cavbench.driving import ActionType, DrivingAttack
 from cavbench.errors import UserError
-from cavbench.core.contracts import Access
 
 if TYPE_CHECKING:
     from cavbench.driving import Oracle

@@ -10,8 +10,8 @@ from annotated_types import Interval
 from tensordict import TensorDict
 from torch import Tensor
 
-from cavbench.driving import DrivingAttack, Oracle, State
 from cavbench.core.contracts import Access
+from cavbench.driving import DrivingAttack, Oracle, State
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,9 +11,9 @@ from torch import Tensor
 from cavbench.attacks.driving.director_training import AdversaryWorld, Director
 from cavbench.attacks.driving.pgd import PGD
 from cavbench.attacks.driving.targets import Controls, EveryAction, Targets
-from cavbench.driving import ActionType, DrivingAttack, Policy
 from cavbench.core.contracts import Access, Progress, Trained
 from cavbench.core.ranges import Count, Width
+from cavbench.driving import ActionType, DrivingAttack, Policy
 
 if TYPE_CHECKING:
     from cavbench.driving import Oracle

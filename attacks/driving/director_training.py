@@ -17,12 +17,12 @@ from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
 from cavbench.attacks.driving.targets import Targets
+from cavbench.core.ranges import Count, Share
 from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingWorld, ObservationThreat, Oracle, Policy, State
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.victim import CountedPolicy
-from cavbench.core.ranges import Count, Share
-from cavbench.scenarios import Cell
 from cavbench.driving.victims.dqn import DQN
+from cavbench.scenarios import Cell
 
 Induce = Callable[[Tensor, Oracle, Tensor], Tensor]
 """The perturbed observation [B, V, F], from the true one, the oracle and the target of each episode [B]."""

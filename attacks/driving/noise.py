@@ -9,9 +9,9 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from cavbench.driving import DrivingAttack
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Natural
+from cavbench.driving import DrivingAttack
 
 if TYPE_CHECKING:
     from cavbench.driving import Oracle

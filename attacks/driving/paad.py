@@ -8,16 +8,24 @@ from typing import Annotated
 from annotated_types import Interval
 from torch import Tensor
 
+from cavbench import zoo
 from cavbench.attacks.driving.directed import Directed
 from cavbench.attacks.driving.director_training import AdversaryWorld, Victim
 from cavbench.attacks.driving.objectives import DiscreteLoss
 from cavbench.attacks.driving.pgd import PGD
 from cavbench.attacks.driving.targets import EveryActionAndWorst, Targets
-from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, ObservationThreat, Oracle, Policy
-from cavbench.driving.threat import Norm
 from cavbench.core.contracts import Progress, Trained
 from cavbench.core.ranges import Count, Natural
-from cavbench import zoo
+from cavbench.driving import (
+    DrivingDefense,
+    DrivingFacts,
+    DrivingVictim,
+    DrivingWorld,
+    ObservationThreat,
+    Oracle,
+    Policy,
+)
+from cavbench.driving.threat import Norm
 from cavbench.driving.victims.networks import QPolicy
 
 

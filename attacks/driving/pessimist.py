@@ -8,8 +8,8 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from cavbench.driving import DrivingAttack, Oracle
 from cavbench.core.contracts import Access
+from cavbench.driving import DrivingAttack, Oracle
 
 Outlook = Literal["pessimist", "optimist"]
 

@@ -11,9 +11,9 @@ from annotated_types import Interval
 from torch import Tensor
 
 from cavbench.attacks.driving.objectives import ContinuousLoss, DiscreteLoss, Objective
-from cavbench.driving import DrivingAttack, parts_of
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Count, Natural, Positive, Share
+from cavbench.driving import DrivingAttack, parts_of
 
 if TYPE_CHECKING:
     from cavbench.driving import DrivingVictim, Oracle

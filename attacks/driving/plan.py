@@ -13,9 +13,9 @@ from torch import Tensor
 
 from cavbench.attacks.driving.objectives import TIE_BREAK, distance, expected, margin, spared, taken, temperature
 from cavbench.attacks.driving.pgd import better, descend, random_starts
-from cavbench.driving import DrivingAttack, Dynamics, Forecast, Oracle, State
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Count, Natural, Positive, Share
+from cavbench.driving import DrivingAttack, Dynamics, Forecast, Oracle, State
 
 CORNERS = ((1.0, -1.0), (1.0, 1.0), (1.0, 0.0), (-1.0, 0.0), (-1.0, 1.0), (-1.0, -1.0))
 """The [acceleration, steering] towards which a continuous victim is pulled; the first one where no forecast fails."""

@@ -10,10 +10,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from cavbench.driving import DrivingAttack, Oracle, State
-from cavbench.driving.threat import project
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Count, NotNegative, Positive
+from cavbench.driving import DrivingAttack, Oracle, State
+from cavbench.driving.threat import project
 
 SIGNS = torch.tensor(list(product((1.0, -1.0), repeat=3)))
 """[8, 3] the lies, of the cars in the ego's lane, on its left and on its right: 1 is nearer and closing, -1 the opposite."""

@@ -13,18 +13,27 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from cavbench import zoo
 from cavbench.attacks.driving.objectives import TIE_BREAK, expected, taken, temperature
 from cavbench.attacks.driving.pgd import PGD
-from cavbench.driving import ActionType, DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, Policy, TrainingHooks
-from cavbench.errors import UserError
 from cavbench.core.contracts import Access, Progress, Trained
 from cavbench.core.ranges import Count, NotNegative, Positive, Share, Width
-from cavbench.scenarios import SeedBlock
-from cavbench import zoo
+from cavbench.driving import (
+    ActionType,
+    DrivingAttack,
+    DrivingDefense,
+    DrivingFacts,
+    DrivingVictim,
+    DrivingWorld,
+    Policy,
+    TrainingHooks,
+)
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase
 from cavbench.driving.victims.networks import Critic, QNetwork
 from cavbench.driving.victims.practice import Practice, roads
 from cavbench.driving.victims.training import WARM_UP
+from cavbench.errors import UserError
+from cavbench.scenarios import SeedBlock
 
 if TYPE_CHECKING:
     from cavbench.driving import Oracle

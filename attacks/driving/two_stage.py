@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from cavbench import zoo
 from cavbench.attacks.driving.directed import Directed
 from cavbench.attacks.driving.director_training import AdversaryWorld
-from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, Policy
 from cavbench.core.contracts import Progress, Trained
 from cavbench.core.ranges import Count
-from cavbench import zoo
+from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, Policy
 from cavbench.driving.victims.networks import QPolicy
 
 

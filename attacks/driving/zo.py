@@ -12,9 +12,9 @@ from annotated_types import Interval
 from torch import Tensor
 
 from cavbench.attacks.driving.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion
-from cavbench.driving import DrivingAttack, Part, parts_of
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Count, Natural, NotNegative, Positive
+from cavbench.driving import DrivingAttack, Part, parts_of
 
 if TYPE_CHECKING:
     from cavbench.driving import Oracle

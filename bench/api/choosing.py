@@ -10,21 +10,21 @@ from typing import Any, get_args
 import torch
 from tensordict import TensorDict
 
-from cavbench.driving import DrivingWorld
-from cavbench.errors import UserError
 from cavbench.core import budgets, registry, suites
-from cavbench.identity.bytecode import content_of
 from cavbench.core.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
 from cavbench.core.pair import Chosen, Pair, choose
 from cavbench.core.registry import GROUPS, Kind
 from cavbench.core.suites import Suite
 from cavbench.core.track import track
-from cavbench.run.config import combined, grid_of
-from cavbench.scenarios import Grid, SeedBlock, Value
+from cavbench.driving import DrivingWorld
 from cavbench.driving.victims.in_process import InProcess, code_of_policies, in_process
 from cavbench.driving.victims.sb3_environment import training_of
 from cavbench.driving.victims.sb3_model import is_model
 from cavbench.driving.victims.spaces import UNKNOWN
+from cavbench.errors import UserError
+from cavbench.identity.bytecode import content_of
+from cavbench.run.config import combined, grid_of
+from cavbench.scenarios import Grid, SeedBlock, Value
 
 BASES: dict[str, type[Component]] = {"attack": Attack, "defense": Defense, "victim": Victim, "world": World}
 TRIED = 4

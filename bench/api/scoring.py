@@ -15,10 +15,10 @@ from cavbench.api.choosing import checked_for_workers, chosen, grid_with, pairs_
 from cavbench.api.table import Scores, scores_of
 from cavbench.cli.progress import RunProgress
 from cavbench.cli.terminal import Console
-from cavbench.errors import UserError
 from cavbench.core.contracts import Attack, Defense, ThreatModel, Victim, World
 from cavbench.core.pair import Pair
 from cavbench.core.track import track_of
+from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.run import runner
 from cavbench.run.config import RunConfig

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cavbench.errors import UserError
 from cavbench.core.registry import Kind
+from cavbench.errors import UserError
 
 Status = Literal["pass", "fail", "skip", "doubt"]
 Check = Callable[[], str | None]

@@ -6,11 +6,11 @@ import pickle
 from collections.abc import Mapping
 
 from cavbench.checks.check import BrokenRuleError, Check, Suite, one_line, require
-from cavbench.errors import UserError
 from cavbench.core import registry
-from cavbench.identity.fingerprint import canonical
 from cavbench.core.options import configured
 from cavbench.core.parameters import description, parameters
+from cavbench.errors import UserError
+from cavbench.identity.fingerprint import canonical
 
 
 class ComponentSuite(Suite):

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from cavbench.checks.check import Subject, Suite
-from cavbench.errors import UserError
 from cavbench.core import registry
 from cavbench.core.registry import Kind
+from cavbench.errors import UserError
 
 KITS = "cavbench.kits"
 Suites = Callable[[Subject], Iterable[Suite]]

@@ -11,10 +11,10 @@ from typing import Literal, cast, get_args
 
 from cavbench.checks import kits
 from cavbench.checks.kits import Kit
-from cavbench.errors import UserError
 from cavbench.core import registry, sources
 from cavbench.core.options import DEFAULTS
 from cavbench.core.registry import Kind
+from cavbench.errors import UserError
 
 NewKind = Literal["attack", "defense", "victim"]
 NOUNS = {"attack": "an attack", "defense": "a defence", "victim": "a victim"}

@@ -8,10 +8,10 @@ import pickle
 from collections.abc import Mapping
 
 from cavbench.checks.check import BrokenRuleError, Check, Suite, one_line, require
-from cavbench.errors import UserError
 from cavbench.core import registry
 from cavbench.core.contracts import Facts, World
 from cavbench.core.registry import KINDS
+from cavbench.errors import UserError
 from cavbench.scenarios import Axes, Axis, Cell, Grid
 
 TAKEN = (*KINDS, "threat", "grid", "episodes", "seeds", "workers", "out", "record", "reference")

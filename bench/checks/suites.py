@@ -10,13 +10,13 @@ from cavbench.checks import kits
 from cavbench.checks.check import NotApplicableError, Outcome, Subject, Suite, one_line
 from cavbench.checks.component import ComponentSuite
 from cavbench.checks.scenarios import ScenarioSuite
-from cavbench.errors import UserError
 from cavbench.core import sources
 from cavbench.core.contracts import ANY_TRACK
 from cavbench.core.options import configured
 from cavbench.core.pair import choose
 from cavbench.core.registry import Kind
 from cavbench.core.track import track
+from cavbench.errors import UserError
 
 
 def examine(

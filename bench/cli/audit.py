@@ -12,9 +12,9 @@ from rich.text import Text
 
 from cavbench.cli.progress import RunProgress, show_downloads
 from cavbench.cli.terminal import Console
-from cavbench.errors import UserError
 from cavbench.core.pair import Pair
 from cavbench.core.track import Track, track_of
+from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.records.schema import AUDIT
 from cavbench.run import runner

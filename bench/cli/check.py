@@ -12,8 +12,8 @@ from rich.text import Text
 
 from cavbench.cli.listing import heading
 from cavbench.cli.words import split
-from cavbench.errors import UserError, short
 from cavbench.core import registry
+from cavbench.errors import UserError, short
 
 if TYPE_CHECKING:
     from cavbench.checks.check import Outcome

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 from cavbench.cli.terminal import Console
+from cavbench.core.names import split
 
 
 def check_names(words: Sequence[str], settings: str) -> None:
@@ -29,7 +30,7 @@ def check_names(words: Sequence[str], settings: str) -> None:
         for name in given.values.get(kind, ()):
             # Hydra's grammar escapes the colon of NAME:CHOICE.
             plain = name.replace("\\:", ":").partition(":")[0]
-            links = registry.split(plain) if kind == "defense" else [plain]
+            links = split(plain) if kind == "defense" else [plain]
             known = [*registry.names(kind), *(suites.names() if run and kind == "attack" else [])]
             for link in links:
                 if link not in known:

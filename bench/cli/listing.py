@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavbench.errors import UserError
 from cavbench.core import registry, suites
 from cavbench.core.contracts import ANY_TRACK
 from cavbench.core.registry import GROUPS, KINDS, Kind
 from cavbench.core.sources import summary, tracks_of
 from cavbench.core.suites import Suite
+from cavbench.errors import UserError
 
 SUITE = "suite"
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from cavbench.cli.words import split
 from cavbench.checks import scaffold
+from cavbench.cli.words import split
 
 KEYS = ("track", "out")
 

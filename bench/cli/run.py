@@ -9,8 +9,8 @@ from rich.text import Text
 
 from cavbench.cli.progress import RunProgress, show_downloads
 from cavbench.cli.terminal import Console
-from cavbench.errors import UnfinishedError, UserError
 from cavbench.core.track import Track, track_of
+from cavbench.errors import UnfinishedError, UserError
 from cavbench.records import reading
 from cavbench.run import rounds, runner
 from cavbench.run.config import run_config

@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavbench.errors import UserError
 from cavbench.core import registry, suites
 from cavbench.core.track import Track, track
+from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.records.schema import IDENTITY
 from cavbench.run import rounds

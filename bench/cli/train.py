@@ -10,17 +10,17 @@ from typing import Any
 
 from rich.text import Text
 
+from cavbench import zoo
 from cavbench.cli.progress import TrainingProgress
 from cavbench.cli.terminal import Console
-from cavbench.errors import UserError
-from cavbench.files import check_folder
 from cavbench.core.chain import Chain
 from cavbench.core.contracts import Trained, World
 from cavbench.core.pair import Chosen, choose
 from cavbench.core.track import track
+from cavbench.errors import UserError
+from cavbench.files import check_folder
 from cavbench.run.config import TrainConfig, train_config
 from cavbench.run.process import settle
-from cavbench import zoo
 
 
 def train(words: Sequence[str], console: Console) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from cavbench.errors import UserError, short
 from cavbench.core import registry
+from cavbench.errors import UserError, short
 
 
 def split(words: Sequence[str], keys: Collection[str], *, names: int) -> tuple[list[str], dict[str, str]]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any, TypeVar
 
-from cavbench.errors import UserError, short
 from cavbench.core.contracts import ThreatModel
+from cavbench.errors import UserError, short
 
 PER_CENT = re.compile(r"\d+(\.\d*)?|\.\d+")
 T = TypeVar("T", bound=ThreatModel)

@@ -8,9 +8,9 @@ from dataclasses import field, fields, make_dataclass
 from functools import cache
 from typing import Any, cast
 
-from cavbench.errors import UserError
 from cavbench.core.contracts import ANY_TRACK, Defense, Victim
-from cavbench.core.registry import MARK
+from cavbench.core.names import MARK
+from cavbench.errors import UserError
 
 
 class Chain(Defense):

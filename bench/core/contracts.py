@@ -3,8 +3,8 @@
 A component is a frozen, keyword-only dataclass. Its fields are its parameters: they have the same names in the constructor, on
 the command line (`attack.steps=50`) and in records. Their annotations give the allowed ranges (`cavbench.core.ranges`).
 
-A track is a kind of victim (`cavbench.core.track`). Its base classes are in `cavbench.driving` and `cavbench.detection`; a component
-that derives from both works on both tracks.
+A track is a kind of victim (`cavbench.core.track`). Its base classes are in `cavbench.driving` and `cavbench.detection`; a
+component that derives from both works on both tracks.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, get_args
 
-from cavbench.errors import UserError
 from cavbench.core import ranges
+from cavbench.errors import UserError
 from cavbench.scenarios import Axes
 
 if TYPE_CHECKING:

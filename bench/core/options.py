@@ -24,7 +24,6 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cavbench.errors import PluginError, UserError, short
 from cavbench.core import budgets, registry, suites
 from cavbench.core.contracts import Access, Defense, ThreatModel
 from cavbench.core.pair import Chosen, choose
@@ -32,6 +31,7 @@ from cavbench.core.parameters import Parameter, flattened, parameters
 from cavbench.core.registry import Kind
 from cavbench.core.suites import Suite
 from cavbench.core.track import track
+from cavbench.errors import PluginError, UserError, short
 from cavbench.scenarios import Axes, Axis, Value
 
 LONGEST_VALUE, MOST_VALUES = 5_000, 1_000

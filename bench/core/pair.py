@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
-from cavbench.errors import PluginError, UserError, message, reason
 from cavbench.core import registry, sources
 from cavbench.core.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
+from cavbench.core.parameters import differing
+from cavbench.core.registry import Kind
+from cavbench.errors import PluginError, UserError, message, reason
 from cavbench.identity.fingerprint import canonical, digest, state_digest
 from cavbench.isolation.foreign import contained, unchanged
 from cavbench.isolation.framework import OWN
-from cavbench.core.parameters import differing
-from cavbench.core.registry import Kind
 
 IN_PROCESS = "a Python process"
 """What records say of a component that no package ships."""
@@ -66,7 +66,7 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
     """
     component = registry.load(kind, name)
     try:
-        with contained(), nullcontext() if component.__module__.partition(".")[0] in OWN else unchanged():
+        with contained(), nullcontext() if component.__module__.partition(".")[0] == OWN else unchanged():
             return Chosen(kind=kind, name=name, component=component(**params))
     except (ValueError, TypeError) as error:
         raise UserError(f"{kind} {name!r}: {message(error) or type(error).__name__}") from error

@@ -10,9 +10,9 @@ from dataclasses import MISSING, Field, dataclass, fields
 from functools import cache
 from typing import Any, Literal, Union, get_args, get_origin
 
-from cavbench.errors import PluginError
 from cavbench.core import ranges
 from cavbench.core.contracts import Component
+from cavbench.errors import PluginError
 
 
 @dataclass(frozen=True, kw_only=True)

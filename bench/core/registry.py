@@ -17,15 +17,13 @@ from functools import cache, partial
 from importlib import metadata
 from typing import Any, Literal, get_args
 
-from cavbench import shadow
+from cavbench.core.names import MARK, plain, split
 from cavbench.errors import EscapeError, PluginError, UserError, reason
 from cavbench.isolation.foreign import contained, harm, unchanged
 from cavbench.scenarios import Grid
 
 Kind = Literal["attack", "defense", "victim", "world"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-MARK = "+"
-"""Separates the links of a chain of defences."""
 GROUPS: dict[Kind, str] = {
     "attack": "cavbench.attacks",
     "defense": "cavbench.defenses",
@@ -95,7 +93,7 @@ def kinds_of(name: str) -> list[Kind]:
     Raises:
         UserError: if there is none.
     """
-    kinds = [kind for kind in KINDS if _plain(name) in names(kind)]
+    kinds = [kind for kind in KINDS if plain(name) in names(kind)]
     if MARK in name and all(link in names("defense") for link in split(name)):
         kinds = ["defense"]
     if not kinds:
@@ -134,13 +132,13 @@ def find(group: str, name: str, noun: str) -> Entry:
     known = entries(group)
     if group == GROUPS["defense"] and MARK in name:
         return _joined([find(group, link, noun) for link in split(name)])
-    plain = _plain(name)
-    if plain not in known:
+    own = plain(name)
+    if own not in known:
         hint = _of_file(name) if noun == "victim" else ""
-        raise UserError(f"unknown {noun} {name!r}; {hint}" if hint else unknown(f"{noun} {plain!r}", plain, known))
-    if complaint := problem(known[plain]):
-        raise UserError(f"{noun} {plain!r} is {complaint}")
-    return known[plain][0]
+        raise UserError(f"unknown {noun} {name!r}; {hint}" if hint else unknown(f"{noun} {own!r}", own, known))
+    if complaint := problem(known[own]):
+        raise UserError(f"{noun} {own!r} is {complaint}")
+    return known[own][0]
 
 
 def _of_file(name: str) -> str:
@@ -188,7 +186,7 @@ def resolve(group: str, name: str, noun: str) -> Any:
             return point.load()
     # Importing a plug-in may raise anything; that must not break the other components.
     except Exception as error:
-        why = shadow.explanation(point.module, entry.distribution) or reason(error)
+        why = reason(error)
         # A second import of it would do nothing, and seem to be harmless.
         if isinstance(error, EscapeError):
             _REFUSED[point.module] = why
@@ -314,16 +312,6 @@ def _chosen(kind: Kind, name: str) -> type[Any]:
             )
         raise UserError(unknown(f"{kind} {name!r}", choice, choices))
     return component.chosen(choice)
-
-
-def split(name: str) -> list[str]:
-    """The links of a chain of defences."""
-    return name.split(MARK)
-
-
-def _plain(name: str) -> str:
-    """NAME of NAME:CHOICE."""
-    return name.partition(":")[0]
 
 
 def _where(group: str, name: str, noun: str) -> str:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import ast
 import importlib.util
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
 from cavbench.core import registry
 from cavbench.core.contracts import ANY_TRACK
-from cavbench.identity.fingerprint import file_of
 from cavbench.core.registry import GROUPS, Kind
+from cavbench.identity.fingerprint import file_of
 
 
 def names(kind: Kind, track: str) -> list[str]:
@@ -94,7 +95,7 @@ def _top_level(module: str) -> tuple[dict[str, _Class], dict[str, tuple[str, str
     classes: dict[str, _Class] = {}
     imported: dict[str, tuple[str, str]] = {}
     try:
-        body = ast.parse(path.read_bytes()).body
+        body = list(_statements(ast.parse(path.read_bytes()).body))
     except (SyntaxError, ValueError):
         return {}, {}
     for node in body:
@@ -107,3 +108,13 @@ def _top_level(module: str) -> tuple[dict[str, _Class], dict[str, tuple[str, str
                 base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
                 imported |= {alias.asname or alias.name: (base, alias.name) for alias in node.names}
     return classes, imported
+
+
+def _statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """The statements of a module, with those for types: a package may import these names when they are first used."""
+    for node in body:
+        match node:
+            case ast.If(test=ast.Name(id="TYPE_CHECKING")):
+                yield from node.body
+            case _:
+                yield node

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cavbench.errors import UserError
 from cavbench.core import registry
 from cavbench.core.contracts import Access
 from cavbench.core.pair import Chosen, Pair, choose
+from cavbench.errors import UserError
 
 VERSIONED = re.compile(r"(?P<family>.+)-(?P<version>\d+)")
 

@@ -17,10 +17,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cavbench.errors import UserError
 from cavbench.core import registry
 from cavbench.core.contracts import Progress
 from cavbench.core.pair import Pair
+from cavbench.errors import UserError
 from cavbench.scenarios import Cell
 
 Columns = Mapping[str, NDArray[np.generic]]

@@ -1,10 +1,15 @@
 """The detection track: stop-sign detectors, attacked with a patch on the sign. Plug-ins import from here."""
 
-from cavbench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
-from cavbench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions, Wrapped
-from cavbench.detection.oracle import PatchOracle
-from cavbench.detection.scenes import Approach, Decoy, Scenes
-from cavbench.detection.threat import PatchThreat
+from typing import TYPE_CHECKING
+
+from cavbench.exports import exported
+
+if TYPE_CHECKING:
+    from cavbench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
+    from cavbench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions, Wrapped
+    from cavbench.detection.oracle import PatchOracle
+    from cavbench.detection.scenes import Approach, Decoy, Scenes
+    from cavbench.detection.threat import PatchThreat
 
 __all__ = [
     "STOP_SIGN",
@@ -23,3 +28,5 @@ __all__ = [
     "Scenes",
     "Wrapped",
 ]
+
+__getattr__ = exported(__name__, __all__, ("contracts", "detector", "oracle", "scenes", "threat"))

@@ -8,6 +8,8 @@ from copy import deepcopy
 import torch
 from torch import Tensor
 
+from cavbench.core.contracts import Progress
+from cavbench.core.track import Job
 from cavbench.detection.contracts import CameraWorld, PatchAttack
 from cavbench.detection.detector import Detector
 from cavbench.detection.enforcer import PatchEnforcer
@@ -16,8 +18,6 @@ from cavbench.detection.placed import placed
 from cavbench.detection.scenes import Scenes
 from cavbench.detection.threat import PatchThreat
 from cavbench.errors import UserError
-from cavbench.core.contracts import Progress
-from cavbench.core.track import Job
 from cavbench.isolation.kept import unchanged
 from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import Watch

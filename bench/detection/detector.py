@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
-from cavbench.errors import UserError
 from cavbench.core.registry import unknown
+from cavbench.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,23 @@ from dataclasses import replace
 import numpy as np
 from torch import Tensor
 
-from cavbench.detection import approach, boxes, closed_loop, crafting, discrimination, driver, enforcer, oracle, precision, printing, sight, stopping, threat
+from cavbench.core.progress import share_done
+from cavbench.core.track import Driven, Job
+from cavbench.detection import (
+    approach,
+    boxes,
+    closed_loop,
+    crafting,
+    discrimination,
+    driver,
+    enforcer,
+    oracle,
+    precision,
+    printing,
+    sight,
+    stopping,
+    threat,
+)
 from cavbench.detection.approach import Sighting, Trace, Unpatched, check_approaches, score
 from cavbench.detection.closed_loop import Drive, Drives
 from cavbench.detection.contracts import CameraWorld
@@ -17,8 +33,6 @@ from cavbench.detection.patch import Patch
 from cavbench.detection.placed import placed
 from cavbench.detection.scenes import Approach
 from cavbench.errors import UserError
-from cavbench.core.progress import share_done
-from cavbench.core.track import Driven, Job
 from cavbench.isolation.seal import Seal
 from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import Watch

@@ -9,10 +9,10 @@ from copy import deepcopy
 import torch
 from torch import Tensor
 
+from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.detection.detector import STOP_SIGN, Detector, Predictions
 from cavbench.detection.oracle import PatchOracle
 from cavbench.detection.threat import PatchThreat
-from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import TamperError, Watch
 

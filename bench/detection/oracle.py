@@ -8,11 +8,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from cavbench.core.contracts import Access
 from cavbench.detection.detector import Predictions, label_of
 from cavbench.detection.patch import MOMENTS, Evolution
 from cavbench.detection.threat import PatchThreat
 from cavbench.errors import UserError
-from cavbench.core.contracts import Access
 
 
 class Door(Protocol):

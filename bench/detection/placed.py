@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cavbench.detection.detector import Detector, Predictions, Wrapped
 from cavbench.core.device import CPU, move
+from cavbench.detection.detector import Detector, Predictions, Wrapped
 
 
 class Placed(Wrapped):

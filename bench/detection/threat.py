@@ -9,10 +9,10 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from cavbench.detection.printing import printed
-from cavbench.errors import UserError
 from cavbench.core.contracts import ThreatModel
 from cavbench.core.ranges import Natural
+from cavbench.detection.printing import printed
+from cavbench.errors import UserError
 
 SIDES = range(8, 513)
 """Allowed width and height of a patch in texels."""

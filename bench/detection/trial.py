@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cavbench.core.contracts import Facts
 from cavbench.detection import STOP_SIGN, CameraWorld, Detector, DetectorVictim, Predictions, Scenes
 from cavbench.detection.boxes import best_other, confidence
 from cavbench.errors import UserError, reason
-from cavbench.core.contracts import Facts
 from cavbench.isolation.memory import changed, kept
 from cavbench.isolation.streams import Stream
 

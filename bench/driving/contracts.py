@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
+from cavbench.core.contracts import Attack, Defense, Progress, ThreatModel, Trained, Victim, World
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.features import ActionType, Driver, DrivingFacts, Features
 from cavbench.driving.kinematics import Kinematics
 from cavbench.driving.oracle import Oracle
 from cavbench.driving.policy import Policy, State
 from cavbench.driving.threat import ObservationThreat
-from cavbench.core.contracts import Attack, Defense, Progress, ThreatModel, Trained, Victim, World
 from cavbench.scenarios import Cell
 
 if TYPE_CHECKING:

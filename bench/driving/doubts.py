@@ -10,13 +10,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cavbench.driving.features import DrivingFacts, Features
-from cavbench.errors import UserError
+from cavbench import zoo
 from cavbench.core.chain import Chain
+from cavbench.core.names import MARK
 from cavbench.core.options import configured
 from cavbench.core.pair import Pair
-from cavbench.core.registry import MARK
-from cavbench import zoo
+from cavbench.driving.features import DrivingFacts, Features
+from cavbench.errors import UserError
 
 
 def doubts(pair: Pair, default_world: str) -> Iterator[str]:

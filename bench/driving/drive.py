@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from copy import deepcopy
 from itertools import accumulate, pairwise
 
+from cavbench.core.pair import Pair
+from cavbench.core.track import Driven, Job
 from cavbench.driving import attacker, enforcer, meter, oracle, probes, shadows, threat, victim
 from cavbench.driving import rollout as rollouts
 from cavbench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
@@ -15,8 +17,6 @@ from cavbench.driving.policy import Policy
 from cavbench.driving.rollout import Trace, rollout
 from cavbench.driving.threat import ObservationThreat
 from cavbench.errors import UserError
-from cavbench.core.pair import Pair
-from cavbench.core.track import Driven, Job
 from cavbench.isolation.seal import Seal
 from cavbench.isolation.streams import Stream
 

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.features import Features
 from cavbench.driving.oracle import DRAWS, Loss, Oracle, Part
@@ -18,7 +19,6 @@ from cavbench.driving.policy import State, repeated, rows_of
 from cavbench.driving.threat import ObservationThreat, bounds
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
-from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.isolation.watch import TamperError
 
 Array = NDArray[Any]

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from cavbench.driving.kinematics import Kinematics
 from cavbench.core.contracts import Facts
+from cavbench.driving.kinematics import Kinematics
 
 ActionType = Literal["discrete", "continuous"]
 Driver = Literal["agent", "idm", "oracle"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cavbench.driving.policy import Policy, PolicyWrapper, State
 from cavbench.core.device import CPU, move
+from cavbench.driving.policy import Policy, PolicyWrapper, State
 
 
 class Placed(PolicyWrapper):

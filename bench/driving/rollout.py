@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from cavbench.core.progress import share_done
 from cavbench.driving.attacker import Attacker, Shown
 from cavbench.driving.contracts import DrivingAttack
 from cavbench.driving.dynamics import Dynamics
@@ -24,7 +25,6 @@ from cavbench.driving.probes import Probe
 from cavbench.driving.threat import ObservationThreat
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
-from cavbench.core.progress import share_done
 from cavbench.isolation.identifiers import opaque
 from cavbench.isolation.kept import unchanged
 from cavbench.isolation.streams import Stream

@@ -10,9 +10,9 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from cavbench.driving.features import Features
 from cavbench.core.contracts import ThreatModel
 from cavbench.core.ranges import Natural, Share
+from cavbench.driving.features import Features
 
 Norm = Literal["relative", "linf"]
 

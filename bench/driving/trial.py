@@ -13,9 +13,9 @@ from torch import Tensor
 from cavbench.driving import DrivingWorld, Policy, State
 from cavbench.driving.policy import repeated, rows_of
 from cavbench.errors import UserError, reason
-from cavbench.scenarios import Cell, SeedBlock
 from cavbench.isolation.memory import changed, kept
 from cavbench.isolation.streams import Stream
+from cavbench.scenarios import Cell, SeedBlock
 
 CONTROLS = 2
 """Size of a continuous action: acceleration and steering."""

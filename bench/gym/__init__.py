@@ -8,10 +8,10 @@ try:
 except ImportError as error:
     raise ImportError("cavbench.gym needs gymnasium: pip install 'cavbench[gym]'") from error
 
+from cavbench.core import sources
 from cavbench.gym.environment import DrivingEnv, make
 from cavbench.gym.vector import DrivingVectorEnv, make_vec
 from cavbench.gym.world import GymWorld
-from cavbench.core import sources
 
 __all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "make", "make_vec"]
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 from gymnasium import spaces
 
+from cavbench.core import registry
 from cavbench.driving import ActionType
 from cavbench.errors import UserError
-from cavbench.core import registry
 from cavbench.identity.fingerprint import canonical
 from cavbench.isolation.foreign import contained
 from cavbench.scenarios import Axes, Cell, Value

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from cavbench.driving import ActionType, DrivingWorld
-from cavbench.errors import UserError
 from cavbench.core import registry
 from cavbench.core.pair import choose
+from cavbench.driving import ActionType, DrivingWorld
+from cavbench.errors import UserError
 from cavbench.scenarios import Cell, Grid, SeedBlock
 
 LAST_SEED = 2**31
@@ -31,7 +31,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
 
     The observation is float32 [V, F] in [-1, 1], as policies get it in a run (`cavbench.driving.Features`). The reward is the
     world's: on the highway highway-env's, normalised to [0, 1] a step, whose sum is the `return` of records. `info` has the truth
-    for scoring: `progress`, `speed`, `x`, `ttc`, `crashed` and `offroad` (`cavbench.driving.DrivingWorld`), `cell` and `scenario`.
+    for scoring: `progress`, `speed`, `x`, `ttc`, `crashed` and `offroad` (`cavbench.driving.DrivingWorld`), `cell`, `scenario`.
 
     Args:
         world: the world.

@@ -15,7 +15,7 @@ from cavbench.identity.fingerprint import digest
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None))
 LIBRARIES = (
-    "bench",
+    "cavbench",
     "torch",
     "torchrl",
     "tensordict",

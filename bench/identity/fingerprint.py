@@ -17,24 +17,18 @@ from typing import Any
 
 LIBRARIES = ("torch", "torchrl", "tensordict", "numba", "numpy")
 
-BESIDE_THE_RESULT = frozenset(
-    [
-        "bounded",
-        "cli",
-        "conformance",
-        "errors",
-        "files",
-        "plugins",
-        "recording",
-        "records",
-        "run",
-        "shadow",
-        "statistics",
-        "tracks",
-        "trial",
-    ]
+OWN = "cavbench"
+PARTS = ("attacks", "defenses", "envs", "leaderboard")
+"""Packages in `cavbench` that stand beside its folder in a checkout."""
+BESIDE_THE_RESULT = (
+    *("api", "bounded", "checks", "cli", "core", "errors", "exports", "files", "identity", "leaderboard", "recording"),
+    *("records", "run", "statistics"),
+    *("driving.checks", "driving.recording", "driving.track", "driving.trial"),
+    *("detection.checks", "detection.recording", "detection.track", "detection.trial"),
+    *("isolation.custody", "isolation.foreign", "isolation.framework", "isolation.held", "isolation.memory"),
+    *("isolation.settings", "isolation.threads"),
 )
-"""Packages and modules of `bench` that choose, store or show results: editing them outdates no record."""
+"""Packages and modules of `cavbench` that choose, store or show results: editing them outdates no record."""
 
 
 STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)
@@ -82,18 +76,16 @@ def sources(modules: Iterable[str]) -> dict[str, Path]:
     """The source files of modules and of everything they import, directly or indirectly, anywhere in their code but for
     types alone (`if TYPE_CHECKING`).
 
-    Imports are followed within the modules' top-level packages and `bench`, except `BESIDE_THE_RESULT`; of other packages only
+    Imports are followed within the modules' top-level packages and `cavbench`, except `BESIDE_THE_RESULT`; of other packages only
     the version counts.
     """
     waiting = list(modules)
-    packages = {"bench", *(name.partition(".")[0] for name in waiting)}
+    packages = {OWN, *(name.partition(".")[0] for name in waiting)}
     found: dict[str, Path] = {}
     while waiting:
         name = waiting.pop()
         path = file_of(name)
-        package, *inner = name.split(".")
-        beside = package == "bench" and bool(inner) and inner[0] in BESIDE_THE_RESULT
-        if path is None or name in found or beside:
+        if path is None or name in found or _is_beside(name):
             continue
         found[name] = path
         imported = (*_imports(name, path), name.rpartition(".")[0])
@@ -101,9 +93,17 @@ def sources(modules: Iterable[str]) -> dict[str, Path]:
     return found
 
 
+def _is_beside(module: str) -> bool:
+    """Whether no result depends on a module; the package `cavbench` itself is the door to all of them."""
+    package, _, inner = module.partition(".")
+    return package == OWN and (not inner or any(f"{inner}.".startswith(f"{beside}.") for beside in BESIDE_THE_RESULT))
+
+
 def file_of(module: str) -> Path | None:
-    """The file of a module, found without importing it or its parents; None if there is no such module."""
+    """The file of a module, found without importing it or its parents, but `cavbench`; None if there is no such module."""
     top, *inner = module.split(".")
+    if top == OWN and inner and inner[0] in PARTS:
+        top, inner = f"{top}.{inner[0]}", inner[1:]
     spec = importlib.util.find_spec(top)
     if spec is None:
         return None
@@ -125,9 +125,10 @@ def _imports(module: str, path: Path) -> tuple[str, ...]:
     waiting: list[ast.AST] = [ast.parse(path.read_bytes())]
     while waiting:
         node = waiting.pop()
-        # What types alone need is never executed.
+        # What types alone need is never executed; a package may import it when it is first used (`cavbench.exports`).
         for_types = isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-        inside = node.orelse if for_types and isinstance(node, ast.If) else ast.iter_child_nodes(node)
+        skipped = for_types and path.name != "__init__.py"
+        inside = node.orelse if skipped and isinstance(node, ast.If) else ast.iter_child_nodes(node)
         waiting += [child for child in inside if isinstance(child, STATEMENTS)]
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]

@@ -9,7 +9,24 @@ from dataclasses import dataclass
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
-from cavbench.isolation.held import ARRAY, CLASS, CONSTANTS, CONTAINERS, DATA, FUNCTION, INSTANCE, MODULE, PLAIN, TENSORS, Kind, is_array, is_computed, is_network, is_tensordict, joined
+from cavbench.isolation.held import (
+    ARRAY,
+    CLASS,
+    CONSTANTS,
+    CONTAINERS,
+    DATA,
+    FUNCTION,
+    INSTANCE,
+    MODULE,
+    PLAIN,
+    TENSORS,
+    Kind,
+    is_array,
+    is_computed,
+    is_network,
+    is_tensordict,
+    joined,
+)
 
 SHOWN = 3
 """Most names in a message."""

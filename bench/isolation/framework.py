@@ -10,8 +10,8 @@ from types import CodeType, FunctionType, ModuleType
 
 from cavbench.isolation.custody import Custody, listed
 
-OWN = ("bench", "attacks", "defenses", "envs", "leaderboard")
-"""Top-level packages of the framework."""
+OWN = "cavbench"
+"""The package of the framework."""
 BOOKS = ("cavbench.core.registry",)
 """Modules that keep books on what was imported: their data change."""
 LIBRARIES = {
@@ -49,7 +49,7 @@ class Snapshot:
         self._functions: list[_Function] = []
         self._classes: list[tuple[str, type, frozenset[str]]] = []
         self._known: set[str] = set()
-        self._data = Custody({}, OWN, functions=False)
+        self._data = Custody({}, (OWN,), functions=False)
         self.extend()
         for name, owners in LIBRARIES.items():
             if name in sys.modules:
@@ -58,7 +58,7 @@ class Snapshot:
 
     def extend(self) -> None:
         """Take in the modules of the framework that were imported since."""
-        new = [name for name in sys.modules if name.partition(".")[0] in OWN and name not in self._known]
+        new = [name for name in sys.modules if name.partition(".")[0] == OWN and name not in self._known]
         self._known.update(new)
         modules = {name: sys.modules[name] for name in sorted(new) if isinstance(sys.modules[name], ModuleType)}
         for module in modules.values():
@@ -134,7 +134,7 @@ class _Function:
 
 def _added(name: str, owner: type, keys: frozenset[str]) -> list[str]:
     """The functions that a class had not; a library's class may gain what it does not inherit."""
-    own = name.partition(".")[0] in OWN
+    own = name.partition(".")[0] == OWN
     inherited = {key for base in owner.__mro__[1:] for key in vars(base)}
     added = [key for key, value in vars(owner).items() if key not in keys and callable(value)]
     return [f"{name}.{key}" for key in added if own or (key in inherited and not key.startswith(SETTINGS))]

@@ -22,7 +22,7 @@ def unchanged(components: Mapping[str, object], *sides: Side, arrays: bool = Fal
     Raises:
         TamperError: if an attribute, or anything in it, was changed, added or removed.
     """
-    packages = {*OWN, *(type(component).__module__.partition(".")[0] for component in components.values())}
+    packages = {OWN, *(type(component).__module__.partition(".")[0] for component in components.values())}
     custody = Custody(components, packages, functions=False, arrays=arrays)
     try:
         yield

@@ -174,7 +174,7 @@ def _put_limits(before: Mapping[int, tuple[int, int]]) -> None:
 
 def _modules() -> dict[str, object]:
     """The modules of the framework, and those that scores are computed with."""
-    return {name: module for name, module in sys.modules.items() if name.partition(".")[0] in OWN or name in LIBRARIES}
+    return {name: module for name, module in sys.modules.items() if name.partition(".")[0] == OWN or name in LIBRARIES}
 
 
 def _files() -> dict[int, tuple[int, int]]:

@@ -15,8 +15,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cavbench.errors import UserError, notice
 from cavbench.core.track import Track
+from cavbench.errors import UserError, notice
 from cavbench.records import validity
 from cavbench.records.generations import check
 from cavbench.records.packing import packed_files

@@ -14,8 +14,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cavbench.errors import UserError
 from cavbench.core.track import Track, tracks
+from cavbench.errors import UserError
 from cavbench.records.schema import FLOAT, IDENTITY, INT, PROVENANCE, TEXT, field, schema
 
 AXES_OF_V1 = (

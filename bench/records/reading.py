@@ -16,9 +16,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from cavbench.errors import UserError, notice, short
 from cavbench.core import track as of
 from cavbench.core.track import Track
+from cavbench.errors import UserError, notice, short
 from cavbench.records import validity
 from cavbench.records.generations import check, glance, selection
 from cavbench.records.packing import units_in

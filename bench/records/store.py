@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cavbench import files
-from cavbench.errors import UserError
 from cavbench.core.track import Columns, Track, tracks
+from cavbench.errors import UserError
 from cavbench.records import validity
 from cavbench.records.schema import schema
 

@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from cavbench.errors import short
 from cavbench.core.contracts import Access
 from cavbench.core.track import Track
+from cavbench.errors import short
 from cavbench.records.schema import LARGEST, schema
 from cavbench.scenarios import Axes
 

@@ -6,8 +6,8 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from cavbench.errors import RefusedNetworkError
 from cavbench.core.pair import Chosen, Pair
+from cavbench.errors import RefusedNetworkError
 from cavbench.run.unit import is_foreign
 
 SIDES = {"attack": ("attack",), "defense": ("defense", "victim")}

@@ -18,12 +18,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cavbench.errors import UserError, message, short
 from cavbench.core import registry
 from cavbench.core.device import recorded
 from cavbench.core.device import stated as stated_device
-from cavbench.identity.fingerprint import canonical
 from cavbench.core.pair import IN_PROCESS, Pair
+from cavbench.errors import UserError, message, short
+from cavbench.identity.fingerprint import canonical
 from cavbench.records import reading
 from cavbench.records.schema import AUDIT, SEQUENTIAL
 from cavbench.run.config import RunConfig

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cavbench.errors import UserError, short
 from cavbench.core import registry
 from cavbench.core.device import CPU, resolved
 from cavbench.core.options import Options, configured
 from cavbench.core.pair import Chosen, Pair, check_track
 from cavbench.core.registry import KINDS, Kind
 from cavbench.core.suites import Suite
+from cavbench.errors import UserError, short
 from cavbench.run.executors import EXECUTORS
 from cavbench.run.options import RunOptions, TrainOptions, half_of_memory
 from cavbench.scenarios import Grid

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from cavbench.errors import UnfinishedError
 from cavbench.core.pair import Pair
+from cavbench.errors import UnfinishedError
 from cavbench.run.unit import Loading, Preparation, Unit
 from cavbench.run.work import Failure
 

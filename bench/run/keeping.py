@@ -9,9 +9,9 @@ from contextlib import suppress
 from types import ModuleType
 from typing import Any
 
+from cavbench.core.pair import Chosen, Pair
 from cavbench.isolation.custody import Custody, forget_computed, listed
 from cavbench.isolation.framework import OWN
-from cavbench.core.pair import Chosen, Pair
 from cavbench.run.unit import is_foreign
 
 
@@ -32,8 +32,8 @@ class Keeping:
         self._parts = list({id(part.component): part for pair in pairs for part in pair.parts}.values())
         # Objects of Python are the user's own: what else their modules hold is not the run's business.
         self._packages = frozenset(_package(part) for part in self._parts if is_foreign(part) and not part.code)
-        self._held = [(part, Custody(_roots(part), (*OWN, _package(part)))) for part in self._parts]
-        self._threats = Custody({"threat": [pair.threat for pair in pairs]}, OWN)
+        self._held = [(part, Custody(_roots(part), (OWN, _package(part)))) for part in self._parts]
+        self._threats = Custody({"threat": [pair.threat for pair in pairs]}, (OWN,))
         self._others = Custody(_modules(self._packages), self._packages) if self._packages else None
         self._environment = dict(os.environ) if self._packages else {}
         self.refused: tuple[str, tuple[Chosen[Any], ...]] | None = None

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from cavbench.identity.fingerprint import canonical
 from cavbench.core.pair import Chosen, Pair
 from cavbench.core.track import track_of
+from cavbench.identity.fingerprint import canonical
 from cavbench.records.schema import SEQUENTIAL
 from cavbench.run.config import RunConfig
 from cavbench.run.unit import Loading, Unit

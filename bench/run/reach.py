@@ -19,10 +19,10 @@ from types import FrameType
 from typing import Any
 
 from cavbench import files
-from cavbench.isolation.framework import OWN
 from cavbench.core.pair import Chosen, Pair
-from cavbench.run.unit import is_foreign
+from cavbench.identity.fingerprint import OWN, PARTS
 from cavbench.isolation.watch import TamperError
+from cavbench.run.unit import is_foreign
 
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 CHANGES = frozenset(
@@ -201,7 +201,8 @@ def _readable(foreign: Sequence[Chosen[Any]], parts: Sequence[Chosen[Any]]) -> t
     home = Path.home()
     found = [sys.prefix, sys.base_prefix, os.environ.get("XDG_CACHE_HOME", home / ".cache")]
     found += [os.environ[name] for name in ("TORCH_HOME", "HF_HOME", "NUMBA_CACHE_DIR") if name in os.environ]
-    for name in (*OWN, *(type(part.component).__module__.partition(".")[0] for part in foreign)):
+    own = (OWN, *(f"{OWN}.{part}" for part in PARTS))
+    for name in (*own, *(type(part.component).__module__.partition(".")[0] for part in foreign)):
         module = sys.modules.get(name)
         found += list(getattr(module, "__path__", None) or filter(None, [getattr(module, "__file__", None)]))
     found += [value for part in parts for value in _paths(part.component)]

@@ -18,10 +18,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cavbench import bounded
-from cavbench.errors import UserError, short
-from cavbench.files import scratch
 from cavbench.core import registry
 from cavbench.core.track import Track, track
+from cavbench.errors import UserError, short
+from cavbench.files import scratch
 from cavbench.records import validity
 from cavbench.records.schema import schema
 from cavbench.records.store import FOLDER

@@ -13,12 +13,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cavbench.errors import UserError
 from cavbench.core import registry
 from cavbench.core.device import recorded as recorded_device
-from cavbench.isolation.framework import Snapshot
 from cavbench.core.pair import IN_PROCESS, Chosen, Pair, choose
 from cavbench.core.track import track
+from cavbench.errors import UserError
+from cavbench.isolation.framework import Snapshot
 from cavbench.records import reading, store
 from cavbench.records.schema import IDENTITY, SEQUENTIAL
 from cavbench.run import artefacts

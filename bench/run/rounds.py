@@ -18,9 +18,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cavbench import bounded, files
-from cavbench.errors import UserError
 from cavbench.core.pair import Pair
 from cavbench.core.track import track_of
+from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.records.schema import SEQUENTIAL
 from cavbench.run.config import RunConfig

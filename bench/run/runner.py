@@ -18,8 +18,8 @@ from typing import Protocol
 import pyarrow as pa
 
 from cavbench import files
-from cavbench.errors import RefusedNetworkError, UserError, message
 from cavbench.core.track import Track
+from cavbench.errors import RefusedNetworkError, UserError, message
 from cavbench.records import packing, store
 from cavbench.records.finished import finished as finished_units
 from cavbench.run import artefacts

@@ -17,10 +17,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cavbench import bounded, files
-from cavbench.errors import UserError, short
-from cavbench.identity.fingerprint import canonical
 from cavbench.core.pair import Pair
 from cavbench.core.track import Track
+from cavbench.errors import UserError, short
+from cavbench.identity.fingerprint import canonical
 from cavbench.records import packing, reading
 from cavbench.records.schema import AUDIT
 from cavbench.records.store import FOLDER

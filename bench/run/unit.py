@@ -9,13 +9,13 @@ from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any
 
-from cavbench.errors import RefusedNetworkError, UserError, message, reason
 from cavbench.core import registry
 from cavbench.core.device import CPU, said
-from cavbench.identity.fingerprint import canonical, code_digest, digest, libraries, machine
-from cavbench.isolation.foreign import contained
 from cavbench.core.pair import Chosen, Pair, weights_of
 from cavbench.core.track import Job, Track, track_of
+from cavbench.errors import RefusedNetworkError, UserError, message, reason
+from cavbench.identity.fingerprint import canonical, code_digest, digest, libraries, machine
+from cavbench.isolation.foreign import contained
 from cavbench.records.schema import AUDIT, SEQUENTIAL
 from cavbench.scenarios import Cell, SeedBlock
 

@@ -14,18 +14,18 @@ from typing import Any, Protocol
 import pyarrow as pa
 
 from cavbench import files
+from cavbench.core.progress import listening
 from cavbench.errors import PluginError, RefusedNetworkError, UserError, message, reason
-from cavbench.isolation.custody import listed
 from cavbench.identity.fingerprint import canonical
+from cavbench.isolation.custody import listed
 from cavbench.isolation.foreign import contained
 from cavbench.isolation.framework import Snapshot
-from cavbench.core.progress import listening
+from cavbench.isolation.watch import TamperError
 from cavbench.records.store import table
 from cavbench.run.blame import blamed, named
 from cavbench.run.keeping import Keeping
 from cavbench.run.reach import within_reach
 from cavbench.run.unit import Loading, Preparation, Unit
-from cavbench.isolation.watch import TamperError
 
 
 class Tell(Protocol):

@@ -20,12 +20,12 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from cavbench import files
-from cavbench.errors import reason
 from cavbench.core import registry
+from cavbench.core.track import track
+from cavbench.errors import reason
 from cavbench.isolation.foreign import contained, ended
 from cavbench.isolation.framework import Snapshot
 from cavbench.isolation.settings import Settings
-from cavbench.core.track import track
 from cavbench.run import tree
 from cavbench.run.blame import blamed
 from cavbench.run.process import children, context, follow_parent, settle

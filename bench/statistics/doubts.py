@@ -15,9 +15,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cavbench.errors import UserError
 from cavbench.core.pair import choose
 from cavbench.core.track import Track
+from cavbench.errors import UserError
 
 SAME, MASKED, NOT_FINITE, DRAWN, ONE_DRAW = 0.99, 0.5, 0.01, 0.01, 2.0
 """Thresholds: the share of probes from which on the answer depends on no input; of gradients that are 0 everywhere, and that are

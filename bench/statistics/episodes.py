@@ -1,7 +1,7 @@
 """Arranges the episodes of a pair and computes estimates with intervals, for one cell or a whole grid.
 
-Records come as a `pyarrow.Table`, one row per episode (columns: `cavbench.records.schema`). `Episodes.arrange` sorts the rows of one
-pair by training seed, cell and scenario seed; `measured` aggregates them; `difference` compares two sets scenario by scenario.
+Records come as a `pyarrow.Table`, one row per episode (columns: `cavbench.records.schema`). `Episodes.arrange` sorts the rows of
+one pair by training seed, cell and scenario seed; `measured` aggregates them; `difference` compares two sets by scenario.
 The statistics are in `cavbench.statistics.estimates`.
 """
 

@@ -21,9 +21,9 @@ from platformdirs import user_cache_path
 
 from cavbench import bounded
 from cavbench.archive import Archive
+from cavbench.core.registry import unknown
 from cavbench.errors import UserError
 from cavbench.files import scratch, whole
-from cavbench.core.registry import unknown
 
 Report = Callable[[int, int], None]
 """Called with the number of bytes downloaded and the total."""

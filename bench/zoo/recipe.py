@@ -16,17 +16,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cavbench.errors import UserError
 from cavbench.core import registry
 from cavbench.core.contracts import Attack, Component, Defense, Victim, World
-from cavbench.identity.fingerprint import digest
 from cavbench.core.parameters import Parameter, differing, parameters
 from cavbench.core.registry import GROUPS, Kind
+from cavbench.errors import UserError
+from cavbench.identity.fingerprint import digest
 
 DIGITS = 8
 """Number of digits of the digest in a folder name."""
 MEANT_OTHERWISE = ("null", "true", "false")
 """Strings that the command line would not read as strings."""
+
+IN_DIGESTS = {
+    "cavbench.attacks": "attacks",
+    "cavbench.defenses": "defenses",
+    "cavbench.envs": "envs",
+    "cavbench": "bench",
+}
+"""Packages of cavbench as the digests of trained weights name them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +44,7 @@ class Part:
     Args:
         kind: victim, defense, attack or world.
         name: name on the command line; the class name if it is not installed.
-        source: top-level package and class, for instance `cavbench.DQN`; it does not change when a class moves within its package.
+        source: package and class, for instance `bench.DQN`; it does not change when a class moves within its package.
         module: module of the class.
         libraries: distributions whose versions influence the result.
         training: version of its training.
@@ -62,7 +70,7 @@ class Part:
         return cls(
             kind=kind,
             name=_registered(kind, component_type),
-            source=f"{component_type.__module__.partition('.')[0]}.{component_type.__qualname__}",
+            source=_class_name(component_type),
             module=component_type.__module__,
             libraries=component_type.libraries,
             training=component_type.training,
@@ -204,6 +212,15 @@ def check_world(recipe: Recipe, world: World) -> None:
 def _where(options: Sequence[str], name: str) -> str:
     parameters = [option.removeprefix("world.") for option in options]
     return shlex.join([name, *parameters] if name else parameters)
+
+
+def _class_name(component: type[Component]) -> str:
+    """The class in digests: its name in its top-level package. The name that a package of cavbench has there must not change."""
+    module = component.__module__
+    package = next(
+        (old for new, old in IN_DIGESTS.items() if f"{module}.".startswith(f"{new}.")), module.partition(".")[0]
+    )
+    return f"{package}.{component.__qualname__}"
 
 
 def _value(component: Component, parameter: Parameter) -> Any:

@@ -27,13 +27,13 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from cavbench import bounded
+from cavbench.core.contracts import World
 from cavbench.errors import UserError
 from cavbench.files import whole
-from cavbench.core.contracts import World
 from cavbench.identity.fingerprint import canonical, code_digest, libraries, machine
 from cavbench.zoo.recipe import DIGITS, Part, Recipe, check_world
 
-SHIPPED = Path(__file__).parents[1] / "policies"
+SHIPPED = Path(__file__).parent / "weights"
 
 
 class Network(Protocol):

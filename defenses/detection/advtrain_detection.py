@@ -10,20 +10,30 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from cavbench.detection import STOP_SIGN, CameraWorld, Detector, DetectorDefense, DetectorVictim, PatchAttack, PatchThreat, Predictions, Scenes
-from cavbench.detection.boxes import detections
-from cavbench.detection.enforcer import PatchEnforcer
-from cavbench.detection.sight import NMS_IOU
-from cavbench.errors import UserError
+from cavbench import zoo
 from cavbench.core.contracts import Facts, Progress, Trained
 from cavbench.core.options import configured, parameter_words
 from cavbench.core.ranges import Count, Natural, NotNegative, Positive, Share
-from cavbench import zoo
+from cavbench.detection import (
+    STOP_SIGN,
+    CameraWorld,
+    Detector,
+    DetectorDefense,
+    DetectorVictim,
+    PatchAttack,
+    PatchThreat,
+    Predictions,
+    Scenes,
+)
+from cavbench.detection.boxes import detections
+from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.detection.sight import NMS_IOU
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.learner import Learner
 from cavbench.detection.victims.loss import missed, mistaken, unlike
 from cavbench.detection.victims.training import descend
 from cavbench.detection.victims.windows import Views, Windows, kept
+from cavbench.errors import UserError
 
 AWAY = 0.2
 """Share of the windows at uniformly random places; the others are near the sign."""

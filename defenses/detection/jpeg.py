@@ -11,9 +11,9 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from cavbench.detection import Detector, DetectorDefense, DetectorVictim
 from cavbench.core.contracts import Facts
 from cavbench.defenses.detection.median import Guarded
+from cavbench.detection import Detector, DetectorDefense, DetectorVictim
 
 
 class _Compressed(Guarded):

@@ -8,15 +8,37 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from cavbench.detection import STOP_SIGN, CameraWorld, Detector, DetectorDefense, DetectorVictim, Predictions, Scenes, Wrapped
-from cavbench.detection.boxes import overlap
-from cavbench.detection.sight import SAME_IOU
+from cavbench import zoo
 from cavbench.core.contracts import Facts, Progress, Trained
 from cavbench.core.ranges import Count, Natural, Positive
-from cavbench import zoo
+from cavbench.defenses.detection.judge import (
+    COARSER,
+    COVER,
+    FINEST,
+    LEVELS,
+    NEVER,
+    SIGN,
+    STEP,
+    WINDOW,
+    Judge,
+    best_of_blocks,
+    bound,
+    levels,
+)
+from cavbench.detection import (
+    STOP_SIGN,
+    CameraWorld,
+    Detector,
+    DetectorDefense,
+    DetectorVictim,
+    Predictions,
+    Scenes,
+    Wrapped,
+)
+from cavbench.detection.boxes import overlap
+from cavbench.detection.sight import SAME_IOU
 from cavbench.detection.victims.training import descend
 from cavbench.detection.victims.windows import Views, Windows, kept
-from cavbench.defenses.detection.judge import COARSER, COVER, FINEST, LEVELS, NEVER, SIGN, STEP, WINDOW, Judge, best_of_blocks, bound, levels
 
 MIDDLE = 4.0
 """Log-odds of the judge with a score of one half. In the training frames 19 of 20 signs have certified log-odds above 10.0,

@@ -9,8 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from cavbench.detection import Detector, DetectorDefense, DetectorVictim, Predictions, Wrapped
 from cavbench.core.contracts import Facts
+from cavbench.detection import Detector, DetectorDefense, DetectorVictim, Predictions, Wrapped
 
 
 class Guarded(Wrapped):

@@ -11,16 +11,16 @@ from annotated_types import Interval
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, interpolate, max_pool2d
 
-from cavbench.detection import CameraWorld, Detector, DetectorDefense, DetectorVictim, Predictions, Scenes, Wrapped
-from cavbench.errors import UserError
+from cavbench import zoo
 from cavbench.core.contracts import Facts, Progress, Trained
 from cavbench.core.ranges import Count, Natural, Positive, Share
-from cavbench import zoo
-from cavbench.detection.victims.training import descend
-from cavbench.detection.victims.windows import Windows
 from cavbench.defenses.detection.completion import closed, filled
 from cavbench.defenses.detection.marker import Marker
 from cavbench.defenses.detection.textures import textures
+from cavbench.detection import CameraWorld, Detector, DetectorDefense, DetectorVictim, Predictions, Scenes, Wrapped
+from cavbench.detection.victims.training import descend
+from cavbench.detection.victims.windows import Windows
+from cavbench.errors import UserError
 
 AWAY = 0.3
 """Share of the training windows at uniformly random places; the others are near the sign."""

@@ -10,14 +10,14 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from cavbench.core.contracts import Facts
+from cavbench.core.ranges import NotNegative, Positive
 from cavbench.detection import STOP_SIGN, Detector, DetectorDefense, DetectorVictim, Predictions, Wrapped
 from cavbench.detection.boxes import detections, overlap
 from cavbench.detection.evidence import log_odds
-from cavbench.core.contracts import Facts
-from cavbench.core.ranges import NotNegative, Positive
 
 SINGLE = 0.2
-"""Score after one frame with the greatest evidence: below `cavbench.detection.stopping.THRESHOLD`, so one frame does not count."""
+"""Score after one frame with the greatest evidence: below `cavbench.detection.stopping.THRESHOLD`, so one does not count."""
 HIGHEST = 0.97
 """Highest score of a track, with log-odds of 3.5: OctoMap's upper clamp (Hornung et al. 2013)."""
 MATCH_IOU, MERGE_IOU = 0.3, 0.45

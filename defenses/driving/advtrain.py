@@ -11,17 +11,27 @@ from annotated_types import Interval
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cavbench.driving import DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, ObservationThreat, Policy, State, TrainingHooks
+from cavbench import zoo
+from cavbench.core.contracts import Progress, Trained
+from cavbench.core.options import configured, parameter_words
+from cavbench.core.ranges import Count, NotNegative, Share
+from cavbench.driving import (
+    DrivingAttack,
+    DrivingDefense,
+    DrivingFacts,
+    DrivingVictim,
+    DrivingWorld,
+    ObservationThreat,
+    Policy,
+    State,
+    TrainingHooks,
+)
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.policy import rows_of
 from cavbench.driving.threat import Norm
 from cavbench.driving.victim import CountedPolicy
-from cavbench.errors import UserError
-from cavbench.core.contracts import Progress, Trained
-from cavbench.core.options import configured, parameter_words
-from cavbench.core.ranges import Count, NotNegative, Share
-from cavbench import zoo
 from cavbench.driving.victims.networks import ActorPolicy
+from cavbench.errors import UserError
 
 CHANGES_LANE = ("LANE_LEFT", "LANE_RIGHT")
 """The discrete actions from which the consistency target subtracts `margin`."""

@@ -13,12 +13,12 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from cavbench.defenses.driving.adversary import Adversary
+from cavbench.defenses.driving.recurrent import RecurrentPolicy
 from cavbench.driving import Policy, TrainingHooks
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase
 from cavbench.driving.victims.networks import StateValue
 from cavbench.driving.victims.practice import Practice
-from cavbench.defenses.driving.adversary import Adversary
-from cavbench.defenses.driving.recurrent import RecurrentPolicy
 
 if TYPE_CHECKING:
     from cavbench.defenses.driving.atla import AlternatingTraining

@@ -12,21 +12,30 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, ObservationThreat, Policy, State, TrainingHooks
-from cavbench.driving.threat import Norm
-from cavbench.errors import UserError
+from cavbench import zoo
 from cavbench.core.contracts import Progress, Trained
 from cavbench.core.ranges import Count, NotNegative, Positive, Share, Width
-from cavbench.scenarios import SeedBlock
-from cavbench import zoo
+from cavbench.defenses.driving.adversary import Adversary
+from cavbench.defenses.driving.alternating import Alternation, RecurrentPractice, Turn
+from cavbench.defenses.driving.recurrent import RecurrentPolicy
+from cavbench.driving import (
+    DrivingDefense,
+    DrivingFacts,
+    DrivingVictim,
+    DrivingWorld,
+    ObservationThreat,
+    Policy,
+    State,
+    TrainingHooks,
+)
+from cavbench.driving.threat import Norm
 from cavbench.driving.victims.dqn import DQN
 from cavbench.driving.victims.learner import CHUNK, Phase
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.driving.victims.practice import roads
 from cavbench.driving.victims.selection import Best
-from cavbench.defenses.driving.adversary import Adversary
-from cavbench.defenses.driving.alternating import Alternation, RecurrentPractice, Turn
-from cavbench.defenses.driving.recurrent import RecurrentPolicy
+from cavbench.errors import UserError
+from cavbench.scenarios import SeedBlock
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,11 +9,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cavbench.driving import DrivingVictim, DrivingWorld, Policy
-from cavbench.errors import UserError
 from cavbench.core.contracts import Progress, Trained
 from cavbench.core.ranges import Positive, Share
 from cavbench.defenses.driving.robust_loss import Own, RobustLoss, Worst
+from cavbench.driving import DrivingVictim, DrivingWorld, Policy
+from cavbench.errors import UserError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,13 +10,13 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from cavbench.core.ranges import Count, Share
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.ego import Ego
 from cavbench.driving.intervals.policy import IntervalPolicy, corrected, with_inner
 from cavbench.driving.threat import Norm
 from cavbench.errors import UserError
-from cavbench.core.ranges import Count, Share
 
 SEED = 0
 """Of the corners; a policy is a function of what it sees."""

@@ -12,15 +12,24 @@ from annotated_types import Interval
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, ObservationThreat, Policy, State, TrainingHooks
+from cavbench import zoo
+from cavbench.core.contracts import Progress, Trained
+from cavbench.core.ranges import Count, NotNegative
+from cavbench.driving import (
+    DrivingDefense,
+    DrivingFacts,
+    DrivingVictim,
+    DrivingWorld,
+    ObservationThreat,
+    Policy,
+    State,
+    TrainingHooks,
+)
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.threat import Norm, project
 from cavbench.driving.victim import CountedPolicy
-from cavbench.errors import UserError
-from cavbench.core.contracts import Progress, Trained
-from cavbench.core.ranges import Count, NotNegative
-from cavbench import zoo
 from cavbench.driving.victims.attack_mix import attack_of, attacked
+from cavbench.errors import UserError
 
 SCORED = "pgd steps=5 restarts=1"
 """The attack under which checkpoints are scored."""

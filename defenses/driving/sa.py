@@ -9,9 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cavbench.driving import Policy
 from cavbench.core.ranges import NotNegative
 from cavbench.defenses.driving.robust_loss import Own, RobustLoss, Worst
+from cavbench.driving import Policy
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ from annotated_types import Interval
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from cavbench.core.ranges import NotNegative
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, State
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.corridor import Corridor, CorridorJudge
@@ -19,7 +20,6 @@ from cavbench.driving.intervals.policy import IntervalPolicy, corrected, with_in
 from cavbench.driving.intervals.rooms import Caution, cars_of
 from cavbench.driving.threat import Norm
 from cavbench.errors import UserError
-from cavbench.core.ranges import NotNegative
 
 SOFTNESS = 2.0
 """Width in m over which the gradient of the filter is spread around its threshold."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cavbench.core.ranges import Positive
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, PolicyWrapper, State
 from cavbench.errors import UserError
-from cavbench.core.ranges import Positive
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,12 +10,12 @@ from annotated_types import Interval
 from tensordict import TensorDict
 from torch import Tensor
 
+from cavbench.core.ranges import NotNegative
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, PolicyWrapper, State
 from cavbench.driving.intervals.boxes import Assumed, Boxes
 from cavbench.driving.intervals.policy import IntervalPolicy, corrected, reckoning, with_inner
 from cavbench.driving.intervals.tracks import narrowed, predicted
 from cavbench.driving.threat import Norm
-from cavbench.core.ranges import NotNegative
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,10 +16,10 @@ from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
 from cavbench.cli.listing import fits
-from cavbench.errors import UserError
 from cavbench.core import registry
 from cavbench.core.parameters import parameters
 from cavbench.core.registry import GROUPS, Kind
+from cavbench.errors import UserError
 
 LEADERBOARD = ("leaderboard/index.html", "leaderboard/index.json", "leaderboard/index.csv")
 """Files of the repository that are copied to the same path in the site, with the films beside them."""

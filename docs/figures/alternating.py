@@ -5,8 +5,8 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 
 from cavbench import zoo
-from cavbench.driving.victims.dqn import DQN
 from cavbench.defenses.driving.atla import AlternatingTraining
+from cavbench.driving.victims.dqn import DQN
 from docs.figures import style
 
 

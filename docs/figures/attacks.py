@@ -7,11 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from cavbench.driving import DrivingAttack
 from cavbench.core.pair import choose
+from cavbench.driving import DrivingAttack
+from cavbench.envs.highway.config import ACTIONS
 from docs.figures import road, style
 from docs.figures.driving import FACTS, FEATURES, Moment, attacked, episode, physical, policy
-from cavbench.envs.highway.config import ACTIONS
 
 STEP = 200
 """The moment: 13.3 s into the episode, close behind a slower car."""

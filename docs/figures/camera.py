@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from cavbench.detection import Approach
-from docs.figures import style
-from docs.figures.sightings import DENSITY, FRAME, LANES, approaches, picture, show
 from cavbench.envs.camera.faces import DECOYS
 from cavbench.envs.camera.places import StopSignPlaces
 from cavbench.envs.camera.windscreen import Windscreen
 from cavbench.envs.camera.windscreen_axes import AXES, LENSES
 from cavbench.envs.weather import WEATHERS
+from docs.figures import style
+from docs.figures.sightings import DENSITY, FRAME, LANES, approaches, picture, show
 
 WINDOW = 400, 230
 """Width and height in pixels of the shown part of each frame."""

@@ -9,8 +9,6 @@ from matplotlib.figure import Figure
 
 from cavbench.detection.driver import Memory
 from cavbench.detection.stopping import SPEED_MPS
-from docs.figures import style
-from docs.figures.sightings import show
 from cavbench.envs.camera.braking import Motion, brakes_in
 from cavbench.envs.camera.crossing import StopSignCrossing
 from cavbench.envs.camera.crossing_axes import AXES
@@ -18,6 +16,8 @@ from cavbench.envs.camera.environment import CLEARED_M
 from cavbench.envs.camera.poses import CLOSED_LOOP_DISTANCES
 from cavbench.envs.camera.street.layout import CROSSING
 from cavbench.envs.weather import WEATHERS
+from docs.figures import style
+from docs.figures.sightings import show
 
 STEP_S = 0.05
 CONFIRMED_M = (29.0, 19.0, 16.0, 13.0)

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from torch import Tensor
 
-from docs.figures import style
-from docs.figures.driving import FEATURES, policy
 from cavbench.envs.highway.config import ACTIONS
 from cavbench.envs.highway.dynamics import LANE_WIDTH
+from docs.figures import style
+from docs.figures.driving import FEATURES, policy
 
 ROWS = 10
 EGO_SPEED = 25.0

@@ -9,11 +9,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from cavbench.detection import Detector
 from cavbench.core.pair import choose
+from cavbench.detection import Detector
+from cavbench.envs.camera.world import StopSignApproach
 from docs.figures import style
 from docs.figures.sightings import approaches, detector, frame_axes, sight
-from cavbench.envs.camera.world import StopSignApproach
 
 SQUARE = 640
 

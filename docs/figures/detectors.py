@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from cavbench.detection.boxes import detections
 from cavbench.detection.sight import NMS_IOU
 from cavbench.detection.stopping import THRESHOLD
+from cavbench.envs.weather import WEATHERS
 from docs.figures import style
 from docs.figures.sightings import FRAME, approaches, box, detector, frame_axes, picture, show, sight
-from cavbench.envs.weather import WEATHERS
 
 COLOURS = {"clear": style.ORANGE, "rain": style.BLUE, "fog": style.GREY, "night": style.INK}
 DASHES = {"clear": "-", "rain": "--", "fog": "-.", "night": ":"}

@@ -11,17 +11,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.core.pair import choose
+from cavbench.core.track import Columns, Driven
 from cavbench.driving import DrivingAttack, ObservationThreat, Policy
 from cavbench.driving.attacker import Attacker
 from cavbench.driving.drive import drive
 from cavbench.driving.rollout import Trace
 from cavbench.driving.victim import CountedPolicy
-from cavbench.core.pair import choose
-from cavbench.core.track import Columns, Driven
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
 
 Array = NDArray[Any]
 

@@ -9,14 +9,14 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from cavbench.detection.stopping import THRESHOLD
 from cavbench.defenses.detection.judge import COVER, GREY, SIGN
-from cavbench.defenses.detection.segmenter import Completed
 from cavbench.defenses.detection.median import Guarded
+from cavbench.defenses.detection.segmenter import Completed
+from cavbench.detection.stopping import THRESHOLD
+from cavbench.envs.camera.faces import DECOYS
 from docs.figures import style
 from docs.figures.patches import STRONGER, texels_of
 from docs.figures.sightings import FRAME, approaches, crop, detector, frame_axes, picture, said, show, sight
-from cavbench.envs.camera.faces import DECOYS
 
 NEAR = 8
 """Index of the frame in the figure of `segmenter`, in which the patch that knows of it avoids the marks."""

@@ -10,16 +10,16 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cavbench.driving import DrivingDefense, ObservationThreat, Policy
-from cavbench.driving.attacker import Attacker
-from cavbench.driving.victim import CountedPolicy
-from cavbench.core.pair import choose
 from cavbench import zoo
-from cavbench.driving.victims.dqn import DQN
+from cavbench.core.pair import choose
 from cavbench.defenses.driving.advtrain import AdversarialTraining
 from cavbench.defenses.driving.car import ConsistentAdversarialRobustness
 from cavbench.defenses.driving.robust_loss import RobustLoss
 from cavbench.defenses.driving.sa import StateAdversarial
+from cavbench.driving import DrivingDefense, ObservationThreat, Policy
+from cavbench.driving.attacker import Attacker
+from cavbench.driving.victim import CountedPolicy
+from cavbench.driving.victims.dqn import DQN
 from docs.figures import style
 from docs.figures.driving import FEATURES, episode, policy
 from docs.figures.sightings import clean, curve, frame_axes, patched, undisturbed

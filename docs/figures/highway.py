@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from docs.figures import road, style
 from cavbench.envs.highway.axes import STANDARD_V2
 from cavbench.envs.highway.batched import BatchedHighway
 from cavbench.envs.highway.sensor import noise_sigma, sensor_range_m
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.envs.weather import WEATHERS
+from docs.figures import road, style
 
 GRID = STANDARD_V2
 SEED = GRID.first_seed

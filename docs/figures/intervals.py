@@ -13,6 +13,8 @@ from matplotlib.patches import Patch
 from tensordict import TensorDict
 
 from cavbench.attacks.driving.noise import Noise
+from cavbench.defenses.driving.pessimist_q import PessimistQ
+from cavbench.defenses.driving.tracker import Tracked, Tracker
 from cavbench.driving import ObservationThreat, Policy
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.intervals.margins import Margins
@@ -20,13 +22,11 @@ from cavbench.driving.intervals.rooms import cars_of
 from cavbench.driving.victim import CountedPolicy
 from cavbench.driving.victims.dqn import DQN
 from cavbench.driving.victims.planner import IntervalPlanner, Planner
-from cavbench.defenses.driving.pessimist_q import PessimistQ
-from cavbench.defenses.driving.tracker import Tracked, Tracker
+from cavbench.envs.highway.config import ACTIONS
+from cavbench.envs.highway.world import HighwayWorld
 from docs.figures import style
 from docs.figures.decisions import BLOCKED, CLOSING, DISTANCE, _map, _observations
 from docs.figures.driving import FACTS
-from cavbench.envs.highway.config import ACTIONS
-from cavbench.envs.highway.world import HighwayWorld
 
 BUDGETS = (0.0, 0.1)
 SEED, STEPS = 1_000_000, 90

@@ -9,10 +9,10 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import blended_transform_factory
 
 from cavbench.core.track import tracks
-from cavbench.statistics.estimates import Interval, share_interval
-from docs.figures import style
 from cavbench.leaderboard.published import published
 from cavbench.leaderboard.ranking.boards import Board, Row, read_boards
+from cavbench.statistics.estimates import Interval, share_interval
+from docs.figures import style
 
 MEASURES = {"driving": "safe progress", "detection": "stop score"}
 MARKS = {

@@ -10,8 +10,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, ObservationThreat, Policy
 from cavbench.core.pair import choose
+from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, ObservationThreat, Policy
 from docs.figures import style
 from docs.figures.driving import FACTS, FEATURES, Array, episode, physical, scored
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from cavbench.attacks.suites import STANDARD_DETECTION_1
+from cavbench.attacks.detection.suites import STANDARD_DETECTION_1
+from cavbench.core.pair import Pair, choose
 from cavbench.detection import PatchThreat
 from cavbench.detection.crafting import prepare
 from cavbench.detection.patch import Patch
+from cavbench.envs.camera.axes import APPROACH_V1
 from cavbench.identity.fingerprint import canonical
-from cavbench.core.pair import Pair, choose
 from cavbench.run import artefacts
 from cavbench.run.unit import Preparation
-from cavbench.envs.camera.axes import APPROACH_V1
 
 KEPT = user_cache_path("cavbench") / "figures"
 STRONGER = {**STANDARD_DETECTION_1.members[1].params, "restarts": 1}

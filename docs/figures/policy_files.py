@@ -13,11 +13,11 @@ from gymnasium.spaces import Box, Discrete
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from cavbench.driving import Policy
 from cavbench.core.pair import choose
+from cavbench.driving import Policy
+from cavbench.envs.highway.config import ACTIONS
 from docs.figures import style
 from docs.figures.driving import FACTS, episode, policy
-from cavbench.envs.highway.config import ACTIONS
 
 EVERY = 10
 """A value of the loaded victim is drawn every so many steps."""

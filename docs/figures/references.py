@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 
 from cavbench.core.pair import choose
 from cavbench.core.track import track
-from cavbench.scenarios import Cell
-from docs.figures import style
-from docs.figures.driving import FACTS, episode, physical
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.dynamics import LANE_WIDTH
 from cavbench.leaderboard.published import published
+from cavbench.scenarios import Cell
+from docs.figures import style
+from docs.figures.driving import FACTS, episode, physical
 
 SECONDS = 30
 CELL = AXES.cell(lanes=3, density=1.0, weather="clear")

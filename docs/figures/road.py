@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
-from docs.figures import style
 from cavbench.envs.highway.dynamics import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH
+from docs.figures import style
 
 Place = tuple[float, float]
 """Position along and across the road in m; the centre of lane i is at 4 i."""

@@ -12,20 +12,20 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.core.pair import choose
+from cavbench.core.track import track
 from cavbench.detection import STOP_SIGN, Approach, Detector
 from cavbench.detection.boxes import confidence
 from cavbench.detection.sight import Sight, look
 from cavbench.detection.stopping import THRESHOLD
-from cavbench.core.pair import choose
-from cavbench.core.track import track
-from docs.figures import style
-from docs.figures.patches import SHARE
 from cavbench.envs.camera.axes import APPROACH_V1, AXES
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.leaderboard.comparisons.comparison import Comparison, parameters
 from cavbench.leaderboard.comparisons.pairing import beside
 from cavbench.leaderboard.comparisons.reading import comparable, read_comparisons
 from cavbench.leaderboard.published import published
+from docs.figures import style
+from docs.figures.patches import SHARE
 
 LANES, DENSITY = 3, 1.0
 FRAME = 6

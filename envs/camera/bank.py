@@ -18,8 +18,6 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from cavbench.detection import Decoy, Objects, Scenes
-from cavbench.errors import UserError
-from cavbench.files import whole
 from cavbench.envs.camera import faces, sign, training_faces
 from cavbench.envs.camera.frame import Frame, noise_level
 from cavbench.envs.camera.objects import objects
@@ -27,6 +25,8 @@ from cavbench.envs.camera.plate import Box, Plate, common, detail, filtered, ope
 from cavbench.envs.camera.poses import Pose
 from cavbench.envs.camera.street.layout import sign_x
 from cavbench.envs.weather import WEATHERS
+from cavbench.errors import UserError
+from cavbench.files import whole
 
 SHIPPED = Path(__file__).parent / "data"
 

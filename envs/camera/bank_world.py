@@ -10,13 +10,13 @@ from typing import ClassVar
 
 from platformdirs import user_cache_path
 
-from cavbench.detection import CameraWorld
-from cavbench.errors import UserError
 from cavbench.core.contracts import Progress
+from cavbench.detection import CameraWorld
 from cavbench.envs.camera import bank
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.objects import NAMES
 from cavbench.envs.camera.poses import Pose
+from cavbench.errors import UserError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,8 +13,6 @@ from torch import Tensor
 
 from cavbench.detection import Approach, Scenes
 from cavbench.detection.closed_loop import Plan
-from cavbench.errors import UserError
-from cavbench.scenarios import Axes, Cell
 from cavbench.envs.camera import bank, poses
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.bank_world import BankWorld
@@ -26,6 +24,8 @@ from cavbench.envs.camera.street import layout
 from cavbench.envs.camera.street.vehicles import footprint
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.envs.weather import WEATHERS
+from cavbench.errors import UserError
+from cavbench.scenarios import Axes, Cell
 
 PLACE = layout.LOCATIONS["crossing"]
 

@@ -29,7 +29,7 @@ class ApproachEnv(DrivingEnv):
     """B cars that approach a stop sign, and brake or cross the road behind it.
 
     The action is the deceleration that the driver asks for in m/s2, float32 [B, 1]. The brakes build it up
-    (`cavbench.envs.camera.braking`). A step is the time in which a car at 10 m/s drives from one frame to the next. `observation` is the
+    (`cavbench.envs.camera.braking`). A car at 10 m/s drives from one frame to the next in a step. `observation` is the
     image of the nearest frame by distance, [B, 3, H, W]; after the last frame it stays the same. The stop line is level with
     the sign (`cavbench.detection.stopping`). An episode ends when the car stands still or has left the crossing road; a collision
     does not end it, because each car meets K draws of the cross traffic at once. The reward is 1 for stopping before the line,

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from cavbench.detection import Approach, Scenes
-from cavbench.scenarios import Axes, Cell
 from cavbench.envs.camera import poses
 from cavbench.envs.camera.bank_world import BankWorld
 from cavbench.envs.camera.places_axes import AXES, PLACES_V1
 from cavbench.envs.camera.poses import Pose
 from cavbench.envs.camera.street.layout import LOCATIONS
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.scenarios import Axes, Cell
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cavbench.errors import UserError
 from cavbench.envs.camera import develop, sign
 from cavbench.envs.camera.bare import Post, post_of, without_sign
 from cavbench.envs.camera.camera import Array, Camera
 from cavbench.envs.camera.faces import Face
 from cavbench.envs.camera.frame import GAMMA, Frame
+from cavbench.errors import UserError
 
 SUPERSAMPLING = 4
 """Texture samples along the side of a pixel."""

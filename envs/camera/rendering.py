@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from cavbench.errors import UserError
-from cavbench.files import whole
 from cavbench.envs.camera import bank
 from cavbench.envs.camera.frame import frame
 from cavbench.envs.camera.poses import Pose
@@ -23,6 +21,8 @@ from cavbench.envs.camera.street import layout, render
 from cavbench.envs.camera.street.light import Light, light, lighting
 from cavbench.envs.camera.street.render import Traced, load, trace, variant, works
 from cavbench.envs.weather import WEATHERS
+from cavbench.errors import UserError
+from cavbench.files import whole
 
 VERSION = 4
 """Version of the traced scene; raise it when the street or its light change."""

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from cavbench.detection import Approach, Objects, Scenes
-from cavbench.scenarios import Axes, Cell
 from cavbench.envs.camera import develop
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.bank_world import BankWorld
@@ -19,6 +18,7 @@ from cavbench.envs.camera.poses import Pose
 from cavbench.envs.camera.windscreen_axes import AXES, LENSES, WINDSCREEN_V1
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.envs.weather import WEATHERS
+from cavbench.scenarios import Axes, Cell
 
 
 class WindscreenScenes(Scenes):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cavbench.scenarios import Axes, Axis, Grid
 from cavbench.envs.camera.axes import AXES as STREET_AXES
+from cavbench.scenarios import Axes, Axis, Grid
 
 LENSES = ("clean", "drops", "glare", "blur")
 

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import ClassVar
 
 from cavbench.detection import Approach
-from cavbench.scenarios import Axes, Cell
 from cavbench.envs.camera import bank, poses
 from cavbench.envs.camera.axes import APPROACH_V1, AXES
 from cavbench.envs.camera.bank import BankScenes, TrainingScenes
 from cavbench.envs.camera.bank_world import BankWorld
 from cavbench.envs.camera.poses import Pose
 from cavbench.envs.camera.street.layout import LOCATIONS
+from cavbench.scenarios import Axes, Cell
 
 TRAINING_WEATHERS = ("clear", "rain", "fog")
 

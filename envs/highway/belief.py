@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.compiled import entry_point, inner
-from cavbench.envs.highway.dynamics import DISCRETE, closest_lane, move, speed_control, steering_control, update_direction
+from cavbench.envs.highway.dynamics import (
+    DISCRETE,
+    closest_lane,
+    move,
+    speed_control,
+    steering_control,
+    update_direction,
+)
 from cavbench.envs.highway.ego import IDLE, apply_meta_action, nearest_target_speed
 from cavbench.envs.highway.engine import advance
 from cavbench.envs.highway.spawn import DEFAULT_DELTA, TRAFFIC_SPEED_HIGH, TRAFFIC_SPEED_LOW

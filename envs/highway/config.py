@@ -10,8 +10,8 @@ from typing import Any, Literal, get_args
 
 from cavbench.driving.features import ActionType, Driver, Features
 from cavbench.driving.kinematics import CarFollowing
-from cavbench.scenarios import Cell
 from cavbench.envs.highway.axes import AXES
+from cavbench.scenarios import Cell
 
 Preset = Literal["standard", "thesis", "wide"]
 
@@ -55,7 +55,7 @@ KINEMATICS: Mapping[str, Any] = {
     "steering_limit": math.pi / 4,
     "following": CarFollowing(acceleration=3.0, braking=5.0, jam_distance=10.0, time_gap=1.5, free_share=0.5),
 }
-"""highway-env's constants, as `cavbench.driving.Kinematics` names them. In flowing traffic half of the IDM's free term is left."""
+"""highway-env's constants, as `cavbench.driving.Kinematics` names them. In flowing traffic half the IDM's free term is left."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,18 @@ from cavbench.envs.highway.ego import apply_action, score, time_to_collision
 from cavbench.envs.highway.observation import observe
 from cavbench.envs.highway.sensor import noise_sigma, sensor_range_m
 from cavbench.envs.highway.spawn import draw_words, lane_spacing, spawn_batch
-from cavbench.envs.highway.state import EPISODE, VEHICLE, EgoKind, Episode, Floats, Integers, Parameters, Vehicle, Vehicles, parameters
+from cavbench.envs.highway.state import (
+    EPISODE,
+    VEHICLE,
+    EgoKind,
+    Episode,
+    Floats,
+    Integers,
+    Parameters,
+    Vehicle,
+    Vehicles,
+    parameters,
+)
 from cavbench.envs.highway.traffic import act, sort_by_position
 from cavbench.envs.weather import WEATHERS
 

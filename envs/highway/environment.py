@@ -12,9 +12,9 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from cavbench.scenarios import SeedBlock
 from cavbench.envs.highway.config import ACTIONS, HighwayConfig
 from cavbench.envs.highway.engine import Flag, Number
+from cavbench.scenarios import SeedBlock
 
 GOLDEN_GAMMA = 0x9E3779B97F4A7C15
 MASK_64 = 0xFFFFFFFFFFFFFFFF

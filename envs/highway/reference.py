@@ -14,7 +14,6 @@ from highway_env.envs.highway_env import HighwayEnv as FaramaHighwayEnv
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
-from cavbench.scenarios import Cell
 from cavbench.envs.highway.config import ACTIONS, HighwayConfig
 from cavbench.envs.highway.constants import own_constants
 from cavbench.envs.highway.dynamics import VEHICLE_LENGTH
@@ -23,6 +22,7 @@ from cavbench.envs.highway.engine import Flag, Number, check_seeds
 from cavbench.envs.highway.environment import HighwayEnv
 from cavbench.envs.highway.sensor import FEATURES, add_noise, noise_sigma, sensor_range_m
 from cavbench.envs.weather import WEATHERS
+from cavbench.scenarios import Cell
 
 IDLE = ACTIONS.index("IDLE")
 LANE_CHANGES = (ACTIONS.index("LANE_LEFT"), ACTIONS.index("LANE_RIGHT"))

@@ -8,7 +8,18 @@ from __future__ import annotations
 import math
 
 from cavbench.compiled import inner
-from cavbench.envs.highway.dynamics import CONTINUOUS, DISCRETE, IDM, SPEED_LIMIT, clip, is_on_lane, is_reachable, not_zero, speed_control, steering_control
+from cavbench.envs.highway.dynamics import (
+    CONTINUOUS,
+    DISCRETE,
+    IDM,
+    SPEED_LIMIT,
+    clip,
+    is_on_lane,
+    is_reachable,
+    not_zero,
+    speed_control,
+    steering_control,
+)
 from cavbench.envs.highway.state import Integers, Vehicle, Vehicles
 
 MAX_ACCELERATION = 6.0

@@ -7,12 +7,23 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
-from cavbench.errors import UserError
 from cavbench.core.parameters import differing
-from cavbench.scenarios import Axes, Cell
+from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
 from cavbench.envs.highway.axes import AXES, STANDARD_V2
-from cavbench.envs.highway.config import ACTIONS, KINEMATICS, STANDARD_FEATURES, STANDARD_TARGET_SPEEDS, THESIS_FEATURES, THESIS_TARGET_SPEEDS, WIDE_FEATURES, HighwayConfig, Preset, lanes_held
+from cavbench.envs.highway.config import (
+    ACTIONS,
+    KINEMATICS,
+    STANDARD_FEATURES,
+    STANDARD_TARGET_SPEEDS,
+    THESIS_FEATURES,
+    THESIS_TARGET_SPEEDS,
+    WIDE_FEATURES,
+    HighwayConfig,
+    Preset,
+    lanes_held,
+)
+from cavbench.errors import UserError
+from cavbench.scenarios import Axes, Cell
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from cavbench.leaderboard.comparisons.comparison import Comparison
 from cavbench.scenarios import Cell
 from cavbench.statistics.estimates import Array
-from cavbench.leaderboard.comparisons.comparison import Comparison
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ from typing import Any
 import pyarrow as pa
 
 from cavbench.core.track import Track
+from cavbench.leaderboard.comparisons.comparison import IDENTITY
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import Episodes
-from cavbench.leaderboard.comparisons.comparison import IDENTITY
 
 
 class Baselines:

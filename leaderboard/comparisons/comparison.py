@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow.compute as pc
 
 from cavbench.core.track import Measure, Track
+from cavbench.leaderboard.comparisons.pairing import beside
 from cavbench.scenarios import Axes, Cell
 from cavbench.statistics.doubts import mean
 from cavbench.statistics.episodes import Episodes, difference, measured
 from cavbench.statistics.estimates import Array, Interval, share_interval
-from cavbench.leaderboard.comparisons.pairing import beside
 
 DEFENDED = ("defense", "defense_params", "victim", "victim_params", "world", "world_params")
 """The columns that name what is attacked; a clean control shares them with the attacked episodes."""

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from cavbench.core import registry
 from cavbench.core.track import Measure, Track, track
-from cavbench.records.reading import times
-from cavbench.records.schema import AUDIT
-from cavbench.statistics.episodes import Episodes
 from cavbench.leaderboard.comparisons.baselines import Baselines, identity_of
 from cavbench.leaderboard.comparisons.comparison import ATTACKER, DEFENDED, NO_ATTACK, Comparison
 from cavbench.leaderboard.comparisons.pairing import with_control
+from cavbench.records.reading import times
+from cavbench.records.schema import AUDIT
+from cavbench.statistics.episodes import Episodes
 
 SCENARIO = ("training_seed", "cell", "seed")
 CONTROL = (*DEFENDED, "grid")

@@ -14,9 +14,6 @@ from urllib.parse import quote
 import numpy as np
 
 from cavbench.core.track import Track
-from cavbench.scenarios import Axes, Cell
-from cavbench.statistics.doubts import Remark
-from cavbench.statistics.estimates import Array, Interval, scenario_covariance, t_quantile, task_intervals
 from cavbench.leaderboard.comparisons.alignment import Aligned, align
 from cavbench.leaderboard.comparisons.baselines import identity_of
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison, parameters
@@ -28,6 +25,9 @@ from cavbench.leaderboard.ranking.curves import Curve
 from cavbench.leaderboard.ranking.families import budgets, efforts
 from cavbench.leaderboard.ranking.flags import FLAGS
 from cavbench.leaderboard.ranking.remarks import comparison_remarks
+from cavbench.scenarios import Axes, Cell
+from cavbench.statistics.doubts import Remark
+from cavbench.statistics.estimates import Array, Interval, scenario_covariance, t_quantile, task_intervals
 
 VERSION = 3
 """Of the schema; a reader that knows it can read every later document of the same version. Version 1 had the values of three
@@ -40,7 +40,7 @@ Labels = Mapping[str, Mapping[tuple[object, object], str]]
 
 def schema() -> dict[str, Any]:
     """The JSON schema (draft 2020-12) of a document."""
-    text = (files("leaderboard") / "data" / "leaderboard.schema.json").read_text(encoding="utf-8")
+    text = (files("cavbench.leaderboard") / "data" / "leaderboard.schema.json").read_text(encoding="utf-8")
     return dict(json.loads(text))
 
 
@@ -146,7 +146,7 @@ def clip(row: Row, board: Board, folder: Path | None, link: str) -> str | None:
     """
     norm, budget, *_ = board.threat
     name = f"clips/{norm}-{budget:g}-{row.identity['defense']}+{row.identity['victim']}.webp"
-    home = folder or Path(str(files("leaderboard")))
+    home = folder or Path(str(files("cavbench.leaderboard")))
     first = board.rows.index(next(one for one in board.rows if _plain_name(one) == _plain_name(row)))
     return link + quote(name, safe="/+") if (home / name).is_file() and board.rows[first] is row else None
 

@@ -19,11 +19,9 @@ import pyarrow as pa
 from rich.console import Console
 from rich.text import Text
 
+from cavbench.core.track import tracks
 from cavbench.errors import UserError
 from cavbench.files import check_folder, whole
-from cavbench.core.track import tracks
-from cavbench.records import reading
-from cavbench.run.process import follow_parent
 from cavbench.leaderboard.comparisons.reading import measurements
 from cavbench.leaderboard.page.document import document
 from cavbench.leaderboard.page.table import table
@@ -32,6 +30,8 @@ from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.ranking.flags import FLAGS
 from cavbench.leaderboard.terminal.ranking import print_boards
 from cavbench.leaderboard.thesis import chapters
+from cavbench.records import reading
+from cavbench.run.process import follow_parent
 
 NAME = "leaderboard.html"
 
@@ -80,7 +80,7 @@ def _copy_films(made: Mapping[str, Any], folder: Path) -> None:
     """Put the published films where the page expects them: beside it."""
     names = {row["clip"] for board in made["boards"] for row in board["rows"] if row["clip"]}
     for name in sorted(map(unquote, names)):
-        film, target = (files("leaderboard") / name).read_bytes(), folder / name
+        film, target = (files("cavbench.leaderboard") / name).read_bytes(), folder / name
         if target.exists() and target.read_bytes() == film:
             continue
         target.parent.mkdir(exist_ok=True)
@@ -109,7 +109,7 @@ def html(made: Mapping[str, Any], episodes: int, thesis: Sequence[chapters.Chapt
         thesis: its tables beside ours.
         recordings: the way from the page to the results folder.
     """
-    site = files("leaderboard") / "page" / "site"
+    site = files("cavbench.leaderboard") / "page" / "site"
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string((site / "page.html").read_text(encoding="utf-8"))
     # "<" would end the element that the data stand in.

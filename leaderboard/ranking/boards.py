@@ -12,14 +12,14 @@ import pyarrow as pa
 from cavbench.core import registry
 from cavbench.core.contracts import Access
 from cavbench.core.track import Track, track
-from cavbench.statistics.doubts import Remark
-from cavbench.statistics.episodes import Episodes
-from cavbench.statistics.estimates import Interval
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.reading import comparable, read_tracks
 from cavbench.leaderboard.ranking.flags import Flag, Subject, flags
 from cavbench.leaderboard.ranking.remarks import row_remarks
 from cavbench.leaderboard.ranking.worst import Panel, Worst, margin
+from cavbench.statistics.doubts import Remark
+from cavbench.statistics.episodes import Episodes
+from cavbench.statistics.estimates import Interval
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from cavbench.scenarios import Cell
-from cavbench.statistics.estimates import Array, Interval, interval, share_interval
 from cavbench.leaderboard.comparisons.alignment import Aligned
 from cavbench.leaderboard.comparisons.comparison import Comparison
+from cavbench.scenarios import Cell
+from cavbench.statistics.estimates import Array, Interval, interval, share_interval
 
 FLOOR, CEILING = 0.05, 0.95
 """A cell tells nothing where even the first point leaves less than `FLOOR`, or even the last more than `CEILING` of the score

@@ -16,16 +16,16 @@ import pyarrow.compute as pc
 
 from cavbench.core import registry
 from cavbench.core.track import Track
-from cavbench.scenarios import Grid
-from cavbench.statistics import doubts
-from cavbench.statistics.doubts import TITLES, Finding
-from cavbench.statistics.estimates import Interval
-from cavbench.statistics.unpaired import ENOUGH_SCENARIOS, unpaired
 from cavbench.leaderboard.comparisons.alignment import align
 from cavbench.leaderboard.comparisons.comparison import ENOUGH_SEEDS, Comparison
 from cavbench.leaderboard.ranking.curves import ENOUGH_CELLS, Curve
 from cavbench.leaderboard.ranking.families import budgets, efforts
 from cavbench.leaderboard.ranking.worst import Panel, Worst, margin
+from cavbench.scenarios import Grid
+from cavbench.statistics import doubts
+from cavbench.statistics.doubts import TITLES, Finding
+from cavbench.statistics.estimates import Interval
+from cavbench.statistics.unpaired import ENOUGH_SCENARIOS, unpaired
 
 NOTHING_LEFT = 0.01
 """A score this low cannot fall further: attacks that reach it are not told apart."""

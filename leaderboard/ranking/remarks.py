@@ -1,16 +1,16 @@
-"""The remarks of tables, where the records are read as comparisons (`cavbench.statistics.doubts` has the words and thresholds)."""
+"""The remarks of tables, where records are read as comparisons (`cavbench.statistics.doubts` has the words and thresholds)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 
-from cavbench.statistics import doubts
-from cavbench.statistics.doubts import OF_VICTIM, Remark
-from cavbench.statistics.episodes import Episodes
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.naming import Varying, component, defended, varying
 from cavbench.leaderboard.ranking.worst import Panel, Worst
+from cavbench.statistics import doubts
+from cavbench.statistics.doubts import OF_VICTIM, Remark
+from cavbench.statistics.episodes import Episodes
 
 
 def comparison_remarks(one: Comparison, about: str = "") -> list[Remark]:

@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from cavbench.leaderboard.comparisons.comparison import Comparison
 from cavbench.scenarios import Cell
 from cavbench.statistics.certificate import certificate
 from cavbench.statistics.doubts import mean
@@ -17,7 +18,6 @@ from cavbench.statistics.episodes import Episodes
 from cavbench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
 from cavbench.statistics.independent import independent
 from cavbench.statistics.strongest import strongest_of, under
-from cavbench.leaderboard.comparisons.comparison import Comparison
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,12 +10,23 @@ from rich.table import Table
 from rich.text import Text
 
 from cavbench.core.track import Baseline, Measure
-from cavbench.statistics.episodes import measured
-from cavbench.statistics.estimates import Interval
 from cavbench.leaderboard.comparisons.comparison import Comparison
 from cavbench.leaderboard.terminal.columns import measure_columns, written
 from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_heading, cell_rows, fitted
-from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MISSING, arrow, estimate, number, share, strip, verdict
+from cavbench.leaderboard.terminal.text import (
+    ATTACKED,
+    BASELINE,
+    CLEAN,
+    MISSING,
+    arrow,
+    estimate,
+    number,
+    share,
+    strip,
+    verdict,
+)
+from cavbench.statistics.episodes import measured
+from cavbench.statistics.estimates import Interval
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from typing import TypeVar
 from rich.text import Text
 
 from cavbench.core.track import Measure
-from cavbench.statistics.estimates import Interval
 from cavbench.leaderboard.comparisons.comparison import Comparison, mean
 from cavbench.leaderboard.terminal.layout import Column
 from cavbench.leaderboard.terminal.text import estimate, number, share
+from cavbench.statistics.estimates import Interval
 
 Subject = TypeVar("Subject")
 

@@ -12,15 +12,27 @@ from rich.table import Table
 from rich.text import Text
 
 from cavbench.core.track import Measure, Track
-from cavbench.scenarios import Cell
-from cavbench.statistics.episodes import Episodes, measured
-from cavbench.statistics.estimates import Interval
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.naming import component, defended, varying
 from cavbench.leaderboard.ranking.worst import Panel, Worst
 from cavbench.leaderboard.terminal.columns import measure_columns, written
 from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
-from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, bounds, change, counted, estimate, number, share, strip, verdict
+from cavbench.leaderboard.terminal.text import (
+    ATTACKED,
+    BASELINE,
+    CLEAN,
+    bounds,
+    change,
+    counted,
+    estimate,
+    number,
+    share,
+    strip,
+    verdict,
+)
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import Episodes, measured
+from cavbench.statistics.estimates import Interval
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,25 @@ from rich.padding import Padding
 from rich.text import Text
 
 from cavbench.core.track import Track
-from cavbench.statistics.estimates import share_interval
 from cavbench.leaderboard.comparisons.naming import Varying, component, varying
 from cavbench.leaderboard.published import every_track
 from cavbench.leaderboard.ranking.boards import Board, Row, read_boards
 from cavbench.leaderboard.ranking.flags import FLAGS
 from cavbench.leaderboard.terminal.columns import written
 from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
-from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, estimate, number, of_frames, share, signed, strip, verdict
+from cavbench.leaderboard.terminal.text import (
+    ATTACKED,
+    BASELINE,
+    CLEAN,
+    estimate,
+    number,
+    of_frames,
+    share,
+    signed,
+    strip,
+    verdict,
+)
+from cavbench.statistics.estimates import share_interval
 
 ADDED = 0.01
 """What an attack must add to be named."""

@@ -12,7 +12,6 @@ from rich.table import Table
 from rich.text import Text
 
 from cavbench.core.track import Track, track
-from cavbench.statistics.episodes import step_mean
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.naming import component, defended, varying
 from cavbench.leaderboard.comparisons.reading import read_comparisons
@@ -20,6 +19,7 @@ from cavbench.leaderboard.ranking.remarks import comparison_remarks, run_remarks
 from cavbench.leaderboard.terminal.cells import cell_by_cell
 from cavbench.leaderboard.terminal.overview import overview
 from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MARKS, counted, of_frames, size, threat
+from cavbench.statistics.episodes import step_mean
 
 SCREEN, AROUND, NOTES = 24, 7, 2
 """Lines of a terminal; those for the title, the headings, the gap, the folder and the prompt; and how many notes are shown that

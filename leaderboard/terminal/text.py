@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 from rich.text import Text
 
-from cavbench.statistics.estimates import Interval
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
+from cavbench.statistics.estimates import Interval
 
 MISSING = "—"
 CLEAN, ATTACKED, BASELINE = "cyan", "yellow", "bright_black"

@@ -12,11 +12,11 @@ from rich.table import Table
 from rich.text import Text
 
 from cavbench.core.track import track
-from cavbench.records.schema import schema
 from cavbench.detection.track import DetectionTrack
 from cavbench.driving.track import DrivingTrack
 from cavbench.leaderboard.thesis.numbers import THESIS, printed
 from cavbench.leaderboard.thesis.policy_records import clear
+from cavbench.records.schema import schema
 
 Chapter = dict[str, Any]
 """`name`, `heading` and `tables`, each with its `title`, `headings`, `rows` and `notes`."""
@@ -26,7 +26,7 @@ def prepare() -> None:
     """Import what the tables need."""
     from scipy import stats  # noqa: F401
 
-    from cavbench.leaderboard.thesis import patches, policies# noqa: F401
+    from cavbench.leaderboard.thesis import patches, policies  # noqa: F401
 
 
 def chapters(own: Mapping[str, pa.Table]) -> list[Chapter]:

@@ -9,14 +9,14 @@ from typing import Literal
 import numpy as np
 from rich.text import Text
 
-from cavbench.statistics.episodes import shared
-from cavbench.statistics.estimates import Array, interval
 from cavbench.detection.track import REFERENCE_PATCHES
 from cavbench.leaderboard.comparisons.comparison import ENOUGH_SEEDS
 from cavbench.leaderboard.comparisons.pairing import beside
 from cavbench.leaderboard.terminal.text import bounds, change
 from cavbench.leaderboard.thesis.patch_records import ABLATION, LOCATIONS, STANDARD, WEATHERS, Detector, Source
 from cavbench.leaderboard.thesis.trend import LEVEL, trend
+from cavbench.statistics.episodes import shared
+from cavbench.statistics.estimates import Array, interval
 
 Place = tuple[str, str | None]
 """A weather and a location of ours; no location is all of them."""

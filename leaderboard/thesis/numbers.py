@@ -40,7 +40,7 @@ def printed() -> dict[str, Any]:
     # Imported here: a page is put together without it, and it takes a tenth of a second.
     from omegaconf import OmegaConf
 
-    text = (files("leaderboard") / "data" / "thesis.yaml").read_text(encoding="utf-8")
+    text = (files("cavbench.leaderboard") / "data" / "thesis.yaml").read_text(encoding="utf-8")
     found = OmegaConf.to_container(OmegaConf.create(text))
     assert isinstance(found, dict)
     return {str(name): value for name, value in found.items()}

@@ -13,10 +13,10 @@ from functools import cache
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cavbench.identity.fingerprint import canonical
 from cavbench.core.registry import Kind
 from cavbench.core.track import track
 from cavbench.detection.track import REFERENCE_PATCHES, DetectionTrack
+from cavbench.identity.fingerprint import canonical
 from cavbench.leaderboard.comparisons.comparison import IDENTITY, NO_ATTACK, Comparison, parameters
 from cavbench.leaderboard.comparisons.reading import SCENARIO, groups, read_comparisons
 from cavbench.leaderboard.published import published

@@ -13,10 +13,28 @@ from rich.text import Text
 from cavbench.core import registry
 from cavbench.leaderboard.comparisons.comparison import NO_ATTACK
 from cavbench.leaderboard.terminal.layout import Column, Section, fitted
-from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MISSING, bounds, change, estimate, share, signed
+from cavbench.leaderboard.terminal.text import (
+    ATTACKED,
+    BASELINE,
+    CLEAN,
+    MISSING,
+    bounds,
+    change,
+    estimate,
+    share,
+    signed,
+)
 from cavbench.leaderboard.thesis.claims import configuration_claims, location_claims
 from cavbench.leaderboard.thesis.numbers import PUBLISHED, THESIS, Beside, as_printed
-from cavbench.leaderboard.thesis.patch_records import CONFIGURATIONS, CONTROLS, LOCATIONS, STANDARD, WEATHERS, Found, Source
+from cavbench.leaderboard.thesis.patch_records import (
+    CONFIGURATIONS,
+    CONTROLS,
+    LOCATIONS,
+    STANDARD,
+    WEATHERS,
+    Found,
+    Source,
+)
 
 GRID = "approach-v1"
 """Whose roads are the standard ones."""

@@ -11,13 +11,13 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from cavbench.scenarios import Cell
 from cavbench.driving.track import BEST_BLIND, IDM
 from cavbench.leaderboard.comparisons.comparison import ENOUGH_SEEDS
 from cavbench.leaderboard.terminal.text import ATTACKED, CLEAN, estimate, share
 from cavbench.leaderboard.thesis.numbers import PUBLISHED, THESIS, Beside, as_printed
 from cavbench.leaderboard.thesis.policy_records import BUDGET, CLEAR, Attack, Found, Source, Victim, Wanted
 from cavbench.leaderboard.thesis.trend import trend
+from cavbench.scenarios import Cell
 
 SKIPS = (0.0, 0.3, 0.5, 1.0)
 """The thesis', and the control: the same training without an attack."""

@@ -12,14 +12,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cavbench.core.track import track
-from cavbench.scenarios import Cell
-from cavbench.statistics.episodes import Episodes
-from cavbench.statistics.estimates import Interval, interval, share_interval
 from cavbench.driving.track import BEST_BLIND, DrivingTrack
 from cavbench.leaderboard.comparisons.baselines import Baselines
 from cavbench.leaderboard.comparisons.comparison import ATTACKER, DEFENDED, IDENTITY, parameters
 from cavbench.leaderboard.comparisons.reading import SCENARIO, groups, newest
 from cavbench.leaderboard.published import published
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import Episodes
+from cavbench.statistics.estimates import Interval, interval, share_interval
 
 Victim = Literal["dqn", "ddpg"]
 Attack = Literal["none", "zo", "noise"]

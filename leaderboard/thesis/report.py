@@ -10,11 +10,11 @@ from rich.padding import Padding
 from rich.text import Text
 
 from cavbench.core.track import track
-from cavbench.records.schema import schema
 from cavbench.detection.track import DetectionTrack
 from cavbench.driving.track import DrivingTrack
 from cavbench.leaderboard.thesis import patches, policies
 from cavbench.leaderboard.thesis.numbers import PUBLISHED, THESIS, Beside, printed
+from cavbench.records.schema import schema
 
 
 def thesis_report(records: Mapping[str, pa.Table], console: Console) -> None:

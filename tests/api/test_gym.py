@@ -19,9 +19,9 @@ from tensordict import TensorDict
 
 import cavbench
 from cavbench.checks import complaints
+from cavbench.core import registry
 from cavbench.driving import DrivingAttack, Features
 from cavbench.gym import GymWorld
-from cavbench.core import registry
 from cavbench.scenarios import Axes, Axis, Cell, Grid, SeedBlock
 from tests.framework.conftest import Said
 from tests.framework.distributions import install

@@ -15,16 +15,15 @@ import torch
 from torch import Tensor, nn
 
 import cavbench
-import cavbench
-from cavbench.driving import ActionType, DrivingAttack, Oracle, Policy
-from cavbench.errors import UserError
 from cavbench.core.contracts import Access
 from cavbench.core.pair import choose
 from cavbench.core.track import track
+from cavbench.driving import ActionType, DrivingAttack, Oracle, Policy
+from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.run import runner
 from cavbench.run.config import run_config
-from cavbench.envs.highway.world import HighwayWorld
 from tests.victims.test_from_file import sb3_model, spaces
 
 SHORT = HighwayWorld(max_steps=15)

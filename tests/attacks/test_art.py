@@ -13,9 +13,9 @@ from cavbench.attacks.driving.art import ATTACKS, _component
 from cavbench.attacks.driving.noise import Noise
 from cavbench.attacks.driving.pgd import PGD
 from cavbench.checks import complaints
+from cavbench.core.pair import choose
 from cavbench.driving import DrivingAttack, ObservationThreat
 from cavbench.errors import UserError
-from cavbench.core.pair import choose
 from tests.attacks.victims import FEATURES, Linear, observations, perturb, victim
 
 THREAT = ObservationThreat(norm="linf", budget=0.4, queries=60)

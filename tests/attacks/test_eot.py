@@ -17,8 +17,8 @@ from cavbench.attacks.detection.views import corners
 from cavbench.detection import Detector, PatchOracle, PatchThreat, Predictions, Scenes
 from cavbench.detection.boxes import confidence
 from cavbench.detection.enforcer import PatchEnforcer
-from cavbench.errors import UserError
 from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
+from cavbench.errors import UserError
 from tests.framework.toy_camera import RedDetector, RedScenes
 from tests.vision.drawn_street import DrawnStreet
 

@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from cavbench import zoo
 from cavbench.attacks.driving.director_training import AdversaryWorld, Victim
 from cavbench.attacks.driving.objectives import margin
 from cavbench.attacks.driving.paad import PAAD
@@ -21,22 +22,21 @@ from cavbench.attacks.driving.sarsa import RobustSarsa, Value
 from cavbench.attacks.driving.targets import Controls, EveryAction
 from cavbench.attacks.driving.two_stage import TwoStage
 from cavbench.checks.check import Subject
-from cavbench.driving.checks.attack import AttackSuite
-from cavbench.driving import DrivingAttack, DrivingWorld, ObservationThreat, Policy
-from cavbench.driving.enforcer import Enforcer
-from cavbench.driving.victim import CountedPolicy
-from cavbench.errors import UserError
 from cavbench.core.contracts import Trained
 from cavbench.core.pair import Pair, choose
-from cavbench.run.unit import Unit
-from cavbench.scenarios import SeedBlock
-from cavbench import zoo
+from cavbench.defenses.driving.advtrain import AdversarialTraining
+from cavbench.defenses.none import NoDefense
+from cavbench.driving import DrivingAttack, DrivingWorld, ObservationThreat, Policy
+from cavbench.driving.checks.attack import AttackSuite
+from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.victim import CountedPolicy
 from cavbench.driving.victims.ddpg import DDPG
 from cavbench.driving.victims.dqn import DQN
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.driving.victims.practice import roads
-from cavbench.defenses.driving.advtrain import AdversarialTraining
-from cavbench.defenses.none import NoDefense
+from cavbench.errors import UserError
+from cavbench.run.unit import Unit
+from cavbench.scenarios import SeedBlock
 from tests.attacks.victims import observations, perturb, victim
 
 SHORT = {"decisions": 8, "hidden": 8}

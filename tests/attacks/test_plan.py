@@ -10,15 +10,15 @@ from torch import Tensor
 
 from cavbench.attacks.driving.plan import Plan
 from cavbench.attacks.driving.rehearse import Rehearse
+from cavbench.core.pair import choose
 from cavbench.driving import ActionType, DrivingAttack, ObservationThreat, Policy
 from cavbench.driving.attacker import Attacker
 from cavbench.driving.victim import CountedPolicy
-from cavbench.errors import UserError
-from cavbench.core.pair import choose
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.batched import BatchedHighway
 from cavbench.envs.highway.forecast import FIELDS
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
 from tests.attacks.victims import victim
 
 WORLD, CELL = HighwayWorld(), AXES.cell(lanes=4, density=1.0)

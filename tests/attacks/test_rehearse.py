@@ -8,17 +8,17 @@ import torch
 from tensordict import TensorDict
 
 from cavbench.attacks.driving.rehearse import SIGNS, shown
+from cavbench.core.pair import choose
 from cavbench.driving import ObservationThreat, Oracle, Policy
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.rollout import rollout
 from cavbench.driving.victim import CountedPolicy
-from cavbench.errors import UserError
-from cavbench.core.pair import choose
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.batched import BatchedHighway
 from cavbench.envs.highway.forecast import FIELDS
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
 
 WORLD, CELL = HighwayWorld(), AXES.cell(lanes=3, density=2.0)
 THREAT = ObservationThreat(access="dynamics")

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from cavbench.attacks.detection.square_patch import SquarePatch
+from cavbench.defenses.detection.temporal import TemporalFusion
 from cavbench.detection import Detector, PatchThreat
 from cavbench.detection.enforcer import PatchEnforcer
-from cavbench.defenses.detection.temporal import TemporalFusion
 from tests.attacks.test_eot import SCENES, red
 from tests.framework.toy_camera import RedDetector, RedStreet, RedVictim
 

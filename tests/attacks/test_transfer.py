@@ -9,13 +9,13 @@ from torch import Tensor
 from cavbench.attacks.detection.eot import CUT, EOT, cut_out
 from cavbench.attacks.detection.shake_drop import branches, shake
 from cavbench.attacks.detection.transfer import Transfer, _Turns
+from cavbench.core.pair import Pair, choose
 from cavbench.detection import PatchThreat
 from cavbench.detection.crafting import craft
-from cavbench.errors import UserError
-from cavbench.core.pair import Pair, choose
 from cavbench.detection.victims.fcos import FCOS
 from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
 from cavbench.detection.victims.yolov5 import Bottleneck, YOLOv5
+from cavbench.errors import UserError
 from tests.attacks.test_eot import SCENES
 from tests.conftest import FACTS
 from tests.framework.toy_camera import RedDetector

@@ -11,18 +11,18 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from cavbench.core.contracts import Facts
+from cavbench.core.pair import Chosen, Pair, choose
+from cavbench.core.track import Driven, Job, track
 from cavbench.detection import Detector, DetectorVictim, PatchThreat, Predictions
 from cavbench.detection.closed_loop import measured
 from cavbench.detection.drive import drive
 from cavbench.detection.patch import Patch
-from cavbench.core.contracts import Facts
-from cavbench.core.pair import Chosen, Pair, choose
-from cavbench.core.track import Driven, Job, track
-from cavbench.recording.film import save
-from cavbench.recording.film.drawing import BLUE, VERMILLION
 from cavbench.envs.camera.crossing import StopSignCrossing
 from cavbench.envs.camera.crossing_axes import AXES, CROSSING_V1
 from cavbench.envs.camera.street import layout
+from cavbench.recording.film import save
+from cavbench.recording.film.drawing import BLUE, VERMILLION
 
 WORLD = StopSignCrossing()
 GREY = torch.full((3, 8, 8), 0.3)

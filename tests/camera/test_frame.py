@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from cavbench.errors import UserError
 from cavbench.envs.camera import bank, develop, sign
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.frame import frame
@@ -22,6 +21,7 @@ from cavbench.envs.camera.plate import detail, filtered
 from cavbench.envs.camera.poses import approach
 from cavbench.envs.camera.weather import air, streaks
 from cavbench.envs.weather import WEATHERS, Weather
+from cavbench.errors import UserError
 from tests.camera.scenes import lit, scenes
 
 SCENES = scenes()

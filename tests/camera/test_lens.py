@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import Job
 from cavbench.detection import PatchThreat
 from cavbench.detection.drive import drive
 from cavbench.detection.patch import Patch
-from cavbench.core.pair import Pair, choose
-from cavbench.core.track import Job
 from cavbench.envs.camera import lens, poses
 from cavbench.envs.camera.lens import EFFECTS
 from cavbench.envs.camera.windscreen import Windscreen, WindscreenScenes

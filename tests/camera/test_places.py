@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cavbench.errors import UserError
 from cavbench.envs.camera import poses
 from cavbench.envs.camera.axes import AXES as STREET
 from cavbench.envs.camera.places import StopSignPlaces
 from cavbench.envs.camera.places_axes import AXES, PLACES_V1
 from cavbench.envs.camera.street.layout import LOCATIONS, traffic
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
 
 WORLD = StopSignPlaces()
 

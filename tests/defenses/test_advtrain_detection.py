@@ -10,23 +10,23 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from cavbench import zoo
 from cavbench.attacks.detection.eot import EOT
 from cavbench.attacks.detection.noise_patch import NoisePatch
+from cavbench.core.contracts import Facts
+from cavbench.defenses.detection.advtrain_detection import DetectorAdversarialTraining, _Hardening
 from cavbench.detection import STOP_SIGN, Detector, DetectorVictim, PatchThreat, Predictions
 from cavbench.detection.boxes import confidence
 from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.sight import look, look_at_decoys
-from cavbench.errors import UserError
-from cavbench.core.contracts import Facts
-from cavbench.run.config import component, run_config
-from cavbench import zoo
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.rcnn import RCNN, RCNNNetwork
 from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
 from cavbench.detection.victims.yolov5 import YOLOv5, YOLOv5Network
-from cavbench.defenses.detection.advtrain_detection import DetectorAdversarialTraining, _Hardening
 from cavbench.envs.camera.bank import TrainingScenes
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
+from cavbench.run.config import component, run_config
 from tests.framework.toy_camera import SIGN, RedDetector, RedStreet
 from tests.vision.drawn_street import DrawnStreet
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from cavbench.detection import DetectorDefense
 from cavbench.defenses.detection.jpeg import JPEG
 from cavbench.defenses.detection.median import Guarded, MedianSmoothing
+from cavbench.detection import DetectorDefense
 from tests.framework.toy_camera import RedStreet, RedVictim
 
 BOTH = [MedianSmoothing(size=5), JPEG(quality=30)]

@@ -13,7 +13,27 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 from torch import Tensor
 
+from cavbench import zoo
 from cavbench.attacks.detection.eot import EOT
+from cavbench.defenses.detection import masking
+from cavbench.defenses.detection.jpeg import JPEG
+from cavbench.defenses.detection.judge import (
+    ACROSS,
+    CELL,
+    COVER,
+    HIDDEN,
+    LEVELS,
+    NEVER,
+    STEP,
+    UNLIKELY,
+    WINDOW,
+    Judge,
+    best_of_blocks,
+    bound,
+    levels,
+)
+from cavbench.defenses.detection.masking import Masked, Masking
+from cavbench.defenses.detection.temporal import TemporalFusion
 from cavbench.detection import Scenes
 from cavbench.detection.approach import score
 from cavbench.detection.boxes import confidence
@@ -22,17 +42,11 @@ from cavbench.detection.patch import Patch
 from cavbench.detection.placed import Placed
 from cavbench.detection.sight import certain, look
 from cavbench.detection.threat import PatchThreat
-from cavbench.errors import UserError
-from cavbench import zoo
 from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
 from cavbench.detection.victims.yolov5 import YOLOv5
-from cavbench.defenses.detection import masking
-from cavbench.defenses.detection.jpeg import JPEG
-from cavbench.defenses.detection.judge import ACROSS, CELL, COVER, HIDDEN, LEVELS, NEVER, STEP, UNLIKELY, WINDOW, Judge, best_of_blocks, bound, levels
-from cavbench.defenses.detection.masking import Masked, Masking
-from cavbench.defenses.detection.temporal import TemporalFusion
 from cavbench.envs.camera.windscreen import Windscreen
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
 from tests.framework.toy_camera import RedDetector, RedScenes, RedStreet, RedVictim
 from tests.vision.drawn_street import DrawnStreet
 

@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from cavbench.errors import UserError
 from cavbench import zoo
-from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
-from cavbench.detection.victims.yolov5 import YOLOv5
 from cavbench.defenses.detection.completion import closed, filled
 from cavbench.defenses.detection.marker import Marker
 from cavbench.defenses.detection.segmenter import SMOOTH, Completed, Segmenter
 from cavbench.defenses.detection.textures import textures
+from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
+from cavbench.detection.victims.yolov5 import YOLOv5
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
 from tests.framework.toy_camera import RedStreet, RedVictim
 from tests.vision.drawn_street import DrawnStreet
 

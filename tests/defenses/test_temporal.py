@@ -13,6 +13,8 @@ from torch import Tensor
 
 from cavbench.attacks.detection.eot import EOT
 from cavbench.attacks.detection.views import reported
+from cavbench.core.pair import choose
+from cavbench.defenses.detection.temporal import HIGHEST, MATCH_IOU, SINGLE, Fused, TemporalFusion
 from cavbench.detection import Detector, PatchThreat, Predictions
 from cavbench.detection.approach import score
 from cavbench.detection.boxes import overlap
@@ -20,9 +22,7 @@ from cavbench.detection.closed_loop import Drive, drive
 from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.sight import look
 from cavbench.detection.stopping import THRESHOLD
-from cavbench.core.pair import choose
 from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
-from cavbench.defenses.detection.temporal import HIGHEST, MATCH_IOU, SINGLE, Fused, TemporalFusion
 from cavbench.envs.camera import sign
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.crossing import StopSignCrossing

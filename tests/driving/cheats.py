@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
-from cavbench.driving.rollout import rollout
 from cavbench.core.contracts import Access
 from cavbench.core.track import Columns
+from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
+from cavbench.driving.rollout import rollout
 from cavbench.scenarios import Cell
 from tests.framework.toy import ToyPolicy, ToyWorld
 

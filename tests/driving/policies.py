@@ -9,10 +9,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from cavbench.driving.victims.reference import Blind, RandomDriver
 from cavbench.defenses.driving.frame_stack import FrameStack, Reduction
 from cavbench.defenses.driving.recurrent import RecurrentPolicy
+from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
+from cavbench.driving.victims.reference import Blind, RandomDriver
 from cavbench.envs.highway.world import HighwayWorld
 from tests.attacks.victims import observations, victim
 

@@ -11,24 +11,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from cavbench import zoo
 from cavbench.attacks.driving.pgd import PGD
 from cavbench.attacks.driving.rehearse import Rehearse
 from cavbench.attacks.driving.zo import ZOSignSGD
-from cavbench.driving import DrivingAttack, ObservationThreat
-from cavbench.driving.rollout import rollout
-from cavbench.errors import UserError
 from cavbench.core.pair import choose
-from cavbench import zoo
-from cavbench.driving.victims.dqn import DQN
-from cavbench.driving.victims.learner import CHUNK, Phase
-from cavbench.driving.victims.networks import QPolicy
-from cavbench.driving.victims.practice import roads
 from cavbench.defenses.driving.adversary import Adversary
 from cavbench.defenses.driving.alternating import Alternation, RecurrentPractice, Turn
 from cavbench.defenses.driving.atla import AlternatingTraining, Scored
 from cavbench.defenses.driving.recurrent import RecurrentPolicy
+from cavbench.driving import DrivingAttack, ObservationThreat
+from cavbench.driving.rollout import rollout
+from cavbench.driving.victims.dqn import DQN
+from cavbench.driving.victims.learner import CHUNK, Phase
+from cavbench.driving.victims.networks import QPolicy
+from cavbench.driving.victims.practice import roads
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
 from tests.attacks.victims import FEATURES, observations, victim
 from tests.driving.policies import recurrent
 

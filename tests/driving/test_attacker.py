@@ -10,11 +10,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from cavbench.core.contracts import Access
 from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, State
 from cavbench.driving.attacker import Attacker
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
-from cavbench.core.contracts import Access
 from tests.attacks.victims import FEATURES, Linear, observations
 
 ALL = torch.ones(3, dtype=torch.bool)

@@ -11,14 +11,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from cavbench.core.contracts import Access, QueryBudgetError
+from cavbench.core.pair import choose
 from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, enforcer
 from cavbench.driving.drive import SEAL
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.rollout import rollout
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
-from cavbench.core.contracts import Access, QueryBudgetError
-from cavbench.core.pair import choose
 from cavbench.isolation.watch import TamperError
 from tests.driving.cheats import CELL, SEEDS, WORLD, Noisy, Victim, drive
 

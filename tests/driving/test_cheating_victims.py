@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from cavbench.core.pair import Pair, choose
 from cavbench.driving import Oracle, State
 from cavbench.driving.drive import _checked
 from cavbench.errors import UserError
-from cavbench.core.pair import Pair, choose
 from cavbench.isolation.identifiers import opaque
 from cavbench.isolation.watch import TamperError
 from tests.driving.cheats import SEEDS, Noisy, Victim, drive, inconsistent

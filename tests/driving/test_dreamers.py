@@ -12,9 +12,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from cavbench.core.contracts import Access
 from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy, State
 from cavbench.driving.rollout import rollout
-from cavbench.core.contracts import Access
 from tests.driving.cheats import CELL, SEEDS, Victim
 from tests.framework.toy import ToyWorld
 

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from cavbench.attacks.driving.noise import Noise
+from cavbench.core.pair import choose
+from cavbench.defenses.driving.frame_stack import FrameStack, Reduction
 from cavbench.driving import ObservationThreat, Policy
 from cavbench.driving.rollout import Trace, rollout
-from cavbench.core.pair import choose
-from cavbench.scenarios import SeedBlock
 from cavbench.driving.victims.reference import Blind, RandomDriver
-from cavbench.defenses.driving.frame_stack import FrameStack, Reduction
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.scenarios import SeedBlock
 from tests.attacks.victims import observations, victim
 from tests.driving.policies import FACTS, STATEFUL, Echo, Given, stacked
 

@@ -13,6 +13,9 @@ from torch import Tensor
 
 from cavbench.attacks.driving.noise import Noise
 from cavbench.attacks.driving.pgd import PGD
+from cavbench.core.pair import choose
+from cavbench.defenses.driving.shield import Shield, Shielded, ShieldedControls
+from cavbench.defenses.driving.tracker import Tracked, Tracker
 from cavbench.driving import DrivingVictim, ObservationThreat, Policy
 from cavbench.driving.intervals.boxes import Assumed
 from cavbench.driving.intervals.ego import Ego
@@ -22,15 +25,12 @@ from cavbench.driving.intervals.policy import reckoning
 from cavbench.driving.intervals.rooms import Cars, Caution, cars_of
 from cavbench.driving.rollout import rollout
 from cavbench.driving.threat import Norm
-from cavbench.errors import UserError
-from cavbench.core.pair import choose
-from cavbench.scenarios import SeedBlock
 from cavbench.driving.victims.planner import IntervalPlanner, Planner
-from cavbench.defenses.driving.shield import Shield, Shielded, ShieldedControls
-from cavbench.defenses.driving.tracker import Tracked, Tracker
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.batched import BatchedHighway
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
+from cavbench.scenarios import SeedBlock
 from tests.attacks.victims import observations
 from tests.framework.toy import ToyWorld
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from cavbench.driving import Policy
-from cavbench.driving.intervals.boxes import Assumed
-from cavbench.errors import UserError
 from cavbench.core.options import configured, parameter_words
 from cavbench.defenses.driving.pessimist_q import Believing, PessimistQ
+from cavbench.driving import Policy
+from cavbench.driving.intervals.boxes import Assumed
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
 from tests.attacks.victims import observations, victim
 from tests.driving.policies import Given, remembered
 

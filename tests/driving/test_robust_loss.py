@@ -11,17 +11,17 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from cavbench.driving import Policy
-from cavbench.errors import UserError
-from cavbench.core.pair import choose
 from cavbench import zoo
-from cavbench.driving.victims.ddpg import DDPG
-from cavbench.driving.victims.dqn import DQN
-from cavbench.driving.victims.training import LearningDriver
+from cavbench.core.pair import choose
 from cavbench.defenses.driving.car import ConsistentAdversarialRobustness
 from cavbench.defenses.driving.robust_loss import RobustLoss, RobustTraining
 from cavbench.defenses.driving.sa import StateAdversarial
+from cavbench.driving import Policy
+from cavbench.driving.victims.ddpg import DDPG
+from cavbench.driving.victims.dqn import DQN
+from cavbench.driving.victims.training import LearningDriver
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
 from tests.attacks.victims import observations
 
 WORLD = HighwayWorld()

@@ -12,16 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cavbench.attacks.suites import STANDARD_2
+from cavbench.attacks.driving.suites import STANDARD_2
+from cavbench.core.pair import choose
+from cavbench.defenses.driving.smoothing import PolicySmoothing, Smoothed
 from cavbench.driving import ObservationThreat, Oracle
 from cavbench.driving.oracle import DRAWS
 from cavbench.driving.threat import Norm
+from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
-from cavbench.core.pair import choose
 from cavbench.statistics.certificate import certificate
 from cavbench.statistics.estimates import Interval
-from cavbench.defenses.driving.smoothing import PolicySmoothing, Smoothed
-from cavbench.envs.highway.world import HighwayWorld
 from tests.attacks.victims import observations
 from tests.driving.cheats import Victim, drive
 from tests.driving.policies import FACTS, Echo

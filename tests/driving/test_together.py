@@ -17,13 +17,16 @@ from cavbench.attacks.driving.noise import Noise
 from cavbench.attacks.driving.pgd import PGD
 from cavbench.attacks.driving.plan import Plan
 from cavbench.attacks.driving.zo import ZOSignSGD
+from cavbench.core.contracts import Access
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import Columns
 from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
 from cavbench.driving.drive import joint
 from cavbench.driving.rollout import NotJointError, rollout
-from cavbench.core.contracts import Access
+from cavbench.driving.victims.networks import ActorPolicy, QPolicy
+from cavbench.envs.highway.axes import AXES
+from cavbench.envs.highway.world import HighwayWorld
 from cavbench.isolation.framework import Snapshot
-from cavbench.core.pair import Pair, choose
-from cavbench.core.track import Columns
 from cavbench.run.batches import EPISODES, batches
 from cavbench.run.config import run_config
 from cavbench.run.plan import key_of, loadings, units_of
@@ -31,9 +34,6 @@ from cavbench.run.runner import _recorded
 from cavbench.run.unit import Unit
 from cavbench.run.work import Outcome, Task, attempt
 from cavbench.scenarios import Cell
-from cavbench.driving.victims.networks import ActorPolicy, QPolicy
-from cavbench.envs.highway.axes import AXES
-from cavbench.envs.highway.world import HighwayWorld
 from tests.driving.cheats import WORLD, Noisy, Victim
 
 PROBES = {"redrawn", "same_answer", "inconsistent", "draws"}

@@ -9,8 +9,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from cavbench.driving import ActionType, DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, Oracle, Policy, State
 from cavbench.core.contracts import Access
+from cavbench.driving import (
+    ActionType,
+    DrivingAttack,
+    DrivingDefense,
+    DrivingFacts,
+    DrivingVictim,
+    Oracle,
+    Policy,
+    State,
+)
 
 
 class _Mean(Policy):

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 from torchrl.envs import EnvBase
 from toy_plugin import ToyEnv, ToyWorld  # type: ignore[import-not-found]
 
+from cavbench.core.contracts import Facts
 from cavbench.driving import ActionType, Driver, DrivingFacts
 from cavbench.errors import UserError
-from cavbench.core.contracts import Facts
 from cavbench.scenarios import Axes, Axis, Cell, Grid
 
 

@@ -19,9 +19,9 @@ from torch import Tensor
 from toy_plugin import ToyWorld  # type: ignore[import-not-found]
 
 import cavbench.driving.probes
-from cavbench.driving import DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, Oracle, Policy
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Natural
+from cavbench.driving import DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, Oracle, Policy
 
 Deed = Literal[
     "none",

@@ -20,7 +20,7 @@ from cavbench.run import worker
 from cavbench.run.process import context
 from tests.framework.distributions import install_toy
 
-BENCH = (sys.executable, "-m", "bench")
+BENCH = (sys.executable, "-m", "cavbench")
 SETTINGS = {"OMP_NUM_THREADS": "1", "COLUMNS": "160"}
 """Of the environment of a command in a process of its own."""
 
@@ -127,4 +127,4 @@ def _command(
     for stream, file in enumerate(files, start=1):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT), stream)
     sys.argv[:] = ["bench", *words]
-    runpy.run_module("bench", run_name="__main__")
+    runpy.run_module("cavbench", run_name="__main__")

@@ -10,8 +10,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, PolicyWrapper, State
-from cavbench.scenarios import Cell
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.scenarios import Cell
 
 CELL = Cell(lanes=3, density=1.0, weather="clear")
 SEEDS = torch.arange(1_000_000, 1_000_020)

@@ -22,8 +22,8 @@ from torch import Tensor
 from toy_plugin import ToyPolicy, ToyVictim
 
 import cavbench.driving.meter
-from cavbench.driving import DrivingAttack, DrivingFacts, Oracle, Policy, State
 from cavbench.core.contracts import Access
+from cavbench.driving import DrivingAttack, DrivingFacts, Oracle, Policy, State
 
 Deed = Literal[
     "none",

@@ -18,14 +18,14 @@ from torch.utils._python_dispatch import return_and_correct_aliasing
 from torch.utils._pytree import tree_iter, tree_map_only
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
+from cavbench.core.pair import Pair, choose
+from cavbench.core.track import Job
 from cavbench.detection.crafting import prepare
 from cavbench.detection.drive import drive as score_patch
 from cavbench.detection.patch import Patch
 from cavbench.detection.threat import PatchThreat
 from cavbench.driving.drive import drive
 from cavbench.driving.threat import ObservationThreat
-from cavbench.core.pair import Pair, choose
-from cavbench.core.track import Job
 from cavbench.envs.highway.axes import AXES
 
 NAME = "elsewhere"

@@ -10,15 +10,15 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from cavbench.errors import UserError
 from cavbench.core import registry
+from cavbench.errors import UserError
+from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.records import reading
 from cavbench.records.schema import AUDIT, IDENTITY
 from cavbench.run.audit import SALTS, audit_config
 from cavbench.scenarios import SeedBlock
 from cavbench.statistics.estimates import Array
 from cavbench.statistics.unpaired import NOTABLE, POWER, Finds, finds, unpaired
-from cavbench.leaderboard.ranking.boards import read_boards
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 

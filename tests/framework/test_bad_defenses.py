@@ -9,9 +9,9 @@ import pytest
 
 from cavbench.core import registry
 from cavbench.core.track import track
-from cavbench.records import reading
 from cavbench.leaderboard.comparisons.reading import measurements
 from cavbench.leaderboard.ranking.boards import Row, read_boards
+from cavbench.records import reading
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 

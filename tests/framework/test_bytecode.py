@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 
 import cavbench
+from cavbench.envs.highway.world import HighwayWorld
 from cavbench.identity.bytecode import content_of
 from cavbench.identity.content import content
-from cavbench.envs.highway.world import HighwayWorld
 
 NUMBER: Any = 1.0
 

@@ -11,20 +11,20 @@ from rich.console import Console
 
 from cavbench.cli.listing import print_component
 from cavbench.cli.train import train
-from cavbench.driving.drive import drive
-from cavbench.errors import UserError
 from cavbench.core.options import configured
 from cavbench.core.pair import choose
+from cavbench.defenses.driving.shield import Shielded
+from cavbench.defenses.driving.tracker import Tracked
+from cavbench.driving.drive import drive
+from cavbench.driving.victims.dqn import DQN
+from cavbench.driving.victims.networks import QPolicy
+from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.run.config import run_config
 from cavbench.run.plan import plan
 from cavbench.run.replay import find, replay
 from cavbench.run.runner import run
-from cavbench.driving.victims.dqn import DQN
-from cavbench.driving.victims.networks import QPolicy
-from cavbench.defenses.driving.shield import Shielded
-from cavbench.defenses.driving.tracker import Tracked
-from cavbench.envs.highway.world import HighwayWorld
 from tests.framework.test_runner import Silent
 
 FACTS = HighwayWorld().facts

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from cavbench.checks import examine
 from cavbench.checks.check import BrokenRuleError, NotApplicableError, Subject
-from cavbench.detection.checks.camera import CameraSuite
-from cavbench.detection import Decoy, Scenes
 from cavbench.core.track import track
+from cavbench.detection import Decoy, Scenes
+from cavbench.detection.checks.camera import CameraSuite
 from tests.framework.conftest import Bench
 from tests.framework.distributions import install
 from tests.framework.test_third_track import POINTS as LISTENING

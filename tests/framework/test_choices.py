@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from cavbench.checks import complaints
-from cavbench.errors import UserError
 from cavbench.core.track import track
+from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.run.config import run_config
 from tests.framework.conftest import Said

@@ -14,14 +14,14 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-import bench as package
+import cavbench
 from cavbench.cli.explain import heading_of, print_term
 from cavbench.cli.options_help import THREAT, settings
 from cavbench.cli.progress import RunProgress
-from cavbench.detection.threat import PatchThreat
-from cavbench.driving.threat import ObservationThreat
 from cavbench.core.registry import GROUPS, KINDS, entries
 from cavbench.core.track import tracks
+from cavbench.detection.threat import PatchThreat
+from cavbench.driving.threat import ObservationThreat
 from cavbench.run.options import RunOptions
 from tests.framework.conftest import Said
 
@@ -37,7 +37,7 @@ def test_bench_alone_shows_its_commands(bench: Bench) -> None:
 
 
 def test_the_version_is_that_of_the_package(bench: Bench) -> None:
-    assert bench("--version").out == f"cavbench {package.__version__}\n"
+    assert bench("--version").out == f"cavbench {cavbench.__version__}\n"
 
 
 def test_every_component_is_listed_with_what_it_does(bench: Bench) -> None:

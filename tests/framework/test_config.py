@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cavbench.errors import UserError
 from cavbench.core.registry import load
-from cavbench.run.config import RunConfig, component, run_config, train_config
 from cavbench.envs.highway.axes import STANDARD_V1, STANDARD_V2
+from cavbench.errors import UserError
+from cavbench.run.config import RunConfig, component, run_config, train_config
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 

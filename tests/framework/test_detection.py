@@ -10,22 +10,22 @@ import pyarrow.compute as pc
 import pytest
 from safetensors import safe_open
 
+from cavbench import zoo
 from cavbench.cli.show import recordings
+from cavbench.core.sources import names, tracks_of
+from cavbench.core.track import track
 from cavbench.detection.patch import Patch
 from cavbench.detection.printing import non_printability
 from cavbench.detection.threat import PatchThreat
 from cavbench.errors import UserError
 from cavbench.identity import fingerprint
-from cavbench.core.sources import names, tracks_of
-from cavbench.core.track import track
+from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.records import reading
 from cavbench.run import runner
 from cavbench.run.config import RunConfig, component, run_config, train_config
 from cavbench.run.plan import plan
 from cavbench.run.replay import find, replay
 from cavbench.run.unit import Preparation
-from cavbench import zoo
-from cavbench.leaderboard.ranking.boards import read_boards
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.framework.test_cli import TOY, assert_one_line

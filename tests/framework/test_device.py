@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from cavbench.errors import UserError
 from cavbench.core import device
+from cavbench.errors import UserError
 from cavbench.run.config import run_config
 from cavbench.run.plan import plan
 from tests.framework import other_device

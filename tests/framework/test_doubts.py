@@ -9,9 +9,9 @@ import pyarrow as pa
 import pytest
 
 import cavbench
+from cavbench import zoo
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import track
-from cavbench import zoo
 from tests.framework.conftest import Bench
 
 FAST = {"target_speeds": (20.0, 25.0, 30.0)}

@@ -12,9 +12,9 @@ import pytest
 
 from cavbench.core import registry
 from cavbench.core.track import track
+from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
 from cavbench.records import reading
 from cavbench.run.replay import find, replay
-from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
 from tests.framework.conftest import Said
 from tests.framework.distributions import install
 from tests.test_recording import read

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from cavbench.errors import UserError
 from cavbench.core import registry
+from cavbench.errors import UserError
 from cavbench.run.executors import ProcessExecutor
 from cavbench.run.tree import resident_bytes
 from cavbench.run.worker import Limits

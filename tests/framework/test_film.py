@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cavbench.driving.rollout import Trace
 from cavbench.driving.recording.episode import Episode
 from cavbench.driving.recording.film import EpisodeFilm
+from cavbench.driving.rollout import Trace
+from cavbench.envs.highway.world import HighwayWorld
 from cavbench.recording.film import save, stacked
 from cavbench.recording.film.drawing import GREEN, SKY, VERMILLION
-from cavbench.envs.highway.world import HighwayWorld
 from tests.framework.conftest import Said, started
 
 Bench = Callable[..., Said]

@@ -124,8 +124,18 @@ def test_the_code_digest_covers_only_the_code_that_computes_a_unit() -> None:
             f"cavbench.driving.{name}"
             for name in ("contracts", "drive", "attacker", "meter", "metrics", "oracle", "policy", "rollout", "threat")
         ),
-        *("cavbench.attacks.driving.pgd", "cavbench.attacks.driving.objectives", "cavbench.defenses.none", "cavbench.driving.victims.ddpg"),
-        *("cavbench.envs.highway.world", "cavbench.envs.highway.batched", "cavbench.envs.highway.engine", "cavbench.envs.highway.sensor"),
+        *(
+            "cavbench.attacks.driving.pgd",
+            "cavbench.attacks.driving.objectives",
+            "cavbench.defenses.none",
+            "cavbench.driving.victims.ddpg",
+        ),
+        *(
+            "cavbench.envs.highway.world",
+            "cavbench.envs.highway.batched",
+            "cavbench.envs.highway.engine",
+            "cavbench.envs.highway.sensor",
+        ),
     }
     assert not counted & {
         "cavbench.attacks.driving.zo",

@@ -20,8 +20,8 @@ import pytest
 
 from cavbench.cli import submit as cli
 from cavbench.cli.terminal import Console
-from cavbench.errors import UserError
 from cavbench.core.track import track
+from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.records.schema import schema
 from cavbench.run import claims, received, verification

@@ -9,12 +9,12 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from cavbench.core.track import track
-from cavbench.records import reading
-from cavbench.run.replay import find, replay
 from cavbench import zoo
+from cavbench.core.track import track
 from cavbench.driving.victims.dqn import DQN
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.records import reading
+from cavbench.run.replay import find, replay
 from tests.framework.conftest import Said
 
 ROAD = ("lanes=3", "density=1", "weather=clear,fog", "episodes=3")

@@ -6,14 +6,12 @@ import re
 import sysconfig
 import tomllib
 from importlib import metadata
-from pathlib import Path
 
 import pytest
 
-from bench.shadow import ROOT
 from locks.licences import complaints, licence, plain
+from tests.tree import ROOT as TREE
 
-TREE = Path(ROOT)
 NOT_LOCKED = {"torch", "cavbench"}
 """The builds of torch differ from index to index."""
 

@@ -15,12 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from bench.shadow import PACKAGES, ROOT
+from tests.tree import FOLDERS
+from tests.tree import ROOT as TREE
 
-TREE = Path(ROOT)
-OWN = ("bench", *PACKAGES)
 FIRST_RUN = ("attack=noise", "lanes=3", "density=1", "weather=clear", "episodes=5")
-NOT_SHIPPED = {f"leaderboard/index.{kind}" for kind in ("html", "json", "csv")}
+NOT_SHIPPED = {f"cavbench/leaderboard/index.{kind}" for kind in ("html", "json", "csv")}
 """The published page, which is generated for readers of the repository."""
 
 
@@ -49,18 +48,18 @@ def wheel(built: Path) -> set[str]:
 
 @pytest.mark.slow
 def test_the_wheel_holds_our_packages_and_nothing_else(wheel: set[str]) -> None:
-    assert {name.partition("/")[0] for name in wheel if ".dist-info/" not in name} == {*OWN, "cavbench.py"}
+    assert {name.partition("/")[0] for name in wheel if ".dist-info/" not in name} == {"cavbench"}
 
 
 @pytest.mark.slow
 def test_the_wheel_holds_every_file_of_our_packages(wheel: set[str]) -> None:
     files = {
-        path.relative_to(TREE).as_posix()
-        for package in OWN
-        for path in (TREE / package).rglob("*")
+        f"{place}/{path.relative_to(TREE / folder).as_posix()}"
+        for folder, place in FOLDERS.items()
+        for path in (TREE / folder).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    assert files - NOT_SHIPPED == {name for name in wheel if name.partition("/")[0] in OWN}
+    assert files - NOT_SHIPPED == {name for name in wheel if ".dist-info/" not in name}
 
 
 @pytest.mark.skipif("CAVBENCH_WHEEL_CHECK" not in os.environ, reason="make wheel-check installs 2 GB")
@@ -133,13 +132,13 @@ def test_the_base_dependencies_are_what_the_packages_import() -> None:
 def _imported() -> set[str]:
     """The top-level packages that cavbench imports, without those of Python and cavbench."""
     found: set[str] = set()
-    for path in (path for package in OWN for path in (TREE / package).rglob("*.py")):
+    for path in (path for folder in FOLDERS for path in (TREE / folder).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_bytes())):
             if isinstance(node, ast.Import):
                 found |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 found.add(node.module.partition(".")[0])
-    return found - sys.stdlib_module_names - set(OWN)
+    return found - sys.stdlib_module_names - {"cavbench"}
 
 
 def _name(requirement: str) -> str:

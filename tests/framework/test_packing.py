@@ -16,8 +16,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from cavbench.errors import Notice
 from cavbench.core.track import Track, track
+from cavbench.errors import Notice
 from cavbench.records import packing, reading, store
 from cavbench.records.finished import finished
 from cavbench.records.schema import schema

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from cavbench.core.contracts import Facts
+from cavbench.core.pair import Chosen
 from cavbench.detection import Detector, Predictions
 from cavbench.detection.patch import Patch
-from cavbench.core.contracts import Facts
 from cavbench.isolation.framework import Snapshot
-from cavbench.core.pair import Chosen
 from cavbench.run.batches import batches
 from cavbench.run.config import run_config
 from cavbench.run.plan import plan

@@ -10,12 +10,12 @@ from annotated_types import Interval
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavbench.errors import UserError
 from cavbench.core import ranges
 from cavbench.core.contracts import Component
 from cavbench.core.pair import choose
 from cavbench.core.parameters import parameters
 from cavbench.core.ranges import Count, NotNegative, Positive, Share
+from cavbench.errors import UserError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from cavbench.errors import UserError
 from cavbench.core import registry
 from cavbench.core.contracts import Attack, Defense, Victim, World
 from cavbench.core.registry import GROUPS, KINDS
+from cavbench.errors import UserError
 from cavbench.run.config import run_config
 from tests.framework.conftest import BENCH
 from tests.framework.distributions import TOY_POINTS, install, install_toy

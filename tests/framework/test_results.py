@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cavbench.errors import Notice, UserError
 from cavbench.core.track import Columns, track
+from cavbench.errors import Notice, UserError
 from cavbench.records import generations as footers
 from cavbench.records import reading
 from cavbench.records import store as results

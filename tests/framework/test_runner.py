@@ -14,9 +14,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from cavbench.errors import Notice, UnfinishedError, UserError
 from cavbench.core import progress, registry
 from cavbench.core.track import track
+from cavbench.errors import Notice, UnfinishedError, UserError
 from cavbench.records import reading
 from cavbench.records.schema import PROBES
 from cavbench.run import runner

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from cavbench.errors import UserError
 from cavbench.core import suites
 from cavbench.core.suites import Suite
+from cavbench.errors import UserError
 from cavbench.run.config import run_config
 
 SMALL = ["lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0"]

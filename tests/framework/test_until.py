@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavbench.errors import UnfinishedError, UserError
 from cavbench.core.track import track
+from cavbench.errors import UnfinishedError, UserError
 from cavbench.records import reading
 from cavbench.run import rounds, runner
 from cavbench.run.audit import audit_config

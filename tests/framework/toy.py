@@ -15,8 +15,21 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from cavbench.driving import ActionType, Driver, DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, DrivingWorld, Features, Oracle, Policy, PolicyWrapper, State
 from cavbench.core.contracts import Access, Progress, Trained
+from cavbench.driving import (
+    ActionType,
+    Driver,
+    DrivingAttack,
+    DrivingDefense,
+    DrivingFacts,
+    DrivingVictim,
+    DrivingWorld,
+    Features,
+    Oracle,
+    Policy,
+    PolicyWrapper,
+    State,
+)
 from cavbench.scenarios import Axes, Axis, Cell, Grid
 
 FLAGS = ("crashed", "offroad")

@@ -11,11 +11,22 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from cavbench.detection import Approach, CameraWorld, Decoy, Detector, DetectorDefense, DetectorVictim, PatchAttack, PatchOracle, Predictions, Scenes
-from cavbench.core.contracts import Access, Facts, Progress, Trained
-from cavbench.scenarios import Axes, Axis, Cell, Grid
 from cavbench import zoo
+from cavbench.core.contracts import Access, Facts, Progress, Trained
+from cavbench.detection import (
+    Approach,
+    CameraWorld,
+    Decoy,
+    Detector,
+    DetectorDefense,
+    DetectorVictim,
+    PatchAttack,
+    PatchOracle,
+    Predictions,
+    Scenes,
+)
 from cavbench.envs.weather import WEATHERS
+from cavbench.scenarios import Axes, Axis, Cell, Grid
 
 SIDE, SIGN = 32, slice(8, 24)
 """Side of the images, and the range of the sign in both directions, in pixels."""

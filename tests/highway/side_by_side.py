@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from cavbench.scenarios import Cell
 from cavbench.envs.highway.config import HighwayConfig
 from cavbench.envs.highway.engine import Flag, HighwayEngine, Number
 from cavbench.envs.highway.reference import SensedHighwayEnv
+from cavbench.scenarios import Cell
 
 Chooser = Callable[[np.random.Generator, int], Any]
 STATE = ("x", "y", "heading", "speed", "lane", "crashed", "target_lane", "target_speed", "timer", "delta")

@@ -20,10 +20,10 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from cavbench.driving import ActionType, Driver
-from cavbench.errors import UserError
-from cavbench.scenarios import Cell, SeedBlock
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import Backend, HighwayWorld
+from cavbench.errors import UserError
+from cavbench.scenarios import Cell, SeedBlock
 
 PAGE = Path(__file__).parents[2] / "docs" / "worlds" / "highway.md"
 CLEAR = AXES.cell(lanes=3, density=1.0)

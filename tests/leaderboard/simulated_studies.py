@@ -22,9 +22,9 @@ import numpy as np
 import pyarrow as pa
 from rich.console import Console
 
-from cavbench.statistics.estimates import Interval
 from cavbench.leaderboard.ranking.boards import Row, read_boards
 from cavbench.leaderboard.ranking.worst import margin
+from cavbench.statistics.estimates import Interval
 from tests.leaderboard.synthetic import CLEAR, drive
 
 SCENARIOS = 20

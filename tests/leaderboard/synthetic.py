@@ -13,11 +13,11 @@ import pyarrow as pa
 from cavbench.core.contracts import Facts
 from cavbench.core.pair import choose
 from cavbench.core.track import track
+from cavbench.envs.camera.axes import APPROACH_V1
+from cavbench.envs.highway.axes import STANDARD_V1
 from cavbench.records.schema import schema
 from cavbench.scenarios import Cell, Grid
 from cavbench.statistics.episodes import as_text
-from cavbench.envs.camera.axes import APPROACH_V1
-from cavbench.envs.highway.axes import STANDARD_V1
 
 FEATURES = {"names": ["x", "vx"], "units": ["m", "m/s"], "floors": [0.5, 0.3]}
 CLEAR = tuple(cell for cell in STANDARD_V1.cells() if cell.weather == "clear")

@@ -7,9 +7,9 @@ import pytest
 from full_house import SEEN
 from synthetic import approach, drive, probed
 
-from cavbench.statistics.certificate import certificate
 from cavbench.leaderboard.comparisons.reading import read_tracks
 from cavbench.leaderboard.ranking.boards import Row, boards
+from cavbench.statistics.certificate import certificate
 
 
 def row(**probes: float) -> Row:

@@ -20,13 +20,9 @@ from typer.main import get_command
 
 from cavbench.cli.main import app
 from cavbench.cli.words import split
-from cavbench.errors import UserError
 from cavbench.core.pair import choose
 from cavbench.core.track import tracks
-from cavbench.records import reading
-from cavbench.run.config import run_config
-from cavbench.scenarios import Cell
-from cavbench.statistics.episodes import as_text
+from cavbench.errors import UserError
 from cavbench.leaderboard.comparisons.naming import labels, varying
 from cavbench.leaderboard.comparisons.reading import measurements, read_tracks
 from cavbench.leaderboard.page.cards import run_command
@@ -35,6 +31,10 @@ from cavbench.leaderboard.page.table import CSV
 from cavbench.leaderboard.page.write import NAME, write
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.ranking.flags import FLAGS
+from cavbench.records import reading
+from cavbench.run.config import run_config
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import as_text
 
 
 def test_the_document_keeps_to_its_schema(site: Path) -> None:
@@ -132,7 +132,7 @@ def _value(params: dict[str, Any], name: str) -> object:
 
 
 def test_every_published_run_command_makes_the_same_pair_on_the_same_scenarios() -> None:
-    made = json.loads((files("leaderboard") / "index.json").read_text())
+    made = json.loads((files("cavbench.leaderboard") / "index.json").read_text())
     assert len(made["pairs"]) > 100
     for pair in made["pairs"]:
         card = pair["card"]

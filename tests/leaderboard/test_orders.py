@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from cavbench.statistics.strongest import strongest_of, under
 from cavbench.leaderboard.page.document import document
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.terminal.ranking import print_boards
 from cavbench.leaderboard.terminal.run import run_report
+from cavbench.statistics.strongest import strongest_of, under
 from tests.leaderboard.synthetic import CLEAR, baseline_drivers, drive
 
 few = settings(max_examples=12, deadline=None)

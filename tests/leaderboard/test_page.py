@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 import leaderboard
+from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.records import reading
 from cavbench.statistics.estimates import share_interval
-from cavbench.leaderboard.ranking.boards import read_boards
 
 Open = Callable[..., Any]
 

@@ -10,10 +10,10 @@ import pytest
 from rich.console import Console
 
 from cavbench.core.track import track
-from cavbench.statistics import doubts
 from cavbench.leaderboard.comparisons.reading import distinct, read_comparisons
 from cavbench.leaderboard.ranking.remarks import run_remarks
 from cavbench.leaderboard.terminal.run import cells_report, run_report
+from cavbench.statistics import doubts
 from tests.leaderboard.synthetic import CLEAR, drive, probed
 
 SMALL = {"cells": CLEAR[:2], "episodes": 5, "weights": "w"}

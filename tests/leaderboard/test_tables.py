@@ -14,10 +14,6 @@ from rich.console import Console
 from synthetic import CLEAR, baseline_drivers, drive
 
 from cavbench.core.track import track
-from cavbench.records.schema import schema
-from cavbench.scenarios import Cell
-from cavbench.statistics.episodes import as_text
-from cavbench.statistics.estimates import Interval
 from cavbench.driving.track import BEST_BLIND
 from cavbench.envs.highway.axes import STANDARD_V1
 from cavbench.leaderboard.comparisons.comparison import Comparison
@@ -25,6 +21,10 @@ from cavbench.leaderboard.comparisons.reading import read_comparisons
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.terminal.run import SCREEN, cells_report, remarks, run_report
 from cavbench.leaderboard.terminal.text import CLEAN, estimate, strip, threat
+from cavbench.records.schema import schema
+from cavbench.scenarios import Cell
+from cavbench.statistics.episodes import as_text
+from cavbench.statistics.estimates import Interval
 
 SCHEMA = schema(track("driving"))
 ZO = {"objective": "expected", "steps": 50}

@@ -18,17 +18,17 @@ from hypothesis.extra.numpy import arrays
 from rich.console import Console
 from synthetic import CLEAR, approach, baseline_drivers, drive
 
-from cavbench.errors import UserError
 from cavbench.core.track import Track, track, tracks
-from cavbench.records import store as results
-from cavbench.records.schema import schema
-from cavbench.run.config import run_config
+from cavbench.errors import UserError
 from cavbench.leaderboard.published import publish, published, rounded
 from cavbench.leaderboard.thesis import policy_records
 from cavbench.leaderboard.thesis.numbers import printed
 from cavbench.leaderboard.thesis.policy_records import Source, Wanted
 from cavbench.leaderboard.thesis.report import thesis_report
 from cavbench.leaderboard.thesis.trend import trend
+from cavbench.records import store as results
+from cavbench.records.schema import schema
+from cavbench.run.config import run_config
 
 SCHEMA = schema(track("driving"))
 TARGET = {"objective": "target", "target_action": 3, "target_acceleration": 1.0, "target_steering": 0.5}

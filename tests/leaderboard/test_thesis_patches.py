@@ -11,17 +11,26 @@ import pytest
 from rich.console import Console
 from synthetic import approach
 
-from cavbench.detection import PatchThreat
 from cavbench.core.pair import choose
 from cavbench.core.track import track
-from cavbench.records.schema import schema
-from cavbench.run.config import run_config
+from cavbench.detection import PatchThreat
 from cavbench.leaderboard.comparisons.comparison import NO_ATTACK, parameters
 from cavbench.leaderboard.thesis import patch_records, policy_records
 from cavbench.leaderboard.thesis.claims import configuration_claims, location_claims
 from cavbench.leaderboard.thesis.numbers import printed
-from cavbench.leaderboard.thesis.patch_records import ABLATION, CONFIGURATIONS, CONTROLS, LOCATIONS, STANDARD, VARIED, WEATHERS, Source
+from cavbench.leaderboard.thesis.patch_records import (
+    ABLATION,
+    CONFIGURATIONS,
+    CONTROLS,
+    LOCATIONS,
+    STANDARD,
+    VARIED,
+    WEATHERS,
+    Source,
+)
 from cavbench.leaderboard.thesis.report import thesis_report
+from cavbench.records.schema import schema
+from cavbench.run.config import run_config
 
 Left = float | Callable[[str, str], float]
 NONE = schema(track("detection")).empty_table()

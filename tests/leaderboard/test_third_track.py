@@ -21,11 +21,11 @@ from synthetic import baseline_drivers, drive, table
 from cavbench.core import registry
 from cavbench.core.contracts import Facts
 from cavbench.core.track import track
+from cavbench.leaderboard.page.document import schema as document_schema
 from cavbench.records.schema import schema
 from cavbench.records.store import FOLDER
 from cavbench.scenarios import Axes, Axis, Cell, Grid
 from cavbench.statistics.episodes import as_text
-from cavbench.leaderboard.page.document import schema as document_schema
 from tests.framework.distributions import install
 
 AXES = Axes(

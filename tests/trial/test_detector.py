@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 import cavbench
-from cavbench.detection import Detector, Predictions
-from cavbench.errors import UserError
 from cavbench.core.pair import choose
+from cavbench.detection import Detector, Predictions
 from cavbench.detection.trial import try_detector
 from cavbench.detection.victims.from_file import DetectorFile
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
 from tests.framework.toy_camera import RED_V1, RedDetector, RedStreet, RedVictim
 from tests.victims.test_detector_files import NAMES, RedCells, torch_file
 

@@ -13,16 +13,16 @@ from torch import Tensor, nn
 
 import cavbench
 from cavbench.api.scoring import _Silent
-from cavbench.driving import PolicyWrapper, State
-from cavbench.errors import UserError
 from cavbench.core.pair import choose
 from cavbench.core.track import track
-from cavbench.run import runner
-from cavbench.run.config import run_config
+from cavbench.driving import PolicyWrapper, State
 from cavbench.driving.trial import try_policy
 from cavbench.driving.victims.from_file import FilePolicy
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
+from cavbench.run import runner
+from cavbench.run.config import run_config
 
 WORLD = HighwayWorld()
 CELLS = (AXES.cell(lanes=3, density=1.0, weather="clear"), AXES.cell(lanes=4, density=2.0, weather="fog"))

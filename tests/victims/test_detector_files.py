@@ -15,17 +15,17 @@ from torch import Tensor, nn
 
 from cavbench.attacks.detection.square_patch import SquarePatch
 from cavbench.checks import complaints
+from cavbench.core.pair import choose
 from cavbench.detection import Detector, PatchThreat
 from cavbench.detection.crafting import craft
 from cavbench.detection.sight import look
-from cavbench.errors import UserError
-from cavbench.core.pair import choose
-from cavbench.run.config import component, run_config
 from cavbench.detection.victims.file_network import DEVIATION, GREY, MEAN, FileDetector, Input, Order, Output, Scaling
 from cavbench.detection.victims.layout import Layout, layout_of, split
+from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
 from cavbench.formats.torch_operations import operation
 from cavbench.formats.trial import RefusedError
-from cavbench.envs.camera.world import StopSignApproach
+from cavbench.run.config import component, run_config
 from tests.framework.toy_camera import RedScenes
 
 FACTS = StopSignApproach().facts

@@ -19,14 +19,14 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.checks import complaints
+from cavbench.core.pair import choose
 from cavbench.driving.drive import drive
 from cavbench.driving.rollout import Columns
-from cavbench.errors import UserError
-from cavbench.core.pair import choose
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
 from cavbench.driving.victims.in_process import in_process
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
+from cavbench.run.config import run_config
+from cavbench.run.plan import plan
 
 FACTS = HighwayWorld().facts
 

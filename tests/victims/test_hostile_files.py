@@ -21,14 +21,14 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.archive import Archive
-from cavbench.driving import DrivingFacts
-from cavbench.errors import UserError
-from cavbench.run.config import component
 from cavbench.detection.victims import yolov5_file
+from cavbench.driving import DrivingFacts
 from cavbench.driving.victims.from_file import FileDriver, FilePolicy
+from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
 from cavbench.formats.torch_operations import operation
 from cavbench.formats.trial import RefusedError
-from cavbench.envs.highway.world import HighwayWorld
+from cavbench.run.config import component
 
 FACTS = HighwayWorld().facts
 Members = dict[str, bytes]

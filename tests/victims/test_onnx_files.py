@@ -12,10 +12,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cavbench.errors import UserError
-from cavbench.run.config import component
-from cavbench.formats.onnx_file import whole
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
+from cavbench.formats.onnx_file import whole
+from cavbench.run.config import component
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

@@ -9,10 +9,10 @@ from torch import Tensor
 from cavbench.driving import DrivingFacts, ObservationThreat, Policy
 from cavbench.driving.meter import Columns
 from cavbench.driving.rollout import rollout
-from cavbench.errors import UserError
-from cavbench.scenarios import SeedBlock
 from cavbench.driving.victims.reference import Blind, IDMDriver, OracleDriver, RandomDriver
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
+from cavbench.scenarios import SeedBlock
 
 FACTS = HighwayWorld().facts
 LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)

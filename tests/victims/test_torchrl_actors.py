@@ -29,9 +29,9 @@ from torchrl.modules import (
     TanhNormal,
 )
 
-from cavbench.errors import UserError
 from cavbench.driving.victims.in_process import in_process
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
 
 FACTS = HighwayWorld().facts
 SHOWN = torch.rand(6, 10, 5, generator=torch.Generator().manual_seed(0)) * 2 - 1

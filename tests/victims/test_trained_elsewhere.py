@@ -15,14 +15,14 @@ import torch
 from torch import Tensor, nn
 
 import cavbench
-from cavbench.driving import DrivingFacts
-from cavbench.errors import UserError
 from cavbench.core.pair import choose
 from cavbench.core.parameters import parameters
-from cavbench.run import runner
-from cavbench.run.config import run_config
+from cavbench.driving import DrivingFacts
 from cavbench.driving.victims.in_process import in_process
 from cavbench.envs.highway.world import HighwayWorld
+from cavbench.errors import UserError
+from cavbench.run import runner
+from cavbench.run.config import run_config
 from tests.victims.test_from_file import saved, sb3_model, spaces
 
 sb3 = pytest.importorskip("stable_baselines3")

@@ -12,10 +12,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from cavbench.driving import DrivingWorld, Policy, State, TrainingHooks
-from cavbench.errors import UserError
-from cavbench.core import registry
 from cavbench import zoo
+from cavbench.core import registry
+from cavbench.defenses.driving.advtrain import AdversarialTraining, AttackInLoop
+from cavbench.driving import DrivingWorld, Policy, State, TrainingHooks
 from cavbench.driving.victims.attack_mix import AttackMix
 from cavbench.driving.victims.behind import Guard, GuardedPractice, defense_of
 from cavbench.driving.victims.ddpg import DDPG
@@ -27,7 +27,7 @@ from cavbench.driving.victims.ppo import PPO
 from cavbench.driving.victims.practice import ALLOWED, Practice, roads
 from cavbench.driving.victims.sac import SAC
 from cavbench.driving.victims.training import LearningDriver
-from cavbench.defenses.driving.advtrain import AdversarialTraining, AttackInLoop
+from cavbench.errors import UserError
 
 SHORT = {"decisions": 160, "copies": 1, "hidden": 8, "batch": 16, "memory": 2000, "checkpoints": 1}
 VICTIMS = [DQN(**SHORT), DDPG(**SHORT)]

@@ -12,20 +12,20 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from cavbench.detection import CameraWorld
-from cavbench.driving import DrivingWorld
-from cavbench.errors import UserError
-from cavbench.core import registry
-from cavbench.identity.fingerprint import sources
-from cavbench.core.track import track
-from cavbench.run.config import run_config, train_config
 from cavbench import zoo
+from cavbench.core import registry
+from cavbench.core.track import track
+from cavbench.defenses.driving.advtrain import AdversarialTraining
+from cavbench.detection import CameraWorld
 from cavbench.detection.victims.yolov5 import YOLOv5, YOLOv5Network
+from cavbench.driving import DrivingWorld
 from cavbench.driving.victims.ddpg import DDPG
 from cavbench.driving.victims.dqn import DQN
 from cavbench.driving.victims.networks import QPolicy
+from cavbench.errors import UserError
+from cavbench.identity.fingerprint import sources
+from cavbench.run.config import run_config, train_config
 from cavbench.zoo.store import SHIPPED
-from cavbench.defenses.driving.advtrain import AdversarialTraining
 
 TINY = DQN(hidden=8)
 RECIPE = zoo.Recipe.of(TINY)

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.detection import Approach, CameraWorld, Scenes
-from cavbench.scenarios import Axes, Cell, Grid
 from cavbench.envs.camera.axes import AXES
 from cavbench.envs.weather import WEATHERS
+from cavbench.scenarios import Axes, Cell, Grid
 from tests.vision.pictures import stop_sign
 
 DRAWN_V1 = Grid(

@@ -11,13 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from cavbench.core.contracts import Access, Progress
 from cavbench.detection import PatchAttack, PatchOracle, Predictions, Scenes
 from cavbench.detection.approach import probed
 from cavbench.detection.crafting import craft
 from cavbench.detection.scenes import Approach
 from cavbench.detection.sight import look
 from cavbench.detection.threat import PatchThreat
-from cavbench.core.contracts import Access, Progress
 from cavbench.isolation.watch import TamperError
 from tests.framework.toy_camera import RedDetector, RedScenes
 

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from cavbench import zoo
 from cavbench.detection import STOP_SIGN, Detector
 from cavbench.detection.approach import score
-from cavbench.errors import UserError
-from cavbench import zoo
 from cavbench.detection.victims.examples import Examples
 from cavbench.detection.victims.fcos import FCOS
 from cavbench.detection.victims.learner import Learner
@@ -20,6 +19,7 @@ from cavbench.detection.victims.windows import Windows
 from cavbench.detection.victims.yolov5 import YOLOv5
 from cavbench.envs.camera.axes import AXES
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
 from tests.vision.drawn_street import DrawnStreet
 
 FACTS = StopSignApproach().facts

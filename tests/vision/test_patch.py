@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from cavbench.core.contracts import Access, QueryBudgetError
 from cavbench.detection import PatchOracle, PatchThreat
 from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.patch import MOMENTS
 from cavbench.detection.threat import GREY
 from cavbench.errors import UserError
-from cavbench.core.contracts import Access, QueryBudgetError
 from tests.framework.toy_camera import RedDetector
 
 

@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.nn.functional import batch_norm, conv2d, interpolate, leaky_relu, max_pool2d, pad
 
 from cavbench.detection.boxes import confidence, detections
-from cavbench.errors import UserError
-from cavbench.zoo import fetch
 from cavbench.detection.victims import yolo
 from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork, read_darknet
+from cavbench.errors import UserError
+from cavbench.zoo import fetch
 from tests.vision.pictures import stop_sign
 
 HEADER = np.array([0, 2, 0, 32_013_312, 0], "<i4").tobytes()

@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from cavbench import zoo
 from cavbench.detection import STOP_SIGN
 from cavbench.detection.approach import score
 from cavbench.detection.boxes import confidence, overlap
-from cavbench.errors import UserError
-from cavbench import zoo
 from cavbench.detection.victims import yolov5_file
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.yolov5 import MULTIPLES, Size, YOLOv5, YOLOv5Network, sign_of
 from cavbench.envs.camera.axes import AXES
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
 from tests.vision.drawn_street import DrawnStreet
 
 FACTS = StopSignApproach().facts

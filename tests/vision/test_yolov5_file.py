@@ -16,10 +16,10 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from cavbench.errors import UserError
 from cavbench.detection.victims import yolov5_file
 from cavbench.detection.victims.yolov5 import YOLOv5, YOLOv5Network
 from cavbench.envs.camera.world import StopSignApproach
+from cavbench.errors import UserError
 
 FACTS = StopSignApproach().facts
 

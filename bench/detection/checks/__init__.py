@@ -9,8 +9,8 @@ from cavbench.checks.kits import Kit, Start
 
 
 def _attack(subject: Subject) -> Iterator[Suite]:
-    from cavbench.detection.checks.patch import PatchSuite
     from cavbench.detection import PatchAttack
+    from cavbench.detection.checks.patch import PatchSuite
 
     if not isinstance(subject.component, PatchAttack):
         raise NotApplicableError("it is not a PatchAttack: it does not change the sign")

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from cavbench.checks.check import Check, NotApplicableError, Suite, require
 from cavbench.checks.scenarios import first_cell
-from cavbench.detection import STOP_SIGN, CameraWorld, Scenes
 from cavbench.core import registry
+from cavbench.detection import STOP_SIGN, CameraWorld, Scenes
 from cavbench.scenarios import SeedBlock
 
 FRAMES = 3

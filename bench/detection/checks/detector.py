@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from cavbench.checks.check import Check, Suite, require
-from cavbench.detection.checks.street import Street
 from cavbench.checks.network import check_frozen, check_gradient, check_white_box, unchanged
 from cavbench.detection import STOP_SIGN, Detector, Predictions
+from cavbench.detection.checks.street import Street
 from cavbench.isolation.memory import changed, kept
 
 PICTURES = 3

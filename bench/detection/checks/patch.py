@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from cavbench.checks.check import BrokenRuleError, Check, NotApplicableError, Suite, one_line, require
-from cavbench.detection.checks.street import SignDetector, Street
 from cavbench.checks.randomness import stir_others
+from cavbench.core.contracts import QueryBudgetError
 from cavbench.detection import PatchAttack, PatchOracle, PatchThreat
+from cavbench.detection.checks.street import SignDetector, Street
 from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.errors import UserError
-from cavbench.core.contracts import QueryBudgetError
 from cavbench.identity.fingerprint import state_digest
 
 QUERIES = 160

@@ -16,12 +16,12 @@ from torch import Tensor
 from cavbench.detection import Scenes, stopping
 from cavbench.detection.approach import Sighting
 from cavbench.detection.patch import Evolution
-from cavbench.detection.sight import Sight
-from cavbench.recording.columns import Colour, Columns
 from cavbench.detection.recording import blueprint as approach_blueprint
 from cavbench.detection.recording.blueprint import GAP, sights
+from cavbench.detection.sight import Sight
 from cavbench.driving.recording.curves import GREY
 from cavbench.driving.recording.scene import EGO, MEASURED, SHOWN
+from cavbench.recording.columns import Colour, Columns
 
 COLOURS: dict[str, Colour] = {"with_patch": SHOWN, "without_patch": MEASURED}
 LOSS_COLOURS: tuple[Colour, ...] = (SHOWN, MEASURED, EGO, GREY)

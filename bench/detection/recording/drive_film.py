@@ -13,8 +13,8 @@ from torch import Tensor
 
 from cavbench.detection.approach import Sighting
 from cavbench.detection.closed_loop import Drive, Drives, Moment
-from cavbench.recording import about
 from cavbench.detection.recording.film import COLOURS, NAMES
+from cavbench.recording import about
 from cavbench.recording.film.drawing import BLACK, GREEN, GREY, ORANGE, PALE, ROAD, Colour, blank, box, line, write
 from cavbench.recording.film.film import PAPER, Film, Picture
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from cavbench.detection import stopping
 from cavbench.detection.approach import Sight, Sighting
-from cavbench.recording import about
 from cavbench.detection.recording.blueprint import FPS, outcome, sights
+from cavbench.recording import about
 from cavbench.recording.film.drawing import BLACK, BLUE, GREEN, GREY, PALE, VERMILLION, Colour, blank, box, line, write
 from cavbench.recording.film.film import PAPER, Film, Picture
 

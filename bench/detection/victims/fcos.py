@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from cavbench.detection import Detector, Predictions
-from cavbench.core.contracts import Facts
 from cavbench import zoo
+from cavbench.core.contracts import Facts
+from cavbench.detection import Detector, Predictions
 from cavbench.detection.victims import yolo
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.learner import Learner

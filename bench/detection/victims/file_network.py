@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.detection import Detector, Predictions
-from cavbench.errors import UserError
 from cavbench.detection.victims.layout import CORNERS, Layout, allowed, layout_of, split
+from cavbench.errors import UserError
 from cavbench.formats.trial import RefusedError, failure
 
 Boxes = Literal["auto", "corners", "corners_yx", "centre"]

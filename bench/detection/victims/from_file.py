@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from cavbench import bounded
-from cavbench.detection import STOP_SIGN, DetectorVictim
-from cavbench.errors import UserError, short
 from cavbench.core.contracts import Facts
 from cavbench.core.ranges import Count
+from cavbench.detection import STOP_SIGN, DetectorVictim
 from cavbench.detection.victims import coco
 from cavbench.detection.victims.file_network import Boxes, FileDetector, Input, Order, Output, Scaling
+from cavbench.errors import UserError, short
 from cavbench.formats import onnx_runtime, torch_program
 from cavbench.formats.trial import hashed, refuse_harm
 

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import update_bn
 
-from cavbench.detection import CameraWorld, Detector, DetectorVictim
 from cavbench.core.contracts import Progress, Trained
 from cavbench.core.ranges import Count, Natural, Positive, Share
+from cavbench.detection import CameraWorld, Detector, DetectorVictim
 from cavbench.detection.victims.examples import Example, Examples
 from cavbench.detection.victims.training import descend
 from cavbench.detection.victims.windows import Windows

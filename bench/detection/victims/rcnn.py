@@ -13,11 +13,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from cavbench.detection import Detector, Predictions
-from cavbench.detection.boxes import overlap
+from cavbench import zoo
 from cavbench.core.contracts import Facts
 from cavbench.core.ranges import Count
-from cavbench import zoo
+from cavbench.detection import Detector, Predictions
+from cavbench.detection.boxes import overlap
 from cavbench.detection.victims import fcos, yolo
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.fcos import GROUPS, PYRAMID, WIDTHS, FCOSNetwork, Raw

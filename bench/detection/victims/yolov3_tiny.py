@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cavbench.detection import Detector, DetectorVictim, Predictions
-from cavbench.errors import UserError
 from cavbench.core.contracts import Facts
-from cavbench.zoo import fetch
+from cavbench.detection import Detector, DetectorVictim, Predictions
 from cavbench.detection.victims import coco, yolo
+from cavbench.errors import UserError
+from cavbench.zoo import fetch
 
 ANCHORS = ((10, 14), (23, 27), (37, 58), (81, 82), (135, 169), (344, 319))
 """Width and height in pixels, for any image size."""

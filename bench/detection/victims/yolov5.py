@@ -15,15 +15,15 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from cavbench.detection import STOP_SIGN, CameraWorld, Detector, Predictions
-from cavbench.errors import UserError
+from cavbench import zoo
 from cavbench.core.contracts import Facts, Progress, Trained
 from cavbench.core.ranges import Count, NotNegative
-from cavbench import zoo
+from cavbench.detection import STOP_SIGN, CameraWorld, Detector, Predictions
 from cavbench.detection.victims import coco, yolo, yolov5_file
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.learner import Learner
 from cavbench.detection.victims.loss import mistaken, supervised
+from cavbench.errors import UserError
 
 Size = Literal["n", "s", "m", "l", "x"]
 MULTIPLES: dict[Size, tuple[float, float]] = {

@@ -9,9 +9,9 @@ from cavbench.checks.kits import Kit, Start
 
 
 def _attack(subject: Subject) -> Iterator[Suite]:
+    from cavbench.driving import DrivingAttack
     from cavbench.driving.checks.attack import AttackSuite
     from cavbench.driving.checks.attack_memory import AttackMemorySuite
-    from cavbench.driving import DrivingAttack
 
     if not isinstance(subject.component, DrivingAttack):
         raise NotApplicableError("it is not a DrivingAttack: it does not change observations")

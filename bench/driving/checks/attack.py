@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from cavbench.checks.check import BrokenRuleError, Check, Suite, one_line, require
-from cavbench.driving.checks.traffic import action_types, observations, victim
 from cavbench.checks.randomness import stir_others
+from cavbench.core import registry
+from cavbench.core.contracts import QueryBudgetError
 from cavbench.driving import ActionType, DrivingAttack, DrivingWorld, ObservationThreat, Policy
+from cavbench.driving.checks.traffic import action_types, observations, victim
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
-from cavbench.core import registry
-from cavbench.core.contracts import QueryBudgetError
 from cavbench.identity.fingerprint import state_digest
 
 EPISODES = 6

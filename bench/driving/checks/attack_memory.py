@@ -9,11 +9,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cavbench.checks.check import Check, Suite, refusals_are_broken_rules, require
+from cavbench.driving import ActionType, DrivingAttack
+from cavbench.driving.attacker import Attacker
 from cavbench.driving.checks.attack import allowing, dynamics
 from cavbench.driving.checks.state import check_state, named
 from cavbench.driving.checks.traffic import action_types, observations, victim
-from cavbench.driving import ActionType, DrivingAttack
-from cavbench.driving.attacker import Attacker
 from cavbench.driving.victim import CountedPolicy
 
 EPISODES, STEPS = 6, 4

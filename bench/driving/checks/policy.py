@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from cavbench.checks.check import BrokenRuleError, Check, NotApplicableError, Subject, Suite, one_line, require
-from cavbench.driving.checks.state import not_noisy
-from cavbench.driving.checks.traffic import observations, rows_of_observation
 from cavbench.checks.network import check_frozen, check_gradient, check_white_box, unchanged
 from cavbench.checks.scenarios import first_cell
 from cavbench.driving import DrivingWorld, Policy, State
-from cavbench.errors import UserError
+from cavbench.driving.checks.state import not_noisy
+from cavbench.driving.checks.traffic import observations, rows_of_observation
 from cavbench.driving.trial import try_policy
+from cavbench.errors import UserError
 
 EPISODES = 6
 

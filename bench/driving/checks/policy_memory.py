@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from cavbench.checks.check import Check, NotApplicableError, Subject, Suite, one_line, require
+from cavbench.driving import ObservationThreat, Policy, State
 from cavbench.driving.checks.remembering import Remembering
 from cavbench.driving.checks.state import ATOL, RTOL, check_state, close, named, not_noisy, same
 from cavbench.driving.checks.traffic import observations, rows_of_observation
-from cavbench.driving import ObservationThreat, Policy, State
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.policy import rows_of
 from cavbench.driving.victim import CHUNK, CountedPolicy

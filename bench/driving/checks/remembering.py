@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from cavbench.driving.checks.traffic import victim
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
+from cavbench.driving.checks.traffic import victim
 
 SHARE = 0.5
 """Weight of the past in the running mean."""

@@ -10,9 +10,9 @@ from torchrl.envs import EnvBase
 
 from cavbench.checks.check import Check, DoubtError, Suite, one_line, require
 from cavbench.checks.scenarios import first_cell
+from cavbench.core import registry
 from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingWorld
 from cavbench.errors import UserError
-from cavbench.core import registry
 from cavbench.scenarios import Cell
 
 MEASURES = ("progress", "speed", "x", "ttc", "crashed", "offroad")
@@ -44,7 +44,9 @@ class WorldSuite(Suite):
     def describes_its_observation(self) -> None:
         """Every feature has a range and a unit."""
         facts = self.component.facts
-        require(isinstance(facts, DrivingFacts), f"facts is a {type(facts).__name__}, not a cavbench.driving.DrivingFacts")
+        require(
+            isinstance(facts, DrivingFacts), f"facts is a {type(facts).__name__}, not a cavbench.driving.DrivingFacts"
+        )
         features = facts.features
         require(
             features == self.component.features,

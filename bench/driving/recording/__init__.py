@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cavbench.driving import DrivingFacts
-from cavbench.driving.rollout import Trace
-from cavbench.recording.columns import Columns
 from cavbench.driving.recording import blueprint, curves, scene
 from cavbench.driving.recording.episode import Episode
+from cavbench.driving.rollout import Trace
+from cavbench.recording.columns import Columns
 from cavbench.recording.file import written
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from cavbench.recording import about
 from cavbench.driving.recording import scene
 from cavbench.driving.recording.curves import group
 from cavbench.driving.recording.episode import Episode
+from cavbench.recording import about
 
 
 def layout(episode: Episode) -> rrb.Blueprint:

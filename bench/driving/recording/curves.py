@@ -7,9 +7,9 @@ from itertools import cycle
 
 import numpy as np
 
-from cavbench.recording.columns import Colour, Columns
 from cavbench.driving.recording.episode import CONTROLS, Episode
 from cavbench.driving.recording.scene import CRASHED, EGO, MEASURED, SHOWN
+from cavbench.recording.columns import Colour, Columns
 
 ACTION_COLOURS: tuple[Colour, ...] = (
     (187, 154, 247),

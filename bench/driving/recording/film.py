@@ -8,10 +8,26 @@ from itertools import cycle, islice
 import numpy as np
 from numpy.typing import NDArray
 
-from cavbench.recording import about
 from cavbench.driving.recording.episode import CONTROLS, Array, Episode
 from cavbench.driving.recording.scene import CAR_LENGTH, CAR_WIDTH, DASH, DASH_EVERY, LANE_WIDTH, edges
-from cavbench.recording.film.drawing import BLACK, BLUE, CYCLE, GREEN, GREY, PALE, ROAD, SKY, TINT, VERMILLION, Colour, blank, box, line, write
+from cavbench.recording import about
+from cavbench.recording.film.drawing import (
+    BLACK,
+    BLUE,
+    CYCLE,
+    GREEN,
+    GREY,
+    PALE,
+    ROAD,
+    SKY,
+    TINT,
+    VERMILLION,
+    Colour,
+    blank,
+    box,
+    line,
+    write,
+)
 from cavbench.recording.film.film import Film, Picture
 
 WIDTH = 960

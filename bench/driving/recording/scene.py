@@ -9,8 +9,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from cavbench.recording.columns import Colour, Columns
 from cavbench.driving.recording.episode import Array, Episode
+from cavbench.recording.columns import Colour, Columns
 
 LANE_WIDTH, CAR_LENGTH, CAR_WIDTH = 4.0, 5.0, 2.0
 """As in highway-env (road/lane.py, vehicle/kinematics.py). Lane 0 is centred on y = 0; y grows to the right."""

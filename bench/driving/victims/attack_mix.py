@@ -8,11 +8,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from cavbench.core.options import configured, parameter_words
 from cavbench.driving import DrivingAttack, DrivingFacts, ObservationThreat, Policy, State, TrainingHooks
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.policy import rows_of
 from cavbench.driving.victim import CountedPolicy
-from cavbench.core.options import configured, parameter_words
 
 MIX = {"none": 7, "pessimist": 3, "pessimist outlook=optimist": 3, "bias": 3, "noise": 2, "targeted": 6}
 """The attacks of the training and their weights; the sum is 24."""

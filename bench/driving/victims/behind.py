@@ -11,11 +11,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from cavbench.driving import DrivingFacts, DrivingVictim, Policy, State
-from cavbench.errors import UserError
 from cavbench.core.contracts import Defense
 from cavbench.core.options import configured, parameter_words
+from cavbench.driving import DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.victims.practice import ALLOWED, Practice
+from cavbench.errors import UserError
 
 
 def defense_of(text: str) -> Defense:

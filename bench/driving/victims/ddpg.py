@@ -16,8 +16,8 @@ from torchrl.envs import EnvBase
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
-from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.core.ranges import Count, NotNegative, Width
+from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.networks import Actor, ActorPolicy, Critic
 from cavbench.driving.victims.training import LearningDriver

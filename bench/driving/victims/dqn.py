@@ -14,8 +14,8 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
-from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.core.ranges import Share
+from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.driving.victims.practice import ALLOWED

@@ -13,10 +13,10 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from cavbench.errors import UserError, short
 from cavbench.core.ranges import Count
+from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.victims.spaces import CONTROLS, UNKNOWN, Bounds, Expected
+from cavbench.errors import UserError, short
 from cavbench.formats.trial import RefusedError, failure, hashed, refuse_harm
 
 TRIED = (1, 2, 1500)

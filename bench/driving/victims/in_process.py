@@ -11,14 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy
-from cavbench.errors import UserError, reason
-from cavbench.identity.bytecode import code_of
-from cavbench.identity.content import content
-from cavbench.identity.fingerprint import digest, state_digest
 from cavbench.driving.victims.from_file import FilePolicy, check_trained_in
 from cavbench.driving.victims.sb3_model import LIBRARY, critic_of, is_model, is_sampling_part, network_of
 from cavbench.driving.victims.spaces import CONTROLS, UNKNOWN
 from cavbench.driving.victims.torchrl_actor import ActorNetwork, is_actor
+from cavbench.errors import UserError, reason
+from cavbench.identity.bytecode import code_of
+from cavbench.identity.content import content
+from cavbench.identity.fingerprint import digest, state_digest
 
 SAME = 1e-5
 """Largest difference of two answers that count as equal."""

@@ -10,10 +10,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from cavbench.driving import DrivingFacts
-from cavbench.errors import UserError
 from cavbench.core.contracts import Access
+from cavbench.driving import DrivingFacts
 from cavbench.driving.victims.from_file import FileDriver, FilePolicy
+from cavbench.errors import UserError
 from cavbench.formats import onnx_runtime
 
 

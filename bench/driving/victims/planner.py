@@ -9,6 +9,7 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from cavbench.core.ranges import NotNegative, Share
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.ego import UNKNOWN_EDGE, Ego
@@ -17,7 +18,6 @@ from cavbench.driving.intervals.margins import Judge
 from cavbench.driving.intervals.policy import IntervalPolicy
 from cavbench.driving.intervals.rooms import Caution, cars_of
 from cavbench.driving.threat import Norm
-from cavbench.core.ranges import NotNegative, Share
 
 FORBIDDEN, UNSAFE = -10.0, -2.0
 """Values of what is never done, and of what is done only if nothing is safe."""

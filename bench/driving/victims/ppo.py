@@ -15,8 +15,8 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.core.ranges import Count, Natural, NotNegative, Positive, Share
+from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase
 from cavbench.driving.victims.logits import Logits
 from cavbench.driving.victims.networks import QPolicy, StateValue

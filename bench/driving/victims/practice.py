@@ -7,10 +7,10 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, ExplorationType, MultiStepTransform, set_exploration_type
 
-from cavbench.driving import DrivingWorld
 from cavbench.core import registry
-from cavbench.scenarios import Cell
+from cavbench.driving import DrivingWorld
 from cavbench.driving.victims.learner import Learner, Phase
+from cavbench.scenarios import Cell
 
 ALLOWED = "allowed"
 """The key of the actions that a defence leaves to the policy behind it."""

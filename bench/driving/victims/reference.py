@@ -9,10 +9,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from cavbench.core.registry import unknown
 from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.features import CONSTANT_CONTROLS, RIGHT_THEN_SLOWER
 from cavbench.errors import UserError
-from cavbench.core.registry import unknown
 
 RIGHT_S = 4.0
 """Seconds of lane changes to the right: enough to cross four lanes at 25 m/s, one after the other."""

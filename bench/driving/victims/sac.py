@@ -21,8 +21,8 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate, ValueEstimators
 
-from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.core.ranges import Count, Positive, Share
+from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.logits import Logits, SoftPolicy
 from cavbench.driving.victims.practice import ALLOWED

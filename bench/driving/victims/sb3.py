@@ -17,11 +17,11 @@ from torch import Tensor, nn
 
 from cavbench.archive import Archive
 from cavbench.driving import ActionType, DrivingFacts
-from cavbench.errors import UserError
 from cavbench.driving.victims.from_file import FileDriver, FilePolicy
 from cavbench.driving.victims.sb3_saved import FORMAT, ONLY, Algorithm, Saved, saved_model
 from cavbench.driving.victims.sb3_traces import check_traces
 from cavbench.driving.victims.spaces import Bounds, Expected, check_actions, check_range
+from cavbench.errors import UserError
 
 STEMS: dict[Algorithm, tuple[str, ...]] = {
     "dqn": ("q_net.q_net",),

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+from cavbench.core.pair import Chosen
 from cavbench.driving import DrivingWorld
+from cavbench.driving.victims.spaces import UNKNOWN
 from cavbench.errors import UserError, short
 from cavbench.identity.content import content
-from cavbench.core.pair import Chosen
 from cavbench.scenarios import Grid
-from cavbench.driving.victims.spaces import UNKNOWN
 
 RESHAPING = ("FlattenObservation", "DtypeObservation")
 """Wrappers that change no number of an observation."""

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.driving import ActionType, DrivingFacts
-from cavbench.errors import UserError, short
 from cavbench.driving.victims.sb3_traces import check_traces
 from cavbench.driving.victims.spaces import Bounds, Expected, check_actions, check_range
+from cavbench.errors import UserError, short
 
 VALUES, DISTRIBUTION, ACTOR = ("DQN",), ("PPO", "A2C"), ("SAC", "TD3", "DDPG")
 LIBRARY = "stable-baselines3"

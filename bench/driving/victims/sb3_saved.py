@@ -20,8 +20,8 @@ from torch import nn
 
 from cavbench.archive import Archive
 from cavbench.driving import ActionType
-from cavbench.errors import UserError, short
 from cavbench.driving.victims.spaces import Bounds
+from cavbench.errors import UserError, short
 from cavbench.formats.pickled_array import floats
 from cavbench.formats.trial import hashed
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavbench.errors import UserError
 from cavbench.driving.victims.spaces import Expected
+from cavbench.errors import UserError
 
 EXACT = 1e-6
 BEYOND = 0.01

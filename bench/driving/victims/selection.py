@@ -13,8 +13,8 @@ from torch import Tensor
 from cavbench.driving import DrivingWorld, Policy, State, TrainingHooks
 from cavbench.driving.metrics import safe_progress
 from cavbench.driving.policy import rows_of
-from cavbench.scenarios import SeedBlock
 from cavbench.driving.victims.practice import roads
+from cavbench.scenarios import SeedBlock
 
 
 @torch.no_grad()

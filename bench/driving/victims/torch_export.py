@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.driving import DrivingFacts
-from cavbench.errors import UserError
 from cavbench.driving.victims.from_file import FileDriver, FilePolicy
+from cavbench.errors import UserError
 from cavbench.formats.torch_graph import Single
 from cavbench.formats.torch_program import read
 

@@ -13,8 +13,8 @@ from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cavbench.errors import UserError
 from cavbench.driving.victims.spaces import UNBOUNDED
+from cavbench.errors import UserError
 
 VALUES = ("action_value", "logits", "probs")
 """Names of entries with a value for each discrete action, in order of preference."""
@@ -53,7 +53,9 @@ class ActorNetwork(nn.Module):
     def _given(self, keys: Sequence[Any]) -> Any:
         if len(keys) != 1:
             memory = (
-                " (a recurrent policy is a cavbench.driving.Policy with `initial` and `advance`)" if len(keys) > 1 else ""
+                " (a recurrent policy is a cavbench.driving.Policy with `initial` and `advance`)"
+                if len(keys) > 1
+                else ""
             )
             raise UserError(f"{self.name} reads {_listed(keys)}, a driver is given one observation{memory}; {INSTEAD}")
         return keys[0]

@@ -12,16 +12,16 @@ from typing import ClassVar
 import torch
 from torchrl.envs import EnvBase
 
-from cavbench.driving import DrivingFacts, DrivingVictim, DrivingWorld, Policy, TrainingHooks
+from cavbench import zoo
 from cavbench.core.contracts import Progress, Trained
 from cavbench.core.ranges import Count, Share, Width
-from cavbench.scenarios import SeedBlock
-from cavbench import zoo
+from cavbench.driving import DrivingFacts, DrivingVictim, DrivingWorld, Policy, TrainingHooks
 from cavbench.driving.victims.attack_mix import AttackMix
 from cavbench.driving.victims.behind import Guard, GuardedPractice, defense_of
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase
 from cavbench.driving.victims.practice import Practice, roads
 from cavbench.driving.victims.selection import Best
+from cavbench.scenarios import SeedBlock
 
 WARM_UP = 40
 """Decisions before the first update."""

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavbench.errors import notice
 from cavbench.envs.camera import sign
 from cavbench.envs.camera.camera import Array, Camera
 from cavbench.envs.camera.street import light as lights
@@ -26,6 +25,7 @@ from cavbench.envs.camera.street.material import Material
 from cavbench.envs.camera.street.mesh import Mesh
 from cavbench.envs.camera.street.textures import noise
 from cavbench.envs.camera.street.vehicles import Part
+from cavbench.errors import notice
 
 SAMPLES, GUIDE_SAMPLES, SIGN_SAMPLES = 8, 4, 64
 """Paths a pixel for the image, for the guides of the denoiser, and for the crop of the sign."""

@@ -1,4 +1,4 @@
-"""The built-in suites of attacks; the lists are in the TOML files of this folder."""
+"""The suites of attacks on detectors; the lists are in the TOML files of this folder."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from pathlib import Path
 
 from cavbench.core.suites import Suite
 
-STANDARD_1 = Suite.read(Path(__file__).with_name("standard-1.toml"))
-STANDARD_2 = Suite.read(Path(__file__).with_name("standard-2.toml"))
 STANDARD_DETECTION_1 = Suite.read(Path(__file__).with_name("standard-detection-1.toml"))
 STANDARD_DETECTION_2 = Suite.read(Path(__file__).with_name("standard-detection-2.toml"))
 STANDARD_DETECTION_3 = Suite.read(Path(__file__).with_name("standard-detection-3.toml"))

@@ -1,0 +1,10 @@
+"""The suites of attacks on driving policies; the lists are in the TOML files of this folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cavbench.core.suites import Suite
+
+STANDARD_1 = Suite.read(Path(__file__).with_name("standard-1.toml"))
+STANDARD_2 = Suite.read(Path(__file__).with_name("standard-2.toml"))
