@@ -34,7 +34,7 @@ docs: install-dev
 
 # The wheel in an environment of its own: installs it, and runs a first command. Takes minutes and 2 GB.
 wheel-check: install-dev
-	CAVBENCH_WHEEL_CHECK=1 $(BIN)/python -m pytest tests/framework/test_packaging.py
+	CAVBENCH_WHEEL_CHECK=1 $(BIN)/python -m pytest tests/packaging/test_packaging.py
 
 bench: install-dev
 	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done

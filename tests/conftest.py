@@ -8,7 +8,9 @@ from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny, YOLOv3TinyNetwork
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.errors import UserError
 from cavbench.run.process import settle
+from tests.command import bench, plugins, toy_folder
 
+__all__ = ["bench", "plugins", "toy_folder"]
 FACTS = StopSignApproach().facts
 
 # Tests run in as many processes as there are cores: threads that wait for each other would only be in the way.

@@ -15,7 +15,7 @@ from cavbench.attacks.driving.pgd import PGD
 from cavbench.attacks.driving.zo import ZOSignSGD
 from cavbench.driving import ActionType, DrivingAttack, ObservationThreat
 from cavbench.driving.threat import Norm
-from tests.attacks.victims import FEATURES, observations, perturb, victim
+from tests.attacks.driving.victims import FEATURES, observations, perturb, victim
 
 OBJECTIVES = ("collision", "expected", "margin", "target")
 ZO_OBJECTIVES = (*OBJECTIVES, "thesis")

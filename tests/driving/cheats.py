@@ -15,7 +15,7 @@ from cavbench.core.track import Columns
 from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
 from cavbench.driving.rollout import rollout
 from cavbench.scenarios import Cell
-from tests.framework.toy import ToyPolicy, ToyWorld
+from tests.plugins.toy import ToyPolicy, ToyWorld
 
 WORLD = ToyWorld(max_steps=90)
 SEEDS = range(1_000_000, 1_000_008)

@@ -14,7 +14,7 @@ from cavbench.defenses.driving.recurrent import RecurrentPolicy
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.victims.reference import Blind, RandomDriver
 from cavbench.envs.highway.world import HighwayWorld
-from tests.attacks.victims import observations, victim
+from tests.attacks.driving.victims import observations, victim
 
 FACTS = HighwayWorld().facts
 

@@ -15,7 +15,7 @@ from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, State
 from cavbench.driving.attacker import Attacker
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
-from tests.attacks.victims import FEATURES, Linear, observations
+from tests.attacks.driving.victims import FEATURES, Linear, observations
 
 ALL = torch.ones(3, dtype=torch.bool)
 

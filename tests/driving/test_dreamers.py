@@ -16,7 +16,7 @@ from cavbench.core.contracts import Access
 from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy, State
 from cavbench.driving.rollout import rollout
 from tests.driving.cheats import CELL, SEEDS, Victim
-from tests.framework.toy import ToyWorld
+from tests.plugins.toy import ToyWorld
 
 WORLD = ToyWorld(max_steps=400)
 FLAGGED = 0.01

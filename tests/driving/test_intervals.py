@@ -31,8 +31,8 @@ from cavbench.envs.highway.batched import BatchedHighway
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
 from cavbench.scenarios import SeedBlock
-from tests.attacks.victims import observations
-from tests.framework.toy import ToyWorld
+from tests.attacks.driving.victims import observations
+from tests.plugins.toy import ToyWorld
 
 WORLD = HighwayWorld()
 FACTS = WORLD.facts

@@ -15,7 +15,7 @@ from torch import Tensor
 from cavbench.driving import ObservationThreat, Oracle, Policy
 from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.victim import CHUNK, CountedPolicy
-from tests.attacks.victims import FEATURES, observations, victim
+from tests.attacks.driving.victims import FEATURES, observations, victim
 from tests.driving.policies import STATEFUL, remembered, stacked
 
 BATCH = 6

@@ -12,7 +12,7 @@ from cavbench.attacks.driving.pgd import PGD, preference_gap
 from cavbench.driving import DrivingAttack, ObservationThreat
 from cavbench.driving.attacker import Attacker
 from cavbench.driving.victim import CountedPolicy
-from tests.attacks.victims import FEATURES, observations, victim
+from tests.attacks.driving.victims import FEATURES, observations, victim
 
 STEPS = 12
 

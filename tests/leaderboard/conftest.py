@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from full_house import write as write_records
 from rich.console import Console
 
 from cavbench.leaderboard.page.write import write as write_page
+from tests.leaderboard.full_house import write as write_records
 
 
 @pytest.fixture(scope="session")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from synthetic import CLEAR, approach, baseline_drivers, drive, probed
 
 from cavbench.records.store import FOLDER
+from tests.leaderboard.synthetic import CLEAR, approach, baseline_drivers, drive, probed
 
 SEEN = {"redrawn": 0.0, "same_answer": 0.2}
 PGD = {"queries": 45.0, "gradient_queries": 44.0, "zero_gradients": 0.0}

@@ -9,7 +9,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from rich.console import Console
-from synthetic import approach, probed
 
 from cavbench.core.pair import choose
 from cavbench.core.track import track
@@ -19,6 +18,7 @@ from cavbench.leaderboard.published import published
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.terminal.run import run_report
 from cavbench.leaderboard.thesis.patch_records import usual_crafting
+from tests.leaderboard.synthetic import approach, probed
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 160])

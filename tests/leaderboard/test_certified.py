@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pyarrow as pa
 import pytest
-from full_house import SEEN
-from synthetic import approach, drive, probed
 
 from cavbench.leaderboard.comparisons.reading import read_tracks
 from cavbench.leaderboard.ranking.boards import Row, boards
 from cavbench.statistics.certificate import certificate
+from tests.leaderboard.full_house import SEEN
+from tests.leaderboard.synthetic import approach, drive, probed
 
 
 def row(**probes: float) -> Row:

@@ -14,8 +14,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
-from full_house import driving
-from synthetic import CLEAR, drive
 from typer.main import get_command
 
 from cavbench.cli.main import app
@@ -35,6 +33,8 @@ from cavbench.records import reading
 from cavbench.run.config import run_config
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import as_text
+from tests.leaderboard.full_house import driving
+from tests.leaderboard.synthetic import CLEAR, drive
 
 
 def test_the_document_keeps_to_its_schema(site: Path) -> None:

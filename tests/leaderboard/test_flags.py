@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 import pytest
-from full_house import PGD, SEEN
-from synthetic import CLEAR, approach, baseline_drivers, drive, probed
 
 from cavbench.envs.highway.axes import STANDARD_V1
 from cavbench.leaderboard.comparisons.reading import read_tracks
 from cavbench.leaderboard.ranking.boards import Board, boards
 from cavbench.leaderboard.ranking.flags import FLAGS, Flag
+from tests.leaderboard.full_house import PGD, SEEN
+from tests.leaderboard.synthetic import CLEAR, approach, baseline_drivers, drive, probed
 
 HALF = CLEAR[:3]
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 from rich.text import Text
-from synthetic import CLEAR, drive
 
 from cavbench.cli import main as cli
 from cavbench.cli.terminal import Console
@@ -20,6 +19,7 @@ from cavbench.leaderboard.page.table import table
 from cavbench.leaderboard.page.write import html
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.records import reading, store
+from tests.leaderboard.synthetic import CLEAR, drive
 
 FORMULA, ESCAPE = "=cmd|' /C calc'!A0", "\x1b[2J\x1b]0;owned\x07\u202egnp\x9b31m<script>alert(1)</script>"
 OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-import leaderboard
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.records import reading
 from cavbench.statistics.estimates import share_interval
+from tests.tree import ROOT
 
 Open = Callable[..., Any]
 
@@ -242,9 +242,7 @@ def test_the_card_of_a_row_shows_its_film(browser: Any, site: Path, tmp_path: Pa
     folder = tmp_path / "site"
     shutil.copytree(site, folder)
     text = (folder / "leaderboard.html").read_text()
-    (folder / "film.webp").write_bytes(
-        (Path(leaderboard.__file__).parent / "clips" / "relative-0.1-none+dqn.webp").read_bytes()
-    )
+    (folder / "film.webp").write_bytes((ROOT / "leaderboard" / "clips" / "relative-0.1-none+dqn.webp").read_bytes())
     (folder / "leaderboard.html").write_text(text.replace('"clip":null', '"clip":"film.webp"'))
     page = browser.new_page()
     page.goto((folder / "leaderboard.html").as_uri())

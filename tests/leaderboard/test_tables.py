@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from rich.console import Console
-from synthetic import CLEAR, baseline_drivers, drive
 
 from cavbench.core.track import track
 from cavbench.driving.track import BEST_BLIND
@@ -25,6 +24,7 @@ from cavbench.records.schema import schema
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import as_text
 from cavbench.statistics.estimates import Interval
+from tests.leaderboard.synthetic import CLEAR, baseline_drivers, drive
 
 SCHEMA = schema(track("driving"))
 ZO = {"objective": "expected", "steps": 50}

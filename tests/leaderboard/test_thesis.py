@@ -16,7 +16,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rich.console import Console
-from synthetic import CLEAR, approach, baseline_drivers, drive
 
 from cavbench.core.track import Track, track, tracks
 from cavbench.errors import UserError
@@ -29,6 +28,7 @@ from cavbench.leaderboard.thesis.trend import trend
 from cavbench.records import store as results
 from cavbench.records.schema import schema
 from cavbench.run.config import run_config
+from tests.leaderboard.synthetic import CLEAR, approach, baseline_drivers, drive
 
 SCHEMA = schema(track("driving"))
 TARGET = {"objective": "target", "target_action": 3, "target_acceleration": 1.0, "target_steering": 0.5}

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 import pyarrow as pa
 import pytest
 from rich.console import Console
-from synthetic import approach
 
 from cavbench.core.pair import choose
 from cavbench.core.track import track
@@ -31,6 +30,7 @@ from cavbench.leaderboard.thesis.patch_records import (
 from cavbench.leaderboard.thesis.report import thesis_report
 from cavbench.records.schema import schema
 from cavbench.run.config import run_config
+from tests.leaderboard.synthetic import approach
 
 Left = float | Callable[[str, str], float]
 NONE = schema(track("detection")).empty_table()

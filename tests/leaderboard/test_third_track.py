@@ -16,7 +16,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from synthetic import baseline_drivers, drive, table
 
 from cavbench.core import registry
 from cavbench.core.contracts import Facts
@@ -26,7 +25,8 @@ from cavbench.records.schema import schema
 from cavbench.records.store import FOLDER
 from cavbench.scenarios import Axes, Axis, Cell, Grid
 from cavbench.statistics.episodes import as_text
-from tests.framework.distributions import install
+from tests.leaderboard.synthetic import baseline_drivers, drive, table
+from tests.plugins.distributions import install
 
 AXES = Axes(
     (

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import psutil
 
-from tests.framework.conftest import started
-from tests.framework.distributions import install_toy
+from tests.command import started
+from tests.plugins.distributions import install_toy
 from tests.soak.conditions import CONDITIONS
 from tests.soak.endurance import endure
 from tests.soak.subjects import SUBJECTS, Subject

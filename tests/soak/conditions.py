@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 import cavbench
 from cavbench.cli import main as cli
-from tests.framework.conftest import Said, ran, started
+from tests.command import Said, ran, started
 from tests.soak.bad_inputs import bad_inputs
 from tests.soak.subjects import RUN, SUBJECTS, Condition
 

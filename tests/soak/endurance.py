@@ -8,7 +8,7 @@ from pathlib import Path
 import psutil
 
 from cavbench.records.packing import units_in
-from tests.framework.conftest import started
+from tests.command import started
 from tests.soak.subjects import RUN
 
 LONG = [word for word in RUN if not word.startswith(("seeds=", "attack.pause="))]

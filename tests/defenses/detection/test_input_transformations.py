@@ -1,0 +1,69 @@
+"""Median smoothing and JPEG compression before a detector."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from cavbench.defenses.detection.jpeg import JPEG
+from cavbench.defenses.detection.median import Guarded, MedianSmoothing
+from cavbench.detection import DetectorDefense
+from tests.plugins.toy_camera import RedStreet, RedVictim
+
+BOTH = [MedianSmoothing(size=5), JPEG(quality=30)]
+
+
+def pictures(count: int = 2) -> Tensor:
+    return torch.rand(count, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+
+
+def guarded(defense: DetectorDefense) -> Guarded:
+    found = defense.load(RedVictim(), 0, RedStreet().facts)
+    assert isinstance(found, Guarded)
+    return found
+
+
+def test_the_median_equals_opencvs() -> None:
+    shown = (pictures(1) * 255).round() / 255
+    transformed = guarded(MedianSmoothing(size=5)).transform(shown)[0].permute(1, 2, 0).numpy()
+    wanted = cv2.medianBlur((shown[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8), 5) / 255
+    assert np.allclose(transformed[2:-2, 2:-2], wanted[2:-2, 2:-2], atol=1e-6)
+
+
+def test_a_lower_quality_loses_more() -> None:
+    shown = pictures()
+    lost = [float((guarded(JPEG(quality=q)).transform(shown) - shown).abs().mean()) for q in (10, 40, 95)]
+    assert lost[0] > lost[1] > lost[2] > 0
+
+
+@pytest.mark.parametrize("defense", BOTH, ids=["median", "jpeg"])
+def test_the_detector_receives_the_transformed_image_and_the_gradient_is_straight_through(
+    defense: DetectorDefense,
+) -> None:
+    door, shown = guarded(defense), pictures().requires_grad_(True)
+    through = door.transform(shown.detach()).requires_grad_(True)
+    assert torch.allclose(door(shown).scores, door.inner(through).scores, atol=1e-6)
+    door(shown).scores.sum().backward()
+    door.inner(through).scores.sum().backward()
+    assert shown.grad is not None
+    assert through.grad is not None
+    assert shown.grad.abs().sum() > 0
+    assert torch.allclose(shown.grad, through.grad, atol=1e-6)
+
+
+@pytest.mark.parametrize("defense", BOTH, ids=["median", "jpeg"])
+def test_images_of_a_batch_are_transformed_independently(defense: DetectorDefense) -> None:
+    shown = pictures(3)
+    door = guarded(defense)
+    assert torch.equal(door.transform(shown)[1:2], door.transform(shown[1:2]))
+    assert (door.names, door.stride) == (door.inner.names, door.inner.stride)
+
+
+@pytest.mark.parametrize("bad", [lambda: MedianSmoothing(size=4), lambda: JPEG(quality=0)])
+def test_a_parameter_out_of_range_is_named(bad: object) -> None:
+    assert callable(bad)
+    with pytest.raises(ValueError, match="must be"):
+        bad()

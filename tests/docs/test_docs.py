@@ -1,0 +1,115 @@
+"""Every built-in component has a page with a formula, a figure and its parameters, which the site reads from the code."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from cavbench.cli.early import check_names
+from cavbench.cli.explain import GLOSSARY
+from cavbench.core.registry import GROUPS, KINDS, Kind, entries
+from tests.tree import ROOT
+
+DOCS = ROOT / "docs"
+FOLDERS: dict[Kind, str] = {"attack": "attacks", "defense": "defenses", "victim": "victims", "world": "worlds"}
+BUILT_IN = [
+    (kind, name)
+    for kind in KINDS
+    for name, claims in entries(GROUPS[kind]).items()
+    if claims[0].distribution == "cavbench"
+]
+
+
+@pytest.mark.parametrize(("kind", "name"), BUILT_IN)
+def test_every_component_has_a_page(kind: Kind, name: str) -> None:
+    page = f"{FOLDERS[kind]}/{name}"
+    text = (DOCS / f"{page}.md").read_text()
+    assert text.startswith(f"# `{name}`")
+    assert re.search(r"^\$\$ .+ \$\$$", text, re.MULTILINE), "no formula"
+    assert f"```{{component}} {kind}\nbench list {name}\n```" in text
+    figure = re.search(rf"!\[.+\]\(\.\./images/({kind}_{name}\.(?:svg|png))\)", text)
+    assert figure, "no figure"
+    assert (DOCS / "images" / figure[1]).is_file()
+    assert re.search(rf"^{name} <{page}>$", (DOCS / "index.md").read_text(), re.MULTILINE), (
+        "not in the table of contents"
+    )
+
+
+WRITTEN_ELSEWHERE = {"plugins.md", "gymnasium.md", "changelog.md"}
+"""Pages whose commands need a plug-in that another test writes, or belong to earlier versions."""
+PLACEHOLDERS = ("…", "=N", "my_", "NAME", "$SLURM")
+
+
+def _commands(page: Path) -> list[list[str]]:
+    """Every `bench ...` of a page, in code blocks and in the text."""
+    text = page.read_text()
+    blocks = re.findall(r"^(?:    +|\$ )?(bench .+)$", text, re.M)
+    return [shlex.split(one, comments=True) for one in (*blocks, *re.findall(r"(?<!`)`(bench [^`]+)`", text))]
+
+
+def test_every_command_in_the_documentation_names_what_exists() -> None:
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
+    checked = 0
+    for page in (page for page in pages if page.name not in WRITTEN_ELSEWHERE and "_build" not in page.parts):
+        for _, name, *words in _commands(page):
+            if any(placeholder in word for word in words for placeholder in PLACEHOLDERS):
+                continue
+            if name in ("run", "audit", "train"):
+                given = [word for word in words if not word.startswith(("--", "salt="))]
+                check_names(given, "TrainOptions" if name == "train" else "RunOptions")
+            elif name in ("list", "check") and words and words[0].isidentifier():
+                assert any(words[0] in entries(GROUPS[kind]) for kind in KINDS) or words[0] in (*KINDS, "standard")
+            checked += 1
+    assert checked > 100
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
+def test_pages_outside_of_the_site_link_to_existing_targets(name: str) -> None:
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / name).read_text())
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+@pytest.mark.slow
+def test_the_site_reads_the_code_and_refuses_unknown_names(tmp_path: Path) -> None:
+    from sphinx.application import Sphinx
+
+    source, built = tmp_path / "docs", tmp_path / "built"
+    source.mkdir()
+    (source / "index.md").write_text(
+        "# Page\n\n$$ \\frac{a}{b} $$\n\n$\\nosuchcommand$\n\n[ranking](../leaderboard/index.html)\n\n"
+        "```{component} attack\nbench list noise\n```\n\n```{component} attack\nbench list nois\n```\n"
+    )
+    (tmp_path / "leaderboard").mkdir()
+    (tmp_path / "leaderboard" / "index.html").write_text("<p>ranks</p>")
+    (warned := tmp_path / "warned").touch()
+    with warned.open("w") as warning:
+        app = Sphinx(source, DOCS, built, tmp_path / "doctrees", "html", status=None, warning=warning)
+        app.build()
+    page = (built / "index.html").read_text()
+    assert re.search(r"<mfrac>\s*<mi>a</mi>\s*<mi>b</mi>", page)
+    assert f"cavbench {metadata.version('cavbench')}" in page
+    row = re.search(r"attack\.distribution.*?</tr>", page, re.DOTALL)
+    assert row
+    assert "<p>uniform</p>" in row[0]
+    assert "one of uniform, gaussian" in row[0]
+    assert 'href="leaderboard/index.html"' in page
+    assert (built / "leaderboard" / "index.html").read_text() == "<p>ranks</p>"
+    complaints = warned.read_text()
+    assert "unknown attack 'nois'; did you mean 'noise'?" in complaints
+    assert r'Unknown LaTeX command "\nosuchcommand"' in complaints
+
+
+def test_the_glossary_is_that_of_bench_help() -> None:
+    terms = tomllib.loads(GLOSSARY.read_text(encoding="utf-8"))
+    rows = re.findall(r"^\| (.+?) \| (.+) \[More\]\((.+)\.md\) \|$", (DOCS / "glossary.md").read_text(), re.M)
+    assert {name: (meaning.replace("&lt;", "<"), page) for name, meaning, page in rows} == {
+        name: (entry["meaning"], entry["page"]) for name, entry in terms.items()
+    }
+    for entry in terms.values():
+        assert (DOCS / f"{entry['page']}.md").is_file()
