@@ -1,14 +1,11 @@
-"""Where the packages of `cavbench` stand in this repository; all else is in pyproject.toml."""
+"""Lists the packages in the folders that pyproject.toml maps to packages; all else is there."""
+
+import tomllib
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
-FOLDERS = {"cavbench": "bench", **{f"cavbench.{name}": name for name in ("attacks", "defenses", "envs", "leaderboard")}}
+SETTINGS = tomllib.loads(Path(__file__).with_name("pyproject.toml").read_text(encoding="utf-8"))
+FOLDERS = SETTINGS["tool"]["setuptools"]["package-dir"].items()
 
-setup(
-    package_dir=FOLDERS,
-    packages=[
-        name
-        for package, folder in FOLDERS.items()
-        for name in (package, *(f"{package}.{inner}" for inner in find_packages(folder)))
-    ],
-)
+setup(packages=[".".join(filter(None, (package, inner))) for package, folder in FOLDERS for inner in ("", *find_packages(folder))])
