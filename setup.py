@@ -8,4 +8,10 @@ from setuptools import find_packages, setup
 SETTINGS = tomllib.loads(Path(__file__).with_name("pyproject.toml").read_text(encoding="utf-8"))
 FOLDERS = SETTINGS["tool"]["setuptools"]["package-dir"].items()
 
-setup(packages=[".".join(filter(None, (package, inner))) for package, folder in FOLDERS for inner in ("", *find_packages(folder))])
+setup(
+    packages=[
+        ".".join(filter(None, (package, inner)))
+        for package, folder in FOLDERS
+        for inner in ("", *find_packages(folder))
+    ]
+)

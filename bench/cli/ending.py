@@ -81,8 +81,9 @@ def _held(phase: str) -> str:
     what = f"the thread {held[0].name!r}" if len(held) == 1 else f"{len(held)} threads"
     if phase == "hooks":
         what = "a hook for the end of the process"
-    owners = dict.fromkeys(filter(None, map(owner, held)))
-    who = " and ".join(owners) if owners else f"one of {', '.join(sorted(set(_foreign().values())))}"
+    packages = _foreign()
+    owners = dict.fromkeys(whose for one in held if (whose := owner(one, packages)))
+    who = " and ".join(owners) if owners else f"one of {', '.join(sorted(set(packages.values())))}"
     return f"{what} of {who} {'do' if len(held) > 1 else 'does'} not end"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-Colour = tuple[int, int, int]
+from cavbench.recording.colours import Colour
 
 
 class Columns:

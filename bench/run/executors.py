@@ -15,6 +15,7 @@ from multiprocessing.connection import wait
 from types import FrameType
 from typing import Protocol
 
+from cavbench.core import registry
 from cavbench.errors import UserError
 from cavbench.isolation.foreign import StopUnitError
 from cavbench.isolation.framework import Snapshot
@@ -196,7 +197,7 @@ class ProcessExecutor:
         """Raise UserError if this process, which only keeps records, grew by more than a unit may use."""
         grown = (resident_bytes(os.getpid()) - before) / GB
         if self.limits.memory_gb and grown > self.limits.memory_gb:
-            owners = " and ".join(holders()) or "something that a plug-in left"
+            owners = " and ".join(holders(registry.foreign())) or "something that a plug-in left"
             raise UserError(
                 f"the run is stopped, what is finished is kept: its own process grew by {grown:.1f} GB, more than "
                 f"unit_memory={self.limits.memory_gb:.3g} GB, by {owners}; use the plug-in alone to see what it does"

@@ -19,9 +19,8 @@ from cavbench.detection.patch import Evolution
 from cavbench.detection.recording import blueprint as approach_blueprint
 from cavbench.detection.recording.blueprint import GAP, sights
 from cavbench.detection.sight import Sight
-from cavbench.driving.recording.curves import GREY
-from cavbench.driving.recording.scene import EGO, MEASURED, SHOWN
-from cavbench.recording.columns import Colour, Columns
+from cavbench.recording.colours import EGO, GREY, MEASURED, SHOWN, Colour
+from cavbench.recording.columns import Columns
 
 COLOURS: dict[str, Colour] = {"with_patch": SHOWN, "without_patch": MEASURED}
 LOSS_COLOURS: tuple[Colour, ...] = (SHOWN, MEASURED, EGO, GREY)

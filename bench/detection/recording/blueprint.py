@@ -9,8 +9,8 @@ import rerun.blueprint as rrb
 from cavbench.detection import Scenes
 from cavbench.detection.approach import Sighting, measured
 from cavbench.detection.sight import Sight
-from cavbench.driving.recording.blueprint import bare
 from cavbench.recording import about
+from cavbench.recording.blueprint import bare
 
 NAMES = {"with_patch": "With the patch", "without_patch": "Without a patch"}
 FPS = 2.0

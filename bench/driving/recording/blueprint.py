@@ -10,6 +10,7 @@ from cavbench.driving.recording import scene
 from cavbench.driving.recording.curves import group
 from cavbench.driving.recording.episode import Episode
 from cavbench.recording import about
+from cavbench.recording.blueprint import bare
 
 
 def layout(episode: Episode) -> rrb.Blueprint:
@@ -25,18 +26,6 @@ def layout(episode: Episode) -> rrb.Blueprint:
     rows.append(_curves(episode))
     shares.append(5.0)
     return bare(rrb.Vertical(*rows, row_shares=shares), timeline="time", fps=episode.facts.decision_hz)
-
-
-def bare(views: rrb.Container, *, timeline: str, fps: float) -> rrb.Blueprint:
-    """A blueprint with these views and a timeline, without rerun's panels."""
-    return rrb.Blueprint(
-        views,
-        rrb.BlueprintPanel(state=rrb.PanelState.Hidden),
-        rrb.SelectionPanel(state=rrb.PanelState.Hidden),
-        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=timeline, fps=fps),
-        auto_views=False,
-        auto_layout=False,
-    )
 
 
 def _road(episode: Episode) -> rrb.View:

@@ -8,8 +8,9 @@ from itertools import cycle
 import numpy as np
 
 from cavbench.driving.recording.episode import CONTROLS, Episode
-from cavbench.driving.recording.scene import CRASHED, EGO, MEASURED, SHOWN
-from cavbench.recording.columns import Colour, Columns
+from cavbench.driving.recording.scene import CRASHED
+from cavbench.recording.colours import EGO, GREY, MEASURED, SHOWN, Colour
+from cavbench.recording.columns import Columns
 
 ACTION_COLOURS: tuple[Colour, ...] = (
     (187, 154, 247),
@@ -24,7 +25,6 @@ FEATURE_COLOURS: dict[str, Colour] = {
     "vx": (255, 158, 74),
     "vy": (125, 207, 255),
 }
-GREY: Colour = (150, 152, 158)
 
 
 def group(unit: str) -> str:

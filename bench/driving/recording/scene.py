@@ -10,7 +10,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from cavbench.driving.recording.episode import Array, Episode
-from cavbench.recording.columns import Colour, Columns
+from cavbench.recording.colours import EGO, MEASURED, SHOWN, Colour
+from cavbench.recording.columns import Columns
 
 LANE_WIDTH, CAR_LENGTH, CAR_WIDTH = 4.0, 5.0, 2.0
 """As in highway-env (road/lane.py, vehicle/kinematics.py). Lane 0 is centred on y = 0; y grows to the right."""
@@ -20,9 +21,6 @@ DASH, DASH_EVERY = 3.0, 9.0
 
 ASPHALT: Colour = (46, 48, 54)
 PAINT: Colour = (150, 152, 158)
-EGO: Colour = (86, 204, 122)
-MEASURED: Colour = (122, 162, 247)
-SHOWN: Colour = (255, 158, 74)
 CRASHED: Colour = (247, 84, 92)
 
 

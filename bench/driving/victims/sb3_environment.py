@@ -63,7 +63,7 @@ class Training:
             UserError: if it is the environment of the run's world, with wrappers that the world does not have.
         """
         trained = getattr(self.inner, "world", None)
-        if isinstance(trained, DrivingWorld) and type(self.inner).__module__ == "cavbench.gym.environment":
+        if isinstance(trained, DrivingWorld) and type(self.inner).__module__ == "cavbench.driving.gym.environment":
             self._refuse(None)
             return label(trained) if self.known else UNKNOWN
         owns = self._of_gym(world.component, grid)
@@ -87,7 +87,7 @@ class Training:
     def _of_gym(self, world: DrivingWorld, grid: Grid) -> Iterator[Training]:
         """The environments of some cells of a world that is made of a gymnasium environment; none for another world."""
         # A model of Stable-Baselines3 comes with gymnasium; a run without one needs none.
-        from cavbench.gym.world import GymWorld
+        from cavbench.driving.gym.world import GymWorld
 
         if not isinstance(world, GymWorld):
             return

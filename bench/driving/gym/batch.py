@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -14,13 +14,11 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from cavbench.driving import ActionType
+from cavbench.driving.gym.declaration import Declaration
+from cavbench.driving.gym.declared import CONTROLS, check
+from cavbench.driving.gym.environment import drawn_seeds
 from cavbench.errors import UserError
-from cavbench.gym.declared import CONTROLS, check
-from cavbench.gym.environment import drawn_seeds
 from cavbench.scenarios import Cell
-
-if TYPE_CHECKING:
-    from cavbench.gym.world import GymWorld
 
 ROUNDING = 1e-6
 """A progress may be this far outside [0, 1]."""
@@ -53,7 +51,7 @@ class Batch(EnvBase):
     batch_locked = True
 
     def __init__(
-        self, world: GymWorld, cells: Sequence[Cell], action_type: ActionType, witness: Witness | None = None
+        self, world: Declaration, cells: Sequence[Cell], action_type: ActionType, witness: Witness | None = None
     ) -> None:
         size = len(cells)
         super().__init__(device="cpu", batch_size=torch.Size([size]))
@@ -161,7 +159,7 @@ class Batch(EnvBase):
         super().close(raise_if_closed=raise_if_closed)
 
 
-def _share(world: GymWorld, progress: float) -> float:
+def _share(world: Declaration, progress: float) -> float:
     """A progress that is one.
 
     Raises:

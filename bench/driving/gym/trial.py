@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from cavbench.driving import ActionType, Features
-from cavbench.gym.batch import Batch
-from cavbench.gym.declared import CONTROLS
-from cavbench.gym.repeats import repeats
+from cavbench.driving.gym.batch import Batch
+from cavbench.driving.gym.declaration import Declaration
+from cavbench.driving.gym.declared import CONTROLS
+from cavbench.driving.gym.repeats import repeats
 from cavbench.scenarios import Cell, SeedBlock
-
-if TYPE_CHECKING:
-    from cavbench.gym.world import GymWorld
 
 STEPS, CELLS = 1000, 4
 """Length of the drive: steps of all episodes together, on so many cells of the grid."""
@@ -80,7 +78,7 @@ class Seen:
         return self.outside > LEFT * self.observations
 
 
-def doubts(world: GymWorld, cells: Sequence[Cell]) -> list[str]:
+def doubts(world: Declaration, cells: Sequence[Cell]) -> list[str]:
     """What random steps say against the declarations of a world, one line each.
 
     Args:
@@ -125,7 +123,7 @@ def _drive(batch: Batch, seen: Seen) -> list[int]:
     return early
 
 
-def _of_ranges(world: GymWorld, seen: Seen) -> Iterator[str]:
+def _of_ranges(world: Declaration, seen: Seen) -> Iterator[str]:
     features = world.features
     forged = np.array([name not in features.fixed for name in features.names])
     steps = len(seen.rewards)
@@ -150,10 +148,8 @@ def _listed(features: Features, seen: Seen, which: NDArray[np.bool_]) -> str:
     return " and ".join([", ".join([*parts, *more][:-1]), *[*parts, *more][-1:]]) if len(parts + more) > 1 else parts[0]
 
 
-def _of_rewards(world: GymWorld, seen: Seen) -> Iterator[str]:
-    from cavbench.gym.world import GymWorld
-
-    if type(world).progress is not GymWorld.progress:
+def _of_rewards(world: Declaration, seen: Seen) -> Iterator[str]:
+    if type(world).progress is not Declaration.progress:
         return
     rewards = np.array(seen.rewards)
     outside = ~((rewards >= -SHARE_OF_RANGE) & (rewards <= 1 + SHARE_OF_RANGE))
@@ -164,7 +160,7 @@ def _of_rewards(world: GymWorld, seen: Seen) -> Iterator[str]:
         )
 
 
-def _of_length(world: GymWorld, lengths: Sequence[int]) -> Iterator[str]:
+def _of_length(world: Declaration, lengths: Sequence[int]) -> Iterator[str]:
     shortest = min(lengths, default=world.max_steps)
     if shortest < world.max_steps:
         yield (

@@ -1,22 +1,17 @@
-"""A world of the benchmark made of a gymnasium environment."""
+"""What a world declares of its gymnasium environment, and how it reads what the environment returns."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
-from torchrl.envs import EnvBase
 
-from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingWorld
-from cavbench.errors import UserError
-from cavbench.gym import trial
-from cavbench.gym.batch import Batch
-from cavbench.gym.declared import native_limits, native_shape
+from cavbench.driving.contracts import DrivingWorld
 from cavbench.scenarios import Cell
 
 SUCCESS = ("is_success", "success")
@@ -24,17 +19,8 @@ SUCCESS = ("is_success", "success")
 
 
 @dataclass(frozen=True, kw_only=True)
-class GymWorld(DrivingWorld):
-    """A world whose episodes are those of a gymnasium environment with a Box observation.
-
-    A subclass sets `axes`, `grid`, `features`, `actions` and `hz`, has a field `max_steps`, and implements `environment`. Its
-    `features` declare a name, a range, a unit and a floor for every entry of the observation, of an array in row-major order: the
-    range is what the sensor can measure (values outside are clipped), and attacks are limited in these units. Features that
-    nobody can forge are named in `features.fixed`. Policies get one row, [1, 1 + n] on the [-1, 1] scale; those from files and
-    from Python get the environment's own array (`DrivingFacts.native`).
-
-    The environments are stepped one after the other, so an episode costs what it costs in gymnasium.
-    """
+class Declaration(DrivingWorld):
+    """The part of `GymWorld` that its author writes."""
 
     hz: ClassVar[float]
     """Decisions per second. Nothing can check it: it is the rate that defences reckon with."""
@@ -83,40 +69,6 @@ class GymWorld(DrivingWorld):
     @property
     def decision_hz(self) -> float:
         return self.hz
-
-    @property
-    def facts(self) -> DrivingFacts:
-        return DrivingFacts(
-            axes=self.axes,
-            decision_hz=self.hz,
-            max_steps=self.max_steps,
-            actions=self.actions,
-            features=self.features,
-            flat=True,
-            shape=native_shape(self),
-            limits=native_limits(self),
-        )
-
-    def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
-        """What 1,000 random steps say against the declarations of the world (`cavbench.gym.trial`)."""
-        return trial.doubts(self, cells)
-
-    def make(
-        self,
-        cells: Sequence[Cell],
-        *,
-        action_type: ActionType = "discrete",
-        driver: Driver = "agent",
-        action_repeat: int = 1,
-    ) -> EnvBase:
-        """See `cavbench.driving.DrivingWorld.make`; an action is never repeated.
-
-        Raises:
-            UserError: if the spaces of an environment are not those that the world declares.
-        """
-        if driver != "agent" or action_repeat != 1:
-            raise UserError(f"{type(self).__name__} has no driver of its own and repeats no actions")
-        return Batch(self, cells, action_type)
 
 
 def _on_road(info: Mapping[str, Any]) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,12 +12,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from cavbench.driving import ActionType
-from cavbench.gym.batch import Batch
-from cavbench.gym.declared import CONTROLS
+from cavbench.driving.gym.batch import Batch
+from cavbench.driving.gym.declaration import Declaration
+from cavbench.driving.gym.declared import CONTROLS
 from cavbench.scenarios import Cell, SeedBlock
-
-if TYPE_CHECKING:
-    from cavbench.gym.world import GymWorld
 
 STEPS, CPU_S = 30, 1.0
 """Length of an episode that is driven again, and CPU seconds after which a slow environment is left."""
@@ -33,7 +30,7 @@ Track = list[NDArray[np.float64]]
 """[n] observation, reward, progress and the ends of one episode, at its start and after each step."""
 
 
-def repeats(world: GymWorld, cells: Sequence[Cell]) -> list[str]:
+def repeats(world: Declaration, cells: Sequence[Cell]) -> list[str]:
     """What makes an episode another one when it is driven again: one line, or none.
 
     Args:
@@ -66,7 +63,7 @@ def repeats(world: GymWorld, cells: Sequence[Cell]) -> list[str]:
 
 
 def _driven(
-    world: GymWorld, cells: Sequence[Cell], seeds: Sequence[int], steps: int, before: int | None = None
+    world: Declaration, cells: Sequence[Cell], seeds: Sequence[int], steps: int, before: int | None = None
 ) -> list[Track]:
     """The episodes of new environments with these seeds, with the same actions each time.
 

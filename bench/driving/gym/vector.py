@@ -14,8 +14,15 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
 from cavbench.driving import ActionType, DrivingWorld
+from cavbench.driving.gym.environment import (
+    Observation,
+    checked_actions,
+    checked_seed,
+    drawn_seeds,
+    spaces_of,
+    world_and_cells,
+)
 from cavbench.errors import UserError
-from cavbench.gym.environment import Observation, checked_actions, checked_seed, drawn_seeds, spaces_of, world_and_cells
 from cavbench.scenarios import Cell
 
 Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections import UserDict
 from math import prod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 from gymnasium import spaces
 
 from cavbench.core import registry
 from cavbench.driving import ActionType
+from cavbench.driving.gym.declaration import Declaration
 from cavbench.errors import UserError
 from cavbench.identity.fingerprint import canonical
 from cavbench.isolation.foreign import contained
 from cavbench.scenarios import Axes, Cell, Value
-
-if TYPE_CHECKING:
-    from cavbench.gym.world import GymWorld
 
 CONTROLS = 2
 # Not among the data that no unit may change (`cavbench.isolation.framework.Snapshot`): a world is asked when it is needed.
@@ -25,7 +23,7 @@ _asked: UserDict[tuple[type, str], spaces.Box | None] = UserDict()
 """What environments that were asked observe, by class and parameters of the world."""
 
 
-def native_shape(world: GymWorld) -> tuple[int, ...]:
+def native_shape(world: Declaration) -> tuple[int, ...]:
     """Shape of the array that the environment itself returns.
 
     It is `world.shape` or, if that is empty, what an environment says that is made once for it. A world whose environment cannot
@@ -37,7 +35,7 @@ def native_shape(world: GymWorld) -> tuple[int, ...]:
     return (len(world.features.names),) if space is None else space.shape
 
 
-def native_limits(world: GymWorld) -> tuple[tuple[float, float], ...]:
+def native_limits(world: Declaration) -> tuple[tuple[float, float], ...]:
     """The lowest and the highest value of each entry in the space of an environment's observation.
 
     Empty if `world.shape` is given, so that none is asked, or none can be made without a cell of its grid.
@@ -48,7 +46,7 @@ def native_limits(world: GymWorld) -> tuple[tuple[float, float], ...]:
     return tuple(zip(space.low.reshape(-1).tolist(), space.high.reshape(-1).tolist(), strict=True))
 
 
-def check(world: GymWorld, env: gymnasium.Env[Any, Any], action_type: ActionType) -> None:
+def check(world: Declaration, env: gymnasium.Env[Any, Any], action_type: ActionType) -> None:
     """Refuse an environment whose spaces are not those of the world.
 
     Raises:
@@ -69,7 +67,7 @@ def check(world: GymWorld, env: gymnasium.Env[Any, Any], action_type: ActionType
         raise UserError(f"continuous policies have {CONTROLS} controls, the environment of {name} takes {action}")
 
 
-def _space(world: GymWorld) -> spaces.Box | None:
+def _space(world: Declaration) -> spaces.Box | None:
     """The space of an environment's observation; None if none can be made, or it is no Box of the declared size."""
     key = (type(world), canonical(world))
     if key not in _asked:
@@ -77,7 +75,7 @@ def _space(world: GymWorld) -> spaces.Box | None:
     return _asked[key]
 
 
-def _ask(world: GymWorld) -> spaces.Box | None:
+def _ask(world: Declaration) -> spaces.Box | None:
     try:
         with contained():
             env = world.environment(_any_cell(world))
@@ -89,7 +87,7 @@ def _ask(world: GymWorld) -> spaces.Box | None:
     return space if isinstance(space, spaces.Box) and prod(space.shape) == len(world.features.names) else None
 
 
-def _any_cell(world: GymWorld) -> Cell:
+def _any_cell(world: Declaration) -> Cell:
     """The first cell of the world's grid or, if that is not installed, one of values that the axes allow."""
     if world.grid in registry.entries(registry.GRIDS):
         return registry.grid(world.grid).cells()[0]

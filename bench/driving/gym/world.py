@@ -1,0 +1,64 @@
+"""A world of the benchmark made of a gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torchrl.envs import EnvBase
+
+from cavbench.driving import ActionType, Driver, DrivingFacts
+from cavbench.driving.gym import trial
+from cavbench.driving.gym.batch import Batch
+from cavbench.driving.gym.declaration import Declaration
+from cavbench.driving.gym.declared import native_limits, native_shape
+from cavbench.errors import UserError
+from cavbench.scenarios import Cell
+
+
+@dataclass(frozen=True, kw_only=True)
+class GymWorld(Declaration):
+    """A world whose episodes are those of a gymnasium environment with a Box observation.
+
+    A subclass sets `axes`, `grid`, `features`, `actions` and `hz`, has a field `max_steps`, and implements `environment`. Its
+    `features` declare a name, a range, a unit and a floor for every entry of the observation, of an array in row-major order: the
+    range is what the sensor can measure (values outside are clipped), and attacks are limited in these units. Features that
+    nobody can forge are named in `features.fixed`. Policies get one row, [1, 1 + n] on the [-1, 1] scale; those from files and
+    from Python get the environment's own array (`DrivingFacts.native`).
+
+    The environments are stepped one after the other, so an episode costs what it costs in gymnasium.
+    """
+
+    @property
+    def facts(self) -> DrivingFacts:
+        return DrivingFacts(
+            axes=self.axes,
+            decision_hz=self.hz,
+            max_steps=self.max_steps,
+            actions=self.actions,
+            features=self.features,
+            flat=True,
+            shape=native_shape(self),
+            limits=native_limits(self),
+        )
+
+    def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
+        """What 1,000 random steps say against the declarations of the world (`cavbench.driving.gym.trial`)."""
+        return trial.doubts(self, cells)
+
+    def make(
+        self,
+        cells: Sequence[Cell],
+        *,
+        action_type: ActionType = "discrete",
+        driver: Driver = "agent",
+        action_repeat: int = 1,
+    ) -> EnvBase:
+        """See `cavbench.driving.DrivingWorld.make`; an action is never repeated.
+
+        Raises:
+            UserError: if the spaces of an environment are not those that the world declares.
+        """
+        if driver != "agent" or action_repeat != 1:
+            raise UserError(f"{type(self).__name__} has no driver of its own and repeats no actions")
+        return Batch(self, cells, action_type)

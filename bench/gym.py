@@ -1,0 +1,8 @@
+"""Gymnasium: every driving world as an environment, and `GymWorld`, a world made of a gymnasium environment.
+
+Importing this module registers an environment `cavbench/WORLD-v0` for each installed driving world.
+"""
+
+from cavbench.driving.gym import DrivingEnv, DrivingVectorEnv, GymWorld, make, make_vec
+
+__all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "make", "make_vec"]
