@@ -26,7 +26,7 @@ from cavbench.run.options import RunOptions
 from tests.command import Said
 
 Bench = Callable[..., Said]
-COMMAND = "import sys; sys.argv = ['bench']; from cavbench import main; main()"
+COMMAND = "import sys; sys.argv = ['bench']; from cavbench.__main__ import main; main()"
 
 
 def test_bench_alone_shows_its_commands(bench: Bench) -> None:
@@ -137,7 +137,7 @@ def test_help_names_every_option_with_the_default_that_it_has() -> None:
 
 def test_an_unknown_name_is_refused_before_torch_is_imported() -> None:
     command = (
-        "import sys; sys.argv = ['bench', 'run', 'attack=zzo']; from cavbench import main\n"
+        "import sys; sys.argv = ['bench', 'run', 'attack=zzo']; from cavbench.__main__ import main\n"
         "try:\n    main()\nfinally:\n    print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)

@@ -150,7 +150,7 @@ def test_the_code_digest_covers_only_the_code_that_computes_a_unit() -> None:
 
 def test_every_module_excluded_from_the_digest_exists() -> None:
     for name in fingerprint.BESIDE_THE_RESULT:
-        assert importlib.util.find_spec(f"bench.{name}"), f"{name} is gone: take it off the list"
+        assert importlib.util.find_spec(f"cavbench.{name}"), f"{name} is gone: take it off the list"
 
 
 def test_canonical_json_does_not_depend_on_the_order_of_keys() -> None:

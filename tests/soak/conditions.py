@@ -85,7 +85,7 @@ def bad_input(site: Path, place: Path) -> str:
 
     They run in copies of one process that has imported everything; every twentieth also in a new one, which must say the same.
     """
-    for module in pkgutil.walk_packages(cavbench.__path__, "bench."):
+    for module in pkgutil.walk_packages(cavbench.__path__, "cavbench."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     wrong, other = [], 0
