@@ -27,9 +27,11 @@ tree:
 	mkdir -p build/tree/cavbench
 	for name in bench/* attacks defenses envs leaderboard; do ln -s ../../../$$name build/tree/cavbench; done
 
-# The site, in docs/_build/html. A broken link, a page missing from the contents or an unknown component is an error.
+# The site, in docs/_build/html. A broken link, a page missing from the contents, an unknown component or a sentence of more than 30 words
+# (docs/prose.py) is an error.
 docs: install-dev
 	rm -rf docs/_build
+	$(BIN)/python docs/prose.py
 	$(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
 
 # The wheel in an environment of its own: installs it, and runs a first command. Takes minutes and 2 GB.

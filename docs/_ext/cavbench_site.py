@@ -1,4 +1,4 @@
-"""Sphinx extension of the site: parameters read from the code, MathML formulas, docstrings, and the leaderboard's page."""
+"""Sphinx extension of the site: what is read from code and records, MathML formulas, docstrings, the leaderboard's page."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any, get_args
 from docutils import nodes
 from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
+from glossary_terms import TermsDirective
+from published_rows import PublishedRowsDirective
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon import GoogleDocstring
@@ -116,6 +118,8 @@ def _copy_leaderboard(app: Sphinx, failure: Exception | None) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Called by Sphinx."""
     app.add_directive("component", ComponentDirective)
+    app.add_directive("terms", TermsDirective)
+    app.add_directive("published-rows", PublishedRowsDirective)
     app.add_html_math_renderer("mathml", inline_renderers=(_formula, None), block_renderers=(_formula, None))
     app.connect("autodoc-process-docstring", _google_style)
     # Before Sphinx collects downloads.

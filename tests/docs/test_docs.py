@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import textwrap
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from cavbench.cli.early import check_names
 from cavbench.cli.explain import GLOSSARY
 from cavbench.core.registry import GROUPS, KINDS, Kind, entries
+from docs.prose import findings
 from tests.tree import ROOT
 
 DOCS = ROOT / "docs"
@@ -47,7 +49,7 @@ PLACEHOLDERS = ("…", "=N", "my_", "NAME", "$SLURM")
 
 def _commands(page: Path) -> list[list[str]]:
     """Every `bench ...` of a page, in code blocks and in the text."""
-    text = page.read_text()
+    text = re.sub(r"\\\n\s*", "", page.read_text())
     blocks = re.findall(r"^(?:    +|\$ )?(bench .+)$", text, re.M)
     return [shlex.split(one, comments=True) for one in (*blocks, *re.findall(r"(?<!`)`(bench [^`]+)`", text))]
 
@@ -83,7 +85,8 @@ def test_the_site_reads_the_code_and_refuses_unknown_names(tmp_path: Path) -> No
     source.mkdir()
     (source / "index.md").write_text(
         "# Page\n\n$$ \\frac{a}{b} $$\n\n$\\nosuchcommand$\n\n[ranking](../leaderboard/index.html)\n\n"
-        "```{component} attack\nbench list noise\n```\n\n```{component} attack\nbench list nois\n```\n"
+        "```{component} attack\nbench list noise\n```\n\n```{component} attack\nbench list nois\n```\n\n"
+        "```{terms}\nbench help\n```\n\n```{published-rows}\nbench report leaderboard\n```\n"
     )
     (tmp_path / "leaderboard").mkdir()
     (tmp_path / "leaderboard" / "index.html").write_text("<p>ranks</p>")
@@ -98,6 +101,7 @@ def test_the_site_reads_the_code_and_refuses_unknown_names(tmp_path: Path) -> No
     assert row
     assert "<p>uniform</p>" in row[0]
     assert "one of uniform, gaussian" in row[0]
+    assert re.search(r"<dt>budget</dt><dd><p>The size of the perturbation set", page)
     assert 'href="leaderboard/index.html"' in page
     assert (built / "leaderboard" / "index.html").read_text() == "<p>ranks</p>"
     complaints = warned.read_text()
@@ -105,11 +109,7 @@ def test_the_site_reads_the_code_and_refuses_unknown_names(tmp_path: Path) -> No
     assert r'Unknown LaTeX command "\nosuchcommand"' in complaints
 
 
-def test_the_glossary_is_that_of_bench_help() -> None:
-    terms = tomllib.loads(GLOSSARY.read_text(encoding="utf-8"))
-    rows = re.findall(r"^\| (.+?) \| (.+) \[More\]\((.+)\.md\) \|$", (DOCS / "glossary.md").read_text(), re.M)
-    assert {name: (meaning.replace("&lt;", "<"), page) for name, meaning, page in rows} == {
-        name: (entry["meaning"], entry["page"]) for name, entry in terms.items()
-    }
-    for entry in terms.values():
-        assert (DOCS / f"{entry['page']}.md").is_file()
+def test_every_term_of_bench_help_has_a_page_and_keeps_the_rules_of_prose() -> None:
+    for name, entry in tomllib.loads(GLOSSARY.read_text(encoding="utf-8")).items():
+        assert (DOCS / f"{entry['page']}.md").is_file(), name
+        assert list(findings(textwrap.fill(entry["meaning"], 120))) == [], name

@@ -112,7 +112,7 @@ def test_the_version_is_the_same_everywhere() -> None:
         "CITATION.cff": rf"^version: {re.escape(version)}$",
         "README.md": rf"version = {{{re.escape(version)}}}",
         "docs/submit.md": rf"version = {{{re.escape(version)}}}",
-        "docs/quick_start.md": rf"cavbench-{re.escape(version)}-py3-none-any\.whl",
+        "docs/install.md": rf"cavbench-{re.escape(version)}-py3-none-any\.whl",
     }
     assert [name for name, text in written.items() if not re.search(text, (TREE / name).read_text(), re.M)] == []
 
