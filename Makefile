@@ -1,6 +1,6 @@
 # make run: installs what running needs and prints the first score. make test, make lint, make docs: the checks of CI.
-# make bench: the speed figures. make licences: the licence of all that is installed. make wheel-check: the wheel in an environment
-# of its own. All but `run` install what development needs.
+# make bench: the speed figures, half an hour. make licences: the licence of all that is installed. make wheel-check: the wheel in an
+# environment of its own. All but `run` install what development needs.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -38,6 +38,7 @@ docs: install-dev
 wheel-check: install-dev
 	CAVBENCH_WHEEL_CHECK=1 $(BIN)/python -m pytest tests/packaging/test_packaging.py
 
+# Each figure is a ratio to a peer that the same run measured. The experiments are in studies/: they take options and hours.
 bench: install-dev
 	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 

@@ -1,9 +1,9 @@
 """Measures the back ends: what a driver sustains with tasks that do nothing, and Ray against processes on one pair.
 
     python benchmarks/executor_speed.py
-    python benchmarks/executor_speed.py --tasks 500 --episodes 50 --rounds 1
+    python benchmarks/executor_speed.py --tasks 2000 --rounds 3
 
-Prints the figures that docs/scale.md and `benchmarks/cluster_cost.py` use. Capacity is the number of tasks for which a second of
+Prints the figures that docs/scale.md and `studies/cluster_cost.py` use. Capacity is the number of tasks for which a second of
 the driver's CPU time is enough: on a busy machine wall time says little. Ray and processes drive the pair in turns; the ratios of
 wall time and of the CPU time of all processes are medians over the rounds.
 """
@@ -147,11 +147,11 @@ def pair_seconds(name: str, attack: str, episodes: int) -> tuple[float, float, f
 def main() -> None:
     """Measure, and print."""
     parser = argparse.ArgumentParser(description="Measure the back ends of `bench run`.")
-    parser.add_argument("--tasks", type=int, default=2000, help="tasks that do nothing")
+    parser.add_argument("--tasks", type=int, default=500, help="tasks that do nothing")
     parser.add_argument("--attack", default="noise", help="attack of the pair; a longer pair hides the start of Ray")
     parser.add_argument("--episodes", type=int, default=100, help="episodes of a unit of the pair")
     parser.add_argument(
-        "--rounds", type=int, default=3, help="runs of the pair with each back end, in turns; 0 for none"
+        "--rounds", type=int, default=1, help="runs of the pair with each back end, in turns; 0 for none"
     )
     arguments = parser.parse_args()
     names = ["processes", *(["ray"] if importlib.util.find_spec("ray") else [])]

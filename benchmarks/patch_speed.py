@@ -1,6 +1,6 @@
 """Measures the time of crafting a patch, compared with the detector's passes alone, and of scoring a patch:
 
-    python benchmarks/patch_speed.py [--bank FOLDER] [--rounds 10] [--steps 4]
+    python benchmarks/patch_speed.py [--bank FOLDER] [--rounds 3] [--steps 4]
 
 Alternates steps of `eot` at its defaults with as many forward and backward passes of the detector alone, in one process and one
 thread; likewise rendering the frames of an approach with rendering and detecting. Prints medians over the rounds, because the
@@ -33,7 +33,7 @@ CLOCKS = ("processor", "wall")
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--bank", default="", help="folder of rendered frames (default: the shipped ones)")
-    parser.add_argument("--rounds", type=int, default=10)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=4, help="steps of the attack per round")
     arguments = parser.parse_args()
     settle()

@@ -1,6 +1,6 @@
 """Measures what is saved by scoring several patches on the same approaches together, as `bench run` does:
 
-    python benchmarks/patches_together.py [--victim yolov3_tiny] [--defense none] [--patches 6] [--rounds 3]
+    python benchmarks/patches_together.py [--victim yolov3_tiny] [--defense none] [--patches 6] [--rounds 1]
 
 Alternates units that are carried out one by one with the same units in one batch, in one process and one thread, on one cell of
 `approach-v1`, with random patches. Prints CPU seconds, medians over the rounds, and the median of the ratios of the rounds.
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--victim", default="yolov3_tiny")
     parser.add_argument("--defense", default="none")
     parser.add_argument("--patches", type=int, default=6)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=1)
     asked = parser.parse_args()
     settle()
     jobs, artefacts = work(asked.victim, asked.defense, asked.patches)

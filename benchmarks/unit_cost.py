@@ -1,6 +1,6 @@
 """Measures what a unit of driving costs besides the victim's network:
 
-    python benchmarks/unit_cost.py [--attacks zo noise pgd] [--victim dqn] [--episodes 30] [--units 9] [--rounds 3]
+    python benchmarks/unit_cost.py [--attacks zo noise pgd] [--victim dqn] [--episodes 20] [--units 3] [--rounds 1]
 
 Prints the CPU time of units in one thread as a ratio to the victim's forward passes alone, with the same number of observations
 in batches of a thousand; a query with a gradient counts as a forward and a backward pass. `alone` drives the units one by one,
@@ -39,9 +39,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--attacks", nargs="+", default=["zo", "noise", "pgd"])
     parser.add_argument("--victim", default="dqn")
-    parser.add_argument("--episodes", type=int, default=30, help="episodes of a unit")
-    parser.add_argument("--units", type=int, default=9, help="units of each density, at most 9")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--episodes", type=int, default=20, help="episodes of a unit")
+    parser.add_argument("--units", type=int, default=3, help="units of each density, at most 9")
+    parser.add_argument("--rounds", type=int, default=1)
     arguments = parser.parse_args()
     settle()
     print(

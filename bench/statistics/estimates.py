@@ -1,7 +1,7 @@
 """Means with 95 % intervals over two crossed random factors: the training (runs) and the scenario.
 
-Pure functions on arrays; `cavbench.statistics.episodes` says what the arrays mean. docs/metrics.md derives the intervals and has
-the table of their coverage (`python -m tests.leaderboard.simulated_studies`).
+Pure functions on arrays; `cavbench.statistics.episodes` says what the arrays mean. docs/statistics.md derives the intervals.
+studies/interval_coverage.md has the table of their coverage (`python -m tests.leaderboard.simulated_studies`).
 """
 
 from __future__ import annotations

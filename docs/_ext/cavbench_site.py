@@ -103,6 +103,28 @@ def _link_leaderboard(app: Sphinx, doctree: nodes.document) -> None:
             link.replace_self(nodes.reference("", "", *link.children, refuri=up + target, internal=True))
 
 
+STUDIES = "studies"
+"""The lab book beside `docs`. Its Markdown is copied as it is, and is no part of the contents."""
+
+
+def _link_studies(app: Sphinx, doctree: nodes.document) -> None:
+    """Point links to the lab book at its copy in the site. Sphinx looks for a page, and warns if there is no such file."""
+    up, folder = "../" * app.env.docname.count("/"), (app.srcdir.parent / STUDIES).resolve()
+    for link in list(doctree.findall(addnodes.pending_xref)):
+        file = (app.srcdir / f"{link['reftarget']}.md").resolve()
+        if file.parent == folder and file.is_file():
+            link.replace_self(
+                nodes.reference("", "", *link.children, refuri=f"{up}{STUDIES}/{file.name}", internal=True)
+            )
+
+
+def _copy_studies(app: Sphinx, failure: Exception | None) -> None:
+    target = Path(app.outdir) / STUDIES
+    for page in (app.srcdir.parent / STUDIES).glob("*.md") if failure is None else ():
+        target.mkdir(exist_ok=True)
+        shutil.copyfile(page, target / page.name)
+
+
 def _copy_leaderboard(app: Sphinx, failure: Exception | None) -> None:
     for name in LEADERBOARD if failure is None else ():
         source, target = app.srcdir.parent / name, Path(app.outdir) / name
@@ -125,4 +147,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     # Before Sphinx collects downloads.
     app.connect("doctree-read", _link_leaderboard, priority=400)
     app.connect("build-finished", _copy_leaderboard)
+    app.connect("doctree-read", _link_studies, priority=400)
+    app.connect("build-finished", _copy_studies)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -36,4 +36,4 @@ STANDARD_V1 = Grid(
 )
 
 STANDARD_V2 = replace(STANDARD_V1, name="standard-v2", episodes=30, block=10, training_seeds=10)
-"""At the cost of `STANDARD_V1`, the split between trainings and scenarios that makes intervals narrow (docs/metrics.md)."""
+"""At the cost of `STANDARD_V1`, the split between trainings and scenarios that makes intervals narrow (docs/statistics.md)."""

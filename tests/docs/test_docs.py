@@ -109,6 +109,24 @@ def test_the_site_reads_the_code_and_refuses_unknown_names(tmp_path: Path) -> No
     assert r'Unknown LaTeX command "\nosuchcommand"' in complaints
 
 
+@pytest.mark.slow
+def test_links_to_studies_lead_to_their_copies_in_the_site(tmp_path: Path) -> None:
+    from sphinx.application import Sphinx
+
+    for folder in ("docs", "studies"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "docs" / "index.md").write_text("# Page\n\n[notes](../studies/notes.md), [lost](../studies/lost.md)\n")
+    (tmp_path / "studies" / "notes.md").write_text("# What was tried\n")
+    (warned := tmp_path / "warned").touch()
+    with warned.open("w") as warning:
+        Sphinx(
+            tmp_path / "docs", DOCS, tmp_path / "site", tmp_path / "trees", "html", status=None, warning=warning
+        ).build()
+    assert 'href="studies/notes.md"' in (tmp_path / "site" / "index.html").read_text()
+    assert (tmp_path / "site" / "studies" / "notes.md").read_text() == "# What was tried\n"
+    assert "studies/lost" in warned.read_text()
+
+
 def test_every_term_of_bench_help_has_a_page_and_keeps_the_rules_of_prose() -> None:
     for name, entry in tomllib.loads(GLOSSARY.read_text(encoding="utf-8")).items():
         assert (DOCS / f"{entry['page']}.md").is_file(), name

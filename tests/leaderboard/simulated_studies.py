@@ -1,6 +1,6 @@
 """How often the intervals that a leaderboard prints hold the truth, in simulated studies.
 
-    python -m tests.leaderboard.simulated_studies 400            # the tables in docs/metrics.md, with so many studies a line
+    python -m tests.leaderboard.simulated_studies 400  # studies/interval_coverage.md, with so many studies a line
     python -m tests.leaderboard.simulated_studies 200 unequal   # one of them: coverage, bad or unequal
 
 A study is a set of records: two defended victims under two attacks each, on the clear roads of the standard grid. Each episode
@@ -200,7 +200,7 @@ NAMES = ("score", "crash rate", "difference of rows", "against blind", "effect o
 
 
 def tables(count: int, only: str = "") -> Iterator[str]:
-    """The tables in docs/metrics.md."""
+    """The tables in studies/interval_coverage.md."""
     if only in ("", "coverage"):
         yield f"| variance of | seeds | {' | '.join(NAMES)} |\n|---|---|{'---|' * len(NAMES)}"
         for title, study in STUDIES.items():

@@ -73,7 +73,7 @@ def _part(scores: Array, truth: float, until: float) -> Array:
 
 
 def main() -> None:
-    """Print the table of docs/metrics.md."""
+    """Print the table of studies/stop_coverage.md."""
     studies = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
     lines = [
         "| scores of scenarios | until | always | at the stop | ordinary | scenarios | ± at the stop |",

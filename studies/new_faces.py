@@ -1,6 +1,6 @@
 """Measures what detectors say of signs that are neither scored nor in any training: real traffic signs, and red octagons.
 
-    python benchmarks/new_faces.py [--victims yolov3_tiny rcnn] [--defenses none advtrain_detection] [--lanes 3] [--picture FILE]
+    python studies/new_faces.py [--victims yolov3_tiny rcnn] [--defenses none advtrain_detection] [--lanes 3] [--picture FILE]
 
 For each face: the mean confidence at the place of the sign, and in brackets the false stops a frame. The frames are those that
 are scored, each with the face in the place of the stop sign. The last two faces are red octagons with a white rim, without the

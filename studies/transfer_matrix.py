@@ -1,6 +1,6 @@
 """Scores detectors under patches that were crafted against other detectors, and against several at once (`transfer`).
 
-    python benchmarks/transfer_matrix.py [--detectors yolov3_tiny yolov5 fcos rcnn] [--hardened yolov3_tiny] [--steps 600]
+    python studies/transfer_matrix.py [--detectors yolov3_tiny yolov5 fcos rcnn] [--hardened yolov3_tiny] [--steps 600]
         [--cutout 0.9] [--shake-drop 0] [--lanes 3 4] [--weathers clear rain] [--rows rcnn]
 
 Each row is a patch, each column a detector that sees it; hardened detectors have columns only. On the diagonal the attack is a

@@ -1,4 +1,4 @@
-"""What each member of a suite costs and takes: python -m benchmarks.suite_cost [SUITE] [EPISODES].
+"""What each member of a suite costs and takes: python studies/suite_cost.py [SUITE] [EPISODES].
 
 One pair (`dqn`, adversarially trained, seed 0) on 4 lanes, density 1, clear weather. CPU seconds of the whole rollout, one
 thread, after a first one that compiles; the scenarios are those that tune attacks.

@@ -1,6 +1,6 @@
 """Scores defences against a patch that does not know of them: `eot` crafts it against the undefended detector.
 
-    python benchmarks/unaware_patch.py segmenter [--victim yolov3_tiny] [--steps 150] [--lanes 3 4] [--weathers clear rain]
+    python studies/unaware_patch.py segmenter [--victim yolov3_tiny] [--steps 150] [--lanes 3 4] [--weathers clear rain]
 
 `bench run` crafts against the defended detector. The difference between the two scores is what an attack gains that knows of the
 defence. The columns are those of the records, means over all approaches.

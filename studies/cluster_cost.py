@@ -1,7 +1,7 @@
 """Simulates what the whole leaderboard takes on a cluster, from figures that were measured on two cores:
 
-    python benchmarks/cluster_cost.py
-    python benchmarks/cluster_cost.py --cores 16 256 --price 0.02 --driver-ms 3
+    python studies/cluster_cost.py
+    python studies/cluster_cost.py --cores 16 256 --price 0.02 --driver-ms 3
 
 Every core takes the longest task that is left, sends it back when it is done, and asks for the next one. Tasks are batches as
 `bench run` makes them; the work that units of a batch share is left out. The driver does one thing at a time: it sends tasks,
@@ -32,7 +32,7 @@ MEMBERS_S = {
     "zo": 4.6,
     "noise": 1.1,
 }
-"""CPU seconds of a member of the suite on 10 scenarios: `python -m benchmarks.suite_cost standard 10` (4 lanes, density 1)."""
+"""CPU seconds of a member of the suite on 10 scenarios: `python studies/suite_cost.py standard 10` (4 lanes, density 1)."""
 SCENARIOS, BLOCKS = 10, 3
 """Of a unit of standard-v2, and the units of a cell."""
 DENSITY_2 = 1.5

@@ -1,6 +1,6 @@
 """Scores `temporal` with and without an attack that knows of it, on scored approaches and in closed loop.
 
-    python benchmarks/temporal_evidence.py [--defense segmenter] [--steps 300] [--weathers clear rain] [--patches FOLDER]
+    python studies/temporal_evidence.py [--defense segmenter] [--steps 300] [--weathers clear rain] [--patches FOLDER]
 
 Each frame is looked at once; the rows with and without `temporal` differ in what they make of the same predictions. The patches
 are `noise_patch`, the stronger `eot` of the suite `standard` with one start, which does not know of `temporal`, and the same
@@ -96,7 +96,7 @@ def _crafted(attack: PatchAttack, detector: Detector, kept: Path | None) -> Patc
     patch = craft(attack, detector, WORLD.training_scenes(), THREAT, attack_seed=0, progress=lambda share, text: None)
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(patch.written("benchmarks/temporal_evidence.py"))
+        path.write_bytes(patch.written("studies/temporal_evidence.py"))
     return patch
 
 

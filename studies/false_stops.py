@@ -1,6 +1,6 @@
 """Says where detectors see stop signs that are not there: on which decoys, and on what else in the image.
 
-    python benchmarks/false_stops.py [--victims yolov5] [--weathers clear rain] [--lanes 3 4]
+    python studies/false_stops.py [--victims yolov5] [--weathers clear rain] [--lanes 3 4]
 
 False stops a frame, on the frames with decoys at the places that are scored. A detection is on the decoy if it overlaps the place
 of the sign, on another object if it overlaps its box, and otherwise in the background.

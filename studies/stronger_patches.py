@@ -1,6 +1,6 @@
 """Measures what a detector keeps under other variants of the last `eot` of `standard-detection-3`.
 
-    python benchmarks/stronger_patches.py [--victim yolov5] [--defense advtrain_detection] [--only NAME ...] [--device cuda]
+    python studies/stronger_patches.py [--victim yolov5] [--defense advtrain_detection] [--only NAME ...] [--device cuda]
 
 Each line is one patch, crafted on the training places and shown in the approaches of four cells (three and four lanes, clear and
 rain): the mean confidence at the sign, the lowest mean of an approach, and the images that the attack asked about. `suite`,

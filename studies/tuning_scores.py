@@ -1,4 +1,4 @@
-"""Scores on the tuning seeds, which are never reported: `python benchmarks/tuning_scores.py victim=planner episodes=16`.
+"""Scores on the tuning seeds, which are never reported: `python studies/tuning_scores.py victim=planner episodes=16`.
 
 Takes the options of `bench run` that choose pairs, cells, training seeds and episodes, and keeps no records.
 """

@@ -1,6 +1,6 @@
 """Measures what detectors say of decoys: faces that no training sees, which are scored, and the faces of the training scenes.
 
-    python benchmarks/decoy_faces.py [--victims yolov3_tiny] [--skips 0.3] [--weathers clear rain] [--lanes 3]
+    python studies/decoy_faces.py [--victims yolov3_tiny] [--skips 0.3] [--weathers clear rain] [--lanes 3]
 
 The places are those that are scored, so both kinds of faces are seen at places that no detector was trained at. The means are
 over the frames of all approaches; the training faces take turns in them as the others do.

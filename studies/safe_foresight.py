@@ -1,6 +1,6 @@
 """How much of the way to perfect information `planner` wins if it knows the future, within the same margins.
 
-    python benchmarks/safe_foresight.py [--lanes 3 4 5] [--density 1 2] [--episodes 16] [--assumed-budget 0 0.1]
+    python studies/safe_foresight.py [--lanes 3 4 5] [--density 1 2] [--episodes 16] [--assumed-budget 0 0.1]
 
 Tuning seeds, clear weather, no attack. `rules` is `planner`. `foresight` knows the future: in every frame it rolls 64 plans of
 4 s in copies of the simulator, as `oracle_planner` does, but takes only actions that `planner` holds to be safe; where none is,
