@@ -18,8 +18,8 @@ import torch
 
 from cavbench.attacks.detection.eot import EOT
 from cavbench.detection import STOP_SIGN, Detector, PatchThreat, Scenes
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.approach import look
-from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
 from cavbench.envs.camera.axes import APPROACH_V1
 from cavbench.envs.camera.world import StopSignApproach

@@ -16,6 +16,7 @@ from cavbench.core.contracts import Access, Facts, Progress
 from cavbench.core.pair import choose
 from cavbench.core.ranges import Count, NotNegative, Share
 from cavbench.detection import STOP_SIGN, Detector, DetectorVictim, PatchOracle, Predictions, Scenes
+from cavbench.detection.access import PatchEnforcer
 from cavbench.errors import UserError
 from cavbench.scenarios.axes import Axes
 
@@ -64,7 +65,11 @@ class Transfer(EOT):
         detectors = self._detectors()
         if self.shake_drop and not sum(shake(each, self.shake_drop, oracle.generator) for each in detectors):
             raise UserError(f"attack.shake_drop={self.shake_drop:g}: {self.surrogates} has no residual branches")
-        return super().craft(_InsteadOfTheVictim(detectors, oracle), scenes, progress)
+        # What `eot` asks instead of the victim; intermediate patches are reported as those of the victim's oracle.
+        surrogates = PatchEnforcer(
+            Turns(detectors), oracle.threat, "gradients", oracle.generator, reports=oracle.reports
+        )
+        return super().craft(surrogates.oracle, scenes, progress)
 
     def misfit(self, victim: DetectorVictim) -> str:
         """A patch against the victim itself would not be one of somebody who knows nothing about it."""
@@ -85,32 +90,22 @@ class Transfer(EOT):
             return [victim.load(0, Facts(axes=Axes(()))) for victim in self._victims()]
 
 
-class _Turns:
-    """The surrogates' side of an oracle: each question goes to the next of them."""
+class Turns(Detector):
+    """A detector of the stop sign alone, which hands each batch of images to the next of some detectors.
+
+    Args:
+        detectors: they take turns.
+    """
+
+    names = (STOP_SIGN,)
 
     def __init__(self, detectors: Sequence[Detector]) -> None:
-        self.detectors, self.spent = cycle(detectors), 0
+        super().__init__()
+        self.stride = max(detector.stride for detector in detectors)
+        self._turns = cycle(detectors)
 
-    def ask(self, pictures: Tensor, access: Access) -> Predictions:
-        detector = next(self.detectors)
-        self.spent += len(pictures)
+    def predict(self, pictures: Tensor) -> Predictions:
+        detector = next(self._turns)
         predictions = detector(pictures)
         of_sign = predictions.scores_of(detector.index(STOP_SIGN))
         return Predictions(predictions.boxes, of_sign, torch.ones_like(of_sign)[..., None])
-
-    def aggregate(self, scores: Tensor) -> Tensor:
-        return scores
-
-
-class _InsteadOfTheVictim(PatchOracle):
-    """What `eot` asks instead of the victim's oracle; intermediate patches are reported to that one."""
-
-    def __init__(self, detectors: Sequence[Detector], victims: PatchOracle) -> None:
-        stride = max(detector.stride for detector in detectors)
-        super().__init__(
-            _Turns(detectors), victims.threat, victims.generator, label=0, stride=stride, names=(STOP_SIGN,)
-        )
-        self._victims = victims
-
-    def report(self, patch: Tensor, **losses: Tensor | float) -> None:
-        self._victims.report(patch, **losses)

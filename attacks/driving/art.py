@@ -96,7 +96,7 @@ class ART(DrivingAttack):
         seed = int(torch.randint(2**31, (1,), generator=oracle.generator))
         best, everyone = observation.clone(), torch.arange(len(observation))
         for rows in (everyone,) if self.choice in BATCHED else everyone.split(1):
-            search = Search(oracle, rows, clean[rows], self._target)
+            search = Search(oracle.select(rows), clean[rows], self._target)
             if search.over:
                 continue
             origin = search.origin()

@@ -41,15 +41,14 @@ class Search:
     more queries) once its goal is met or its next queries would exceed the budget.
 
     Args:
-        oracle: access to the victim.
-        rows: the episodes [n].
+        oracle: access to the victim in the n episodes.
         clean: the victim's scores on the true observations [n, C], or its decisions [n] for a decision-based attack.
         target: the target action; None for any action other than the clean one.
     """
 
-    def __init__(self, oracle: Oracle, rows: Tensor, clean: Tensor, target: int | None) -> None:
-        self._oracle, self._rows, self._targeted = oracle, rows, target is not None
-        self._truth, self._radius = oracle.observation[rows], oracle.radius[rows]
+    def __init__(self, oracle: Oracle, clean: Tensor, target: int | None) -> None:
+        self._oracle, self._targeted = oracle, target is not None
+        self._truth, self._radius = oracle.observation, oracle.radius
         decision = clean if clean.ndim == 1 else clean.argmax(-1)
         wanted = decision if target is None else torch.full_like(decision, target)
         # A decision is class 1 if it is the wanted action, else class 0. Class 2 is never used: some of ART's attacks need at
@@ -61,7 +60,7 @@ class Search:
         self._lead = self._leads(scores, self.labels).tolist()
         self._running = [lead >= 0 for lead in self._lead]
         self._known: dict[object, Array] = {}
-        self._keep(self._keys(range(len(rows)), self.origin(), [""] * len(rows)), scores)
+        self._keep(self._keys(range(len(clean)), self.origin(), [""] * len(clean)), scores)
 
     @property
     def over(self) -> bool:
@@ -82,11 +81,12 @@ class Search:
 
         def ask(fresh: list[int]) -> Tensor:
             at = torch.tensor([places[n] for n in fresh])
-            shown = self._shown(points[fresh], at)
+            oracle = self._oracle.select(at)
+            shown = _shown(points[fresh], oracle)
             if self._action is None:
-                scores = self._oracle.scores(shown, self._rows[at])
+                scores = oracle.scores(shown)
             else:
-                scores = _classified(self._oracle.decide(shown, self._rows[at]) == self._action[at])
+                scores = _classified(oracle.decide(shown) == self._action[at])
             self._judge(shown, scores, at)
             return scores
 
@@ -100,16 +100,17 @@ class Search:
 
         def ask(fresh: list[int]) -> Tensor:
             at = torch.tensor([places[n] for n in fresh])
-            shown, answered = self._shown(points[fresh], at), []
+            oracle, answered = self._oracle.select(at), []
+            shown = _shown(points[fresh], oracle)
 
             def taken(scores: Tensor) -> Tensor:
                 answered.append(scores.detach())
                 return value(scores, labels[fresh])
 
-            _, gradient = self._oracle.gradient(shown, taken, self._rows[at])
+            _, gradient = oracle.gradient(shown, taken)
             self._keep(self._keys(at.tolist(), points[fresh], [""] * len(fresh)), answered[0])
             self._judge(shown, answered[0], at)
-            return functional.pad((gradient * self._radius[at])[..., 1:], (0, 1, 0, 1)).unsqueeze(1)
+            return functional.pad((gradient * oracle.radius)[..., 1:], (0, 1, 0, 1)).unsqueeze(1)
 
         asked = [f"{value.__name__} {label}" for label in labels.tolist()]
         answers = self._look_up(places, self._keys(places, points, asked), ask)
@@ -124,7 +125,7 @@ class Search:
             OverError: if all episodes are over.
         """
         if unknown := [n for n, key in enumerate(keys) if self._running[places[n]] and key not in self._known]:
-            left = self._oracle.remaining[self._rows].tolist()
+            left = self._oracle.remaining.tolist()
             for place, wanted in Counter(places[n] for n in unknown).items():
                 self._running[place] = wanted <= left[place]
             if fresh := [n for n in unknown if self._running[places[n]]]:
@@ -135,7 +136,7 @@ class Search:
 
     def _places(self, count: int) -> Sequence[int]:
         """The episode of each of `count` points: all of a single episode, one of every episode, or one of every running one."""
-        everyone = range(len(self._rows))
+        everyone = range(len(self._truth))
         if len(everyone) == 1:
             return [0] * count
         return everyone if count == len(everyone) else [at for at in everyone if self._running[at]]
@@ -146,11 +147,6 @@ class Search:
 
     def _keep(self, keys: Sequence[object], answers: Tensor) -> None:
         self._known.update(zip(keys, answers.float().numpy(), strict=True))
-
-    def _shown(self, points: Array, at: Tensor) -> Tensor:
-        """The observations [N, V, F] of points."""
-        z = functional.pad(torch.from_numpy(points[:, 0, :-1, :-1]).to(self._truth), (1, 0))
-        return self._oracle.project(self._truth[at] + self._radius[at] * z, self._rows[at])
 
     def _leads(self, scores: Tensor, labels: Tensor) -> Tensor:
         """Distance to the goal [N] in scores [N, C]; the goal is met below 0."""
@@ -208,6 +204,12 @@ class Classifier(ClassGradientsMixin, ClassifierMixin, LossGradientsMixin, Neura
 
     def get_activations(self, x: Array, layer: int | str, batch_size: int, framework: bool = False) -> Array:
         raise NotImplementedError("an attack has access to decisions, scores and gradients only")
+
+
+def _shown(points: Array, oracle: Oracle) -> Tensor:
+    """The observations [N, V, F] of points [N, 1, V + 1, F], one for each episode of the oracle."""
+    z = functional.pad(torch.from_numpy(points[:, 0, :-1, :-1]).to(oracle.observation), (1, 0))
+    return oracle.project(oracle.observation + oracle.radius * z)
 
 
 def _points(x: Array) -> Array:

@@ -18,8 +18,8 @@ from torchrl.envs import EnvBase
 
 from cavbench.attacks.driving.targets import Targets
 from cavbench.core.ranges import Count, Share
-from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingWorld, ObservationThreat, Oracle, Policy, State
-from cavbench.driving.enforcer import Enforcer
+from cavbench.driving import ActionType, Control, DrivingFacts, DrivingWorld, ObservationThreat, Oracle, Policy, State
+from cavbench.driving.access import Enforcer
 from cavbench.driving.victim import CountedPolicy
 from cavbench.driving.victims.dqn import DQN
 from cavbench.scenarios import Cell
@@ -81,21 +81,14 @@ class AdversaryWorld(DrivingWorld):
     def facts(self) -> DrivingFacts:
         return self.world.facts
 
-    def make(
-        self,
-        cells: Sequence[Cell],
-        *,
-        action_type: ActionType = "discrete",
-        driver: Driver = "agent",
-        action_repeat: int = 1,
-    ) -> EnvBase:
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
         """An environment as of `world`, with int64 targets [B] as actions; the victim decides at every frame."""
-        env = self.world.make(cells, action_type=self.action_type, driver=driver)
-        return _AdversaryEnv(env, self.facts, self.count, self.driver, action_repeat)
+        env = self.world.make(cells, action_type=self.action_type, driver=control.driver)
+        return _AdversaryEnv(env, self.facts, self.count, self.driver, control.action_repeat)
 
 
 class _AdversaryEnv(EnvBase):
-    """Executes each target for `repeat` frames. Arguments as in `AdversaryWorld.make`."""
+    """Executes each target for `repeat` frames. Arguments as in `AdversaryWorld`."""
 
     batch_locked = True
 

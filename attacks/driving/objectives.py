@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -87,6 +87,9 @@ class DiscreteLoss:
     Raises:
         ValueError: if the victim has no such action.
     """
+
+    price: ClassVar[int] = 1
+    """Queries for one point."""
 
     objective: Objective
     clean: Tensor
@@ -171,6 +174,9 @@ class ContinuousLoss:
         target: [acceleration, steering] to reach; None moves away from the clean action and is never met.
         tolerance: an action within this distance of the target has reached it.
     """
+
+    price: ClassVar[int] = 1
+    """Queries for one point."""
 
     clean: Tensor
     target: tuple[float, float] | None

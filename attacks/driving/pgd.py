@@ -10,10 +10,13 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from cavbench.attacks.driving.candidates import best_of, better, random_starts
+from cavbench.attacks.driving.critic import CriticLoss
 from cavbench.attacks.driving.objectives import ContinuousLoss, DiscreteLoss, Objective
+from cavbench.attacks.driving.timing import gap_misfit, timed
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Count, Natural, Positive, Share
-from cavbench.driving import DrivingAttack, parts_of
+from cavbench.driving import DrivingAttack
 
 if TYPE_CHECKING:
     from cavbench.driving import DrivingVictim, Oracle
@@ -84,183 +87,84 @@ class PGD(DrivingAttack):
     draw: Natural = 0
 
     def misfit(self, victim: DrivingVictim) -> str:
-        if self.gap > 0 and victim.action_type != "discrete":
-            return f"whose actions are {victim.action_type}: a preference gap needs discrete ones"
-        return super().misfit(victim)
+        return gap_misfit(self.gap, victim) or super().misfit(victim)
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if not len(observation) or int(oracle.remaining.min()) < 1:
             return observation
         clean = oracle.scores(observation)
-        if self.gap == 0:
-            return self._attacked(observation, clean, oracle)
-        rows = (preference_gap(clean, self.gap_temperature) >= self.gap).nonzero().squeeze(-1)
-        shown = observation.clone()
-        if len(rows):
-            shown[rows] = self._attacked(observation[rows], clean[rows], oracle, rows)
-        return shown
+        return timed(self._attacked, observation, clean, oracle, gap=self.gap, temperature=self.gap_temperature)
 
-    def _attacked(self, observation: Tensor, clean: Tensor, oracle: Oracle, rows: Tensor | None = None) -> Tensor:
-        """The attacked observations of all episodes, or of `rows`, whose clean scores are known."""
-        price = self._price(oracle)
-        if _left(oracle, rows) < 3 * price - 1:
+    def _attacked(self, observation: Tensor, clean: Tensor, oracle: Oracle) -> Tensor:
+        loss = self._loss(observation, clean, oracle)
+        if int(oracle.remaining.min()) < 3 * loss.price - 1:
             return observation
-        loss, key = self._loss(observation, clean, oracle)
         # The scores on the true observation are known: it is the first candidate.
-        return self.descend(observation, oracle, loss, key, rows, price=price, known=key(clean, loss(clean)))
+        known = loss.key(clean, loss(clean))
+        return self.descend(observation, oracle, loss, loss.key, price=loss.price, known=known)
 
     def descend(
-        self,
-        observation: Tensor,
-        oracle: Oracle,
-        loss: Loss,
-        key: Key,
-        rows: Tensor | None = None,
-        *,
-        price: int = 1,
-        known: Tensor | None = None,
+        self, observation: Tensor, oracle: Oracle, loss: Loss, key: Key, *, price: int = 1, known: Tensor | None = None
     ) -> Tensor:
         """The descent on any loss of the victim's scores: the point with the lowest key of all restarts, [B, V, F].
 
         Args:
-            observation: the true observation [B, V, F] of all episodes, or of `rows`.
-            oracle: the oracle; a budget that is too small for all restarts gets the first ones.
+            observation: the true observation [B, V, F].
+            oracle: the oracle of these episodes; a budget that is too small for all restarts gets the first ones.
             loss: the loss [R, B] to descend on, of scores [R, B, A]; R is the number of restarts.
             key: the key [R, B] to compare points by, of their scores and losses.
-            rows: the episodes.
             price: queries for one point.
             known: the key of the true observation [B], which is then a candidate, too.
         """
-        affordable = _left(oracle, rows) // price
+        affordable = int(oracle.remaining.min()) // price
         restarts = min(self.restarts, affordable // 2)
         if restarts < 1:
             return observation
+        start = observation.expand(restarts, *observation.shape)
+        if self.random_start:
+            start = random_starts(observation, restarts, oracle)
         steps = min(self.steps, affordable // restarts - 1)
-        start = (
-            random_starts(observation, restarts, oracle, rows)
-            if self.random_start
-            else observation.expand(restarts, *observation.shape)
-        )
-        best, lowest = descend(
-            start, loss, key, oracle, rows, steps=steps, step_size=self.step_size, momentum=self.momentum
-        )
-        if known is None:
-            return best[lowest.argmin(0), torch.arange(len(observation))]
-        return better(observation, known, best, lowest)
+        best, lowest = descend(start, loss, key, oracle, steps=steps, step_size=self.step_size, momentum=self.momentum)
+        return best_of(best, lowest, observation, known)
 
-    def _price(self, oracle: Oracle) -> int:
-        """Queries per iterate: one, and one more where the loss asks the victim's critic."""
-        return 2 if oracle.action_type == "continuous" and self.objective not in ("margin", "target") else 1
-
-    def _loss(self, observation: Tensor, clean: Tensor, oracle: Oracle) -> tuple[Loss, Key]:
-        """The loss to minimise, from scores, and the key to compare iterates, from scores and loss; [..., B] each."""
+    def _loss(self, observation: Tensor, clean: Tensor, oracle: Oracle) -> DiscreteLoss | ContinuousLoss | CriticLoss:
+        """The objective in this step."""
         if oracle.action_type == "discrete":
-            discrete = DiscreteLoss(
+            return DiscreteLoss(
                 objective=self.objective,
                 clean=clean,
                 temperature=self.temperature,
                 target_action=self.target_action,
                 braking_action=self.braking_action,
             )
-            return discrete, discrete.key
         if self.objective in ("margin", "target"):
             target = (self.target_acceleration, self.target_steering) if self.objective == "target" else None
-            continuous = ContinuousLoss(clean=clean, target=target)
-            return continuous, continuous.key
-
-        def critic(action: Tensor) -> Tensor:
-            if self.objective == "collision":
-                acceleration = torch.maximum(action[..., :1], clean[..., :1])
-                action = torch.cat((acceleration, action[..., 1:]), -1)
-            return oracle.value(observation.expand(*action.shape[:-1], *observation.shape[1:]), action)
-
-        return critic, lambda _, loss: loss
-
-
-def random_starts(observation: Tensor, restarts: int, oracle: Oracle, rows: Tensor | None = None) -> Tensor:
-    """[R, B, V, F] random points of the perturbation set; all episodes of a unit share the random numbers."""
-    shape = (restarts, 1, *observation.shape[1:])
-    shares = [
-        torch.rand(shape, generator=part.generator).expand(-1, part.rows.stop - part.rows.start, -1, -1)
-        for part in (oracle.parts if rows is None else parts_of(oracle.parts, rows))
-    ]
-    return oracle.project(observation + (torch.cat(shares, 1) * 2 - 1) * _radius(oracle, rows), rows)
+            return ContinuousLoss(clean=clean, target=target)
+        return CriticLoss(observation, clean, oracle, spares_braking=self.objective == "collision")
 
 
 def descend(
-    x: Tensor,
-    loss: Callable[[Tensor], Tensor],
-    key: Callable[[Tensor, Tensor], Tensor],
-    oracle: Oracle,
-    rows: Tensor | None = None,
-    *,
-    steps: int,
-    step_size: float,
-    momentum: float = 0.0,
+    x: Tensor, loss: Loss, key: Key, oracle: Oracle, *, steps: int, step_size: float, momentum: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Sign steps from the points `x` [R, B, V, F] (of all episodes, or of `rows`), with R * (steps + 1) queries.
-
-    Args:
-        x: starts in the perturbation set.
-        loss: the loss to minimise [R, B], from scores.
-        key: the key to compare points [R, B], from scores and loss.
-        oracle: access to the victim.
-        rows: the episodes.
-        steps, step_size, momentum: as in `PGD`.
+    """Sign steps from the points `x` [R, B, V, F] of the perturbation set, with R * (steps + 1) queries of each episode.
 
     Returns:
-        The best point of each start [R, B, V, F], the starts included, and its key [R, B].
+        The best point of each start [R, B, V, F], the starts included, and its key [R, B]. Arguments as in `PGD.descend`.
     """
-    radius, accumulated = _radius(oracle, rows), torch.zeros_like(x)
     best, lowest = x, torch.full(x.shape[:2], torch.inf)
+    accumulated = torch.zeros_like(x)
     for _ in range(steps):
-        asked, gradient = _ask(x, loss, key, oracle, rows)
-        best, lowest = _better(best, lowest, x, asked)
-        accumulated = momentum * accumulated + _unit(gradient)
-        x = oracle.project(x - step_size * radius * accumulated.sign(), rows)
-    scores = oracle.scores(x, rows)
-    return _better(best, lowest, x, key(scores, loss(scores)))
+        keys, gradient = _ask(x, loss, key, oracle)
+        best, lowest = better(best, lowest, x, keys)
+        # A mean magnitude of 1 for each episode, so that momentum averages directions.
+        size = gradient.abs().mean((-2, -1), keepdim=True)
+        accumulated = momentum * accumulated + gradient / size.clamp(min=torch.finfo(gradient.dtype).tiny)
+        x = oracle.project(x - step_size * oracle.radius * accumulated.sign())
+    scores = oracle.scores(x)
+    return better(best, lowest, x, key(scores, loss(scores)))
 
 
-def better(observation: Tensor, known: Tensor, best: Tensor, lowest: Tensor) -> Tensor:
-    """[B, V, F] the point with the lowest key; the true observation if none is below its key `known` [B].
-
-    Args:
-        observation: the true observation [B, V, F].
-        known: its key [B].
-        best, lowest: points [R, B, V, F] and their keys [R, B].
-    """
-    least, start = lowest.min(0)
-    found = best[start, torch.arange(len(observation))]
-    return torch.where((least < known)[:, None, None], found, observation)
-
-
-def preference_gap(scores: Tensor, temperature: float) -> Tensor:
-    """[B] how much the victim prefers its best action: the largest minus the smallest entry of softmax(Q / T).
-
-    Lin et al. 2017, "Tactics of Adversarial Attack on Deep Reinforcement Learning Agents", Eq. 3.
-    """
-    preferred = torch.softmax(scores / temperature, -1)
-    return preferred.amax(-1) - preferred.amin(-1)
-
-
-def _left(oracle: Oracle, rows: Tensor | None) -> int:
-    """Queries that are left for every episode, or for every one of `rows`."""
-    left = oracle.remaining if rows is None else oracle.remaining[rows]
-    return int(left.min()) if len(left) else 0
-
-
-def _radius(oracle: Oracle, rows: Tensor | None) -> Tensor:
-    return oracle.radius if rows is None else oracle.radius[rows]
-
-
-def _ask(
-    x: Tensor,
-    loss: Callable[[Tensor], Tensor],
-    key: Callable[[Tensor, Tensor], Tensor],
-    oracle: Oracle,
-    rows: Tensor | None,
-) -> tuple[Tensor, Tensor]:
+def _ask(x: Tensor, loss: Loss, key: Key, oracle: Oracle) -> tuple[Tensor, Tensor]:
     """The keys of the iterates [R, B] and the gradient of the loss [R, B, V, F], each from one query."""
     keys: list[Tensor] = []
 
@@ -269,17 +173,5 @@ def _ask(
         keys.append(key(scores.detach(), value.detach()))
         return value
 
-    _, gradient = oracle.gradient(x, asked, rows)
+    _, gradient = oracle.gradient(x, asked)
     return keys[0], gradient
-
-
-def _unit(gradient: Tensor) -> Tensor:
-    """`gradient` [R, B, V, F] scaled to a mean magnitude of 1 per episode, so that momentum averages directions."""
-    scale = gradient.abs().mean((-2, -1), keepdim=True)
-    return gradient / scale.clamp(min=torch.finfo(gradient.dtype).tiny)
-
-
-def _better(best: Tensor, lowest: Tensor, x: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Keep the better iterate for each restart and episode."""
-    improved = key < lowest
-    return torch.where(improved[..., None, None], x, best), torch.where(improved, key, lowest)

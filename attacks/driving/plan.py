@@ -11,8 +11,9 @@ from annotated_types import Interval
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from cavbench.attacks.driving.candidates import best_of, random_starts
 from cavbench.attacks.driving.objectives import TIE_BREAK, distance, expected, margin, spared, taken, temperature
-from cavbench.attacks.driving.pgd import better, descend, random_starts
+from cavbench.attacks.driving.pgd import descend
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Count, Natural, Positive, Share
 from cavbench.driving import DrivingAttack, Dynamics, Forecast, Oracle, State
@@ -134,7 +135,7 @@ class Plan(DrivingAttack):
         if self.gap > 0:
             # The keys are worths up to the tie-break.
             lowest = lowest.where(danger & (known - lowest >= self.gap), torch.inf)
-        return better(observation, known, best, lowest)
+        return best_of(best, lowest, observation, known)
 
     def _collision(self, clean: Tensor) -> Tensor:
         """[B, A] the worth of the actions by `pgd`'s objective `collision`, from the clean Q-values, scaled to [0, 1]."""
@@ -168,7 +169,7 @@ class Plan(DrivingAttack):
         lowest[0] -= TIE_BREAK
         if self.gap > 0:
             lowest = lowest.where(known - lowest >= self.gap, torch.inf)
-        return better(observation, known, best, lowest)
+        return best_of(best, lowest, observation, known)
 
     def _affordable(self, starts: int, oracle: Oracle, *, asked: int) -> tuple[int, int]:
         """Numbers of starts and steps within the query budget, with `asked` queries of each start besides its gradients."""

@@ -97,7 +97,7 @@ class ZOSignSGD(DrivingAttack):
         if self.random_start:
             share = torch.cat([torch.rand(shape, generator=part.generator).expand_as(x[part.rows]) for part in parts])
             x = oracle.project(x + oracle.radius * (2 * share - 1))
-        run = _Run(torch.arange(len(observation)), observation, oracle.radius, x, observation, lowest, loss, parts)
+        run = _Run(torch.arange(len(observation)), oracle, x, observation, lowest, loss, parts)
         answer = observation.clone()
         if self.early_stop:
             run = run.without(met, answer)
@@ -110,13 +110,14 @@ class ZOSignSGD(DrivingAttack):
                 break
             directions = _directions(count, shape, [part.generator for part in run.parts]).to(observation)
             left -= base + count
-            points = oracle.project(run.around(directions, self.smoothing), run.rows)
-            scores = oracle.scores(points[1 - base :], run.rows)
+            points = run.oracle.project(run.around(directions, self.smoothing))
+            scores = run.oracle.scores(points[1 - base :])
             scores, known = scores if known is None else torch.cat((known.unsqueeze(0), scores)), None
-            value, key, met = self._judge(run.loss, scores, points, run.truth)
+            value, key, met = self._judge(run.loss, scores, points, run.oracle.observation)
             run.keep_best(points, key)
             sign = _gradient(value, directions, run.parts).sign_()
-            run.x = oracle.project(torch.addcmul(run.x, self.step_size * run.radius, sign, value=-1), run.rows)
+            step = self.step_size * run.oracle.radius
+            run.x = run.oracle.project(torch.addcmul(run.x, step, sign, value=-1))
             if self.early_stop:
                 run = run.without(met.any(0), answer)
         answer[run.rows] = run.best
@@ -153,15 +154,15 @@ class _Run:
 
     Args:
         rows: int64 [R] their places in the batch.
-        truth, radius, x, best: [R, V, F] true observation, radius, current point, and best point so far.
+        oracle: access to the victim in these episodes.
+        x, best: [R, V, F] current point, and best point so far.
         lowest: [R] key of the best point.
         loss: the objective.
         parts: the units of these episodes, with the generator of each unit for this step.
     """
 
     rows: Tensor
-    truth: Tensor
-    radius: Tensor
+    oracle: Oracle
     x: Tensor
     best: Tensor
     lowest: Tensor
@@ -170,7 +171,7 @@ class _Run:
 
     def around(self, directions: Tensor, smoothing: float) -> Tensor:
         """[q + 1, R, V, F] the current points, and the points along the directions [P, q, V, F] of the parts."""
-        reach, points = smoothing * self.radius, self.x.new_empty(directions.shape[1] + 1, *self.x.shape)
+        reach, points = smoothing * self.oracle.radius, self.x.new_empty(directions.shape[1] + 1, *self.x.shape)
         points[0] = self.x
         for part, own in zip(self.parts, directions, strict=True):
             torch.addcmul(self.x[part.rows], reach[part.rows], own.unsqueeze(1), out=points[1:, part.rows])
@@ -189,9 +190,8 @@ class _Run:
             return self
         answer[self.rows] = self.best
         on = (~met).nonzero().squeeze(-1)
-        rows, truth, radius, x = self.rows[on], self.truth[on], self.radius[on], self.x[on]
         loss, parts = self.loss.of(on), parts_of(self.parts, on)
-        return _Run(rows, truth, radius, x, self.best[on], self.lowest[on], loss, parts)
+        return _Run(self.rows[on], self.oracle.select(on), self.x[on], self.best[on], self.lowest[on], loss, parts)
 
 
 def _gradient(value: Tensor, directions: Tensor, parts: Sequence[Part]) -> Tensor:

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from cavbench.exports import exported
 
 if TYPE_CHECKING:
+    from cavbench.detection.access import PatchOracle
     from cavbench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
     from cavbench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions, Wrapped
-    from cavbench.detection.oracle import PatchOracle
     from cavbench.detection.scenes import Approach, Decoy, Scenes
     from cavbench.detection.threat import PatchThreat
 
@@ -29,4 +29,5 @@ __all__ = [
     "Wrapped",
 ]
 
-__getattr__ = exported(__name__, __all__, ("contracts", "detector", "oracle", "scenes", "threat"))
+_MODULES = ("access", "contracts", "detector", "scenes", "threat")
+__getattr__ = exported(__name__, __all__, _MODULES)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from torch import Tensor
 
 from cavbench.core.contracts import Attack, Defense, Facts, Progress, ThreatModel, Trained, Victim, World
+from cavbench.detection.access import PatchOracle
 from cavbench.detection.detector import STOP_SIGN, Detector
-from cavbench.detection.oracle import PatchOracle
 from cavbench.detection.scenes import Approach, Scenes
 from cavbench.detection.threat import PatchThreat
 from cavbench.scenarios import Cell

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from cavbench.core.contracts import Progress
 from cavbench.core.track import Job
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.contracts import CameraWorld, PatchAttack
 from cavbench.detection.detector import Detector
-from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.patch import Patch
 from cavbench.detection.placed import placed
 from cavbench.detection.scenes import Scenes
@@ -69,7 +69,7 @@ def craft(
         nan_gradients=enforcer.nans,
         seconds=seconds,
         excess=excess,
-        evolution=enforcer.oracle.evolution,
+        evolution=enforcer.reports.evolution,
     )
 
 

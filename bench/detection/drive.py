@@ -11,16 +11,16 @@ from torch import Tensor
 from cavbench.core.progress import share_done
 from cavbench.core.track import Driven, Job
 from cavbench.detection import (
+    access,
     approach,
     boxes,
     closed_loop,
     crafting,
     discrimination,
     driver,
-    enforcer,
-    oracle,
     precision,
     printing,
+    reports,
     sight,
     stopping,
     threat,
@@ -38,16 +38,16 @@ from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import Watch
 
 SEAL = Seal(
+    access,
     approach,
     boxes,
     closed_loop,
     crafting,
     discrimination,
     driver,
-    enforcer,
-    oracle,
     precision,
     printing,
+    reports,
     sight,
     stopping,
     threat,

@@ -5,16 +5,18 @@ from typing import TYPE_CHECKING
 from cavbench.exports import exported
 
 if TYPE_CHECKING:
+    from cavbench.driving.access import Oracle
     from cavbench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, DrivingWorld, TrainingHooks
     from cavbench.driving.dynamics import Dynamics, Forecast
-    from cavbench.driving.features import ActionType, Driver, DrivingFacts, Features
+    from cavbench.driving.features import ActionType, Control, Driver, DrivingFacts, Features
     from cavbench.driving.kinematics import Kinematics
-    from cavbench.driving.oracle import Oracle, Part, parts_of
+    from cavbench.driving.parts import Part, parts_of
     from cavbench.driving.policy import Passed, Policy, PolicyWrapper, State
     from cavbench.driving.threat import ObservationThreat
 
 __all__ = [
     "ActionType",
+    "Control",
     "Driver",
     "DrivingAttack",
     "DrivingDefense",
@@ -36,6 +38,5 @@ __all__ = [
     "parts_of",
 ]
 
-__getattr__ = exported(
-    __name__, __all__, ("contracts", "dynamics", "features", "kinematics", "oracle", "policy", "threat")
-)
+_MODULES = ("access", "contracts", "dynamics", "features", "kinematics", "parts", "policy", "threat")
+__getattr__ = exported(__name__, __all__, _MODULES)

@@ -10,11 +10,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from cavbench.driving.access import Enforcer
 from cavbench.driving.contracts import DrivingAttack
 from cavbench.driving.dynamics import Dynamics
-from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.features import Features
-from cavbench.driving.oracle import Part, parts_of
+from cavbench.driving.parts import Part, parts_of
 from cavbench.driving.policy import State, rows_of
 from cavbench.driving.threat import ObservationThreat
 from cavbench.driving.victim import CountedPolicy

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, ClassVar
 from torch import Tensor
 
 from cavbench.core.contracts import Attack, Defense, Progress, ThreatModel, Trained, Victim, World
+from cavbench.driving.access import Oracle
 from cavbench.driving.dynamics import Dynamics
-from cavbench.driving.features import ActionType, Driver, DrivingFacts, Features
+from cavbench.driving.features import ActionType, Control, Driver, DrivingFacts, Features
 from cavbench.driving.kinematics import Kinematics
-from cavbench.driving.oracle import Oracle
 from cavbench.driving.policy import Policy, State
 from cavbench.driving.threat import ObservationThreat
 from cavbench.scenarios import Cell
@@ -74,6 +74,14 @@ class DrivingWorld(World):
         )
 
     @abstractmethod
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
+        """An environment with len(cells) episodes; episode b is on cells[b].
+
+        Args:
+            cells: the cell of each episode of the batch.
+            control: how the car is driven.
+        """
+
     def make(
         self,
         cells: Sequence[Cell],
@@ -82,16 +90,8 @@ class DrivingWorld(World):
         driver: Driver = "agent",
         action_repeat: int = 1,
     ) -> EnvBase:
-        """An environment with len(cells) episodes; episode b is on cells[b].
-
-        Args:
-            cells: the cell of each episode of the batch.
-            action_type: discrete lane-changing actions, or continuous [acceleration, steering] in [-1, 1].
-            driver: `agent` executes the actions; the others ignore them: `idm` is the world's own rule-based driver, `oracle` a
-                planner that knows its hidden state.
-            action_repeat: number of frames for which a decision is held (training only). A lane change is sent once, other
-                actions are repeated. Reward and progress are summed over the frames; an episode may end between them.
-        """
+        """The environment of `build`; the other arguments are those of `cavbench.driving.Control`."""
+        return self.build(cells, Control(action_type=action_type, driver=driver, action_repeat=action_repeat))
 
     def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics | None:
         """The rules of motion, for attacks with access `dynamics`; None if the world does not offer them.

@@ -8,7 +8,7 @@ from itertools import accumulate, pairwise
 
 from cavbench.core.pair import Pair
 from cavbench.core.track import Driven, Job
-from cavbench.driving import attacker, enforcer, meter, oracle, probes, shadows, threat, victim
+from cavbench.driving import access, attacker, gradients, meter, parts, probes, shadows, threat, victim
 from cavbench.driving import rollout as rollouts
 from cavbench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
 from cavbench.driving.meter import Columns
@@ -20,7 +20,7 @@ from cavbench.errors import UserError
 from cavbench.isolation.seal import Seal
 from cavbench.isolation.streams import Stream
 
-SEAL = Seal(attacker, enforcer, meter, oracle, probes, rollouts, shadows, threat, victim)
+SEAL = Seal(access, attacker, gradients, meter, parts, probes, rollouts, shadows, threat, victim)
 
 
 def drive(job: Job, traced: Sequence[int]) -> Driven:

@@ -13,6 +13,25 @@ from cavbench.driving.kinematics import Kinematics
 
 ActionType = Literal["discrete", "continuous"]
 Driver = Literal["agent", "idm", "oracle"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Control:
+    """How the car of an environment is driven.
+
+    Args:
+        action_type: discrete lane-changing actions, or continuous [acceleration, steering] in [-1, 1].
+        driver: `agent` executes the actions; the others ignore them: `idm` is the world's own rule-based driver, `oracle` a
+            planner that knows its hidden state.
+        action_repeat: number of frames for which a decision is held (training only). A lane change is sent once, other actions
+            are repeated. Reward and progress are summed over the frames; an episode may end between them.
+    """
+
+    action_type: ActionType = "discrete"
+    driver: Driver = "agent"
+    action_repeat: int = 1
+
+
 CONSTANT_CONTROLS = {"throttle": (1.0, 0.0), "coast": (0.0, 0.0), "brake": (-1.0, 0.0)}
 """[acceleration, steering] in [-1, 1] of the constant policies, by name."""
 RIGHT_THEN_SLOWER = "right_then_slower"

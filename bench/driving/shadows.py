@@ -1,6 +1,6 @@
 """Shadows: copies of running episodes that go the way of a rehearsal, in which the victim must answer as it drives.
 
-A rehearsal (`cavbench.driving.oracle.Oracle.rehearse`) clones the victim's state, and advances many copies for many steps. A
+A rehearsal (`cavbench.driving.access.Oracle.rehearse`) clones the victim's state, and advances many copies for many steps. A
 victim that told this from driving could behave better, or worse, in a rehearsal than on the road. So a shadow clones the state
 at a step that nobody can foresee, shows one of its copies what the victim is shown while it drives, shows others something near,
 and compares the answers to that one copy with the scores that the victim drives by.

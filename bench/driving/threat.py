@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 from annotated_types import Interval
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cavbench.core.contracts import ThreatModel
@@ -105,3 +107,33 @@ def within(perturbed: Tensor, observation: Tensor, low: Tensor, high: Tensor) ->
     if bool(clipped.sum().isfinite()):
         return clipped
     return torch.where(clipped.isnan(), observation.clamp(-1.0, 1.0), clipped)
+
+
+class PerturbationSet:
+    """The perturbation set of a step as the run holds it: arrays on immutable bytes, which nobody can write to.
+
+    Args:
+        observation: the true observation [B, V, F].
+        radius: the largest deviation of each entry.
+        low, high: its `bounds`.
+    """
+
+    def __init__(self, observation: Tensor, radius: Tensor, low: Tensor, high: Tensor) -> None:
+        self._truth, self.radius, self._low, self._high = map(_fixed, (observation, radius, low, high))
+
+    def project(self, answer: Tensor) -> tuple[Tensor, Tensor]:
+        """The answer [B, V, F] projected onto the set, and its L-inf distance [B] to the set before.
+
+        The distance of an answer with NaN or infinity is not finite.
+        """
+        given = answer.detach().cpu().numpy()
+        inside = np.clip(given, self._low, self._high)
+        inside = np.where(np.isnan(inside), np.clip(self._truth, -1.0, 1.0), inside)
+        excess = np.abs(given - inside).reshape(len(given), -1).max(1, initial=0.0)
+        return torch.from_numpy(inside).to(answer), torch.from_numpy(excess)
+
+
+def _fixed(values: Tensor) -> NDArray[Any]:
+    """A copy that cannot be written to: an array on immutable bytes."""
+    found = values.detach().cpu().contiguous().numpy()
+    return np.frombuffer(found.tobytes(), found.dtype).reshape(found.shape)

@@ -25,8 +25,8 @@ from cavbench.detection import (
     Predictions,
     Scenes,
 )
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.boxes import detections
-from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.sight import NMS_IOU
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.learner import Learner

@@ -26,7 +26,7 @@ from cavbench.driving import (
     State,
     TrainingHooks,
 )
-from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.access import Enforcer
 from cavbench.driving.policy import rows_of
 from cavbench.driving.threat import Norm
 from cavbench.driving.victim import CountedPolicy

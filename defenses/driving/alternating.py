@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,10 +21,33 @@ from cavbench.driving.victims.learner import CHUNK, Learner, Phase
 from cavbench.driving.victims.networks import StateValue
 from cavbench.driving.victims.practice import Practice
 
-if TYPE_CHECKING:
-    from cavbench.defenses.driving.atla import AlternatingTraining
-
 Turn = Literal["policy", "adversary"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Updates:
+    """How both players learn, with numbers of PPO.
+
+    Args:
+        learning_rate, adversary_rate: of the policy and of the adversary (Adam).
+        rollout: decisions on every road between two rounds of updates.
+        epochs: how often each decision is learned from.
+        parts: minibatches in an epoch.
+        clip: epsilon of PPO.
+        entropy: weight of the policy's entropy bonus.
+        trace: lambda of the advantages.
+        guide: weight of the start's Q-function in both losses.
+    """
+
+    learning_rate: float
+    adversary_rate: float
+    rollout: int
+    epochs: int
+    parts: int
+    clip: float
+    entropy: float
+    trace: float
+    guide: float
 
 
 class Game(nn.Module):
@@ -47,17 +71,15 @@ class Alternation(Learner):
         policy: the policy.
         adversary: the adversary.
         start: the Q-network that the policy continues from; it guides both (`_worth`).
-        recipe: the defence, with the settings of the training.
+        how: how both learn.
     """
 
     on_policy = True
 
-    def __init__(
-        self, policy: RecurrentPolicy, adversary: Adversary, start: Policy, recipe: AlternatingTraining
-    ) -> None:
+    def __init__(self, policy: RecurrentPolicy, adversary: Adversary, start: Policy, how: Updates) -> None:
         super().__init__(TrainingHooks())
         self.policy: RecurrentPolicy = policy
-        self.adversary, self.start, self.recipe = adversary, start, recipe
+        self.adversary, self.start, self.how = adversary, start, how
         self.players: dict[Turn, nn.Module] = {"policy": policy, "adversary": adversary}
         self.turn: Turn = "adversary"
         self.chunks: list[TensorDictBase] = []
@@ -75,20 +97,20 @@ class Alternation(Learner):
             log_prob_key="action_log_prob",
         )
         self.explore = self.actor = ProbabilisticTensorDictSequential(game, action)
-        self.loss = ClipPPOLoss(self.actor, self.critic, clip_epsilon=recipe.clip, critic_coeff=1.0)
-        rates = {"policy": recipe.learning_rate, "adversary": recipe.adversary_rate}
+        self.loss = ClipPPOLoss(self.actor, self.critic, clip_epsilon=how.clip, critic_coeff=1.0)
+        rates = {"policy": how.learning_rate, "adversary": how.adversary_rate}
         self.adams = {
             turn: torch.optim.Adam([*player.parameters(), *network.parameters()], rates[turn], eps=1e-5)
             for turn, player in self.players.items()
         }
 
     def enter(self, phase: Phase) -> None:
-        self.advantage = GAE(gamma=phase.gamma, lmbda=self.recipe.trace, value_network=self.critic)
+        self.advantage = GAE(gamma=phase.gamma, lmbda=self.how.trace, value_network=self.critic)
 
     def begin(self, turn: Turn) -> None:
         """Begin a turn: only this player's weights change until the next one."""
         self.turn, self.chunks = turn, []
-        self.loss.entropy_coeff.fill_(self.recipe.entropy if turn == "policy" else 0.0)
+        self.loss.entropy_coeff.fill_(self.how.entropy if turn == "policy" else 0.0)
         for name, player in self.players.items():
             player.requires_grad_(name == turn)
 
@@ -96,9 +118,8 @@ class Alternation(Learner):
         self.chunks.append(chunk)
 
     def learn(self, learning_rate: float, share: float) -> None:
-        """Learn from the last `rollout` decisions; `learning_rate` is a share of the rates of the recipe."""
-        recipe = self.recipe
-        if len(self.chunks) * CHUNK < recipe.rollout:
+        """Learn from the last `rollout` decisions; `learning_rate` is a share of the rates of both."""
+        if len(self.chunks) * CHUNK < self.how.rollout:
             return
         played: TensorDictBase = torch.cat(self.chunks, -1)
         self.chunks = []
@@ -109,19 +130,19 @@ class Alternation(Learner):
         played = played.exclude("next").set(
             "advantage", self._sign * (found - found.mean()) / found.std().clamp_min(1e-6)
         )
-        for _ in range(recipe.epochs):
-            for rows in torch.randperm(len(played)).chunk(recipe.parts):
+        for _ in range(self.how.epochs):
+            for rows in torch.randperm(len(played)).chunk(self.how.parts):
                 self.update(played[rows], learning_rate)
 
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
-        adam, recipe = self.adams[self.turn], self.recipe
+        adam, guide = self.adams[self.turn], self.how.guide
         adam.param_groups[0]["lr"] = adam.defaults["lr"] * learning_rate
         adam.zero_grad()
         parts = self.loss(sample)
         loss = parts["loss_objective"] + parts["loss_critic"] + parts["loss_entropy"]
-        if recipe.guide:
+        if guide:
             expected = (self.actor.get_dist(sample).probs * sample["worth"]).sum(-1).mean()
-            loss = loss - recipe.guide * self._sign * expected
+            loss = loss - guide * self._sign * expected
         loss.backward()
         for network in (self.players[self.turn], self.critic):
             nn.utils.clip_grad_norm_(network.parameters(), 0.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Annotated
 
 import torch
@@ -16,7 +16,7 @@ from cavbench import zoo
 from cavbench.core.contracts import Progress, Trained
 from cavbench.core.ranges import Count, NotNegative, Positive, Share, Width
 from cavbench.defenses.driving.adversary import Adversary
-from cavbench.defenses.driving.alternating import Alternation, RecurrentPractice, Turn
+from cavbench.defenses.driving.alternating import Alternation, RecurrentPractice, Turn, Updates
 from cavbench.defenses.driving.recurrent import RecurrentPolicy
 from cavbench.driving import (
     DrivingDefense,
@@ -92,6 +92,11 @@ class AlternatingTraining(DrivingDefense):
     def zoo_name(self, victim: DrivingVictim) -> str:
         return f"{victim.zoo_name()}-atla"
 
+    @property
+    def updates(self) -> Updates:
+        """How both learn."""
+        return Updates(**{field.name: getattr(self, field.name) for field in fields(Updates)})
+
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
         return zoo.load(zoo.Recipe.of(_dqn(victim), self), seed, RecurrentPolicy)
 
@@ -110,7 +115,7 @@ class AlternatingTraining(DrivingDefense):
         threat = ObservationThreat(norm=self.norm, budget=self.budget)
         policy = RecurrentPolicy.continuing(start, self.memory, self.temperature)
         adversary = Adversary(start.shape["features"], self.adversary_hidden, threat, world.facts.features)
-        learner = Alternation(policy, adversary, start, self)
+        learner = Alternation(policy, adversary, start, self.updates)
         env = world.make(roads(world, dqn.copies), action_type="discrete")
         env.set_seed(SeedBlock.TRAIN * (seed + 1))
         phase = Phase(1, self.decisions, dqn.gamma ** (1 / dqn.repeat), n_step=1)

@@ -25,7 +25,7 @@ from cavbench.driving import (
     State,
     TrainingHooks,
 )
-from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.access import Enforcer
 from cavbench.driving.threat import Norm, project
 from cavbench.driving.victim import CountedPolicy
 from cavbench.driving.victims.attack_mix import attack_of, attacked

@@ -16,7 +16,7 @@ from cavbench.attacks.driving.noise import Noise
 from cavbench.defenses.driving.pessimist_q import PessimistQ
 from cavbench.defenses.driving.tracker import Tracked, Tracker
 from cavbench.driving import ObservationThreat, Policy
-from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.access import Enforcer
 from cavbench.driving.intervals.margins import Margins
 from cavbench.driving.intervals.rooms import cars_of
 from cavbench.driving.victim import CountedPolicy

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 from cavbench.core.parameters import differing
-from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
+from cavbench.driving import ActionType, Control, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
 from cavbench.envs.highway.axes import AXES, STANDARD_V2
 from cavbench.envs.highway.config import (
     ACTIONS,
@@ -111,16 +111,9 @@ class HighwayWorld(DrivingWorld):
         options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
         return replace(super().facts, environment=f'cavbench.gym.make("highway"{options})')
 
-    def config(
-        self,
-        cells: Sequence[Cell],
-        *,
-        action_type: ActionType = "discrete",
-        driver: Driver = "agent",
-        action_repeat: int = 1,
-    ) -> HighwayConfig:
-        """The environment's full configuration; arguments as in `DrivingWorld.make`."""
-        thesis = self.preset == "thesis"
+    def config(self, cells: Sequence[Cell], control: Control | None = None) -> HighwayConfig:
+        """The environment's full configuration; arguments as in `DrivingWorld.build`."""
+        thesis, control = self.preset == "thesis", control or Control()
         preset_speeds = THESIS_TARGET_SPEEDS if thesis else STANDARD_TARGET_SPEEDS
         return HighwayConfig(
             cells=tuple(cells),
@@ -128,9 +121,9 @@ class HighwayWorld(DrivingWorld):
             simulation_frequency=self.simulation_frequency,
             policy_frequency=self.policy_frequency,
             max_steps=self.max_steps,
-            action_type=action_type,
-            driver=driver,
-            action_repeat=action_repeat,
+            action_type=control.action_type,
+            driver=control.driver,
+            action_repeat=control.action_repeat,
             target_speeds=self.target_speeds if self.target_speeds is not None else preset_speeds,
             features=self.features,
             observed_vehicles=self.observed_rows,
@@ -165,23 +158,16 @@ class HighwayWorld(DrivingWorld):
         """See `cavbench.driving.DrivingWorld.dynamics`; on the compiled engine for both backends."""
         from cavbench.envs.highway.forecast import HighwayDynamics
 
-        return HighwayDynamics(self.config(tuple(cells), action_type=action_type))
+        return HighwayDynamics(self.config(cells, Control(action_type=action_type)))
 
-    def make(
-        self,
-        cells: Sequence[Cell],
-        *,
-        action_type: ActionType = "discrete",
-        driver: Driver = "agent",
-        action_repeat: int = 1,
-    ) -> EnvBase:
-        """See `cavbench.driving.DrivingWorld.make`.
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
+        """See `cavbench.driving.DrivingWorld.build`.
 
         Raises:
             UserError: if there are more lanes than the range of y holds.
         """
         self._check_lanes(cells)
-        config = self.config(cells, action_type=action_type, driver=driver, action_repeat=action_repeat)
+        config = self.config(cells, control)
         # Imported here because both load torchrl and numba or pygame, which `bench list` must not load.
         if self.backend == "batched":
             from cavbench.envs.highway.batched import BatchedHighway

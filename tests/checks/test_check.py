@@ -91,7 +91,7 @@ class Crooked(DrivingAttack):
                 self.memory.append(1)
                 return observation + len(self.memory) * 0.01 * oracle.radius
             case "widen":
-                oracle._door._enforcer._high = (observation + 1).numpy()
+                oracle._enforcer._set._high = (observation + 1).numpy()
                 return observation + 0.9
             case "greedy":
                 for _ in range(3):
@@ -102,11 +102,11 @@ class Crooked(DrivingAttack):
                 return observation
             case "weights":
                 with torch.no_grad():
-                    for weight in oracle._door._enforcer.subject.policy.parameters():
+                    for weight in oracle._enforcer.subject.policy.parameters():
                         weight.add_(0.1)
                 return observation
             case "mode":
-                oracle._door._enforcer.subject.policy.train()
+                oracle._enforcer.subject.policy.train()
                 return observation
             case "in place":
                 observation += 0.001
@@ -232,7 +232,7 @@ class BadPatch(PatchAttack):
                 progress(2.0, "done twice")
             case "weights":
                 with torch.no_grad():
-                    for weight in oracle._door.detector.parameters():
+                    for weight in oracle._enforcer.detector.parameters():
                         weight.add_(0.1)
             case "scenes":
                 scenes.distance += 1

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cavbench.core.contracts import Access, QueryBudgetError
 from cavbench.detection import PatchOracle, PatchThreat
-from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.patch import MOMENTS
 from cavbench.detection.threat import GREY
 from cavbench.errors import UserError
@@ -93,7 +93,7 @@ def test_reported_steps_are_few_and_evenly_spaced(steps: int) -> None:
         door.report(
             torch.full((3, 8, 8), step / steps), loss=torch.tensor(step, requires_grad=True, dtype=float), **more
         )
-    kept = door.evolution
+    kept = door.reports.evolution
     assert kept is not None
     apart = kept.steps.diff().unique().tolist()
     assert kept.steps[0] == 0
@@ -108,7 +108,7 @@ def test_reported_steps_are_few_and_evenly_spaced(steps: int) -> None:
 
 def test_reported_patches_must_have_one_size() -> None:
     door = oracle("oblivious")
-    assert door.evolution is None
+    assert door.reports.evolution is None
     door.report(torch.zeros(3, 8, 8))
     with pytest.raises(UserError, match="reported patches of 8 and 9 texels"):
         door.report(torch.zeros(3, 9, 9))

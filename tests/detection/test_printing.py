@@ -11,8 +11,8 @@ from hypothesis.extra.numpy import arrays
 
 from cavbench.attacks.detection.eot import EOT
 from cavbench.detection import PatchThreat
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.colour import linear, srgb
-from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.printing import LEAST, MOST, inks, non_printability, printed, triplets
 from tests.plugins.toy_camera import RedDetector, RedScenes
 

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from cavbench.core.contracts import Access, QueryBudgetError
 from cavbench.core.pair import choose
-from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, enforcer
+from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, access
+from cavbench.driving.access import Enforcer
 from cavbench.driving.drive import SEAL
-from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.rollout import rollout
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
@@ -30,7 +30,7 @@ def widen(observation: Tensor, oracle: Oracle) -> Tensor:
     oracle.radius.fill_(FAR)
     oracle.observation.fill_(FAR)
     observation.fill_(FAR)
-    oracle._set = (observation, observation - FAR, observation + FAR)
+    oracle._bounds = (observation - FAR, observation + FAR)
     object.__setattr__(oracle.threat, "budget", 2.0)
     object.__setattr__(oracle.threat, "queries", 10**6)
     return oracle.project(observation)
@@ -135,6 +135,15 @@ def test_the_budget_holds_however_the_attack_changes_its_oracle() -> None:
         drive(overspend)
 
 
+@pytest.mark.parametrize("name", ["_paid", "_answered", "scores", "spent", "forged"])
+def test_nothing_that_asks_or_pays_can_be_replaced_on_the_oracle(name: str) -> None:
+    def replace(observation: Tensor, oracle: Oracle) -> None:
+        object.__setattr__(oracle, name, lambda *asked: None)
+
+    with pytest.raises(AttributeError):
+        drive(replace)
+
+
 def test_catching_the_refusal_gives_no_answer_and_no_query() -> None:
     answers: list[Tensor] = []
 
@@ -213,7 +222,7 @@ def test_changing_a_method_of_the_victim_is_refused() -> None:
 def test_changing_the_runs_own_counters_is_refused() -> None:
     def dig(observation: Tensor, oracle: Oracle) -> None:
         oracle.scores(observation)
-        oracle._door._enforcer.spent.zero_()  # type: ignore[attr-defined]
+        oracle._enforcer.spent.zero_()
 
     with pytest.raises(TamperError, match="changed the counts"):
         drive(dig)
@@ -221,8 +230,8 @@ def test_changing_the_runs_own_counters_is_refused() -> None:
 
 def test_the_runs_own_truth_and_set_cannot_be_written_to() -> None:
     def dig(observation: Tensor, oracle: Oracle) -> None:
-        own = oracle._door._enforcer  # type: ignore[attr-defined]
-        for values in (own._truth, own._low, own._high):
+        held = oracle._enforcer._set
+        for values in (held._truth, held._low, held._high):
             with pytest.raises(ValueError):
                 values[:] = FAR
             with pytest.raises(ValueError):
@@ -326,6 +335,6 @@ def test_changing_the_settings_of_torch_reaches_nobody() -> None:
 
 def test_replacing_a_function_that_enforces_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     SEAL.check()
-    monkeypatch.setattr(enforcer.Enforcer, "project", lambda self, answer: (answer, torch.zeros(len(answer))))
-    with pytest.raises(TamperError, match=r"bench\.driving\.enforcer\.Enforcer\.project was replaced"):
+    monkeypatch.setattr(access.Enforcer, "project", lambda self, answer: (answer, torch.zeros(len(answer))))
+    with pytest.raises(TamperError, match=r"bench\.driving\.access\.Enforcer\.project was replaced"):
         SEAL.check()

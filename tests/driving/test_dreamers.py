@@ -42,9 +42,10 @@ class Rehearses(DrivingAttack):
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         rows = torch.tensor(self.rows(len(observation)))
-        state = oracle.imagined(8, rows)
+        some = oracle.select(rows)
+        state = some.imagined(8)
         for _ in range(3):
-            _, state = oracle.rehearse(observation[rows].expand(8, -1, -1, -1), state, rows)
+            _, state = some.rehearse(observation[rows].expand(8, -1, -1, -1), state)
         return observation
 
 

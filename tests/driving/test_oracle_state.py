@@ -13,8 +13,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cavbench.driving import ObservationThreat, Oracle, Policy
-from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.access import Enforcer
 from cavbench.driving.victim import CHUNK, CountedPolicy
+from cavbench.errors import UserError
 from tests.attacks.driving.victims import FEATURES, observations, victim
 from tests.driving.policies import STATEFUL, remembered, stacked
 
@@ -39,6 +40,11 @@ def started(policy: Policy, state: TensorDictBase) -> tuple[Enforcer, Oracle]:
     generator = torch.Generator().manual_seed(0)
     enforcer = Enforcer(CountedPolicy(policy), ObservationThreat(queries=10**6), "gradients", FEATURES, generator)
     return enforcer, enforcer.begin(observations(len(state), 99), state)
+
+
+def chosen(oracle: Oracle, rows: list[int] | None) -> Oracle:
+    """The oracle of these episodes; the whole one for None."""
+    return oracle if rows is None else oracle.select(torch.tensor(rows, dtype=torch.int64))
 
 
 def asked_about(leading: Sequence[int], episodes: int) -> Tensor:
@@ -67,17 +73,16 @@ def test_answers_equal_the_policys_with_the_same_state(
 ) -> None:
     policy = STATEFUL[name]()
     state = remembered(policy, BATCH, steps)
-    before, oracle = state.clone(), opened(policy, state)
+    before, oracle = state.clone(), chosen(opened(policy, state), rows)
     question = asked_about(leading, BATCH if rows is None else len(rows))
-    places = None if rows is None else torch.tensor(rows, dtype=torch.int64)
-    scores, decisions = oracle.scores(question, places), oracle.decide(question, places)
+    scores, decisions = oracle.scores(question), oracle.decide(question)
     assert scores.shape[:-1] == question.shape[:-2]
     flat = scores.flatten(0, -2)
     for index, (query, own) in enumerate(one_by_one(state, rows, question)):
         assert_same(flat[index], policy.scores(query, own)[0])
     assert_same(decisions, policy.choose(scores), rtol=0, atol=0)
     assert bool((state == before).all())
-    assert_same(oracle.scores(question, places), scores, rtol=0, atol=0)
+    assert_same(oracle.scores(question), scores, rtol=0, atol=0)
 
 
 @every_policy
@@ -88,10 +93,9 @@ def test_gradients_equal_the_policys_with_the_same_state(
 ) -> None:
     policy = STATEFUL[name]()
     state = remembered(policy, BATCH, steps)
-    before, oracle = state.clone(), opened(policy, state)
+    before, oracle = state.clone(), chosen(opened(policy, state), rows)
     question = asked_about(leading, BATCH if rows is None else len(rows))
-    places = None if rows is None else torch.tensor(rows, dtype=torch.int64)
-    value, gradient = oracle.gradient(question, weighed, places)
+    value, gradient = oracle.gradient(question, weighed)
     assert (value.shape, gradient.shape) == (question.shape[:-2], question.shape)
     values, gradients = value.flatten(), gradient.flatten(0, -3)
     for index, (query, own) in enumerate(one_by_one(state, rows, question)):
@@ -146,16 +150,61 @@ def test_the_answer_depends_on_the_state() -> None:
     question = asked_about((), BATCH)
     first, other = (opened(policy, state).scores(question) for state in (here, elsewhere))
     assert (first != other).any(-1).all()
-    swapped = opened(policy, here).scores(question[[1, 0]], torch.tensor([1, 0]))
+    swapped = chosen(opened(policy, here), [1, 0]).scores(question[[1, 0]])
     assert_same(swapped, first[[1, 0]])
 
 
 def test_queries_are_counted_for_their_episodes() -> None:
     policy = stacked(victim("discrete"))
     enforcer, oracle = started(policy, remembered(policy, BATCH, 4))
-    oracle.scores(asked_about((3,), 2), torch.tensor([4, 1]))
-    oracle.gradient(asked_about((2, 2), 1), weighed, torch.tensor([4]))
+    some = chosen(oracle, [4, 1])
+    some.scores(asked_about((3,), 2))
+    chosen(some, [0]).gradient(asked_about((2, 2), 1), weighed)
     assert oracle.spent.tolist() == [0, 3, 0, 0, 7, 0]
+    assert some.spent.tolist() == [7, 3]
+    assert (oracle.remaining - some.remaining.min()).tolist() == [7, 4, 7, 7, 0, 7]
     spent, gradients, *_ = enforcer.counts
     assert spent.tolist() == oracle.spent.tolist()
     assert gradients.tolist() == [0, 0, 0, 0, 4, 0]
+
+
+@at_any_size
+@given(rows=st.lists(st.integers(0, BATCH - 1), min_size=1), data=st.data())
+def test_a_selection_of_a_selection_has_the_limits_of_its_episodes(rows: list[int], data: st.DataObject) -> None:
+    policy = stacked(victim("discrete"))
+    oracle = opened(policy, remembered(policy, BATCH, 4))
+    inner = data.draw(st.lists(st.integers(0, len(rows) - 1), unique=True).map(sorted))
+    some, places = chosen(chosen(oracle, rows), inner), torch.tensor(rows)[inner]
+    assert torch.equal(some.observation, oracle.observation[places])
+    assert torch.equal(some.radius, oracle.radius[places])
+    far = 9 * asked_about((2,), BATCH)
+    assert torch.equal(some.project(far[:, places]), oracle.project(far)[:, places])
+
+
+def test_the_episodes_of_a_selection_pay_once_for_each_time_they_are_named() -> None:
+    policy = stacked(victim("discrete"))
+    oracle = opened(policy, remembered(policy, BATCH, 4))
+    chosen(oracle, [2, 2, 2, 5]).scores(asked_about((), 4))
+    assert oracle.spent.tolist() == [0, 0, 3, 0, 0, 1]
+
+
+@pytest.mark.parametrize("rows", [torch.tensor([0, BATCH]), torch.tensor([-1]), torch.ones(BATCH, dtype=torch.bool)])
+def test_only_numbers_of_its_episodes_can_be_selected(rows: Tensor) -> None:
+    policy = stacked(victim("discrete"))
+    with pytest.raises(UserError, match=r"selected episodes by other than numbers from 0 to 5, int64 \[R\]"):
+        opened(policy, remembered(policy, BATCH, 4)).select(rows)
+
+
+def test_what_an_attack_does_to_its_rows_afterwards_changes_no_account() -> None:
+    policy = stacked(victim("discrete"))
+    oracle, rows = opened(policy, remembered(policy, BATCH, 4)), torch.tensor([1, 2])
+    some = oracle.select(rows)
+    rows.fill_(0)
+    some.scores(asked_about((), 2))
+    assert oracle.spent.tolist() == [0, 1, 1, 0, 0, 0]
+
+
+def test_a_question_about_fewer_episodes_names_the_selection() -> None:
+    policy = stacked(victim("discrete"))
+    with pytest.raises(UserError, match=r"asked about 2 episodes, its oracle has 6: ask oracle\.select\(rows\)"):
+        opened(policy, remembered(policy, BATCH, 4)).scores(asked_about((), 2))

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from cavbench.attacks.driving.noise import Noise
-from cavbench.attacks.driving.pgd import PGD, preference_gap
+from cavbench.attacks.driving.pgd import PGD
+from cavbench.attacks.driving.timing import preference_gap
 from cavbench.driving import DrivingAttack, ObservationThreat
 from cavbench.driving.attacker import Attacker
 from cavbench.driving.victim import CountedPolicy

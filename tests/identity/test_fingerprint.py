@@ -122,7 +122,7 @@ def test_the_code_digest_covers_only_the_code_that_computes_a_unit() -> None:
     assert counted >= {
         *(
             f"cavbench.driving.{name}"
-            for name in ("contracts", "drive", "attacker", "meter", "metrics", "oracle", "policy", "rollout", "threat")
+            for name in ("access", "contracts", "drive", "attacker", "meter", "metrics", "policy", "rollout", "threat")
         ),
         *(
             "cavbench.attacks.driving.pgd",

@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 from toy_plugin import ToyEnv, ToyWorld  # type: ignore[import-not-found]
 
 from cavbench.core.contracts import Facts
-from cavbench.driving import ActionType, Driver, DrivingFacts
+from cavbench.driving import Control, Driver, DrivingFacts
 from cavbench.errors import UserError
 from cavbench.scenarios import Axes, Axis, Cell, Grid
 
@@ -158,8 +158,8 @@ class Miscounted(Bad):
     grid: ClassVar[str] = "miscounted-v1"
     actions: ClassVar[tuple[str, ...]] = ("LEFT", "STRAIGHT", "RIGHT")
 
-    def make(self, cells: Sequence[Cell], *, action_type: ActionType = "discrete", **kwargs: Any) -> EnvBase:
-        return ToyEnv(cells, 5 if action_type == "discrete" else 0, self.max_steps)
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
+        return ToyEnv(cells, 5 if control.action_type == "discrete" else 0, self.max_steps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,10 +169,10 @@ class Driverless(Bad):
     grid: ClassVar[str] = "driverless-v1"
     drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm")
 
-    def make(self, cells: Sequence[Cell], *, driver: Driver = "agent", **kwargs: Any) -> EnvBase:
-        if driver == "idm":
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
+        if control.driver == "idm":
             raise KeyError("idm")
-        return super().make(cells, driver=driver, **kwargs)
+        return super().build(cells, control)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,10 +181,10 @@ class Choosy(Bad):
 
     grid: ClassVar[str] = "choosy-v1"
 
-    def make(self, cells: Sequence[Cell], **kwargs: Any) -> EnvBase:
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
         if any(cell.gap > 20 for cell in cells):
             raise ValueError("the gap is too large")
-        return super().make(cells, **kwargs)
+        return super().build(cells, control)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +193,7 @@ class Refusing(Bad):
 
     grid: ClassVar[str] = "refusing-v1"
 
-    def make(self, cells: Sequence[Cell], *, action_type: ActionType = "discrete", **kwargs: Any) -> EnvBase:
-        if action_type == "continuous":
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
+        if control.action_type == "continuous":
             raise UserError("this world has no steering")
-        return super().make(cells, action_type=action_type, **kwargs)
+        return super().build(cells, control)

@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from cavbench.core.contracts import Access, Progress, Trained
 from cavbench.driving import (
     ActionType,
-    Driver,
+    Control,
     DrivingAttack,
     DrivingDefense,
     DrivingFacts,
@@ -144,15 +144,8 @@ class ToyWorld(DrivingWorld):
     def decision_hz(self) -> float:
         return 10.0
 
-    def make(
-        self,
-        cells: Sequence[Cell],
-        *,
-        action_type: ActionType = "discrete",
-        driver: Driver = "agent",
-        action_repeat: int = 1,
-    ) -> EnvBase:
-        return ToyEnv(cells, len(self.actions) if action_type == "discrete" else 0, self.max_steps)
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
+        return ToyEnv(cells, len(self.actions) if control.action_type == "discrete" else 0, self.max_steps)
 
 
 @dataclass(frozen=True, kw_only=True)

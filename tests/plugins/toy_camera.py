@@ -186,7 +186,7 @@ class Paint(PatchAttack):
         if self.mood == "kill":
             os.kill(os.getpid(), signal.SIGKILL)
         if self.mood == "tamper":
-            oracle._door.detector.bias -= 1
+            oracle._enforcer.detector.bias -= 1
         frames = torch.arange(len(scenes))
         patch = torch.rand(1, 3, self.texels, self.texels, generator=oracle.generator)
         for step in range(10**9 if self.mood == "greedy" else self.steps):

@@ -11,8 +11,8 @@ from cavbench.checks.check import BrokenRuleError, Check, NotApplicableError, Su
 from cavbench.checks.randomness import stir_others
 from cavbench.core.contracts import QueryBudgetError
 from cavbench.detection import PatchAttack, PatchOracle, PatchThreat
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.checks.street import SignDetector, Street
-from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.errors import UserError
 from cavbench.identity.fingerprint import state_digest
 

@@ -15,9 +15,9 @@ from cavbench.checks.randomness import stir_others
 from cavbench.core import registry
 from cavbench.core.contracts import QueryBudgetError
 from cavbench.driving import ActionType, DrivingAttack, DrivingWorld, ObservationThreat, Policy
+from cavbench.driving.access import Enforcer
 from cavbench.driving.checks.traffic import action_types, observations, victim
 from cavbench.driving.dynamics import Dynamics
-from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
 from cavbench.identity.fingerprint import state_digest

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from cavbench.checks.check import Check, NotApplicableError, Subject, Suite, one_line, require
 from cavbench.driving import ObservationThreat, Policy, State
+from cavbench.driving.access import Enforcer
 from cavbench.driving.checks.remembering import Remembering
 from cavbench.driving.checks.state import ATOL, RTOL, check_state, close, named, not_noisy, same
 from cavbench.driving.checks.traffic import observations, rows_of_observation
-from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.policy import rows_of
 from cavbench.driving.victim import CHUNK, CountedPolicy
 from cavbench.errors import UserError
@@ -102,8 +102,9 @@ class PolicyMemorySuite(Suite):
         threat = ObservationThreat(queries=POINTS)
         oracle = Enforcer(CountedPolicy(policy), threat, "scores", self.features, generator).begin(observation, state)
         share = 2 * torch.rand(POINTS, *observation[rows].shape, generator=generator) - 1
-        points = oracle.project(observation[rows] + share * oracle.radius[rows], rows)
-        answered = oracle.scores(points, rows)
+        some = oracle.select(rows)
+        points = some.project(some.observation + share * some.radius)
+        answered = some.scores(points)
         for place in (0, POINTS - 1):
             asked = policy.scores(points[place], rows_of(state, rows))
             require(

@@ -96,7 +96,7 @@ class WorldSuite(Suite):
         count = td["observation"].shape[0]
         require(
             count == len(cells),
-            f"make({len(cells)} cells) creates {count} episodes: create one for each cell, in order",
+            f"build({len(cells)} cells) creates {count} episodes: create one for each cell, in order",
         )
         require(not bool(td["done"].any()), "an episode is done before its first step")
         return f"{len(cells)} of {len(grid.cells())} cells" if len(cells) < len(grid.cells()) else f"{len(cells)} cells"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torchrl.envs import EnvBase
 
-from cavbench.driving import ActionType, Driver, DrivingFacts
+from cavbench.driving import Control, DrivingFacts
 from cavbench.driving.gym import trial
 from cavbench.driving.gym.batch import Batch
 from cavbench.driving.gym.declaration import Declaration
@@ -46,19 +46,12 @@ class GymWorld(Declaration):
         """What 1,000 random steps say against the declarations of the world (`cavbench.driving.gym.trial`)."""
         return trial.doubts(self, cells)
 
-    def make(
-        self,
-        cells: Sequence[Cell],
-        *,
-        action_type: ActionType = "discrete",
-        driver: Driver = "agent",
-        action_repeat: int = 1,
-    ) -> EnvBase:
-        """See `cavbench.driving.DrivingWorld.make`; an action is never repeated.
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
+        """See `cavbench.driving.DrivingWorld.build`; an action is never repeated.
 
         Raises:
             UserError: if the spaces of an environment are not those that the world declares.
         """
-        if driver != "agent" or action_repeat != 1:
+        if control.driver != "agent" or control.action_repeat != 1:
             raise UserError(f"{type(self).__name__} has no driver of its own and repeats no actions")
-        return Batch(self, cells, action_type)
+        return Batch(self, cells, control.action_type)

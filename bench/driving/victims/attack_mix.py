@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cavbench.core.options import configured, parameter_words
 from cavbench.driving import DrivingAttack, DrivingFacts, ObservationThreat, Policy, State, TrainingHooks
-from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.access import Enforcer
 from cavbench.driving.policy import rows_of
 from cavbench.driving.victim import CountedPolicy
 

@@ -15,8 +15,8 @@ from cavbench.attacks.detection.grey_patch import GreyPatch
 from cavbench.attacks.detection.noise_patch import NoisePatch
 from cavbench.attacks.detection.views import corners
 from cavbench.detection import Detector, PatchOracle, PatchThreat, Predictions, Scenes
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.boxes import confidence
-from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
 from cavbench.errors import UserError
 from tests.detection.drawn_street import DrawnStreet
@@ -50,7 +50,7 @@ def test_the_patch_is_close_to_the_optimum() -> None:
     patch, oracle = crafted(EOT(texels=16, steps=40, batch=4, window=32))
     assert patch.shape == (3, 16, 16)
     assert 0 <= patch.min() <= patch.max() <= 1
-    assert (oracle.spent, oracle._door.backwards) == (160, 160)
+    assert (oracle.spent, oracle._enforcer.backwards) == (160, 160)
     best = red(torch.tensor([0.0, 1.0, 1.0])[:, None, None].expand(3, 8, 8))
     controls = [red(crafted(control)[0]) for control in (NoisePatch(texels=16), GreyPatch())]
     assert best <= red(patch) < best + 0.1 * (min(controls) - best)
@@ -94,7 +94,7 @@ def test_a_start_without_the_queries_for_it_is_not_kept() -> None:
 def test_it_reports_its_losses_without_changing_the_patch(monkeypatch: pytest.MonkeyPatch) -> None:
     attack = EOT(texels=8, steps=6, batch=2, window=32)
     patch, oracle = crafted(attack)
-    reported = oracle.evolution
+    reported = oracle.reports.evolution
     assert reported is not None
     assert set(reported.losses) == {"found", "total_variation"}
     variation = torch.stack([total_variation(texels / 255) for texels in reported.texels])

@@ -8,7 +8,7 @@ from torch import Tensor
 from cavbench.attacks.detection.square_patch import SquarePatch
 from cavbench.defenses.detection.temporal import TemporalFusion
 from cavbench.detection import Detector, PatchThreat
-from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.detection.access import PatchEnforcer
 from tests.attacks.detection.test_eot import SCENES, red
 from tests.plugins.toy_camera import RedDetector, RedStreet, RedVictim
 

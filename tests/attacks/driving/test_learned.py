@@ -27,8 +27,8 @@ from cavbench.core.pair import Pair, choose
 from cavbench.defenses.driving.advtrain import AdversarialTraining
 from cavbench.defenses.none import NoDefense
 from cavbench.driving import DrivingAttack, DrivingWorld, ObservationThreat, Policy
+from cavbench.driving.access import Enforcer
 from cavbench.driving.checks.attack import AttackSuite
-from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.victim import CountedPolicy
 from cavbench.driving.victims.ddpg import DDPG
 from cavbench.driving.victims.dqn import DQN

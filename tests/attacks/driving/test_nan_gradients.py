@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from cavbench.attacks.driving.pgd import PGD
-from cavbench.detection.enforcer import PatchEnforcer
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.threat import PatchThreat
 from cavbench.driving import ActionType, ObservationThreat, Policy, PolicyWrapper, State
-from cavbench.driving.enforcer import Enforcer
-from cavbench.driving.oracle import Oracle
+from cavbench.driving.access import Enforcer, Oracle
 from cavbench.driving.victim import CountedPolicy
 from tests.attacks.driving.victims import FEATURES, observations, perturb, victim
 from tests.plugins.toy_camera import RedDetector

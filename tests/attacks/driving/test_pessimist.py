@@ -7,7 +7,7 @@ import torch
 
 from cavbench.attacks.driving.pessimist import Outlook, Pessimist
 from cavbench.driving import Features, ObservationThreat
-from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.access import Enforcer
 from cavbench.driving.victim import CountedPolicy
 from tests.attacks.driving.victims import FEATURES, observations, perturb, victim
 

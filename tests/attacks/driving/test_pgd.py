@@ -7,9 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cavbench.attacks.driving.candidates import random_starts
 from cavbench.attacks.driving.noise import Noise
 from cavbench.attacks.driving.objectives import Objective
-from cavbench.attacks.driving.pgd import PGD, random_starts
+from cavbench.attacks.driving.pgd import PGD
 from cavbench.driving import ActionType, ObservationThreat
 from cavbench.driving.threat import project
 from tests.attacks.driving.victims import FEATURES, Linear, left, loss_of, observations, open_oracle, perturb, victim

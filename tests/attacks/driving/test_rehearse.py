@@ -10,8 +10,8 @@ from tensordict import TensorDict
 from cavbench.attacks.driving.rehearse import SIGNS, shown
 from cavbench.core.pair import choose
 from cavbench.driving import ObservationThreat, Oracle, Policy
+from cavbench.driving.access import Enforcer
 from cavbench.driving.dynamics import Dynamics
-from cavbench.driving.enforcer import Enforcer
 from cavbench.driving.rollout import rollout
 from cavbench.driving.victim import CountedPolicy
 from cavbench.envs.highway.axes import AXES

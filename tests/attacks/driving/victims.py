@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from cavbench.attacks.driving.objectives import DiscreteLoss, Objective
 from cavbench.driving import ActionType, DrivingAttack, Features, ObservationThreat, Oracle, Policy
-from cavbench.driving.enforcer import Enforcer
+from cavbench.driving.access import Enforcer
 from cavbench.driving.victim import CountedPolicy
 from cavbench.driving.victims.networks import ActorPolicy, QPolicy
 

@@ -16,8 +16,8 @@ from cavbench.attacks.detection.noise_patch import NoisePatch
 from cavbench.core.contracts import Facts
 from cavbench.defenses.detection.advtrain_detection import DetectorAdversarialTraining, _Hardening
 from cavbench.detection import STOP_SIGN, Detector, DetectorVictim, PatchThreat, Predictions
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.boxes import confidence
-from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.sight import look, look_at_decoys
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.rcnn import RCNN, RCNNNetwork

@@ -16,10 +16,10 @@ from cavbench.attacks.detection.views import reported
 from cavbench.core.pair import choose
 from cavbench.defenses.detection.temporal import HIGHEST, MATCH_IOU, SINGLE, Fused, TemporalFusion
 from cavbench.detection import Detector, PatchThreat, Predictions
+from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.approach import score
 from cavbench.detection.boxes import overlap
 from cavbench.detection.closed_loop import Drive, drive
-from cavbench.detection.enforcer import PatchEnforcer
 from cavbench.detection.sight import look
 from cavbench.detection.stopping import THRESHOLD
 from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny

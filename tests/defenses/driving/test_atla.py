@@ -125,7 +125,7 @@ def alternation(**changes: Any) -> tuple[Alternation, RecurrentPractice]:
     threat = ObservationThreat(budget=recipe.budget)
     made = Adversary(5, recipe.adversary_hidden, threat, WORLD.facts.features)
     made.scale = 1.0
-    learner = Alternation(policy, made, start(), recipe)
+    learner = Alternation(policy, made, start(), recipe.updates)
     env = WORLD.make(roads(WORLD, 1), action_type="discrete")
     env.set_seed(0)
     phase = Phase(1, 16, 0.99, 1)

@@ -16,7 +16,7 @@ from cavbench.attacks.driving.suites import STANDARD_2
 from cavbench.core.pair import choose
 from cavbench.defenses.driving.smoothing import PolicySmoothing, Smoothed
 from cavbench.driving import ObservationThreat, Oracle
-from cavbench.driving.oracle import DRAWS
+from cavbench.driving.access import DRAWS
 from cavbench.driving.threat import Norm
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
