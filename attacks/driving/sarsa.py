@@ -28,9 +28,10 @@ from cavbench.driving import (
     Policy,
     TrainingHooks,
 )
-from cavbench.driving.victims.learner import CHUNK, Learner, Phase
+from cavbench.driving.victims.learner import CHUNK, Phase
 from cavbench.driving.victims.networks import Critic, QNetwork
 from cavbench.driving.victims.practice import Practice, roads
+from cavbench.driving.victims.replay import OffPolicyLearner
 from cavbench.driving.victims.training import WARM_UP
 from cavbench.errors import UserError
 from cavbench.scenarios import SeedBlock
@@ -150,17 +151,17 @@ class RobustSarsa(DrivingAttack):
         policy = defense.load(victim, seed, world.facts)
         if policy.initial(torch.arange(1)) is not None:
             raise UserError("the critic of this attack knows no memory, and the defended victim has one")
-        phase = Phase(self.repeat, self.decisions, self.gamma, n_step=1)
+        phase = Phase(self.repeat, self.decisions, self.gamma)
         env = world.make(roads(world, 24), action_type=victim.action_type, action_repeat=self.repeat)
         env.set_seed(SeedBlock.TRAIN * (seed + 1))
         learner = _SarsaLearner(self, policy, victim.action_type, env)
         learner.enter(phase)
-        practice = Practice(env, learner, phase, crash_penalty=self.crash_penalty, memory=600_000, batch=512)
+        practice = Practice(env, learner, phase, crash_penalty=self.crash_penalty)
         for done in range(CHUNK, self.decisions + 1, CHUNK):
             share = done / self.decisions
             practice.drive(CHUNK, share)
-            for _ in range(CHUNK * self.updates if done > WARM_UP else 0):
-                learner.update(practice.sample(share), 5e-4 * max(0.05, min(1.0, 2 * (1 - share))))
+            if done > WARM_UP:
+                learner.learn(5e-4 * max(0.05, min(1.0, 2 * (1 - share))), share)
             progress(share, f"loss {learner.last:.4f}")
         card = {"against": policy.weights_sha256, "loss": learner.last}
         critic = learner.mean.requires_grad_(False).eval()
@@ -171,11 +172,11 @@ class RobustSarsa(DrivingAttack):
         return zoo.load(zoo.Recipe.of(victim, defense, self), seed, Value, against=against)
 
 
-class _SarsaLearner(Learner):
+class _SarsaLearner(OffPolicyLearner):
     """Sarsa with the robustness regulariser; the victim does not change."""
 
     def __init__(self, recipe: RobustSarsa, policy: Policy, action_type: ActionType, env: EnvBase) -> None:
-        super().__init__(TrainingHooks())
+        super().__init__(TrainingHooks(), memory=600_000, batch=512, updates=recipe.updates)
         self.recipe, self.policy, self.gamma, self.last = recipe, policy, recipe.gamma, 0.0
         actions = int(env.action_spec.space.n) if action_type == "discrete" else 0
         features = env.observation_spec["observation"].shape[-1]
@@ -186,6 +187,7 @@ class _SarsaLearner(Learner):
         self.explore = _Exploring(policy, actions, recipe.exploration, self.unit)
 
     def enter(self, phase: Phase) -> None:
+        super().enter(phase)
         self.gamma = phase.gamma
 
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from cavbench.checks.check import Subject, Suite
 from cavbench.core import registry
@@ -29,18 +29,36 @@ class Start:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Home:
+    """Where the built-in components of a kind stand in a checkout of cavbench.
+
+    Args:
+        folder: folder of their code.
+        package: the package that this folder is.
+        tests: folder of their tests.
+    """
+
+    folder: str
+    package: str
+    tests: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class Kit:
     """The suites and the templates of a track. Importing it must be quick: no torch.
 
     Args:
         suites: suites by kind of component.
         starts: first commands by kind; each of these kinds has a template.
-        package: package whose folder `templates` contains KIND.py.tmpl and test_KIND.py.tmpl for these kinds.
+        package: package whose folder `templates` contains KIND.py.tmpl and test_KIND.py.tmpl for these kinds, and KIND.md.tmpl
+            for those with a home.
+        homes: where built-in components stand, by kind; for the tracks of cavbench itself.
     """
 
     suites: Mapping[Kind, Suites]
     starts: Mapping[Kind, Start]
     package: str
+    homes: Mapping[Kind, Home] = field(default_factory=dict)
 
 
 def kits() -> list[str]:

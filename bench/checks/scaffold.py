@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import keyword
 import re
+from collections.abc import Mapping
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from string import Template
 from typing import Literal, cast, get_args
@@ -32,7 +34,7 @@ def first_run(kind: str, name: str, track: str) -> str:
     Raises:
         UserError: if the kind or the track is unknown, or the track has no template for the kind.
     """
-    return _kit(kind, track).starts[cast(Kind, kind)].run.format(name=name)
+    return kit_of(kind, track).starts[cast(Kind, kind)].run.format(name=name)
 
 
 def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Path:
@@ -47,8 +49,8 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
     Raises:
         UserError: if the name is not allowed, there is no template, or the folder is not empty or cannot be written.
     """
-    kit = _kit(kind, track)
-    _check_name(kind, name)
+    kit = kit_of(kind, track)
+    check_name(kind, name)
     distribution = f"cavbench-{name.replace('_', '-')}"
     module = f"cavbench_{name}"
     folder = folder or Path(distribution)
@@ -60,7 +62,7 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
         "name": name,
         "distribution": distribution,
         "module": module,
-        "Class": "".join(part.capitalize() for part in name.split("_")),
+        "Class": class_name(name),
         "article": article.capitalize(),
         "noun": noun,
         "run": first_run(kind, name, track),
@@ -76,14 +78,23 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
     try:
         (folder / "tests").mkdir(parents=True)
         for path, template in files.items():
-            text = Template(template.read_text(encoding="utf-8")).substitute(values)
-            (folder / path).write_text(text, encoding="utf-8")
+            (folder / path).write_text(filled(template, values), encoding="utf-8")
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror}; choose another folder with out=") from error
     return folder
 
 
-def _kit(kind: str, track: str) -> Kit:
+def filled(template: Traversable, values: Mapping[str, str]) -> str:
+    """The text of a template with its `$names` replaced."""
+    return Template(template.read_text(encoding="utf-8")).substitute(values)
+
+
+def class_name(name: str) -> str:
+    """The class of a component: MyAttack for my_attack."""
+    return "".join(part.capitalize() for part in name.split("_"))
+
+
+def kit_of(kind: str, track: str) -> Kit:
     """The kit of a track with a template for the kind; UserError if there is none."""
     if kind not in get_args(NewKind):
         raise UserError(registry.unknown(f"kind {kind!r}", kind, get_args(NewKind)))
@@ -98,7 +109,7 @@ def _kit(kind: str, track: str) -> Kit:
     return kit
 
 
-def _check_name(kind: str, name: str) -> None:
+def check_name(kind: str, name: str) -> None:
     """Raise UserError unless the name is valid and not taken."""
     if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or keyword.iskeyword(name) or len(name) > 40:
         raise UserError(

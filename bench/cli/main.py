@@ -114,6 +114,9 @@ def new(
         list[str] | None,
         typer.Argument(metavar="[track=…] [out=…]", help="track=detection for a detector; out=FOLDER for the package."),
     ] = None,
+    builtin: Annotated[
+        bool, typer.Option("--builtin", help="Add it to a checkout of cavbench instead: code, entry, page and test.")
+    ] = False,
 ) -> None:
     """Create a plug-in package: a small component that works and passes its tests, to start from.
 
@@ -121,7 +124,7 @@ def new(
     """
     from cavbench.cli import new as cli_new
 
-    cli_new.print_new(kind, name, words or [], Console())
+    cli_new.print_new(kind, name, words or [], Console(), built_in=builtin)
 
 
 @app.command()

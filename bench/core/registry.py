@@ -17,6 +17,7 @@ from functools import cache, partial
 from importlib import metadata
 from typing import Any, Literal, get_args
 
+from cavbench.core import checkout
 from cavbench.core.names import MARK, plain, split
 from cavbench.errors import EscapeError, PluginError, UserError, reason
 from cavbench.isolation.foreign import contained, harm, unchanged
@@ -97,6 +98,8 @@ def kinds_of(name: str) -> list[Kind]:
     if MARK in name and all(link in names("defense") for link in split(name)):
         kinds = ["defense"]
     if not kinds:
+        if hint := next(filter(None, (checkout.waiting(group, name) for group in GROUPS.values())), ""):
+            raise UserError(f"unknown component {name!r}; {hint}")
         raise UserError(
             unknown(f"component {name!r}", name, sorted({known for kind in KINDS for known in names(kind)}))
         )
@@ -134,7 +137,7 @@ def find(group: str, name: str, noun: str) -> Entry:
         return _joined([find(group, link, noun) for link in split(name)])
     own = plain(name)
     if own not in known:
-        hint = _of_file(name) if noun == "victim" else ""
+        hint = (_of_file(name) if noun == "victim" else "") or checkout.waiting(group, own)
         raise UserError(f"unknown {noun} {name!r}; {hint}" if hint else unknown(f"{noun} {own!r}", own, known))
     if complaint := problem(known[own]):
         raise UserError(f"{noun} {own!r} is {complaint}")

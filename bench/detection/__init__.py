@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from cavbench.detection.access import PatchOracle
     from cavbench.detection.contracts import CameraWorld, DetectorDefense, DetectorVictim, PatchAttack
     from cavbench.detection.detector import STOP_SIGN, Detections, Detector, Objects, Predictions, Wrapped
+    from cavbench.detection.filter import ImageFilter
     from cavbench.detection.scenes import Approach, Decoy, Scenes
     from cavbench.detection.threat import PatchThreat
 
@@ -20,6 +21,7 @@ __all__ = [
     "Detector",
     "DetectorDefense",
     "DetectorVictim",
+    "ImageFilter",
     "Objects",
     "PatchAttack",
     "PatchOracle",
@@ -29,5 +31,5 @@ __all__ = [
     "Wrapped",
 ]
 
-_MODULES = ("access", "contracts", "detector", "scenes", "threat")
+_MODULES = ("access", "contracts", "detector", "filter", "scenes", "threat")
 __getattr__ = exported(__name__, __all__, _MODULES)

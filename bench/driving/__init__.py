@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from cavbench.driving.contracts import DrivingAttack, DrivingDefense, DrivingVictim, DrivingWorld, TrainingHooks
     from cavbench.driving.dynamics import Dynamics, Forecast
     from cavbench.driving.features import ActionType, Control, Driver, DrivingFacts, Features
+    from cavbench.driving.filter import ObservationFilter
     from cavbench.driving.kinematics import Kinematics
     from cavbench.driving.parts import Part, parts_of
     from cavbench.driving.policy import Passed, Policy, PolicyWrapper, State
@@ -27,6 +28,7 @@ __all__ = [
     "Features",
     "Forecast",
     "Kinematics",
+    "ObservationFilter",
     "ObservationThreat",
     "Oracle",
     "Part",
@@ -38,5 +40,5 @@ __all__ = [
     "parts_of",
 ]
 
-_MODULES = ("access", "contracts", "dynamics", "features", "kinematics", "parts", "policy", "threat")
+_MODULES = ("access", "contracts", "dynamics", "features", "filter", "kinematics", "parts", "policy", "threat")
 __getattr__ = exported(__name__, __all__, _MODULES)

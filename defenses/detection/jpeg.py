@@ -11,17 +11,20 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from cavbench.core.contracts import Facts
-from cavbench.defenses.detection.median import Guarded
-from cavbench.detection import Detector, DetectorDefense, DetectorVictim
+from cavbench.detection import ImageFilter
 
 
-class _Compressed(Guarded):
-    def __init__(self, inner: Detector, quality: int) -> None:
-        super().__init__(inner)
-        self.quality = quality
+@dataclass(frozen=True, kw_only=True)
+class JPEG(ImageFilter):
+    """JPEG compression of the detector's input (Das et al. 2018, "SHIELD").
 
-    def transform(self, pictures: Tensor) -> Tensor:
+    Args:
+        quality: quality of the compression, from 1 to 100 (default 40).
+    """
+
+    quality: Annotated[int, Interval(ge=1, le=100)] = 40
+
+    def filter(self, pictures: Tensor) -> Tensor:
         coded = (pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
         through = np.stack([self._through(picture) for picture in coded])
         return torch.from_numpy(through).permute(0, 3, 1, 2).to(pictures) / 255
@@ -32,17 +35,3 @@ class _Compressed(Guarded):
         decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
         assert decoded is not None
         return np.ascontiguousarray(decoded[..., ::-1])
-
-
-@dataclass(frozen=True, kw_only=True)
-class JPEG(DetectorDefense):
-    """JPEG compression of the detector's input (Das et al. 2018, "SHIELD").
-
-    Args:
-        quality: quality of the compression, from 1 to 100 (default 40).
-    """
-
-    quality: Annotated[int, Interval(ge=1, le=100)] = 40
-
-    def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
-        return _Compressed(victim.load(seed, facts), self.quality).eval()

@@ -74,8 +74,6 @@ class Alternation(Learner):
         how: how both learn.
     """
 
-    on_policy = True
-
     def __init__(self, policy: RecurrentPolicy, adversary: Adversary, start: Policy, how: Updates) -> None:
         super().__init__(TrainingHooks())
         self.policy: RecurrentPolicy = policy

@@ -118,9 +118,9 @@ class AlternatingTraining(DrivingDefense):
         learner = Alternation(policy, adversary, start, self.updates)
         env = world.make(roads(world, dqn.copies), action_type="discrete")
         env.set_seed(SeedBlock.TRAIN * (seed + 1))
-        phase = Phase(1, self.decisions, dqn.gamma ** (1 / dqn.repeat), n_step=1)
+        phase = Phase(1, self.decisions, dqn.gamma ** (1 / dqn.repeat))
         learner.enter(phase)
-        practice = RecurrentPractice(env, learner, phase, crash_penalty=dqn.crash_penalty, memory=1, batch=1)
+        practice = RecurrentPractice(env, learner, phase, crash_penalty=dqn.crash_penalty)
         scored = Scored(adversary)
         best = Best(world, scored, dqn.selection_episodes)
 

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 from docutils import nodes
+from docutils.statemachine import StringList
 from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 from glossary_terms import TermsDirective
 from published_rows import PublishedRowsDirective
 from sphinx import addnodes
 from sphinx.application import Sphinx
+from sphinx.directives.other import TocTree
 from sphinx.ext.napoleon import GoogleDocstring
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
@@ -50,6 +52,19 @@ class ComponentDirective(SphinxDirective):
         for table in (node for node in found if isinstance(node, nodes.table)):
             table["classes"].append("parameters")
         return found
+
+
+class PagesDirective(TocTree):
+    """A table of contents with every page of a folder, by the name of its file. A new page needs no entry."""
+
+    required_arguments = 1
+    has_content = False
+
+    def run(self) -> list[nodes.Node]:
+        (folder,) = self.arguments
+        pages = sorted(path.stem for path in (Path(self.env.srcdir) / folder).glob("*.md"))
+        self.content = StringList([f"{page} <{folder}/{page}>" for page in pages], source=self.env.docname)
+        return super().run()
 
 
 def described(kind: Kind, name: str) -> str:
@@ -142,6 +157,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("component", ComponentDirective)
     app.add_directive("terms", TermsDirective)
     app.add_directive("published-rows", PublishedRowsDirective)
+    app.add_directive("pages", PagesDirective)
     app.add_html_math_renderer("mathml", inline_renderers=(_formula, None), block_renderers=(_formula, None))
     app.connect("autodoc-process-docstring", _google_style)
     # Before Sphinx collects downloads.

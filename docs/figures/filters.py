@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from cavbench.defenses.detection.judge import COVER, GREY, SIGN
-from cavbench.defenses.detection.median import Guarded
 from cavbench.defenses.detection.segmenter import Completed
+from cavbench.detection.filter import FilteredDetector
 from cavbench.detection.stopping import THRESHOLD
 from cavbench.envs.camera.faces import DECOYS
 from docs.figures import style
@@ -45,7 +45,7 @@ def segmenter() -> Figure:
     for row, (name, texels) in zip(made.subfigures(1, 2), patches, strict=True):
         shown = picture(approach, NEAR, texels)
         with torch.no_grad():
-            seen, marks = guarded.transform(shown[None])[0], guarded.log_odds(shown[None])[0] > 0
+            seen, marks = guarded.defense.filter(shown[None])[0], guarded.log_odds(shown[None])[0] > 0
         marked = torch.where(marks, torch.tensor([0.0, 0.45, 0.7])[:, None, None], shown)
         row.suptitle(name, fontsize=10)
         for axes, part, title in zip(row.subplots(1, 2), (marked, seen), ("marked", "completed"), strict=True):
@@ -83,7 +83,7 @@ def masking() -> Figure:
 def _figure(defense: str, aware: Tensor) -> Figure:
     """The sign and the confidence with a patch crafted without the defence, and with `aware`, crafted against it."""
     guarded = detector(defense=defense)
-    assert isinstance(guarded, Guarded)
+    assert isinstance(guarded, FilteredDetector)
     unaware = texels_of("eot")
     approach = approaches()[0]
     seen = {
@@ -105,7 +105,7 @@ def _figure(defense: str, aware: Tensor) -> Figure:
     ):
         shown = picture(approach, FRAME, texels)
         with torch.no_grad():
-            shown = guarded.transform(shown[None])[0] if filtered else shown
+            shown = guarded.defense.filter(shown[None])[0] if filtered else shown
         show(axes, crop(shown, approach, FRAME))
         axes.set_title(name, fontsize=10)
     axes = curves.subplots()

@@ -1,4 +1,4 @@
-"""Every built-in component has a page with a formula, a figure and its parameters, which the site reads from the code."""
+"""Every built-in component has a page with a formula and its parameters, which the site reads from the code."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 from cavbench.cli.early import check_names
 from cavbench.cli.explain import GLOSSARY
 from cavbench.core.registry import GROUPS, KINDS, Kind, entries
+from docs.figures.__main__ import FIGURES
 from docs.prose import findings
 from tests.tree import ROOT
 
@@ -34,12 +35,15 @@ def test_every_component_has_a_page(kind: Kind, name: str) -> None:
     assert text.startswith(f"# `{name}`")
     assert re.search(r"^\$\$ .+ \$\$$", text, re.MULTILINE), "no formula"
     assert f"```{{component}} {kind}\nbench list {name}\n```" in text
-    figure = re.search(rf"!\[.+\]\(\.\./images/({kind}_{name}\.(?:svg|png))\)", text)
-    assert figure, "no figure"
-    assert (DOCS / "images" / figure[1]).is_file()
-    assert re.search(rf"^{name} <{page}>$", (DOCS / "index.md").read_text(), re.MULTILINE), (
-        "not in the table of contents"
-    )
+    assert f"```{{pages}} {FOLDERS[kind]}\n" in (DOCS / "index.md").read_text(), "not in the table of contents"
+
+
+@pytest.mark.parametrize("file", sorted(file for file in FIGURES if file.partition("_")[0] in KINDS))
+def test_the_figure_of_a_component_is_on_its_page(file: str) -> None:
+    kind, _, name = file.rpartition(".")[0].partition("_")
+    page = (DOCS / f"{kind}s" / f"{name}.md").read_text()
+    assert re.search(rf"!\[.+\]\(\.\./images/{re.escape(file)}\)", page)
+    assert (DOCS / "images" / file).is_file()
 
 
 WRITTEN_ELSEWHERE = {"plugins.md", "gymnasium.md", "changelog.md"}
@@ -86,8 +90,11 @@ def test_the_site_reads_the_code_and_refuses_unknown_names(tmp_path: Path) -> No
     (source / "index.md").write_text(
         "# Page\n\n$$ \\frac{a}{b} $$\n\n$\\nosuchcommand$\n\n[ranking](../leaderboard/index.html)\n\n"
         "```{component} attack\nbench list noise\n```\n\n```{component} attack\nbench list nois\n```\n\n"
-        "```{terms}\nbench help\n```\n\n```{published-rows}\nbench report leaderboard\n```\n"
+        "```{terms}\nbench help\n```\n\n```{published-rows}\nbench report leaderboard\n```\n\n"
+        "```{pages} attacks\n:caption: Attacks\n```\n"
     )
+    (source / "attacks").mkdir()
+    (source / "attacks" / "mine.md").write_text("# `mine`: found without an entry\n")
     (tmp_path / "leaderboard").mkdir()
     (tmp_path / "leaderboard" / "index.html").write_text("<p>ranks</p>")
     (warned := tmp_path / "warned").touch()
@@ -104,6 +111,7 @@ def test_the_site_reads_the_code_and_refuses_unknown_names(tmp_path: Path) -> No
     assert re.search(r"<dt>budget</dt><dd><p>The size of the perturbation set", page)
     assert 'href="leaderboard/index.html"' in page
     assert (built / "leaderboard" / "index.html").read_text() == "<p>ranks</p>"
+    assert 'href="attacks/mine.html">mine</a>' in page
     complaints = warned.read_text()
     assert "unknown attack 'nois'; did you mean 'noise'?" in complaints
     assert r'Unknown LaTeX command "\nosuchcommand"' in complaints

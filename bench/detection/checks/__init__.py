@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from cavbench.checks.check import NotApplicableError, Subject, Suite
-from cavbench.checks.kits import Kit, Start
+from cavbench.checks.kits import Home, Kit, Start
 
 
 def _attack(subject: Subject) -> Iterator[Suite]:
@@ -42,4 +42,15 @@ KIT = Kit(
         "victim": Start(run=f"bench run attack=noise_patch victim={{name}} {PLACE}", setting="victim.sharpness=20"),
     },
     package="cavbench.detection.checks",
+    homes={
+        "attack": Home(
+            folder="attacks/detection", package="cavbench.attacks.detection", tests="tests/attacks/detection"
+        ),
+        "defense": Home(
+            folder="defenses/detection", package="cavbench.defenses.detection", tests="tests/defenses/detection"
+        ),
+        "victim": Home(
+            folder="bench/detection/victims", package="cavbench.detection.victims", tests="tests/detection/victims"
+        ),
+    },
 )

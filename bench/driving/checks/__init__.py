@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from cavbench.checks.check import NotApplicableError, Subject, Suite
-from cavbench.checks.kits import Kit, Start
+from cavbench.checks.kits import Home, Kit, Start
 
 
 def _attack(subject: Subject) -> Iterator[Suite]:
@@ -38,8 +38,15 @@ KIT = Kit(
     suites={"attack": _attack, "defense": _policy, "victim": _policy, "world": _world},
     starts={
         "attack": Start(run=f"bench run attack={{name}} attack.strength=2 {ROAD}", setting="attack.strength=2"),
-        "defense": Start(run=f"bench run attack=noise,pgd defense={{name}} {ROAD}", setting="defense.copies=16"),
+        "defense": Start(run=f"bench run attack=noise,pgd defense={{name}} {ROAD}", setting="defense.step_size=0.05"),
         "victim": Start(run=f"bench run attack=noise,pgd victim={{name}} {ROAD}", setting="victim.gap_m=60"),
     },
     package="cavbench.driving.checks",
+    homes={
+        "attack": Home(folder="attacks/driving", package="cavbench.attacks.driving", tests="tests/attacks/driving"),
+        "defense": Home(folder="defenses/driving", package="cavbench.defenses.driving", tests="tests/defenses/driving"),
+        "victim": Home(
+            folder="bench/driving/victims", package="cavbench.driving.victims", tests="tests/driving/victims"
+        ),
+    },
 )

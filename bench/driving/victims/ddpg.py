@@ -20,11 +20,11 @@ from cavbench.core.ranges import Count, NotNegative, Width
 from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.networks import Actor, ActorPolicy, Critic
-from cavbench.driving.victims.training import LearningDriver
+from cavbench.driving.victims.replay import OffPolicyDriver, OffPolicyLearner
 
 
 @dataclass(frozen=True, kw_only=True)
-class DDPG(LearningDriver):
+class DDPG(OffPolicyDriver):
     """A deterministic actor (Lillicrap et al. 2016) with continuous steering and acceleration.
 
     TorchRL's TD3Loss: twin critics, smoothed target actions and delayed actor updates (Fujimoto et al. 2018) on top of DDPG,
@@ -55,15 +55,15 @@ class DDPG(LearningDriver):
         return _ActorCriticLearner(self, env, hooks)
 
 
-class _ActorCriticLearner(Learner):
+class _ActorCriticLearner(OffPolicyLearner):
     def __init__(self, recipe: DDPG, env: EnvBase, hooks: TrainingHooks) -> None:
-        super().__init__(hooks)
+        super().__init__(hooks, memory=recipe.memory, batch=recipe.batch, updates=recipe.updates)
         batch, _, features = env.observation_spec["observation"].shape
         self.policy: ActorPolicy = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
         self.mean = ActorPolicy(features, recipe.hidden, recipe.steering_limit)
         if hooks.start is not None:
             self.policy.load_state_dict(hooks.start.state_dict())
-        self.delay, self.updates = recipe.actor_delay, 0
+        self.delay, self.steps = recipe.actor_delay, 0
         limit = self.policy.actor.limit
         actor = _actor(self.policy.actor)
         self.noise = AdditiveGaussianModule(
@@ -90,14 +90,15 @@ class _ActorCriticLearner(Learner):
         self.critic_adam = torch.optim.Adam(list(self.loss.qvalue_network_params.flatten_keys().values()))
 
     def enter(self, phase: Phase) -> None:
+        super().enter(phase)
         # The noise is drawn at every decision and averages out over single frames, so its scale does not change.
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
 
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
-        self.updates += 1
+        self.steps += 1
         value, _ = self.loss.value_loss(sample.copy().set("observation", sample["truth"]))
         _descend(self.critic_adam, value.mean(), learning_rate)
-        if self.updates % self.delay == 0:
+        if self.steps % self.delay == 0:
             loss = self.hooks.loss(self.policy, sample, self._actor_loss)
             _descend(self.actor_adam, loss.mean(), learning_rate)
             self.target.step()

@@ -19,11 +19,11 @@ from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.driving.victims.practice import ALLOWED
-from cavbench.driving.victims.training import LearningDriver
+from cavbench.driving.victims.replay import OffPolicyDriver, OffPolicyLearner
 
 
 @dataclass(frozen=True, kw_only=True)
-class DQN(LearningDriver):
+class DQN(OffPolicyDriver):
     """A deep Q-network (Mnih et al. 2015) that chooses lane changes and target speeds.
 
     TorchRL's DQNLoss with double Q-learning (van Hasselt et al. 2016), n-step returns, a smooth L1 loss and a Polyak-averaged
@@ -46,9 +46,9 @@ class DQN(LearningDriver):
         return _QLearner(self, env, hooks)
 
 
-class _QLearner(Learner):
+class _QLearner(OffPolicyLearner):
     def __init__(self, recipe: DQN, env: EnvBase, hooks: TrainingHooks) -> None:
-        super().__init__(hooks)
+        super().__init__(hooks, memory=recipe.memory, batch=recipe.batch, updates=recipe.updates)
         self.recipe, self.gap = recipe, 0.0
         batch, _, features = env.observation_spec["observation"].shape
         actions = int(env.action_spec.space.n)
@@ -71,6 +71,7 @@ class _QLearner(Learner):
         self.adam = torch.optim.Adam(self.policy.parameters(), recipe.learning_rate)
 
     def enter(self, phase: Phase) -> None:
+        super().enter(phase)
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
         self.gap = phase.gap
         if phase.exploration < 1:

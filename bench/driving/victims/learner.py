@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
 
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -23,7 +22,7 @@ class Phase:
         repeat: number of frames for which a decision is held.
         decisions: number of decisions on every road in this phase.
         gamma: discount per decision.
-        n_step: number of decisions in a return.
+        n_step: number of decisions in a return, for learners with a replay buffer.
         exploration: multiplies the recipe's final exploration, so that the rate of random actions per second does not change.
         gap: gap of advantage learning, in [0, 1); it widens the action gap by 1 / (1 - gap).
     """
@@ -31,7 +30,7 @@ class Phase:
     repeat: int
     decisions: int
     gamma: float
-    n_step: int
+    n_step: int = 1
     exploration: float = 1.0
     gap: float = 0.0
 
@@ -43,8 +42,6 @@ class Learner(ABC):
         hooks: the changes of a defence; the policy continues from `hooks.start` if it is set.
     """
 
-    on_policy: ClassVar[bool] = False
-    """Whether it learns from its latest transitions alone, without a replay buffer."""
     policy: Policy
     """The network in training."""
     explore: nn.Module
@@ -55,20 +52,20 @@ class Learner(ABC):
 
     @abstractmethod
     def enter(self, phase: Phase) -> None:
-        """Set the discount and exploration of a phase."""
+        """Set the discount and exploration of a phase, and forget the transitions of the one before."""
 
     def progress(self, info: TensorDictBase) -> Tensor:
         """The reward [B, 1] of a decision without a failure, summed over its frames, from the environment's `info`."""
         progress: Tensor = info["progress"]
         return progress
 
+    @abstractmethod
     def collect(self, chunk: TensorDictBase) -> None:
-        """Take a chunk of transitions [B, T], if the algorithm is `on_policy`."""
-        raise NotImplementedError(f"{type(self).__name__} learns from a replay buffer")
+        """Take a chunk of transitions [B, T]."""
 
+    @abstractmethod
     def learn(self, learning_rate: float, share: float) -> None:
-        """Learn from what was collected, if the algorithm is `on_policy`; `share` of the training is finished."""
-        raise NotImplementedError(f"{type(self).__name__} learns from a replay buffer")
+        """Learn from what was collected; `share` of the training is finished."""
 
     @abstractmethod
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:

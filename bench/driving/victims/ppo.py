@@ -29,8 +29,7 @@ class PPO(LearningDriver):
     """Proximal policy optimisation (Schulman et al. 2017) that chooses lane changes and target speeds.
 
     TorchRL's ClipPPOLoss with generalised advantages (Schulman et al. 2016). The policy drives greedily: the scores that an
-    attack sees are the logits, and the most likely action is taken. It learns from its latest experience only, so `n_step`,
-    `memory` and `updates` have no meaning for it. `tau` is the rate at which the averaged weights, with which it drives, follow.
+    attack sees are the logits, and the most likely action is taken. It drives with averaged weights.
 
     Its second phase, from scratch, decides at every frame and takes few careful steps: a crash is rare and comes seconds after
     the decision that led to it, so it costs more, and each update learns from more experience. For the first `settling` rounds of
@@ -49,6 +48,7 @@ class PPO(LearningDriver):
         fine_rate: learning rate of the policy in the second phase.
         critic_speed: learning rate of the critic there, as a multiple of `fine_rate`.
         settling: rounds of updates at the beginning of the second phase in which the critic alone learns.
+        tau: rate at which the averaged weights follow, per update.
         clip: epsilon, the largest change of an action's probability ratio that is rewarded.
         trace: lambda of the advantages per decision of the first phase.
         entropy: initial weight of the entropy bonus.
@@ -105,8 +105,6 @@ BEHIND = 0.5
 
 
 class _ProximalLearner(Learner):
-    on_policy = True
-
     def __init__(self, recipe: PPO, env: EnvBase, hooks: TrainingHooks) -> None:
         super().__init__(hooks)
         self.recipe = recipe

@@ -1,11 +1,10 @@
-"""Collects the training experience: the roads, the reward, and the replay buffer of n-step transitions."""
+"""Collects the training experience: the roads and the reward."""
 
 from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import EnvBase, ExplorationType, MultiStepTransform, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from cavbench.core import registry
 from cavbench.driving import DrivingWorld
@@ -26,7 +25,7 @@ def roads(world: DrivingWorld, copies: int) -> list[Cell]:
 
 
 class Practice:
-    """Drives the roads in one phase of the training and stores n-step transitions.
+    """Drives the roads in one phase of the training, for the learner to collect.
 
     The reward is Eq. 4.1 of the thesis without highway-env's normalisation, divided by 0.5, minus `crash_penalty` on a failure.
     It is the mean over the frames of a decision, times (1 - gamma), which keeps the values in one range. (With the normalised
@@ -37,8 +36,6 @@ class Practice:
         learner: makes the decisions.
         phase: the phase of the training.
         crash_penalty: cost of a crash or of leaving the road, in frames of perfect driving.
-        memory: size of the replay buffer in transitions.
-        batch: size of a sample in transitions.
         sign: 1 for a driver; -1 for an adversary, whose reward is minus the driver's.
     """
 
@@ -49,27 +46,16 @@ class Practice:
         phase: Phase,
         *,
         crash_penalty: float,
-        memory: int,
-        batch: int,
         sign: float = 1.0,
     ) -> None:
         self.env, self.learner, self.phase, self.crash_penalty = env, learner, phase, crash_penalty
         self.sign = sign
-        self.buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(memory), batch_size=batch)
-        # Without done_keys=[] the transform keeps `terminated` of the first step and bootstraps through crashes.
-        self.multi_step = MultiStepTransform(n_steps=phase.n_step, gamma=phase.gamma, done_keys=[])
         self.td = env.reset()
 
     @torch.no_grad()
     def drive(self, decisions: int, share: float) -> None:
         """Make `decisions` decisions on every road; `share` of the training is finished."""
-        chunk = torch.stack([self.decide(share) for _ in range(decisions)], -1)
-        if self.learner.on_policy:
-            self.learner.collect(chunk)
-            return
-        transitions = self.multi_step.inv(chunk)
-        if transitions is not None and transitions.numel():
-            self.buffer.extend(transitions.exclude("gamma", "nonterminal", ("next", "original_reward")).reshape(-1))
+        self.learner.collect(torch.stack([self.decide(share) for _ in range(decisions)], -1))
 
     def decide(self, share: float) -> TensorDict:
         """One decision on every road: the transitions [B]."""
@@ -85,13 +71,6 @@ class Practice:
         """The learner's actions for the observations in `td`, with exploration."""
         with set_exploration_type(ExplorationType.RANDOM):
             self.learner.explore(self.td)
-
-    def sample(self, share: float) -> TensorDictBase:
-        """A batch of transitions: `truth` is the stored observation, `observation` is after `hooks.replayed`."""
-        sample = self.buffer.sample()
-        truth = sample["observation"]
-        sample.set("truth", truth)
-        return sample.set("observation", self.learner.hooks.replayed(truth, self.learner.policy, share))
 
     def transition(self, step: TensorDictBase) -> TensorDict:
         """The transitions [B] with their rewards, from a step of the environment."""

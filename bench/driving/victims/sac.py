@@ -26,13 +26,13 @@ from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.logits import Logits, SoftPolicy
 from cavbench.driving.victims.practice import ALLOWED
-from cavbench.driving.victims.training import LearningDriver
+from cavbench.driving.victims.replay import OffPolicyDriver, OffPolicyLearner
 
 EntropyShare = Annotated[float, Interval(gt=0, lt=1)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SAC(LearningDriver):
+class SAC(OffPolicyDriver):
     """Soft actor-critic (Haarnoja et al. 2018) for discrete actions (Christodoulou 2019): lane changes and target speeds.
 
     TorchRL's DiscreteSACLoss with n-step returns, a temperature that is learned for a target entropy, and
@@ -79,9 +79,9 @@ class _AveragedSACLoss(DiscreteSACLoss):
     delay_actor = True
 
 
-class _SoftLearner(Learner):
+class _SoftLearner(OffPolicyLearner):
     def __init__(self, recipe: SAC, env: EnvBase, hooks: TrainingHooks) -> None:
-        super().__init__(hooks)
+        super().__init__(hooks, memory=recipe.memory, batch=recipe.batch, updates=recipe.updates)
         self.recipe, self.decisions = recipe, 0
         batch, _, features = env.observation_spec["observation"].shape
         actions = int(env.action_spec.space.n)
@@ -126,6 +126,7 @@ class _SoftLearner(Learner):
         self.adam = torch.optim.Adam(groups)
 
     def enter(self, phase: Phase) -> None:
+        super().enter(phase)
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
         self.gap = phase.gap
         self._aim()

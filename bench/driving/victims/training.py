@@ -40,15 +40,11 @@ class LearningDriver(DrivingVictim):
         repeat: number of frames for which a decision is held in the first phase.
         hidden: width of the hidden layers after the encoder.
         gamma: discount per decision in the first phase; gamma^(1/repeat) in the second.
-        n_step: decisions in a return of the first phase; the second phase uses the same time span.
         crash_penalty: cost of a crash or of leaving the road, in frames of perfect driving.
         learning_rate: initial rate of Adam; it falls linearly to a twentieth over the second half. With a trained start it is
             half of this.
         batch: transitions per update.
-        updates: gradient updates per decision of the whole batch of roads.
         copies: number of parallel episodes on each road of the grid.
-        memory: size of the replay buffer in transitions.
-        tau: rate of the target networks' soft update.
         checkpoints: number of candidates for the final weights, spread over the last share `fine` of the training.
         trained_in: non-default parameters of the training world, for instance `vehicles=5`; set by `bench train`.
         behind: the defence that it is trained behind, with its parameters, for instance `tracker+shield shield.band=6`; empty for
@@ -70,14 +66,10 @@ class LearningDriver(DrivingVictim):
     repeat: Count = 5
     hidden: Width = 128
     gamma: Share = 0.97
-    n_step: Count = 3
     crash_penalty: float = 40.0
     learning_rate: float = 5e-4
     batch: Count = 512
-    updates: Count = 1
     copies: Count = 24
-    memory: Count = 600_000
-    tau: Share = 0.005
     checkpoints: Count = 8
     trained_in: str = ""
     behind: str = ""
@@ -94,14 +86,12 @@ class LearningDriver(DrivingVictim):
         started = hooks.start is not None
         fine = hooks.decisions if started else round(self.decisions * self.fine)
         phases = [
-            Phase(self.repeat, self.decisions - fine, self.gamma, self.n_step),
-            # One frame of another action changes the value a fifth as much as five frames: `gap` restores the action gap. An
-            # n-step return assumes that the actions are the policy's own, so it is short if they are not (`off_policy`).
+            Phase(self.repeat, self.decisions - fine, self.gamma),
+            # One frame of another action changes the value a fifth as much as five frames: `gap` restores the action gap.
             Phase(
                 1,
                 fine,
                 self.gamma ** (1 / self.repeat),
-                self.repeat if hooks.off_policy else self.n_step * self.repeat,
                 exploration=1 / self.repeat,
                 gap=1 - 1 / self.repeat,
             ),
@@ -135,15 +125,7 @@ class LearningDriver(DrivingVictim):
             learner = learner or self.learner(env, hooks)
             learner.enter(phase)
             practiced = Practice if guard is None else partial(GuardedPractice, guard=guard)
-            practice = practiced(
-                env,
-                learner,
-                phase,
-                crash_penalty=self.crash_penalty,
-                memory=self.memory,
-                batch=self.batch,
-                sign=self.sign,
-            )
+            practice = practiced(env, learner, phase, crash_penalty=self.crash_penalty, sign=self.sign)
             for taken in range(CHUNK, phase.decisions + 1, CHUNK):
                 share = done / total
                 practice.drive(CHUNK, share)
@@ -151,11 +133,7 @@ class LearningDriver(DrivingVictim):
                 learner.anneal()
                 if taken > WARM_UP:
                     rate = self.learning_rate * max(0.05, min(1.0 if hooks.start is None else 0.5, 2 * (1 - share)))
-                    if learner.on_policy:
-                        learner.learn(rate, share)
-                    else:
-                        for _ in range(CHUNK * self.updates):
-                            learner.update(practice.sample(share), rate)
+                    learner.learn(rate, share)
                 if self._due(done / total, len(best.history), hooks):
                     best.offer(learner.averaged(), done / total)
                 progress(done / total, f"safe_progress {best.score:.2f}" if best.score is not None else "")

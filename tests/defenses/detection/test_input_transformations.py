@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from cavbench.defenses.detection.jpeg import JPEG
-from cavbench.defenses.detection.median import Guarded, MedianSmoothing
+from cavbench.defenses.detection.median import MedianSmoothing
 from cavbench.detection import DetectorDefense
+from cavbench.detection.filter import FilteredDetector
 from tests.plugins.toy_camera import RedStreet, RedVictim
 
 BOTH = [MedianSmoothing(size=5), JPEG(quality=30)]
@@ -20,22 +21,22 @@ def pictures(count: int = 2) -> Tensor:
     return torch.rand(count, 3, 32, 32, generator=torch.Generator().manual_seed(0))
 
 
-def guarded(defense: DetectorDefense) -> Guarded:
+def guarded(defense: DetectorDefense) -> FilteredDetector:
     found = defense.load(RedVictim(), 0, RedStreet().facts)
-    assert isinstance(found, Guarded)
+    assert isinstance(found, FilteredDetector)
     return found
 
 
 def test_the_median_equals_opencvs() -> None:
     shown = (pictures(1) * 255).round() / 255
-    transformed = guarded(MedianSmoothing(size=5)).transform(shown)[0].permute(1, 2, 0).numpy()
+    transformed = guarded(MedianSmoothing(size=5)).defense.filter(shown)[0].permute(1, 2, 0).numpy()
     wanted = cv2.medianBlur((shown[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8), 5) / 255
     assert np.allclose(transformed[2:-2, 2:-2], wanted[2:-2, 2:-2], atol=1e-6)
 
 
 def test_a_lower_quality_loses_more() -> None:
     shown = pictures()
-    lost = [float((guarded(JPEG(quality=q)).transform(shown) - shown).abs().mean()) for q in (10, 40, 95)]
+    lost = [float((guarded(JPEG(quality=q)).defense.filter(shown) - shown).abs().mean()) for q in (10, 40, 95)]
     assert lost[0] > lost[1] > lost[2] > 0
 
 
@@ -44,7 +45,7 @@ def test_the_detector_receives_the_transformed_image_and_the_gradient_is_straigh
     defense: DetectorDefense,
 ) -> None:
     door, shown = guarded(defense), pictures().requires_grad_(True)
-    through = door.transform(shown.detach()).requires_grad_(True)
+    through = door.defense.filter(shown.detach()).requires_grad_(True)
     assert torch.allclose(door(shown).scores, door.inner(through).scores, atol=1e-6)
     door(shown).scores.sum().backward()
     door.inner(through).scores.sum().backward()
@@ -58,7 +59,7 @@ def test_the_detector_receives_the_transformed_image_and_the_gradient_is_straigh
 def test_images_of_a_batch_are_transformed_independently(defense: DetectorDefense) -> None:
     shown = pictures(3)
     door = guarded(defense)
-    assert torch.equal(door.transform(shown)[1:2], door.transform(shown[1:2]))
+    assert torch.equal(door.defense.filter(shown)[1:2], door.defense.filter(shown[1:2]))
     assert (door.names, door.stride) == (door.inner.names, door.inner.stride)
 
 

@@ -130,7 +130,7 @@ def alternation(**changes: Any) -> tuple[Alternation, RecurrentPractice]:
     env.set_seed(0)
     phase = Phase(1, 16, 0.99, 1)
     learner.enter(phase)
-    return learner, RecurrentPractice(env, learner, phase, crash_penalty=40.0, memory=1, batch=1)
+    return learner, RecurrentPractice(env, learner, phase, crash_penalty=40.0)
 
 
 def weights(learner: Alternation) -> list[list[Tensor]]:

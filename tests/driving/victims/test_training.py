@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -29,9 +29,10 @@ from cavbench.driving.victims.sac import SAC
 from cavbench.driving.victims.training import LearningDriver
 from cavbench.errors import UserError
 
-SHORT = {"decisions": 160, "copies": 1, "hidden": 8, "batch": 16, "memory": 2000, "checkpoints": 1}
-VICTIMS = [DQN(**SHORT), DDPG(**SHORT)]
-LEARNERS = [*VICTIMS, PPO(**SHORT, fine_rollout=16), SAC(**SHORT)]
+SHORT = {"decisions": 160, "copies": 1, "hidden": 8, "batch": 16, "checkpoints": 1}
+REPLAYED = SHORT | {"memory": 2000}
+VICTIMS = [DQN(**REPLAYED), DDPG(**REPLAYED)]
+LEARNERS = [*VICTIMS, PPO(**SHORT, fine_rollout=16), SAC(**REPLAYED)]
 NAMES = ["dqn", "ddpg", "ppo", "sac"]
 
 
@@ -60,16 +61,22 @@ def test_the_card_has_the_checkpoint_selection(world: DrivingWorld) -> None:
     }
 
 
+def test_only_a_driver_that_learns_from_a_replay_buffer_has_its_parameters() -> None:
+    of_the_buffer = {"n_step", "memory", "updates"}
+    assert all(of_the_buffer <= {field.name for field in fields(victim)} for victim in (DQN, DDPG, SAC))
+    assert not of_the_buffer & {field.name for field in fields(PPO)}
+
+
 def test_returns_end_where_the_episode_ends(world: DrivingWorld) -> None:
-    victim = DQN(**SHORT | {"copies": 4, "crash_penalty": 1000.0})
+    victim = DQN(**REPLAYED | {"copies": 4, "crash_penalty": 1000.0})
     phase = victim.phases(TrainingHooks())[0]
     env = world.make(roads(world, 4), action_type="discrete", action_repeat=phase.repeat)
     env.set_seed(0)
     learner = victim.learner(env, TrainingHooks())
     learner.enter(phase)
-    practice = Practice(env, learner, phase, crash_penalty=1000.0, memory=2000, batch=16)
+    practice = Practice(env, learner, phase, crash_penalty=1000.0)
     practice.drive(120, 0.0)
-    seen = practice.buffer[:]
+    seen = learner.buffer[:]
     short = seen["steps_to_next_obs"].squeeze(-1) < phase.n_step
     over = seen["next", "done"].squeeze(-1)
     crashed = seen["next", "terminated"].squeeze(-1)
@@ -87,7 +94,7 @@ def test_in_the_second_phase_of_ppo_the_critic_learns_first_and_a_crash_costs_mo
     learner = victim.learner(env, TrainingHooks())
     learner.enter(phase)
     assert learner.progress(TensorDict({"progress": 1.0, "crashed": True, "offroad": False})) == 1 - 360
-    practice = Practice(env, learner, phase, crash_penalty=40.0, memory=2000, batch=16)
+    practice = Practice(env, learner, phase, crash_penalty=40.0)
     moved = []
     for _ in range(3):
         before = [[weight.clone() for weight in part.parameters()] for part in (learner.policy, learner.critic)]
@@ -262,7 +269,7 @@ def test_a_policy_behind_a_filter_learns_from_what_passes_it(victim: LearningDri
     phase = recipe.phases(hooks)[0]
     learner.enter(phase)
     guard = Guard(defense_of(recipe.behind), recipe, world.facts)
-    practice = GuardedPractice(env, learner, phase, crash_penalty=40.0, memory=2000, batch=16, guard=guard)
+    practice = GuardedPractice(env, learner, phase, crash_penalty=40.0, guard=guard)
     executed = []
     for _ in range(40):
         before = practice.seen
@@ -282,7 +289,7 @@ def test_a_policy_behind_a_filter_learns_from_what_passes_it(victim: LearningDri
 
 def soft_lesson(**params: object) -> tuple[SAC, Lesson]:
     """A SAC and transitions [64] of single decisions: `action` 2 earns 1, the others 0."""
-    victim = SAC(**SHORT | params)
+    victim = SAC(**REPLAYED | params)
     lesson = Lesson(victim, registry.load("world", "highway")())
     sample = lesson.sample
     sample["next", "reward"] = (sample["action"] == 2).float().unsqueeze(-1)
@@ -330,7 +337,7 @@ def test_actions_that_are_not_allowed_have_no_part_in_the_soft_values() -> None:
 def test_a_soft_policy_continues_with_its_critics(world: DrivingWorld) -> None:
     start = SoftPolicy(5, 5, 8)
     hooks = AttackMix(start, 40, world.facts, seed=0)
-    learner = SAC(**SHORT).learner(world.make(roads(world, 1), action_type="discrete"), hooks)
+    learner = SAC(**REPLAYED).learner(world.make(roads(world, 1), action_type="discrete"), hooks)
     learner.anneal()
     for network in (learner.policy, learner.averaged()):
         assert all(torch.equal(value, start.state_dict()[name]) for name, value in network.state_dict().items())
