@@ -19,9 +19,9 @@ from tests.checks.test_new import EVERY, TESTS, name_of
 from tests.cli.test_cli import assert_one_line
 from tests.command import SETTINGS, Said, import_path
 from tests.plugins.distributions import install
+from tests.tree import FOLDERS, ROOT
 
-ROOT = Path(__file__).parents[2]
-CODE = ("bench", "attacks", "defenses", "envs", "leaderboard", "tests")
+CODE = (*FOLDERS, "tests")
 Bench = Callable[..., Said]
 
 
@@ -36,6 +36,12 @@ def checkout(tmp_path: Path) -> Path:
     for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
         (folder / name).symlink_to(ROOT / name)
     shutil.copy(ROOT / "pyproject.toml", folder)
+    for inner, place in FOLDERS.items():
+        # As `make tree`: what a finder does for an editable installation.
+        for path in (folder / inner).iterdir() if inner == "bench" else [folder / inner]:
+            link = folder / "build" / "tree" / place / (path.name if inner == "bench" else "")
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(path)
     return folder
 
 
@@ -45,7 +51,7 @@ def files(folder: Path) -> set[str]:
 
 def typed(checkout: Path, site: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Run Python in the checkout, with the distributions in `site`."""
-    environment = os.environ | SETTINGS | {"PYTHONPATH": import_path(site, checkout)}
+    environment = os.environ | SETTINGS | {"PYTHONPATH": import_path(site, checkout / "build" / "tree")}
     command = [sys.executable, *words]
     return subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
 
@@ -57,13 +63,13 @@ def test_a_built_in_component_is_four_files(bench: Bench, checkout: Path) -> Non
     assert files(checkout) - before == {
         "attacks/driving/my_attack.py",
         "docs/attacks/my_attack.md",
-        "tests/attacks/test_my_attack.py",
+        "tests/attacks/driving/test_my_attack.py",
     }
     now = (checkout / "pyproject.toml").read_text()
     assert [line for line in now.splitlines() if line not in project.splitlines()] == [
-        'my_attack = "attacks.my_attack:MyAttack"'
+        'my_attack = "cavbench.attacks.driving.my_attack:MyAttack"'
     ]
-    assert now.replace('my_attack = "attacks.my_attack:MyAttack"\n', "") == project
+    assert now.replace('my_attack = "cavbench.attacks.driving.my_attack:MyAttack"\n', "") == project
     for part in (f"pip install --no-deps -e {checkout}", "bench check my_attack", "make docs"):
         assert part in said.out
 
@@ -96,7 +102,7 @@ def test_another_folder_than_a_checkout_is_refused(bench: Bench, tmp_path: Path)
 def test_an_entry_that_is_not_installed_yet_is_named_in_one_line(bench: Bench, checkout: Path, tmp_path: Path) -> None:
     bench("new", "attack", "my_attack", "--builtin", f"out={checkout}")
     for words in (("list", "my_attack"), ("run", "attack=my_attack")):
-        ended = typed(checkout, tmp_path / "nothing", "-m", "bench", *words)
+        ended = typed(checkout, tmp_path / "nothing", "-m", "cavbench", *words)
         assert ended.returncode != 0
         (line,) = ended.stderr.strip().splitlines()
         assert "it is not installed yet: pip install --no-deps -e" in line
