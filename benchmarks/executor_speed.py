@@ -20,25 +20,24 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
 import psutil
 import pyarrow as pa
 
-from cavbench.core.pair import Pair, choose
 from cavbench.core.track import track
-from cavbench.driving.victims.reference import Blind
 from cavbench.errors import in_one_line
 from cavbench.isolation.framework import Snapshot
 from cavbench.records import packing, reading, store
 from cavbench.run import runner
-from cavbench.run.config import run_config
+from cavbench.run.attempt import attempt
+from cavbench.run.config import plan_of
 from cavbench.run.executors import EXECUTORS
+from cavbench.run.plan import Plan
 from cavbench.run.process import cores
-from cavbench.run.unit import Loading
-from cavbench.run.work import Outcome, Task, attempt
-from cavbench.run.worker import Limits
+from cavbench.run.task import Outcome, Task
 
 PAIR = ("defense=none", "victim=dqn", "lanes=3,4", "density=1", "weather=clear,fog", "seeds=0,1")
 QUIET = ("record=0", "reference=false")
@@ -54,32 +53,23 @@ class Silent:
         return lambda *arguments: None
 
 
-def nothing() -> Task:
+def nothing(plan: Plan) -> Task:
     """A task that loads a victim without weights."""
-    blind = choose("victim", "blind")
-    assert isinstance(blind.component, Blind)
-    pair = Pair(
-        attack=choose("attack", "none"),
-        defense=choose("defense", "none"),
-        victim=blind,
-        world=choose("world", "highway"),
-        threat=blind.component.threat.of_nobody(),
-    )
-    return Task(work=Loading(pair=pair, training_seed=0))
+    return replace(plan.loadings[0], cells=(), asks_world=False)
 
 
 def throughput(name: str, count: int) -> tuple[float, float]:
     """Finished tasks a second of wall time, and of the driver's CPU time. Nothing is written."""
-    task = nothing()
-    with closing(EXECUTORS[name](None, Limits(seconds=600), "local")) as back_end:
+    plan = plan_of(["victim=blind", f"executor={name}", "unit_timeout=600", "unit_memory=0"])
+    with closing(EXECUTORS[name](plan)) as back_end:
         # The first tasks wait for the workers to start.
-        list(back_end.map([Task(work=task.work) for _ in range(2 * cores())], Silent()))  # type: ignore[arg-type]
+        list(back_end.map([nothing(plan) for _ in range(2 * cores())], Silent()))  # type: ignore[arg-type]
         start, used = time.perf_counter(), time.process_time()
-        tasks = (Task(work=task.work) for _ in range(count))
+        tasks = (nothing(plan) for _ in range(count))
         ended = list(chain.from_iterable(back_end.map(tasks, Silent())))  # type: ignore[arg-type]
         seconds, used = time.perf_counter() - start, time.process_time() - used
     assert len(ended) == count
-    assert all(isinstance(outcome, Outcome) for _, outcome in ended)
+    assert not any(outcome.failed for _, outcome in ended)
     return count / seconds, count / used
 
 
@@ -98,7 +88,7 @@ def of_records() -> None:
         out = Path(folder)
         words = [word for word in PAIR if not word.startswith(("lanes", "weather", "seeds"))]
         more = ("attack=noise", "lanes=3", "weather=clear", "seeds=0", "episodes=100", "executor=serial", *QUIET)
-        units = runner.run(run_config([*words, *more, f"out={out}"]), Silent())
+        units = runner.run(plan_of([*words, *more, f"out={out}"]), Silent())
         records = reading.read(out, units[:1], track=track("driving"))
         sent = pickle.dumps(Outcome(wall_s=1.0, records=records), pickle.HIGHEST_PROTOCOL)
         many = [_renamed(records, number) for number in range(packing.UNITS)]
@@ -129,7 +119,7 @@ def pair_seconds(name: str, attack: str, episodes: int) -> tuple[float, float, f
         used: dict[tuple[int, float], float] = {}
 
         class Watching(Silent):
-            def working(self, works: object) -> None:
+            def working(self, tasks: object) -> None:
                 nonlocal largest
                 # Ray's own processes have a few hundred MB as well.
                 for child in psutil.Process().children(recursive=True):
@@ -140,7 +130,7 @@ def pair_seconds(name: str, attack: str, episodes: int) -> tuple[float, float, f
                         used[child.pid, child.create_time()] = times.user + times.system
 
         start, own = time.perf_counter(), time.process_time()
-        runner.run(run_config(words), Watching())
+        runner.run(plan_of(words), Watching())
         return time.perf_counter() - start, time.process_time() - own + sum(used.values()), largest
 
 
@@ -160,7 +150,7 @@ def main() -> None:
         print(
             f"{name}: {wall:.0f} tasks that do nothing a second on {cores()} cores; capacity of the driver {capacity:.0f}"
         )
-    framework, task = Snapshot(), nothing()
+    framework, task = Snapshot(), nothing(plan_of(["victim=blind"]))
     print(f"a worker takes {milliseconds(lambda: attempt(task, lambda *news: None, framework), 100):.1f} ms a task")
     of_records()
     rounds = [

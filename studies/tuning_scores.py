@@ -13,7 +13,7 @@ import numpy as np
 
 from cavbench.driving.drive import drive
 from cavbench.errors import in_one_line
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from cavbench.run.process import settle
 from cavbench.run.unit import Unit
 from cavbench.scenarios import SeedBlock
@@ -21,7 +21,7 @@ from cavbench.scenarios import SeedBlock
 
 def main() -> None:
     settle()
-    config = run_config([*sys.argv[1:], "reference=false"])
+    config = plan_of([*sys.argv[1:], "reference=false"])
     grid = replace(config.grid, first_seed=SeedBlock.TUNE)
     for pair in config.pairs:
         start, cells = time.process_time(), []

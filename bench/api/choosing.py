@@ -14,7 +14,7 @@ from cavbench.core import budgets, registry, suites
 from cavbench.core.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
 from cavbench.core.pair import Chosen, Pair, choose
 from cavbench.core.registry import GROUPS, Kind
-from cavbench.core.suites import Suite
+from cavbench.core.suites import Suite, combined
 from cavbench.core.track import track
 from cavbench.driving import DrivingWorld
 from cavbench.driving.victims.in_process import InProcess, code_of_policies, in_process
@@ -23,7 +23,7 @@ from cavbench.driving.victims.sb3_model import is_model
 from cavbench.driving.victims.spaces import UNKNOWN
 from cavbench.errors import UserError
 from cavbench.identity.bytecode import content_of
-from cavbench.run.config import combined, grid_of
+from cavbench.run.config import grid_of
 from cavbench.scenarios import Grid, SeedBlock, Value
 
 BASES: dict[str, type[Component]] = {"attack": Attack, "defense": Defense, "victim": Victim, "world": World}
@@ -163,7 +163,7 @@ def _refuse_twice(victim: InProcess) -> None:
 def pairs_of(
     attack: Any, defense: Any, victim: Chosen[Any], world: Chosen[Any], threat: ThreatModel | Mapping[str, Any] | None
 ) -> tuple[list[Pair], list[str]]:
-    """Every combination of attacks and defences, as `cavbench.run.config.combined`."""
+    """Every combination of attacks and defences, as `cavbench.core.suites.combined`."""
     own_track = victim.component.tracks()[0]
     names = suites.names()
     chosen_suites = [suites.suite(one, own_track) for one in several(attack) if isinstance(one, str) and one in names]

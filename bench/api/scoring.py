@@ -13,16 +13,15 @@ import torch
 
 from cavbench.api.choosing import checked_for_workers, chosen, grid_with, pairs_of, victim_of, world_of
 from cavbench.api.table import Scores, scores_of
-from cavbench.cli.progress import RunProgress
-from cavbench.cli.terminal import Console
 from cavbench.core.contracts import Attack, Defense, ThreatModel, Victim, World
 from cavbench.core.pair import Pair
-from cavbench.core.track import track_of
 from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.run import runner
-from cavbench.run.config import RunConfig
+from cavbench.run.plan import Plan
+from cavbench.run.progress import RunProgress
 from cavbench.scenarios import Grid, Value
+from cavbench.terminal import Console
 
 if TYPE_CHECKING:
     from torch import nn
@@ -101,7 +100,7 @@ def score(
     policies = getattr(attacked.component, "policies", ())
     count = len(policies) if len(policies) > 1 else asked.training_seeds
     try:
-        config = RunConfig(
+        plan = Plan(
             pairs=tuple(pairs),
             grid=asked,
             seeds=tuple(range(count) if seeds is None else seeds),
@@ -115,22 +114,22 @@ def score(
         )
     except ValueError as error:
         raise UserError(str(error)) from error
-    return scores_of(config, _driven(config, progress), by)
+    return scores_of(plan, _driven(plan, progress), by)
 
 
-def _driven(config: RunConfig, progress: bool | None) -> Any:
+def _driven(plan: Plan, progress: bool | None) -> Any:
     """The records of a run, as a pyarrow.Table."""
     shown = sys.stderr.isatty() if progress is None else progress
     # A run computes with one thread; the caller's torch goes on as before.
     threads = torch.get_num_threads()
     try:
         with RunProgress(Console(stderr=True)) if shown else nullcontext(_Silent()) as watcher:
-            for line in config.skipped:
+            for line in plan.skipped:
                 watcher.warn(line)
-            units = runner.run(config, watcher)
+            units = runner.run(plan, watcher)
     finally:
         torch.set_num_threads(threads)
-    return reading.read(config.out, units, track=track_of(config.pairs[0]))
+    return reading.read(plan.out, units, track=plan.track)
 
 
 class _Silent:
@@ -139,16 +138,16 @@ class _Silent:
     def begin(self, *, episodes: int, finished: int) -> None:
         pass
 
-    def working(self, works: object) -> None:
+    def working(self, tasks: object) -> None:
         pass
 
-    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
+    def preparing(self, task: str, share: float, text: str, episodes: int = 0) -> None:
         pass
 
-    def finished(self, work: object, wall_s: float) -> None:
+    def finished(self, task: object, wall_s: float) -> None:
         pass
 
-    def printed(self, work: object, lines: Sequence[str]) -> None:
+    def printed(self, task: object, lines: Sequence[str]) -> None:
         sys.stdout.write("".join(f"{line}\n" for line in lines))
 
     def failed(self, line: str) -> None:

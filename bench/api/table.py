@@ -13,8 +13,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cavbench.core.pair import Pair
-from cavbench.core.track import Track, track_of
-from cavbench.run.config import RunConfig
+from cavbench.core.track import Track
+from cavbench.run.plan import Plan
 from cavbench.scenarios import Cell
 from cavbench.statistics import doubts
 from cavbench.statistics.doubts import Remark
@@ -91,7 +91,7 @@ class _Row:
     table: pa.Table | None = None
 
 
-def scores_of(config: RunConfig, records: pa.Table, by: str = "pair") -> Scores:
+def scores_of(plan: Plan, records: pa.Table, by: str = "pair") -> Scores:
     """One row for each pair, or for each pair and cell, the strongest attack first.
 
     Columns: `role` (`strongest`: in each cell the attack counts that is the strongest on other scenarios; `attacked`, `clean`,
@@ -100,21 +100,21 @@ def scores_of(config: RunConfig, records: pa.Table, by: str = "pair") -> Scores:
     clean score), `worst_cell` and `worst_score` if by pair, `queries` of the attack, `episodes`, and `pair`, its name in records.
 
     Args:
-        config: the run.
+        plan: the run.
         records: its records, clean controls and baselines among them.
         by: `pair` or `cell`.
     """
-    track = track_of(config.pairs[0])
-    rows = list(_rows(config, records, track))
+    track = plan.track
+    rows = list(_rows(plan, records, track))
     table = Scores([line for row in rows for line in _lines(row, track, by)])
     table._episodes = records
     table._remarks = tuple(dict.fromkeys(_said_against(rows, track)))
     return table
 
 
-def _rows(config: RunConfig, records: pa.Table, track: Track) -> Iterator[_Row]:
+def _rows(plan: Plan, records: pa.Table, track: Track) -> Iterator[_Row]:
     groups: dict[str, list[Pair]] = {}
-    for pair in config.pairs:
+    for pair in plan.pairs:
         groups.setdefault(pair.clean().id, []).append(pair)
     for pairs in sorted(groups.values(), key=lambda pairs: _place(pairs[0])):
         control = pairs[0].clean()
@@ -135,9 +135,8 @@ def _rows(config: RunConfig, records: pa.Table, track: Track) -> Iterator[_Row]:
         yield _Row(
             "clean", control, "none", clean.cells, clean.column(track.metric), _failed(clean, track), table=clean.table
         )
-    others = {other.id: other for pair in config.pairs for other in track.baselines(pair)} if config.reference else {}
     baselines = []
-    for pair in others.values():
+    for pair in plan.baselines:
         own = _episodes(records, pair)
         baselines.append(
             _Row(

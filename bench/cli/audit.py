@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import pyarrow as pa
@@ -10,18 +10,19 @@ import pyarrow.compute as pc
 from rich.table import Table
 from rich.text import Text
 
-from cavbench.cli.progress import RunProgress, show_downloads
-from cavbench.cli.terminal import Console
+from cavbench.cli.progress import show_downloads
 from cavbench.core.pair import Pair
-from cavbench.core.track import Track, track_of
+from cavbench.core.track import Track
 from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.records.schema import AUDIT
 from cavbench.run import runner
-from cavbench.run.audit import AuditConfig, audit_config
+from cavbench.run.audit import Audit
+from cavbench.run.progress import RunProgress
 from cavbench.statistics.episodes import Episodes
 from cavbench.statistics.estimates import Interval
 from cavbench.statistics.unpaired import NOTABLE, POWER, Finds, finds, unpaired
+from cavbench.terminal import Console
 
 OFTEN = f"{100 * POWER:.0f} %"
 
@@ -43,28 +44,27 @@ class Difference(NamedTuple):
     episodes: int
 
 
-def audit(words: Sequence[str], console: Console) -> int:
+def audit(both: Audit, console: Console) -> int:
     """Drive what is missing of both runs, and print the difference of each pair.
 
     Returns:
         0 if no pair scores significantly higher on the public scenarios, otherwise 1.
 
     Raises:
-        UserError: if an option is not allowed or a component fails, or after Ctrl-C.
+        UserError: if a component fails, or after Ctrl-C.
     """
     show_downloads()
-    config = audit_config(words)
-    again = f"salt={config.salt} repeats or continues this audit"
+    again = f"salt={both.salt} repeats or continues this audit"
     console.print(Text(f"Drawn scenarios: {again}."), soft_wrap=True)
     units: list[str] = []
     with RunProgress(Console(stderr=True)) as progress:
-        for part in (config.public, config.drawn):
+        for part in (both.public, both.drawn):
             try:
                 units += runner.run(part, progress)
             except KeyboardInterrupt:
                 raise UserError(f"interrupted; {again}") from None
-    track = track_of(config.public.pairs[0])
-    found = differences(config, reading.read(config.public.out, units, track=track), track)
+    track = both.public.track
+    found = differences(both, reading.read(both.public.out, units, track=track), track)
     return int(not verdict(found, track, console))
 
 
@@ -93,9 +93,9 @@ def reach(found: Mapping[Pair, Difference]) -> str:
     return f"{line}; {larger}. In {OFTEN} this size finds one that is {smallest:.3f} too high."
 
 
-def differences(config: AuditConfig, records: pa.Table, track: Track) -> dict[Pair, Difference]:
+def differences(both: Audit, records: pa.Table, track: Track) -> dict[Pair, Difference]:
     """What the records say of each pair (`cavbench.statistics.unpaired`)."""
-    pairs = {pair.id: pair for pair in (*config.public.pairs, *(pair.clean() for pair in config.public.pairs))}
+    pairs = {pair.id: pair for pair in (*both.public.pairs, *(pair.clean() for pair in both.public.pairs))}
     found = {}
     for name, pair in pairs.items():
         own = records.filter(pc.equal(records["pair"], name))

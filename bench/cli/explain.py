@@ -8,12 +8,12 @@ from pathlib import Path
 
 from rich.text import Text
 
-from cavbench.cli.terminal import Console
 from cavbench.core import registry, suites
 from cavbench.core.registry import GROUPS, KINDS
 from cavbench.core.track import Measure, tracks
 from cavbench.errors import UserError
 from cavbench.records.schema import IDENTITY, PROVENANCE
+from cavbench.terminal import Console
 
 GLOSSARY = Path(__file__).with_name("glossary.toml")
 DOCUMENTATION = "docs/{page}.md"

@@ -1,6 +1,7 @@
 """The command line: one function for each command of `bench`.
 
-A command imports what it needs when it is called, so that `bench list` and `--help` do not import torch.
+A command imports what it needs when it is called, so that `bench list` and `--help` do not import torch. What was typed is read
+before that, so that an unknown name is refused at once.
 """
 
 from __future__ import annotations
@@ -9,8 +10,6 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,9 +19,10 @@ from rich.text import Text
 
 from cavbench import __version__
 from cavbench.cli.completion import completed
+from cavbench.cli.early import start
 from cavbench.cli.options_help import RunHelp, TrainHelp
-from cavbench.cli.terminal import Console
 from cavbench.errors import Notice, UnfinishedError, UserError, bounded, short
+from cavbench.terminal import Console
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -153,10 +153,12 @@ def run(words: Words = None, cells: Cells = False) -> None:
 
     For instance: bench run attack=zo defense=advtrain
     """
-    with _known(words, "RunOptions"):
-        from cavbench.cli import run as cli_run
+    from cavbench.run.config import plan_of
 
-    cli_run.run(words or [], Console(), partial(_print_report, cells=cells))
+    plan = plan_of(words or [], start)
+    from cavbench.cli import run as cli_run
+
+    cli_run.run(plan, Console(), partial(_print_report, cells=cells))
 
 
 @app.command(cls=RunHelp)
@@ -165,10 +167,12 @@ def audit(words: Words = None) -> None:
 
     The options are those of bench run; salt=NUMBER repeats an audit. For instance: bench audit attack=pgd defense=advtrain
     """
-    with _known([word for word in words or [] if not word.startswith("salt=")], "RunOptions"):
-        from cavbench.cli import audit as cli_audit
+    from cavbench.run.audit import audit_of
 
-    raise typer.Exit(cli_audit.audit(words or [], Console()))
+    asked = audit_of(words or [], start)
+    from cavbench.cli import audit as cli_audit
+
+    raise typer.Exit(cli_audit.audit(asked, Console()))
 
 
 TrainWords = Annotated[
@@ -187,10 +191,12 @@ def train(words: TrainWords = None) -> None:
 
     For instance: bench train victim=dqn seeds=0,1,2, or bench train defense=advtrain defense.skip=0.3 victim=dqn
     """
-    with _known(words, "TrainOptions"):
-        from cavbench.cli import train as cli_train
+    from cavbench.run.config import training_of
 
-    cli_train.train(words or [], Console())
+    asked = training_of(words or [], start)
+    from cavbench.cli import train as cli_train
+
+    cli_train.train(asked, Console())
 
 
 Out = Annotated[Path | None, typer.Option(help="The same as out=FOLDER.")]
@@ -359,14 +365,6 @@ def _print_report(track: Track, records: pa.Table, *, cells: bool = False) -> No
 
     for name in ("run", "cells") if cells else ("run",):
         registry.resolve(registry.REPORTS, name, "report")({track.name: records}, Console())
-
-
-def _known(words: Sequence[str] | None, settings: str) -> AbstractContextManager[object]:
-    """Refuses unknown names at once, and shows that something happens while torch is imported, which takes seconds."""
-    from cavbench.cli.early import check_names, starting
-
-    check_names(words or [], settings)
-    return starting(Console(stderr=True))
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperCommand
 
-from cavbench.cli.terminal import Console
+from cavbench.terminal import Console
 
 COMPONENTS = {
     "attack": ("none", "Attacks, or a suite such as standard: bench list attack."),

@@ -7,10 +7,10 @@ from pathlib import Path
 from rich.text import Text
 
 from cavbench.cli.progress import TrainingProgress
-from cavbench.cli.terminal import Console
 from cavbench.errors import UserError
 from cavbench.files import check_folder
 from cavbench.run.config import component
+from cavbench.terminal import Console
 
 
 def render(world: str, out: Path | None, console: Console) -> None:

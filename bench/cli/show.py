@@ -18,7 +18,7 @@ from cavbench.core.track import Track, track
 from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.records.schema import IDENTITY
-from cavbench.run import rounds
+from cavbench.run import stops
 from cavbench.scenarios import Value
 from cavbench.scenarios.axes import written
 
@@ -44,7 +44,7 @@ def print_run(run: str, out: Path, console: Console, report: Report) -> None:
         shown = records.filter(pc.field("pair") == name if name else pc.field("sees"))
         _print_facts(shown if shown.num_rows else records, console)
         report(own, _with_controls(shown, records, own) if name else records)
-        for stop in rounds.read(folder, pc.unique(shown["pair"]).to_pylist()):
+        for stop in stops.read(folder, pc.unique(shown["pair"]).to_pylist()):
             console.print(Text(str(stop)), soft_wrap=True)
     for path in recordings(folder, name):
         console.print(Text(f"recording: bench view {path}"), soft_wrap=True)

@@ -14,21 +14,21 @@ import pyarrow.compute as pc
 from rich.text import Text
 
 from cavbench.cli.audit import differences, verdict
-from cavbench.cli.progress import RunProgress
 from cavbench.cli.show import Report, pair_named, records_of
-from cavbench.cli.terminal import Console
 from cavbench.cli.words import split
 from cavbench.errors import UserError, short
 from cavbench.files import scratch
 from cavbench.records import reading
 from cavbench.records.schema import AUDIT
 from cavbench.run import claims, received, runner, submission, verification
-from cavbench.run.audit import SALTS, AuditConfig
+from cavbench.run.audit import SALTS, Audit
 from cavbench.run.claims import Claim
+from cavbench.run.progress import RunProgress
 from cavbench.run.submission import Submission
 from cavbench.run.verification import Verified
 from cavbench.scenarios import SeedBlock
 from cavbench.statistics.unpaired import ENOUGH_SCENARIOS
+from cavbench.terminal import Console
 
 SAMPLE, EPISODES = 3, 20
 """Units that are replayed, and scenarios in each cell that are drawn, if nothing else is said."""
@@ -87,7 +87,7 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
         )
         claim = claims.of(list(found.records.values()))
         submission.check_description(found, claim.pair)
-        received.check_weights(found, submission.weights_of(claim.pair, claim.config.seeds))
+        received.check_weights(found, submission.weights_of(claim.pair, claim.plan.seeds))
         with _zoo_of(found), verification.staging(out, claim) as place:
             with RunProgress(Console(stderr=True)) as progress:
                 verified = verification.drive(found, claim, place, progress, sample=sample, out=out)
@@ -170,7 +170,7 @@ def _audited(
     found: Submission, claim: Claim, verified: Verified, salt: int | None, episodes: int, console: Console
 ) -> bool:
     """Drive the pair on scenarios drawn now, and compare them with the submitted ones."""
-    grid, world = claim.config.grid, claim.pair.world
+    grid, world = claim.plan.grid, claim.pair.world
     if not world.component.redraws:
         console.print(Text(f"World {world.name!r} has a fixed set of scenarios: it is not audited."))
         return True
@@ -180,11 +180,11 @@ def _audited(
     salt = secrets.randbelow(SALTS) if salt is None else salt
     drawn = replace(grid, name=AUDIT, episodes=episodes, block=0, first_seed=SeedBlock.AUDIT + salt)
     with scratch() as folder:
-        config = replace(claim.config, grid=drawn, out=folder, reference=False)
+        plan = replace(claim.plan, grid=drawn, out=folder, reference=False)
         with RunProgress(Console(stderr=True)) as progress:
-            units = runner.run(config, progress)
-        fresh = reading.read(config.out, units, track=found.track)
-    both = AuditConfig(public=claim.config, drawn=config, salt=salt)
+            units = runner.run(plan, progress)
+        fresh = reading.read(plan.out, units, track=found.track)
+    both = Audit(public=claim.plan, drawn=plan, salt=salt)
     public = _row(found, verified)
     console.print(Text(f"Fresh scenarios (salt={salt}), {drawn.episodes} a cell:"))
     return verdict(differences(both, pa.concat_tables([public, fresh]), found.track), found.track, console)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -12,25 +11,24 @@ from rich.text import Text
 
 from cavbench import zoo
 from cavbench.cli.progress import TrainingProgress
-from cavbench.cli.terminal import Console
 from cavbench.core.chain import Chain
 from cavbench.core.contracts import Trained, World
 from cavbench.core.pair import Chosen, choose
 from cavbench.core.track import track
 from cavbench.errors import UserError
 from cavbench.files import check_folder
-from cavbench.run.config import TrainConfig, train_config
+from cavbench.run.config import TrainConfig
 from cavbench.run.process import settle
+from cavbench.terminal import Console
 
 
-def train(words: Sequence[str], console: Console) -> None:
+def train(asked: TrainConfig, console: Console) -> None:
     """Train every requested training seed, and print where it is saved and how to use it.
 
     Raises:
-        UserError: if an option is invalid, there is nothing to train, or the zoo cannot be written.
+        UserError: if there is nothing to train, or the zoo cannot be written.
     """
     settle()
-    asked = train_config(words)
     config = _behind(asked)
     trained = config.trained
     if trained.kind != "defense" and not trained.component.learns:

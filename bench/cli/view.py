@@ -20,10 +20,10 @@ import pyarrow.compute as pc
 from rich.text import Text
 
 from cavbench.cli.show import located, pair_named, recordings, records_of
-from cavbench.cli.terminal import Console
 from cavbench.errors import UserError
 from cavbench.files import check_folder
 from cavbench.scenarios.axes import written
+from cavbench.terminal import Console
 
 LOCAL = "127.0.0.1"
 """The web viewer is offered to this machine only."""

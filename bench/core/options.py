@@ -85,6 +85,22 @@ class Options:
         if key not in known and not (head in self.kinds and parameter):
             raise UserError(registry.unknown(f"key {short(key)!r}", key, known))
 
+    def check_names(self) -> None:
+        """Refuse names of components that nothing has. It is quick: nothing is imported.
+
+        Raises:
+            UserError: if there is one.
+        """
+        for kind in self.kinds:
+            # A training takes one attack, no suite of them.
+            known = [*registry.names(kind), *(suites.names() if self.axes and kind == "attack" else [])]
+            for name in self.values.get(kind, ()):
+                # Hydra's grammar escapes the colon of NAME:CHOICE.
+                plain = name.replace("\\:", ":").partition(":")[0]
+                for link in registry.split(plain) if kind == "defense" else [plain]:
+                    if link not in known:
+                        registry.find(registry.GROUPS[kind], link, kind)
+
     def settings(self) -> dict[str, Any]:
         """The values of the keys that choose neither a component nor a cell."""
         lists = {item.name for item in fields(self.schema) if "list" in str(item.type)}

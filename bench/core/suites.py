@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -129,6 +129,35 @@ def suite(name: str, track: str = "") -> Suite:
     if not isinstance(found, Suite) or found.name != newest:
         raise UserError(f"suite {newest!r} is not a cavbench.core.suites.Suite with that name")
     return found
+
+
+def combined(
+    attacks: Sequence[Chosen[Any]], suites: Sequence[Suite], others: Sequence[Mapping[str, Any]]
+) -> tuple[list[Pair], list[str]]:
+    """The pairs of every attack, and of every member of the suites, with every combination of the other parts.
+
+    Args:
+        attacks: attacks chosen by name.
+        suites: suites of attacks.
+        others: combinations of `defense`, `victim`, `world` and `threat`, as keywords of `Pair`.
+
+    Returns:
+        The distinct pairs, and why members of suites are skipped, one line each.
+
+    Raises:
+        UserError: if an attack that was chosen by its name does not fit, or no member of a suite does.
+    """
+    pairs, skipped = [], []
+    for parts in others:
+        own = [Pair(attack=attack, **parts) for attack in attacks]
+        pairs += [pair.clean() if pair.is_clean else pair for pair in own]
+        for suite in suites:
+            made, left = suite.pairs(**parts)
+            pairs += made
+            skipped += left
+    if not pairs:
+        raise UserError(skipped[0] if skipped else f"no member of {suites[0].name} is meant for the victim")
+    return list({pair.id: pair for pair in pairs}.values()), list(dict.fromkeys(skipped))
 
 
 def _family(name: str) -> str:

@@ -22,7 +22,7 @@ PARTS = ("attacks", "defenses", "envs", "leaderboard")
 """Packages in `cavbench` that stand beside its folder in a checkout."""
 BESIDE_THE_RESULT = (
     *("api", "bounded", "checks", "cli", "core", "errors", "exports", "files", "identity", "leaderboard", "recording"),
-    *("records", "run", "statistics"),
+    *("records", "run", "statistics", "terminal"),
     *("driving.checks", "driving.recording", "driving.track", "driving.trial"),
     *("detection.checks", "detection.recording", "detection.track", "detection.trial"),
     *("isolation.custody", "isolation.foreign", "isolation.framework", "isolation.held", "isolation.memory"),

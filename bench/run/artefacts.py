@@ -1,4 +1,4 @@
-"""The artefacts in a results folder: one file per preparation, written atomically, named by its fingerprint."""
+"""The artefacts in a results folder: a file each, written atomically, named by its fingerprint."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ from pathlib import Path
 
 from cavbench import bounded, files
 from cavbench.errors import UserError
-from cavbench.run.unit import Preparation
+from cavbench.run.unit import Unit
 
 
-def path_of(out: Path, preparation: Preparation) -> Path:
-    """The file of a preparation's artefact."""
-    artefact = preparation.track.artefact
+def path_of(out: Path, unit: Unit) -> Path:
+    """The file of a unit's artefact, which others may share."""
+    artefact = unit.track.artefact
     assert artefact
-    return out / artefact[1] / f"{preparation.fingerprint}.safetensors"
+    return out / artefact[1] / f"{unit.artefact}.safetensors"
 
 
-def write(out: Path, preparation: Preparation, content: bytes) -> Path:
-    """Write an artefact atomically, and return its file.
+def write(out: Path, unit: Unit, content: bytes) -> Path:
+    """Write the artefact of a unit atomically, and return its file.
 
     Raises:
         UserError: if it cannot be written.
     """
-    path = path_of(out, preparation)
+    path = path_of(out, unit)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with files.whole(path) as file:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from cavbench.errors import UserError
 from cavbench.records.schema import AUDIT
-from cavbench.run.config import RunConfig, run_config
+from cavbench.run.config import plan_of
+from cavbench.run.plan import Plan
 from cavbench.scenarios import SeedBlock
 from cavbench.statistics.unpaired import ENOUGH_SCENARIOS
 
@@ -16,7 +17,7 @@ SALTS = 2**50
 
 
 @dataclass(frozen=True, kw_only=True)
-class AuditConfig:
+class Audit:
     """The two runs of an audit, into the same results folder.
 
     Args:
@@ -25,13 +26,17 @@ class AuditConfig:
         salt: determines the drawn scenarios; the first of their seeds is `SeedBlock.AUDIT + salt`.
     """
 
-    public: RunConfig
-    drawn: RunConfig
+    public: Plan
+    drawn: Plan
     salt: int
 
 
-def audit_config(words: Sequence[str]) -> AuditConfig:
-    """The audit with these options: those of `bench run`, and `salt=NUMBER` to repeat or continue an audit.
+def audit_of(words: Sequence[str], start: Callable[[], None] = lambda: None) -> Audit:
+    """The audit with these words: those of `bench run`, and `salt=NUMBER` to repeat or continue an audit.
+
+    Args:
+        words: options, each `key=value`.
+        start: as in `cavbench.run.config.plan_of`.
 
     Raises:
         UserError: if an option is not allowed, or the world has a fixed set of scenarios.
@@ -41,7 +46,7 @@ def audit_config(words: Sequence[str]) -> AuditConfig:
         raise UserError(
             f"salt must be one whole number from 0 to {SALTS - 1}, got {', '.join(salts)}; leave it out to draw one"
         )
-    public = run_config([word for word in words if not word.startswith("salt=")])
+    public = plan_of([word for word in words if not word.startswith("salt=")], start)
     if public.until is not None:
         raise UserError("an audit drives as many scenarios as the grid has: leave out until")
     for pair in public.pairs:
@@ -51,4 +56,4 @@ def audit_config(words: Sequence[str]) -> AuditConfig:
         raise UserError(f"an audit needs at least {ENOUGH_SCENARIOS} episodes per cell")
     salt = int(salts[0]) if salts else secrets.randbelow(SALTS)
     grid = replace(public.grid, name=AUDIT, first_seed=SeedBlock.AUDIT + salt)
-    return AuditConfig(public=public, drawn=replace(public, grid=grid, reference=False, record=0), salt=salt)
+    return Audit(public=public, drawn=replace(public, grid=grid, reference=False, record=0), salt=salt)

@@ -1,35 +1,33 @@
-"""Puts units together that are driven in one batch: it shares what is the same for all, or takes as long for one as for many."""
+"""Puts tasks together that are driven in one batch: it shares what is the same for all, or takes as long for one as for many."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from cavbench.run.unit import Preparation, Unit
+from cavbench.run.task import Task
 
 EPISODES = 400
 """Most episodes in one batch: an operation on more does not fit into the processor's cache."""
 TASKS = 4
-"""Fewest tasks for each worker, so that all workers end at about the same time."""
-
-Works = Sequence[Preparation | Unit]
+"""Fewest batches for each worker, so that all workers end at about the same time."""
 
 
-def batches(works: Works, recorded: Collection[str], workers: int) -> list[Works]:
-    """The works in batches of units that are alike (`Track.alike`); alone, what cannot be driven together.
+def batches(tasks: Sequence[Task], recorded: Collection[str], workers: int) -> list[list[Task]]:
+    """The tasks in batches of units that are alike (`Track.alike`); alone, what cannot be driven together.
 
     Args:
-        works: in the order in which they should begin.
+        tasks: of a unit each, in the order in which they should begin.
         recorded: fingerprints of the units that are recorded, which are driven alone.
         workers: number of worker processes.
     """
-    alike: dict[object, list[Preparation | Unit]] = {}
-    for place, work in enumerate(works):
-        single = isinstance(work, Preparation) or work.fingerprint in recorded
-        key = None if single else work.track.alike(work.job)
-        alike.setdefault(place if key is None else key, []).append(work)
-    most = max(1, len(works) // (TASKS * workers))
-    found: list[Works] = []
+    alike: dict[object, list[Task]] = {}
+    for place, task in enumerate(tasks):
+        single = task.step != "drive" or task.unit.fingerprint in recorded
+        key = None if single else task.unit.track.alike(task.unit.job)
+        alike.setdefault(place if key is None else key, []).append(task)
+    most = max(1, len(tasks) // (TASKS * workers))
+    found: list[list[Task]] = []
     for group in alike.values():
-        size = max(1, min(most, EPISODES // len(group[0].seeds)))
+        size = max(1, min(most, EPISODES // len(group[0].unit.seeds)))
         found += [group[start : start + size] for start in range(0, len(group), size)]
     return found

@@ -26,8 +26,7 @@ from cavbench.errors import UserError, message, short
 from cavbench.identity.fingerprint import canonical
 from cavbench.records import reading
 from cavbench.records.schema import AUDIT, SEQUENTIAL
-from cavbench.run.config import RunConfig
-from cavbench.run.plan import cells_of
+from cavbench.run.plan import Plan
 from cavbench.run.replay import pair_of
 from cavbench.run.unit import Unit
 from cavbench.scenarios import Cell, Grid, SeedBlock
@@ -51,11 +50,11 @@ class Claim:
 
     Args:
         pair: the pair.
-        config: the run that drives it again, with its clean control and its baselines.
+        plan: the run that drives it again, with its clean control and its baselines.
     """
 
     pair: Pair
-    config: RunConfig
+    plan: Plan
 
 
 def of(units: Sequence[pa.Table]) -> Claim:
@@ -88,12 +87,12 @@ def of(units: Sequence[pa.Table]) -> Claim:
     grid = _grid(units, records, pair)
     seeds = tuple(sorted(set(records["training_seed"].to_pylist())))
     try:
-        config = RunConfig(pairs=(pair,), grid=grid, seeds=seeds, record=0, device=recorded(first["machine"]))
+        plan = Plan(pairs=(pair,), grid=grid, seeds=seeds, record=0, device=recorded(first["machine"]))
     except ValueError as error:
         raise UserError(f"the records are of no run: {error}") from None
     if not pair.is_seeded and seeds != (0,):
         raise UserError(f"the records have the training_seed {max(seeds)}; {pair} has none, which is written as 0")
-    wanted = {(seed, cell, block) for seed in seeds for cell in cells_of(pair, config) for block in grid.blocks()}
+    wanted = {(seed, cell, block) for seed in seeds for cell in plan.cells(pair) for block in grid.blocks()}
     given = [_key(unit) for unit in units]
     if len(set(given)) < len(given) or set(given) != wanted:
         odd = next(iter(set(given) - wanted or wanted - set(given)), given[0])
@@ -102,7 +101,7 @@ def of(units: Sequence[pa.Table]) -> Claim:
             f"expected; for instance {odd[1]}, training seed {odd[0]}, scenarios {odd[2].start} to {odd[2].stop - 1}): drive "
             "every combination of the values on its axes, into a folder of its own"
         )
-    return Claim(pair=pair, config=config)
+    return Claim(pair=pair, plan=plan)
 
 
 def _check_loadable(first: Mapping[str, Any]) -> None:

@@ -1,95 +1,24 @@
-"""Typed, frozen configurations of runs and trainings, from `key=value` options."""
+"""From the options as typed to the plan of a run, or to what is trained."""
 
 from __future__ import annotations
 
 import itertools
-import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cavbench.core import registry
-from cavbench.core.device import CPU, resolved
 from cavbench.core.options import Options, configured
 from cavbench.core.pair import Chosen, Pair, check_track
 from cavbench.core.registry import KINDS, Kind
-from cavbench.core.suites import Suite
+from cavbench.core.suites import combined
 from cavbench.errors import UserError, short
-from cavbench.run.executors import EXECUTORS
-from cavbench.run.options import RunOptions, TrainOptions, half_of_memory
+from cavbench.run.options import RunOptions, TrainOptions
+from cavbench.run.plan import Plan, check_seeds
 from cavbench.scenarios import Grid
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunConfig:
-    """A run: every pair on every cell of the grid with every training seed.
-
-    Args:
-        pairs: pairs to evaluate.
-        grid: cells and scenario seeds.
-        seeds: training seeds of the victims, and seeds of the patches.
-        executor: back end that carries out the work, a name in `cavbench.run.executors.EXECUTORS`.
-        workers: number of worker processes; results do not depend on it. None takes every core, of this machine or of the
-            Ray cluster.
-        ray_address: of the Ray cluster: `local` starts one on this machine, `auto` finds the running one.
-        out: results folder.
-        record: episodes to record in every cell of each pair; None records one episode of the first cell.
-        reference: whether to run the baselines of the pairs, too.
-        skipped: members of suites that do not fit a victim, one line each.
-        broken: plug-ins that were chosen but cannot be used, one line each.
-        shard: (3, 10) drives the third of ten equal parts of the units.
-        unit_timeout: seconds that a unit or preparation may take; 0 for no limit.
-        unit_memory: GB of memory that a worker process may use; 0 for no limit.
-        device: where victims compute: `auto` is a GPU if there is one, and becomes `cpu` or `cuda` here.
-        until: half the width of the interval at which a row has enough scenarios (`cavbench.run.rounds`); None drives them all.
-
-    Raises:
-        ValueError: if a number is out of range.
-    """
-
-    pairs: tuple[Pair, ...]
-    grid: Grid
-    seeds: tuple[int, ...] = (0, 1, 2)
-    executor: str = "processes"
-    workers: int | None = None
-    ray_address: str = "local"
-    out: Path = Path("results")
-    record: int | None = None
-    reference: bool = True
-    skipped: tuple[str, ...] = ()
-    broken: tuple[str, ...] = ()
-    shard: tuple[int, int] = (1, 1)
-    unit_timeout: float = 3600.0
-    unit_memory: float = field(default_factory=half_of_memory)
-    until: float | None = None
-    device: str = CPU
-
-    def __post_init__(self) -> None:
-        check_seeds(self.seeds)
-        if self.executor not in EXECUTORS:
-            raise ValueError(registry.unknown(f"executor {self.executor!r}", self.executor, EXECUTORS))
-        object.__setattr__(self, "device", resolved(self.device, self.executor))
-        if self.workers is not None and self.workers < 1:
-            raise ValueError(f"workers must be at least 1, got {self.workers}")
-        for name in ("unit_timeout", "unit_memory"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be a number of at least 0 (0: no limit), got {getattr(self, name):g}")
-        if self.record is not None and not 0 <= self.record <= self.grid.episodes:
-            raise ValueError(f"record must be between 0 and the {self.grid.episodes} episodes, got {self.record}")
-        if self.until is not None:
-            self._check_until(self.until)
-
-    def _check_until(self, until: float) -> None:
-        if not 0.001 <= until < 0.5:
-            raise ValueError(f"until must be between 0.001 and 0.5 (half the width of the interval), got {until:g}")
-        if self.shard != (1, 1):
-            raise ValueError("until looks at all units of a row: leave out shard, or leave out until")
-        for pair in self.pairs:
-            if not pair.world.component.redraws:
-                raise ValueError(f"world {pair.world.name!r} has a fixed set of scenarios: leave out until")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,30 +54,28 @@ class TrainConfig:
         return next((part for part in (self.attack, self.defense) if part.name != "none"), self.victim)
 
 
-def check_seeds(seeds: tuple[int, ...]) -> None:
-    """Raise ValueError unless there is at least one training seed, and all are distinct and not negative."""
-    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
-        raise ValueError(
-            f"seeds must be distinct whole numbers of at least 0, got {short(','.join(map(str, seeds))) or 'none'}"
-        )
+def plan_of(words: Sequence[str], start: Callable[[], None] = lambda: None) -> Plan:
+    """The plan of `bench run` with these words.
 
-
-def run_config(words: Sequence[str]) -> RunConfig:
-    """The configuration of `bench run` with these options.
+    Args:
+        words: options, each `key=value`.
+        start: called when all names are known, before the first component is imported, which takes seconds.
 
     Raises:
         UserError: if an option cannot be parsed or is not allowed.
     """
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     given = Options(words, kinds=KINDS, settings=RunOptions, axes=list(axes))
+    given.check_names()
+    start()
     settings = given.settings()
-    if settings["executor"] != "ray" and any(word.startswith("ray.") for word in words):
+    if settings["executor"] != "ray" and any(key.startswith("ray.") for key in given.values):
         raise UserError("ray.address is of executor=ray: add executor=ray, or leave it out")
     with _one_line():
         standard = _grid(given, settings["grid"])
         grid = standard.with_(episodes=settings["episodes"], **given.cell_values(standard.axes))
         pairs, skipped = _pairs(given)
-        return RunConfig(
+        return Plan(
             pairs=tuple(pairs),
             grid=grid,
             seeds=tuple(range(standard.training_seeds) if settings["seeds"] is None else settings["seeds"]),
@@ -173,37 +100,6 @@ def _shard(text: str) -> tuple[int, int]:
     if match is None or int(match[1]) > int(match[2]):
         raise UserError(f"shard must be PART/PARTS, for instance shard=3/10, got {short(text)}")
     return int(match[1]), int(match[2])
-
-
-def combined(
-    attacks: Sequence[Chosen[Any]],
-    suites: Sequence[Suite],
-    others: Sequence[Mapping[str, Any]],
-) -> tuple[list[Pair], list[str]]:
-    """The pairs of every attack, and of every member of the suites, with every combination of the other parts.
-
-    Args:
-        attacks: attacks chosen by name.
-        suites: suites of attacks.
-        others: combinations of `defense`, `victim`, `world` and `threat`, as keywords of `Pair`.
-
-    Returns:
-        The distinct pairs, and why members of suites are skipped, one line each.
-
-    Raises:
-        UserError: if an attack that was chosen by its name does not fit, or no member of a suite does.
-    """
-    pairs, skipped = [], []
-    for parts in others:
-        own = [Pair(attack=attack, **parts) for attack in attacks]
-        pairs += [pair.clean() if pair.is_clean else pair for pair in own]
-        for suite in suites:
-            made, left = suite.pairs(**parts)
-            pairs += made
-            skipped += left
-    if not pairs:
-        raise UserError(skipped[0] if skipped else f"no member of {suites[0].name} is meant for the victim")
-    return list({pair.id: pair for pair in pairs}.values()), list(dict.fromkeys(skipped))
 
 
 def _pairs(given: Options) -> tuple[list[Pair], list[str]]:
@@ -242,14 +138,15 @@ def grid_of(world: str, name: str) -> Grid:
     return registry.grid(name)
 
 
-def train_config(words: Sequence[str]) -> TrainConfig:
-    """The configuration of `bench train` with these options; `seed` is an alias of `seeds`.
+def training_of(words: Sequence[str], start: Callable[[], None] = lambda: None) -> TrainConfig:
+    """What `bench train` trains with these words; arguments as in `plan_of`.
 
     Raises:
         UserError: if an option cannot be parsed or is not allowed.
     """
-    words = [f"seeds={word.removeprefix('seed=')}" if word.startswith("seed=") else word for word in words]
-    given = Options(words, kinds=("attack", "defense", "victim", "world"), settings=TrainOptions)
+    given = Options(words, kinds=KINDS, settings=TrainOptions)
+    given.check_names()
+    start()
     settings = given.settings()
     one: dict[Kind, Chosen[Any]] = {}
     for kind in given.kinds:

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from cavbench.core.pair import Pair
 from cavbench.errors import UnfinishedError
-from cavbench.run.unit import Loading, Preparation, Unit
-from cavbench.run.work import Failure
+from cavbench.run.task import Outcome, Task
 
 ENOUGH = 2
 """A pair is given up when so many of its units hung, ended their process, or used up its memory."""
@@ -34,15 +33,15 @@ class Failures:
         self._place: dict[str, tuple[str, str]] = {}
         self._trace = ""
 
-    def add(self, work: Unit | Preparation | Loading, failure: Failure) -> str:
-        """Note a failure, and return its line; empty if the pair failed for the same reason before."""
-        key = work.pair.id, failure.why
-        line = "" if key in self._first else f"{work} {failure.why}"
+    def add(self, task: Task, outcome: Outcome) -> str:
+        """Note a task that failed, and return its line; empty if the pair failed for the same reason before."""
+        key = task.pair.id, outcome.why
+        line = "" if key in self._first else f"{task} {outcome.why}"
         self._first.setdefault(key, line)
         self._units[key] += 1
-        self._place[work.pair.id] = key
-        self._lost[work.pair.id] += failure.lost
-        self._trace = self._trace or failure.trace
+        self._place[task.pair.id] = key
+        self._lost[task.pair.id] += outcome.lost
+        self._trace = self._trace or outcome.trace
         return line
 
     def given_up(self, pair: Pair) -> bool:

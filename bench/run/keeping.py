@@ -16,7 +16,7 @@ from cavbench.run.unit import is_foreign
 
 
 class Keeping:
-    """The components of some pairs and the packages of plug-ins, as they are before a piece of work.
+    """The components of some pairs and the packages of plug-ins, as they are before a task.
 
     `end` finds what changed, and puts it back:
 

@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 
 from cavbench.run.process import machine_bytes
 
+EXECUTORS = ("serial", "processes", "ray")
+"""The names of the back ends (`cavbench.run.executors`)."""
+
 
 def half_of_memory() -> float:
     """Half of the machine's memory in GB; 0 if it cannot be read."""

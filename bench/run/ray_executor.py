@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from cavbench.errors import UserError, short
-from cavbench.run.executors import NEWS_S, Finished, Retries, Watcher
+from cavbench.run.executor import NEWS_S, Finished, Retries, Watcher
 from cavbench.run.process import cores
-from cavbench.run.work import Failure, Outcome, Task
-from cavbench.run.worker import Limits, Worker, packed
+from cavbench.run.task import Limits, Outcome, Task
+from cavbench.run.worker import Worker, packed
 
 NO_CORES_S = 120.0
 """Seconds to wait for a core of the cluster before the run is given up."""
@@ -59,7 +59,7 @@ class Host:
         while True:
             worker.wait(NEWS_S)
             for item in worker.news():
-                if not isinstance(item, Outcome | Failure):
+                if not isinstance(item, Outcome):
                     self.told.append(item)
                     continue
                 lines = worker.lines()
@@ -138,13 +138,13 @@ class RayExecutor:
                 for actor in self._idle():
                     while following is not None and actor.task is None:
                         content = packed(following)
-                        if isinstance(content, Failure):
+                        if isinstance(content, Outcome):
                             ended.append((following, content))
                         else:
                             actor.task = following
                             actor.pending = actor.handle.carry_out.remote(content)
                         following = retries.next(waiting)
-                watcher.working([work for a in self.actors if a.task for work in (a.task.work, *a.task.others)])
+                watcher.working([one for actor in self.actors if actor.task for one in actor.task.each])
                 for actor, answer in self._answers(watcher):
                     alive = time.monotonic()
                     task, actor.task = actor.task, None
@@ -152,7 +152,7 @@ class RayExecutor:
                         self.actors.remove(actor)
                         if task is not None and lost.setdefault(id(task), 1) >= LOST:
                             why = f"failed: the machine that drove it was lost {LOST} times"
-                            ended += retries.ended(task, Failure(why=why, lost=True), (), watcher)
+                            ended += retries.ended(task, Outcome(why=why, lost=True), (), watcher)
                         elif task is not None:
                             lost[id(task)] += 1
                             retries.put_back(task)
@@ -210,7 +210,7 @@ class RayExecutor:
             return None
 
     def _ask(self, watcher: Watcher) -> None:
-        """Pass on the progress of the work."""
+        """Pass on the progress of the tasks."""
         for actor in self.actors:
             if actor.task is None:
                 continue

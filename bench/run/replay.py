@@ -22,10 +22,11 @@ from cavbench.isolation.framework import Snapshot
 from cavbench.records import reading, store
 from cavbench.records.schema import IDENTITY, SEQUENTIAL
 from cavbench.run import artefacts
+from cavbench.run.attempt import attempt
 from cavbench.run.process import settle
-from cavbench.run.runner import keep_recording, recording_path, stem
+from cavbench.run.results import keep_recording, recording_path, stem
+from cavbench.run.task import Outcome, Task
 from cavbench.run.unit import Unit
-from cavbench.run.work import Failure, Outcome, Task, attempt
 from cavbench.scenarios import Cell
 
 
@@ -93,7 +94,7 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
     """
     unit, before = _unit(out, record)
     task = Task(
-        work=unit,
+        unit=unit,
         artefacts=_artefacts(out, unit, record),
         recorded=[record["seed"]],
         entropy=record.get("entropy"),
@@ -112,8 +113,8 @@ def replay(out: Path, record: Mapping[str, Any]) -> Replay:
 def _carried_out(task: Task) -> Outcome:
     """The outcome of a task in this process; UserError if it fails."""
     outcome = attempt(task, lambda *news: None, Snapshot())
-    if isinstance(outcome, Failure):
-        raise UserError(f"{task.work} {outcome.why}")
+    if outcome.failed:
+        raise UserError(f"{task} {outcome.why}")
     return outcome
 
 
@@ -153,7 +154,7 @@ def repeat(out: Path, record: Mapping[str, Any]) -> Repeated:
         UserError: if a component, the weights or the artefact is missing.
     """
     unit, before = _unit(out, record)
-    task = Task(work=unit, artefacts=_artefacts(out, unit, record), entropy=record.get("entropy"))
+    task = Task(unit=unit, artefacts=_artefacts(out, unit, record), entropy=record.get("entropy"))
     after = _carried_out(task).records
     assert after is not None
     return Repeated(unit, before, after, _changed(unit, record, after), _differences(unit, before, after))

@@ -88,7 +88,7 @@ def write(results: Path, pair: str, out: Path, *, own: Track) -> int:
         (out / FOLDER).mkdir(parents=True, exist_ok=True)
         packing.copy(results, pc.unique(asked["unit"]).to_pylist(), out)
         _copy_artefacts(results, asked, own, out)
-        for name, path in weights_of(claim.pair, claim.config.seeds).items():
+        for name, path in weights_of(claim.pair, claim.plan.seeds).items():
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             if path is not None:
                 shutil.copyfile(path, out / name)

@@ -1,4 +1,4 @@
-"""Units of work, pure functions of their configuration: a pair on every scenario seed of a cell, and its preparation."""
+"""Units of work, pure functions of their configuration: a pair on every scenario seed of a cell."""
 
 from __future__ import annotations
 
@@ -11,88 +11,26 @@ from typing import Any
 
 from cavbench.core import registry
 from cavbench.core.device import CPU, said
-from cavbench.core.pair import Chosen, Pair, weights_of
+from cavbench.core.pair import Chosen, Pair
 from cavbench.core.track import Job, Track, track_of
-from cavbench.errors import RefusedNetworkError, UserError, message, reason
 from cavbench.identity.fingerprint import canonical, code_digest, digest, libraries, machine
-from cavbench.isolation.foreign import contained
 from cavbench.records.schema import AUDIT, SEQUENTIAL
 from cavbench.scenarios import Cell, SeedBlock
 
 
 @dataclass(frozen=True, kw_only=True)
-class Loading:
-    """Loads the networks of a pair once, before anything is driven, to hash their weights.
+class Unit:
+    """One batch of episodes: a pair on every scenario seed of a cell, with one training seed.
 
     Args:
         pair: attack, defence, victim, world, threat model.
-        training_seed: seed of the victim.
-        cells: cells of the run, whose observations the network is tried on.
-        asks_world: whether to ask the world, too, what it doubts about these cells; one loading of a world does.
-    """
-
-    pair: Pair
-    training_seed: int
-    cells: tuple[Cell, ...] = ()
-    asks_world: bool = False
-
-    def doubts(self) -> tuple[str, ...]:
-        """What makes the scores doubtful, one line each.
-
-        Raises:
-            UserError: if the world cannot be driven in its cells.
-        """
-        world = self.pair.world
-        of_world = world.component.doubts(self.cells) if self.asks_world else ()
-        return (*(f"world {world}: {line}" for line in of_world), *track_of(self.pair).doubts(self.pair))
-
-    def weights(self) -> tuple[str, str]:
-        """The hashes of the weights of the defended victim, and of an attack that learns (otherwise empty).
-
-        Raises:
-            UserError: if a network cannot be loaded.
-        """
-        return self.pair.weights_sha256(self.training_seed), self.pair.adversary_sha256(self.training_seed)
-
-    def tried(self) -> tuple[tuple[str, str], tuple[str, ...]]:
-        """As `weights`, with what makes the scores doubtful (`doubts`), and the warnings about the network (`Track.try_network`).
-
-        Raises:
-            UserError: if a network cannot be loaded.
-            RefusedNetworkError: if its score would be wrong.
-        """
-        pair, named, doubts = self.pair, self.pair.defended, self.doubts()
-        network = pair.network(self.training_seed)
-        weights = weights_of(network)
-        try:
-            with contained():
-                warnings = track_of(pair).try_network(network, pair, self.cells)
-        except UserError as error:
-            raise RefusedNetworkError(f"it {message(error)}") from error
-        # The network of a stranger may raise anything.
-        except Exception as error:
-            raise RefusedNetworkError(f"it fails when it is tried: {reason(error)} (--debug shows why)") from error
-        lines = (*doubts, *(f"{named} {line}" for line in warnings))
-        return (weights, pair.adversary_sha256(self.training_seed)), lines
-
-    def __str__(self) -> str:
-        seed = f", seed {self.training_seed}" if self.pair.is_seeded else ""
-        named = str(self.pair) if self.pair.attack.component.learns else self.pair.defended
-        return f"{named}{seed}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Work:
-    """The common part of units and preparations.
-
-    Args:
-        pair: attack, defence, victim, world, threat model.
-        training_seed: seed of the victim and of the preparation.
-        weights_sha256: hash of the defended victim's weights.
+        training_seed: seed of the victim and of the artefact.
+        weights_sha256: hash of the defended victim's weights; empty until they are loaded.
         adversary_sha256: hash of the weights of an attack that learns; otherwise empty.
         device: where the victim computes: `cpu` or `cuda`.
         cell: one value on each axis of the world.
         seeds: the scenario seed of each episode.
+        sequential: whether it is part of a round (`cavbench.run.rounds`).
     """
 
     pair: Pair
@@ -102,6 +40,7 @@ class Work:
     seeds: range
     adversary_sha256: str = ""
     device: str = CPU
+    sequential: bool = False
 
     @property
     def track(self) -> Track:
@@ -109,21 +48,22 @@ class Work:
         return track_of(self.pair)
 
     @property
-    def module(self) -> str:
-        """The module that does the work."""
-        raise NotImplementedError
+    def networks(self) -> str:
+        """Equal for units with the same networks: of the same defended victim, training seed and, if it learns, attack."""
+        pair = self.pair
+        parts: list[Chosen[Any]] = [pair.defense, pair.victim, pair.world]
+        parts += [pair.attack] if pair.attack.component.learns else []
+        return canonical([*([part.kind, part.name, part.params] for part in parts), self.training_seed])
 
     @property
     def modules(self) -> tuple[str, ...]:
         """Modules hashed into the code digest, with their imports."""
-        shipped = (part for part in self.pair.parts if not part.code)
-        return (self.module, *sorted(module for part in shipped for module in part.component.modules()))
+        return self._modules(self.track.work)
 
     @property
     def code_digest(self) -> str:
         """Hash of the source code that computes it: the track's and the components' modules, with their imports."""
-        own = [part.code for part in self.pair.parts if part.code]
-        return digest([code_digest(self.modules), *own]) if own else code_digest(self.modules)
+        return self._code(self.modules)
 
     @property
     def libraries(self) -> dict[str, str]:
@@ -132,108 +72,80 @@ class Work:
 
     @property
     def attack_seed(self) -> int:
-        """Seed of the attack's random generator."""
-        raise NotImplementedError
-
-    @property
-    def job(self) -> Job:
-        """What its track is asked to do."""
-        return Job(
-            pair=self.pair,
-            training_seed=self.training_seed,
-            attack_seed=self.attack_seed,
-            cell=self.cell,
-            seeds=self.seeds,
-            artefact=self.artefact,
-            device=self.device,
-        )
-
-    @property
-    def artefact(self) -> str:
-        """Fingerprint of what was prepared for it; empty for nothing."""
-        return ""
-
-    @property
-    def origin(self) -> dict[str, object]:
-        """Everything that determines the result."""
-        return {
-            "pair": self.pair.identity,
-            "training_seed": self.training_seed,
-            "attack_seed": self.attack_seed,
-            "weights": self.weights_sha256,
-            **({"adversary": self.adversary_sha256} if self.adversary_sha256 else {}),
-            **({"device": self.device} if self.device != CPU else {}),
-            "code": self.code_digest,
-            "shipped_by": [part.shipped_by for part in self.pair.parts],
-            "libraries": self.libraries,
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Preparation(Work):
-    """What an attack prepares once for a defended victim, before any cell is driven: for instance a patch.
-
-    Its cell and seeds are those of the unit that needs it; the result does not depend on them.
-    """
-
-    @property
-    def module(self) -> str:
-        return self.track.preparation
-
-    @cached_property
-    def fingerprint(self) -> str:
-        """sha256 of everything that determines it."""
-        return digest(self.origin)
-
-    @property
-    def attack_seed(self) -> int:
-        """Seed of the attack's random generator; the same for every pair."""
-        assert self.track.artefact
-        return int(digest([self.track.artefact[0], self.training_seed])[:15], 16)
-
-    def __str__(self) -> str:
-        noun = self.track.artefact[0] if self.track.artefact else "preparation"
-        return f"{self.pair} | {noun}, seed {self.training_seed}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Unit(Work):
-    """One batch of episodes: a pair on every scenario seed of a cell, with one training seed.
-
-    Args:
-        sequential: whether it is part of a round (`cavbench.run.rounds`).
-    """
-
-    sequential: bool = False
-
-    @property
-    def module(self) -> str:
-        return self.track.work
-
-    @property
-    def attack_seed(self) -> int:
-        """Seed of the attack's random generator; the same for every order of work, and for every pair with the same `draw`."""
+        """Seed of the attack's random generator; the same for every order of tasks, and for every pair with the same `draw`."""
         draw = getattr(self.pair.attack.component, "draw", 0)
         return int(digest([canonical(self.cell), self.training_seed, *([draw] if draw else [])])[:15], 16)
 
+    @property
+    def job(self) -> Job:
+        """What its track is asked to drive."""
+        return self._job(self.attack_seed, self.artefact)
+
+    @property
+    def origin(self) -> dict[str, object]:
+        """Everything that determines the result, but for its scenarios and its artefact."""
+        return self._origin(self.attack_seed, self.modules)
+
     @cached_property
-    def preparation(self) -> Preparation | None:
-        """The preparation that it needs; None if it needs none."""
-        if not self.track.artefact or self.pair.is_clean:
-            return None
-        return Preparation(
+    def artefact(self) -> str:
+        """Fingerprint of its artefact: what the attack prepares once for a defended victim, such as a patch; empty for none.
+
+        Units of a pair that differ in cell and scenarios have the same.
+        """
+        return digest(self.artefact_origin) if self.track.artefact and not self.pair.is_clean else ""
+
+    @property
+    def artefact_modules(self) -> tuple[str, ...]:
+        """As `modules`, of its artefact."""
+        return self._modules(self.track.preparation)
+
+    @property
+    def artefact_origin(self) -> dict[str, object]:
+        """Everything that determines its artefact."""
+        return self._origin(self._artefact_seed, self.artefact_modules)
+
+    @property
+    def preparing_job(self) -> Job:
+        """What its track is asked to prepare."""
+        return self._job(self._artefact_seed, "")
+
+    @property
+    def _artefact_seed(self) -> int:
+        """Seed of the attack's random generator when it prepares; the same for every pair."""
+        assert self.track.artefact
+        return int(digest([self.track.artefact[0], self.training_seed])[:15], 16)
+
+    def _modules(self, own: str) -> tuple[str, ...]:
+        shipped = (part for part in self.pair.parts if not part.code)
+        return (own, *sorted(module for part in shipped for module in part.component.modules()))
+
+    def _code(self, modules: tuple[str, ...]) -> str:
+        own = [part.code for part in self.pair.parts if part.code]
+        return digest([code_digest(modules), *own]) if own else code_digest(modules)
+
+    def _job(self, attack_seed: int, artefact: str) -> Job:
+        return Job(
             pair=self.pair,
             training_seed=self.training_seed,
-            weights_sha256=self.weights_sha256,
+            attack_seed=attack_seed,
             cell=self.cell,
             seeds=self.seeds,
-            adversary_sha256=self.adversary_sha256,
+            artefact=artefact,
             device=self.device,
         )
 
-    @property
-    def artefact(self) -> str:
-        return self.preparation.fingerprint if self.preparation else ""
+    def _origin(self, attack_seed: int, modules: tuple[str, ...]) -> dict[str, object]:
+        return {
+            "pair": self.pair.identity,
+            "training_seed": self.training_seed,
+            "attack_seed": attack_seed,
+            "weights": self.weights_sha256,
+            **({"adversary": self.adversary_sha256} if self.adversary_sha256 else {}),
+            **({"device": self.device} if self.device != CPU else {}),
+            "code": self._code(modules),
+            "shipped_by": [part.shipped_by for part in self.pair.parts],
+            "libraries": self.libraries,
+        }
 
     @cached_property
     def fingerprint(self) -> str:
@@ -277,7 +189,7 @@ class Unit(Work):
     def constants(self, wall_s: float) -> dict[str, object]:
         """The columns that all records of the unit share: IDENTITY (without `seed`) and PROVENANCE of `cavbench.records.schema`.
 
-        Call it in the process that did the work: it reads machine, code and libraries there.
+        Call it in the process that drove it: it reads machine, code and libraries there.
         """
         pair = self.pair
         return {

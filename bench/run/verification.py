@@ -140,8 +140,8 @@ def drive(
         known.update({key: unit for key, unit in units.items() if key in submitted or unit.pair.id != claim.pair.id})
         return known
 
-    config = replace(claim.config, out=place, reference=sample is None)
-    runner.run(config, watcher, choose)
+    plan = replace(claim.plan, out=place, reference=sample is None)
+    runner.run(plan, watcher, choose)
     records = reading.read(place, list(known), track=found.track)
     again = [
         Again(unit=known[key], submitted=before, driven=records.filter(pc.equal(records["unit"], key)).sort_by("seed"))
@@ -179,8 +179,8 @@ def add(verified: Verified, place: Path, out: Path) -> tuple[int, int]:
     for key, unit in verified.units.items():
         if key in there:
             continue
-        if unit.preparation is not None and not artefacts.path_of(out, unit.preparation).exists():
-            artefacts.write(out, unit.preparation, artefacts.read(artefacts.path_of(place, unit.preparation)))
+        if unit.artefact and not artefacts.path_of(out, unit).exists():
+            artefacts.write(out, unit, artefacts.read(artefacts.path_of(place, unit)))
         store.write(out, verified.records.filter(pc.equal(verified.records["unit"], key)))
     shutil.rmtree(place, ignore_errors=True)
     return len(verified.units) - len(there), len(there)

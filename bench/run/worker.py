@@ -14,7 +14,7 @@ import signal
 import tempfile
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -27,9 +27,10 @@ from cavbench.isolation.foreign import contained, ended
 from cavbench.isolation.framework import Snapshot
 from cavbench.isolation.settings import Settings
 from cavbench.run import tree
+from cavbench.run.attempt import attempt
 from cavbench.run.blame import blamed
 from cavbench.run.process import children, context, follow_parent, settle
-from cavbench.run.work import Failure, Outcome, Task, Tell, attempt
+from cavbench.run.task import Limits, Outcome, Task, Tell
 
 GB = 1e9
 READY = "ready"
@@ -40,26 +41,13 @@ KEPT_BYTES = 8192
 """Bytes that are kept of what a task prints."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """What a task may use.
-
-    Args:
-        seconds: wall time; 0 for no limit.
-        memory_gb: memory of its process and all that it started in GB, with files in memory and temporary files; 0 for no limit.
-    """
-
-    seconds: float = 0.0
-    memory_gb: float = 0.0
-
-
 class Worker:
     """A worker process, as its parent sees it. Start it from a thread that lives as long as the parent.
 
     Args:
         limits: of each task.
 
-    `busy` says whether it has a task, `spent` whether it can do no other work: it is dead, hangs, or was changed.
+    `busy` says whether it has a task, `spent` whether it can do no other task: it is dead, hangs, or was changed.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -99,7 +87,7 @@ class Worker:
         wait(self.sources, seconds)
 
     def news(self) -> list[Any]:
-        """What the worker sent since: progress as (work, share, text, episodes); at the end of a task an outcome or a failure.
+        """What the worker sent since: progress as (task, share, text, episodes); at the end of a task its outcome.
 
         A worker that died, or used more time or memory than allowed, has failed its task, and is `spent`.
         """
@@ -119,9 +107,9 @@ class Worker:
             # Its imports do not count.
             found.remove(READY)
             self.ready, self.started = True, time.monotonic()
-        ends = [item for item in found if isinstance(item, Outcome | Failure)]
+        ends = [item for item in found if isinstance(item, Outcome)]
         if self.busy and not ends and (why := self._death() if died else self._excess()):
-            ends = [Failure(why=f"failed: {why}", lost=True, died=died)]
+            ends = [Outcome(why=f"failed: {why}", lost=True, died=died)]
             found += ends
         if ends:
             self.busy = False
@@ -186,19 +174,19 @@ class Worker:
         return ""
 
 
-def _is_harmful(item: Outcome | Failure) -> bool:
-    """Whether the process that did this work must do no other."""
-    return item.last if isinstance(item, Outcome) else not item.bad_input
+def _is_harmful(item: Outcome) -> bool:
+    """Whether the process that this came of must do no other task."""
+    return not item.bad_input if item.failed else item.last
 
 
-def packed(task: Task) -> bytes | Failure:
+def packed(task: Task) -> bytes | Outcome:
     """A task as a worker is sent it; a failure if a component does not survive pickling."""
     try:
         with contained():
             return pickle.dumps(task, pickle.HIGHEST_PROTOCOL)
     # A plug-in's own way of being pickled may raise anything.
     except Exception as error:
-        return Failure(why=f"failed: it cannot be sent to a worker: {reason(error)}{blamed(task.work.pair, error)}")
+        return Outcome(why=f"failed: it cannot be sent to a worker: {reason(error)}{blamed(task.pair, error)}")
 
 
 def _serve(connection: Connection, output: Connection, environment: dict[str, str]) -> None:
@@ -224,11 +212,11 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
     settings, started = Settings(alone=True), _running()
     connection.send_bytes(pickle.dumps(READY))
 
-    def tell(work: str, share: float, text: str, episodes: int = 0) -> None:
+    def tell(task: str, share: float, text: str, episodes: int = 0) -> None:
         # A copy of this process may prepare something, too.
         if os.getpid() != own:
             os._exit(1)
-        connection.send_bytes(pickle.dumps((work, share, text, episodes)))
+        connection.send_bytes(pickle.dumps((task, share, text, episodes)))
 
     while True:
         try:
@@ -238,7 +226,7 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
                 os.killpg(0, signal.SIGKILL)
             return
         outcome = _carried_out(content, tell, before)
-        if isinstance(outcome, Outcome) and (_left(started) or settings.changed()):
+        if not outcome.failed and (_left(started) or settings.changed()):
             outcome = replace(outcome, last=True)
         connection.send_bytes(pickle.dumps(outcome, pickle.HIGHEST_PROTOCOL))
 
@@ -271,11 +259,11 @@ def work_modules() -> tuple[str, ...]:
     return (*work, RANGES)
 
 
-def _carried_out(content: bytes, tell: Tell, before: Snapshot) -> Outcome | Failure:
+def _carried_out(content: bytes, tell: Tell, before: Snapshot) -> Outcome:
     try:
         with contained():
             task: Task = pickle.loads(content)
     # Unpickling imports the plug-ins.
     except Exception as error:
-        return Failure(why=f"failed: a worker cannot load it: {reason(error)}")
+        return Outcome(why=f"failed: a worker cannot load it: {reason(error)}")
     return attempt(task, tell, before)

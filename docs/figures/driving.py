@@ -20,8 +20,7 @@ from cavbench.driving.rollout import Trace
 from cavbench.driving.victim import CountedPolicy
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
+from cavbench.run.config import plan_of
 
 Array = NDArray[Any]
 
@@ -34,7 +33,7 @@ ROAD = "lanes=3 density=1 weather=clear seeds=0 reference=false"
 
 def scored(episodes: int, *options: str, traced: int = 0) -> Driven:
     """The first episodes of the first pair of a run, by options of `bench run`; the first `traced` of them step by step."""
-    unit = next(iter(plan(run_config([*ROAD.split(), f"episodes={episodes}", *options]))))
+    unit = next(iter(plan_of([*ROAD.split(), f"episodes={episodes}", *options]).units()))
     return drive(unit.job, unit.seeds[:traced])
 
 

@@ -13,7 +13,7 @@ from cavbench.detection.patch import Patch
 from cavbench.envs.camera.axes import APPROACH_V1
 from cavbench.identity.fingerprint import canonical
 from cavbench.run import artefacts
-from cavbench.run.unit import Preparation
+from cavbench.run.unit import Unit
 
 KEPT = user_cache_path("cavbench") / "figures"
 STRONGER = {**STANDARD_DETECTION_1.members[1].params, "restarts": 1}
@@ -36,17 +36,17 @@ def patch_of(attack: str, defense: str = "none", **params: object) -> Patch:
         world=choose("world", "camera"),
         threat=PatchThreat(),
     )
-    preparation = Preparation(
+    unit = Unit(
         pair=pair,
         training_seed=0,
         weights_sha256=pair.weights_sha256(0),
         cell=APPROACH_V1.cells()[0],
         seeds=APPROACH_V1.seeds(),
     )
-    path = artefacts.path_of(KEPT, preparation)
+    path = artefacts.path_of(KEPT, unit)
     if not path.exists():
-        crafted = prepare(preparation.job, canonical(preparation.origin), lambda share, said: None)
-        artefacts.write(KEPT, preparation, crafted)
+        crafted = prepare(unit.preparing_job, canonical(unit.artefact_origin), lambda share, said: None)
+        artefacts.write(KEPT, unit, crafted)
     return Patch.read(artefacts.read(path))
 
 

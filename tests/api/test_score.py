@@ -23,7 +23,7 @@ from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.run import runner
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from tests.driving.victims.test_from_file import sb3_model, spaces
 
 SHORT = HighwayWorld(max_steps=15)
@@ -71,7 +71,7 @@ def score(tmp_path: Path) -> Callable[..., Any]:
 def test_it_writes_the_records_of_the_command(tmp_path: Path, score: Callable[..., Any]) -> None:
     found = score("dqn", "noise", seeds=[0])
     words = "attack=noise lanes=3 density=1 weather=clear episodes=2 seeds=0 world.max_steps=15 reference=false"
-    config = run_config([*words.split(), f"out={tmp_path}", "executor=serial"])
+    config = plan_of([*words.split(), f"out={tmp_path}", "executor=serial"])
     driven: list[object] = []
 
     class Watch:

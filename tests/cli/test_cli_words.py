@@ -17,12 +17,12 @@ from rich.console import Console
 import cavbench
 from cavbench.cli.explain import heading_of, print_term
 from cavbench.cli.options_help import THREAT, settings
-from cavbench.cli.progress import RunProgress
 from cavbench.core.registry import GROUPS, KINDS, entries
 from cavbench.core.track import tracks
 from cavbench.detection.threat import PatchThreat
 from cavbench.driving.threat import ObservationThreat
 from cavbench.run.options import RunOptions
+from cavbench.run.progress import RunProgress
 from tests.command import Said
 
 Bench = Callable[..., Said]

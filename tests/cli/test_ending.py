@@ -14,7 +14,7 @@ import pytest
 
 from cavbench.core import registry
 from cavbench.errors import UserError
-from cavbench.run.executors import ProcessExecutor
+from cavbench.run.process_executor import ProcessExecutor
 from cavbench.run.tree import resident_bytes
 from cavbench.run.worker import Limits
 from tests.command import import_path

@@ -13,7 +13,7 @@ from cavbench.core import registry
 from cavbench.core.contracts import Attack, Defense, Victim, World
 from cavbench.core.registry import GROUPS, KINDS
 from cavbench.errors import UserError
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from tests.command import BENCH
 from tests.plugins.distributions import TOY_POINTS, install, install_toy
 
@@ -85,9 +85,9 @@ def test_a_broken_grid_is_reported_when_it_is_used_and_breaks_no_other(plugins: 
         "cavbench.worlds": {"rough": "cavbench.envs.highway.world:HighwayWorld"},
     }
     install(plugins, "rough-pack", points, {"rough": "1 / 0\n"})
-    assert run_config(["victim=blind"]).grid.name == "standard-v2"
+    assert plan_of(["victim=blind"]).grid.name == "standard-v2"
     with pytest.raises(UserError, match=r"grid 'rough-v1' .* cannot be imported: ZeroDivisionError"):
-        run_config(["victim=blind", "world=rough", "grid=rough-v1"])
+        plan_of(["victim=blind", "world=rough", "grid=rough-v1"])
 
 
 def test_a_name_that_two_packages_ship_is_refused_with_both_packages(plugins: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from cavbench.core import suites
 from cavbench.core.suites import Suite
 from cavbench.errors import UserError
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 
 SMALL = ["lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0"]
 
@@ -23,7 +23,7 @@ def test_the_newest_version_is_meant_by_the_plain_name() -> None:
 
 @pytest.mark.parametrize(("victim", "actions"), [("dqn", "discrete"), ("ddpg", "continuous")])
 def test_a_suite_expands_to_the_members_meant_for_the_victim(victim: str, actions: str) -> None:
-    config = run_config(["attack=standard", f"victim={victim}", *SMALL])
+    config = plan_of(["attack=standard", f"victim={victim}", *SMALL])
     meant = [m for m in suites.suite("standard").members if m.victims.get("action_type", actions) == actions]
     assert [pair.attack for pair in config.pairs] == [member.chosen for member in meant]
     assert len({pair.id for pair in config.pairs}) == len(meant) >= 11
@@ -32,7 +32,7 @@ def test_a_suite_expands_to_the_members_meant_for_the_victim(victim: str, action
 
 
 def test_each_track_has_its_standard() -> None:
-    config = run_config(["attack=standard", "victim=yolov5", "weather=clear", "lanes=3", "density=1", "seeds=0"])
+    config = plan_of(["attack=standard", "victim=yolov5", "weather=clear", "lanes=3", "density=1", "seeds=0"])
     assert [pair.attack for pair in config.pairs] == [
         one.chosen for one in suites.suite("standard-detection-3").members
     ]
@@ -41,31 +41,31 @@ def test_each_track_has_its_standard() -> None:
 
 def test_a_member_is_the_pair_that_its_own_options_make() -> None:
     words = ["attack=pgd", "attack.objective=target", "attack.target_action=4", "threat.access=dynamics", *SMALL]
-    (alone,) = run_config(words).pairs
-    assert alone.id in {pair.id for pair in run_config(["attack=standard-1", *SMALL]).pairs}
+    (alone,) = plan_of(words).pairs
+    assert alone.id in {pair.id for pair in plan_of(["attack=standard-1", *SMALL]).pairs}
 
 
 def test_members_above_the_threat_model_are_skipped_with_a_line() -> None:
-    config = run_config(["attack=standard", "threat.access=scores", *SMALL])
+    config = plan_of(["attack=standard", "threat.access=scores", *SMALL])
     assert [pair.attack.name for pair in config.pairs] == ["pessimist", "zo", "noise"]
     assert len(config.skipped) == 9
     assert any(line.startswith("standard-2 skips plan: attack 'plan' needs access") for line in config.skipped)
     # The same attack chosen by its name is refused.
     with pytest.raises(UserError, match="attack 'plan' needs access 'dynamics'"):
-        run_config(["attack=plan", "threat.access=scores", *SMALL])
+        plan_of(["attack=plan", "threat.access=scores", *SMALL])
 
 
 def test_a_suite_and_attacks_by_name_can_be_mixed() -> None:
-    config = run_config(["attack=bias,standard,zo", "attack.scale=0.5", *SMALL])
+    config = plan_of(["attack=bias,standard,zo", "attack.scale=0.5", *SMALL])
     assert [pair.attack.name for pair in config.pairs].count("zo") == 1
     assert config.pairs[0].attack.component.scale == 0.5  # type: ignore[attr-defined]
 
 
 def test_what_cannot_be_is_refused_in_one_line() -> None:
     with pytest.raises(UserError, match=r"suite standard-2 have fixed parameters, got attack\.steps"):
-        run_config(["attack=standard", "attack.steps=3", *SMALL])
+        plan_of(["attack=standard", "attack.steps=3", *SMALL])
     with pytest.raises(UserError, match="suite 'standard-1' is for the driving track; suites for the detection track"):
-        run_config(["attack=standard-1", "victim=yolov5"])
+        plan_of(["attack=standard-1", "victim=yolov5"])
 
 
 def test_a_file_that_is_no_suite_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -84,10 +84,9 @@ def test_a_file_that_is_no_suite_is_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_another_draw_is_the_same_attack_with_other_random_numbers() -> None:
-    from cavbench.run.plan import plan
 
-    config = run_config(["attack=noise", "attack.draw=0,1", "reference=false", *SMALL])
-    seeds = {unit.pair.attack.component.draw: unit.attack_seed for unit in plan(config) if not unit.pair.is_clean}  # type: ignore[attr-defined]
+    config = plan_of(["attack=noise", "attack.draw=0,1", "reference=false", *SMALL])
+    seeds = {unit.pair.attack.component.draw: unit.attack_seed for unit in config.units() if not unit.pair.is_clean}  # type: ignore[attr-defined]
     assert len(set(seeds.values())) == 2
 
 
@@ -123,7 +122,7 @@ def test_a_suite_runs_end_to_end(tmp_path: Path) -> None:
         *SMALL,
     ]
     console = Console(record=True, width=120)
-    run([*words, f"out={tmp_path}", "world.max_steps=20"], console, lambda track, table: None)
+    run(plan_of([*words, f"out={tmp_path}", "world.max_steps=20"]), console, lambda track, table: None)
     records = reading.read_all(tmp_path)["driving"]
     assert set(records["attack"].to_pylist()) == {"none", "pessimist", "noise"}
     shares = {(row["attack"], row["threat_share"]) for row in records.to_pylist()}

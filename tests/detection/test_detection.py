@@ -22,10 +22,10 @@ from cavbench.identity import fingerprint
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.records import reading
 from cavbench.run import runner
-from cavbench.run.config import RunConfig, component, run_config, train_config
-from cavbench.run.plan import plan
+from cavbench.run.config import component, plan_of, training_of
+from cavbench.run.plan import Plan
 from cavbench.run.replay import find, replay
-from cavbench.run.unit import Preparation
+from cavbench.run.task import Task
 from tests.cli.test_cli import TOY, assert_one_line
 from tests.command import Said
 from tests.plugins.distributions import install
@@ -38,19 +38,19 @@ SMALL = "attack=paint victim=red world=red_street lanes=3 density=1 weather=clea
 BESIDE = ["created_at", "wall_s", "crafting_s", "entropy"]
 
 
-def read(line: str) -> RunConfig:
-    return run_config(line.split())
+def read(line: str) -> Plan:
+    return plan_of(line.split())
 
 
 def run(out: Path, *more: str, watcher: Silent | None = None) -> tuple[pa.Table, Silent]:
     words = dict(word.split("=", 1) for word in [*SMALL.split(), "executor=serial", f"out={out}", "record=0", *more])
     watcher = watcher or Silent()
-    units = runner.run(run_config([f"{key}={value}" for key, value in words.items()]), watcher)
+    units = runner.run(plan_of([f"{key}={value}" for key, value in words.items()]), watcher)
     return reading.read(out, units, track=track("detection")), watcher
 
 
-def crafted(watcher: Silent) -> list[Preparation]:
-    return [work for work in watcher.done if isinstance(work, Preparation)]
+def crafted(watcher: Silent) -> list[Task]:
+    return [task for task in watcher.done if task.step == "prepare"]
 
 
 def patch_path(out: Path, fingerprint: str) -> Path:
@@ -107,7 +107,7 @@ def test_a_patch_is_crafted_once_a_seed_and_shown_in_every_cell(tmp_path: Path) 
     records, watcher = run(tmp_path)
     attacked = records.filter(pc.field("attack") == "paint")
     assert len(crafted(watcher)) == 2
-    assert {work.training_seed for work in crafted(watcher)} == {0, 1}
+    assert {task.unit.training_seed for task in crafted(watcher)} == {0, 1}
     assert watcher.told[-1][1] == 1.0
     files = {path.stem for path in (tmp_path / "patches").iterdir()}
     assert set(attacked["patch"].to_pylist()) == files
@@ -137,13 +137,13 @@ def test_each_scenario_seed_has_a_location_and_every_frame_is_recorded(tmp_path:
 
 def test_every_attack_is_compared_with_baseline_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cavbench.detection.track.REFERENCE_PATCHES", ("blank", "not_installed"))
-    units = plan(read(SMALL))
+    units = read(SMALL).units()
     blank = [unit for unit in units if unit.pair.attack.name == "blank"]
     assert {unit.training_seed for unit in blank} == {0}
     assert len(blank) == 2
     assert {unit.pair.threat for unit in blank} == {units[0].pair.threat}
-    assert not [unit for unit in plan(read(f"{SMALL} reference=false")) if unit.pair.attack.name == "blank"]
-    assert {unit.pair.attack.name for unit in plan(read(SMALL.replace("paint", "none")))} == {"none"}
+    assert not [unit for unit in read(f"{SMALL} reference=false").units() if unit.pair.attack.name == "blank"]
+    assert {unit.pair.attack.name for unit in read(SMALL.replace("paint", "none")).units()} == {"none"}
 
 
 def test_an_interrupted_run_loses_neither_patches_nor_cells(tmp_path: Path) -> None:
@@ -171,9 +171,8 @@ def test_results_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
 
 
 def test_scoring_and_crafting_have_separate_code_digests() -> None:
-    unit = next(unit for unit in plan(read(SMALL)) if unit.preparation)
-    assert unit.preparation is not None
-    scoring, crafting = (set(fingerprint.sources(work.modules)) for work in (unit, unit.preparation))
+    unit = next(unit for unit in read(SMALL).units() if unit.artefact)
+    scoring, crafting = (set(fingerprint.sources(modules)) for modules in (unit.modules, unit.artefact_modules))
     assert "cavbench.detection.approach" in scoring
     assert "cavbench.detection.crafting" in crafting
     assert "cavbench.detection.approach" not in crafting
@@ -234,7 +233,7 @@ def test_a_trained_detector_has_one_zoo_entry_per_seed(
     assert records.num_rows == 2 * 2 * 3
     assert len(set(records["weights_sha256"].to_pylist())) == 2
     with pytest.raises(UserError, match="defense 'harden' does not fit victim 'toy' of the driving track"):
-        train_config(["victim=toy", "defense=harden"])
+        training_of(["victim=toy", "defense=harden"])
 
 
 COUNT = """

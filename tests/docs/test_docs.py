@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from cavbench.cli.early import check_names
 from cavbench.cli.explain import GLOSSARY
-from cavbench.core.registry import GROUPS, KINDS, Kind, entries
+from cavbench.core.options import Options
+from cavbench.core.registry import GROUPS, KINDS, Kind, all_grids, entries
+from cavbench.run import options
 from docs.figures.__main__ import FIGURES
 from docs.prose import findings
 from tests.tree import ROOT
@@ -58,6 +59,12 @@ def _commands(page: Path) -> list[list[str]]:
     return [shlex.split(one, comments=True) for one in (*blocks, *re.findall(r"(?<!`)`(bench [^`]+)`", text))]
 
 
+def _check_names(words: list[str], *, train: bool) -> None:
+    axes = [] if train else [axis for grid in all_grids() for axis in grid.axes]
+    settings = options.TrainOptions if train else options.RunOptions
+    Options(words, kinds=KINDS, settings=settings, axes=axes).check_names()
+
+
 def test_every_command_in_the_documentation_names_what_exists() -> None:
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
     checked = 0
@@ -67,7 +74,7 @@ def test_every_command_in_the_documentation_names_what_exists() -> None:
                 continue
             if name in ("run", "audit", "train"):
                 given = [word for word in words if not word.startswith(("--", "salt="))]
-                check_names(given, "TrainOptions" if name == "train" else "RunOptions")
+                _check_names(given, train=name == "train")
             elif name in ("list", "check") and words and words[0].isidentifier():
                 assert any(words[0] in entries(GROUPS[kind]) for kind in KINDS) or words[0] in (*KINDS, "standard")
             checked += 1

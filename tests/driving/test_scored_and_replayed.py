@@ -12,9 +12,9 @@ from rerun.chunk import RrdReader
 from cavbench.core.track import track
 from cavbench.records import reading
 from cavbench.run import runner
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from cavbench.run.replay import find, replay
-from cavbench.run.unit import Preparation, Unit
+from cavbench.run.task import Task
 
 ATTACKS = ("bias", "pgd")
 RUN = (
@@ -34,19 +34,19 @@ class Warned:
     def begin(self, *, episodes: int, finished: int) -> None:
         pass
 
-    def working(self, works: Sequence[Unit | Preparation]) -> None:
+    def working(self, tasks: Sequence[Task]) -> None:
         pass
 
-    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
+    def preparing(self, task: str, share: float, text: str, episodes: int = 0) -> None:
         pass
 
-    def finished(self, work: Unit | Preparation, wall_s: float) -> None:
+    def finished(self, task: Task, wall_s: float) -> None:
         pass
 
     def failed(self, line: str) -> None:
         self.failures.append(line)
 
-    def printed(self, work: object, lines: Sequence[str]) -> None:
+    def printed(self, task: object, lines: Sequence[str]) -> None:
         self.said += lines
 
     def warn(self, line: str) -> None:
@@ -57,7 +57,7 @@ class Warned:
 @pytest.mark.parametrize("back_end", ["executor=serial", "workers=2"])
 def test_a_stateful_attack_on_a_stateful_defence_is_scored_recorded_and_replayed(tmp_path: Path, back_end: str) -> None:
     watcher = Warned()
-    runner.run(run_config([*RUN.split(), back_end, f"out={tmp_path}"]), watcher)
+    runner.run(plan_of([*RUN.split(), back_end, f"out={tmp_path}"]), watcher)
     assert watcher.lines == []
     records = reading.read(tmp_path, track=track("driving"))
     assert set(records["attack"].to_pylist()) >= set(ATTACKS)

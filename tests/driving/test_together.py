@@ -27,12 +27,11 @@ from cavbench.driving.victims.networks import ActorPolicy, QPolicy
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.isolation.framework import Snapshot
+from cavbench.run.attempt import attempt
 from cavbench.run.batches import EPISODES, batches
-from cavbench.run.config import run_config
-from cavbench.run.plan import key_of, loadings, units_of
-from cavbench.run.runner import _recorded
+from cavbench.run.config import plan_of
+from cavbench.run.task import Outcome, Task
 from cavbench.run.unit import Unit
-from cavbench.run.work import Outcome, Task, attempt
 from cavbench.scenarios import Cell
 from tests.driving.cheats import WORLD, Noisy, Victim
 
@@ -157,11 +156,16 @@ def units(attack: str, count: int, victim: str = "dqn", **seeds: Any) -> list[Un
     ]
 
 
+def batched(some: Sequence[Unit], *recorded: str, workers: int = 1) -> list[list[Unit]]:
+    tasks = [Task(unit=unit) for unit in some]
+    return [[task.unit for task in batch] for batch in batches(tasks, recorded, workers=workers)]
+
+
 def test_alike_units_come_together_and_all_workers_have_enough_to_do() -> None:
     zo, noise, pessimist = (units(attack, 6) for attack in ("zo", "noise", "pessimist"))
     assert [joint(one[0].pair) for one in (zo, noise, pessimist)] == [True, True, False]
     works = [unit for three in zip(zo, noise, pessimist, strict=True) for unit in three]
-    found = batches(works, (), workers=2)
+    found = batched(works, workers=2)
     assert sorted(map(len, found)) == [1] * 6 + [2] * 6
     assert sorted(map(str, works)) == sorted(str(unit) for batch in found for unit in batch)
     assert {len({(unit.pair.id, unit.training_seed) for unit in batch}) for batch in found} == {1}
@@ -169,26 +173,25 @@ def test_alike_units_come_together_and_all_workers_have_enough_to_do() -> None:
 
 def test_a_batch_is_not_larger_than_the_cache_and_holds_no_recorded_unit() -> None:
     many = units("zo", 6, seeds=range(EPISODES // 2)) * 2
-    assert {len(batch) for batch in batches(many, (), workers=1)} == {2}
+    assert {len(batch) for batch in batched(many)} == {2}
     few = units("zo", 6, seeds=range(10)) * 2
-    sizes = [len(batch) for batch in batches(few, {few[0].fingerprint}, workers=1)]
+    sizes = [len(batch) for batch in batched(few, few[0].fingerprint)]
     assert sorted(sizes) == [1, 1, 1, 3, 3, 3]
 
 
 def carried_out(task: Task) -> Outcome:
     outcome = attempt(task, lambda *news: None, Snapshot())
-    assert isinstance(outcome, Outcome)
+    assert not outcome.failed
     return outcome
 
 
 def test_a_task_of_several_units_has_the_outcome_of_each() -> None:
     works = units("noise", 3, seeds=range(1_000_000, 1_000_002))
-    task = Task(work=works[0], others=works[1:])
+    task = Task(unit=works[0], others=works[1:])
     outcome = carried_out(task)
-    alone = [carried_out(Task(work=unit)) for unit in works]
+    alone = [carried_out(Task(unit=unit)) for unit in works]
     timed = {"attack_ms", "wall_s", "created_at", "entropy"}
     for one, other in zip((outcome, *outcome.others), alone, strict=True):
-        assert isinstance(one, Outcome)
         assert one.records is not None
         assert other.records is not None
         same = [name for name in one.records.column_names if name not in PROBES | timed]
@@ -196,7 +199,7 @@ def test_a_task_of_several_units_has_the_outcome_of_each() -> None:
 
 
 def test_an_outcome_survives_the_way_from_a_worker() -> None:
-    outcome = carried_out(Task(work=units("noise", 1, seeds=range(1_000_000, 1_000_002))[0]))
+    outcome = carried_out(Task(unit=units("noise", 1, seeds=range(1_000_000, 1_000_002))[0]))
     assert outcome.records is not None
     sent = pickle.dumps(replace(outcome, others=[outcome, Outcome(wall_s=1.0, artefact=b"patch")]))
     found = pickle.loads(sent)
@@ -217,7 +220,7 @@ def test_a_run_without_recordings_drives_its_units_in_batches() -> None:
     )
     sizes = []
     for record in ("record=0", "record=1"):
-        config = run_config([*words, record])
-        works = units_of(config, {key_of(loading): ("", "") for loading in loadings(config)})
-        sizes.append({len(batch) for batch in batches(works, _recorded(config, works), workers=1)})
+        plan = plan_of([*words, record])
+        some = plan.units({task.unit.networks: ("", "") for task in plan.loadings})
+        sizes.append({len(batch) for batch in batched(some, *plan.recorded(some))})
     assert sizes == [{3}, {1, 3}]

@@ -22,7 +22,7 @@ from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
 from cavbench.run import runner
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 
 WORLD = HighwayWorld()
 CELLS = (AXES.cell(lanes=3, density=1.0, weather="clear"), AXES.cell(lanes=4, density=2.0, weather="fog"))
@@ -340,7 +340,7 @@ def test_a_file_that_draws_random_numbers_is_refused_before_anything_is_driven(t
     torch.onnx.export(Noisy(), (torch.rand(3, 10, 5),), path, dynamic_shapes=batch, external_data=False, verbose=False)
     words = f"attack=noise victim=onnx victim.path={path} out={tmp_path / 'results'} episodes=1 executor=serial"
     with pytest.raises(UserError, match="is refused: it answers otherwise when it is asked the same again"):
-        runner.run(run_config(words.split()), _Silent())
+        runner.run(plan_of(words.split()), _Silent())
     assert not list(tmp_path.rglob("*.parquet"))
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from cavbench.identity import fingerprint
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
+from cavbench.run.config import plan_of
 from cavbench.run.unit import Unit
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
@@ -20,7 +19,7 @@ LINE = "attack=nudge victim=toy world=toy lanes=3 density=1 weather=clear episod
 
 def first(*more: str) -> Unit:
     words = dict(word.split("=", 1) for word in [*LINE.split(), *more])
-    return plan(run_config([f"{key}={value}" for key, value in words.items()]))[0]
+    return plan_of([f"{key}={value}" for key, value in words.items()]).units()[0]
 
 
 @pytest.mark.parametrize(
@@ -41,7 +40,7 @@ def test_a_changed_parameter_is_another_unit(more: str) -> None:
     ],
 )
 def test_a_changed_scenario_is_another_unit(word: str, other: str) -> None:
-    changed = plan(run_config(LINE.replace(word, other).split()))[0]
+    changed = plan_of(LINE.replace(word, other).split()).units()[0]
     assert changed.fingerprint != first().fingerprint
 
 

@@ -30,7 +30,7 @@ from cavbench.leaderboard.page.write import NAME, write
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.ranking.flags import FLAGS
 from cavbench.records import reading
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import as_text
 from tests.leaderboard.full_house import driving
@@ -101,7 +101,7 @@ def test_the_command_of_a_chain_gives_the_parameters_of_its_links_and_the_grid()
     chain = choose("defense", "tracker+shield")
     records = drive(defense=chain.name, defense_params=json.loads(chain.params), grid="standard-v2", episodes=10)
     (one,) = read_tracks({"driving": records})
-    config = run_config(shlex.split(run_command(one))[2:])
+    config = plan_of(shlex.split(run_command(one))[2:])
     assert [pair.defense for pair in config.pairs] == [chain]
     assert (config.grid.name, config.grid.episodes) == ("standard-v2", 10)
 
@@ -136,7 +136,7 @@ def test_every_published_run_command_makes_the_same_pair_on_the_same_scenarios()
     assert len(made["pairs"]) > 100
     for pair in made["pairs"]:
         card = pair["card"]
-        config = run_config(shlex.split(card["run"])[2:])
+        config = plan_of(shlex.split(card["run"])[2:])
         (found,) = config.pairs
         for kind, component in card["components"].items():
             chosen = getattr(found, kind)

@@ -12,13 +12,13 @@ import pytest
 from rich.text import Text
 
 from cavbench.cli import main as cli
-from cavbench.cli.terminal import Console
 from cavbench.core.track import track
 from cavbench.leaderboard.page.document import document
 from cavbench.leaderboard.page.table import table
 from cavbench.leaderboard.page.write import html
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.records import reading, store
+from cavbench.terminal import Console
 from tests.leaderboard.synthetic import CLEAR, drive
 
 FORMULA, ESCAPE = "=cmd|' /C calc'!A0", "\x1b[2J\x1b]0;owned\x07\u202egnp\x9b31m<script>alert(1)</script>"

@@ -27,7 +27,7 @@ from cavbench.leaderboard.thesis.report import thesis_report
 from cavbench.leaderboard.thesis.trend import trend
 from cavbench.records import store as results
 from cavbench.records.schema import schema
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from tests.leaderboard.synthetic import CLEAR, approach, baseline_drivers, drive
 
 SCHEMA = schema(track("driving"))
@@ -86,7 +86,7 @@ def test_a_missing_number_is_a_dash_and_a_command_that_the_command_line_takes(mo
     assert "—" in text
     assert len(commands) >= 4
     for command in commands:
-        config = run_config(command.removeprefix("bench run ").split())
+        config = plan_of(command.removeprefix("bench run ").split())
         assert all(
             pair.threat.budget == 0.2 and pair.threat.norm == "linf" for pair in config.pairs if not pair.is_clean
         )

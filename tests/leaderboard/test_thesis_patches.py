@@ -29,7 +29,7 @@ from cavbench.leaderboard.thesis.patch_records import (
 )
 from cavbench.leaderboard.thesis.report import thesis_report
 from cavbench.records.schema import schema
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from tests.leaderboard.synthetic import approach
 
 Left = float | Callable[[str, str], float]
@@ -124,7 +124,7 @@ def test_what_is_missing_is_a_dash_and_a_command_that_makes_it() -> None:
     commands = re.findall(r"missing: (bench run .*)", text)
     made = set()
     for command in commands:
-        config = run_config(command.removeprefix("bench run ").split())
+        config = plan_of(command.removeprefix("bench run ").split())
         assert config.grid.values["weather"] == ("clear", "rain")
         assert config.seeds == (0, 1, 2)
         assert config.reference
@@ -177,7 +177,7 @@ def test_our_numbers_stand_beside_the_thesis() -> None:
         patch(budget=0.4),
         patch(defense="jpeg"),
         patch(changes={"hue": 0.1}),
-        patch(cells=[cell for cell in run_config(["victim=yolov3_tiny"]).grid.cells() if cell.weather == "fog"]),
+        patch(cells=[cell for cell in plan_of(["victim=yolov3_tiny"]).grid.cells() if cell.weather == "fog"]),
     ],
 )
 def test_records_of_other_settings_do_not_stand_beside_the_thesis(other: pa.Table) -> None:
@@ -199,7 +199,7 @@ def test_a_location_has_its_own_approaches_and_all_have_all() -> None:
 
 def test_the_rows_of_a_table_are_on_the_same_approaches() -> None:
     whole = [approach(0.9), approach(0.6, attack="noise_patch"), approach(0.7, attack="grey_patch"), patch()]
-    part = [cell for cell in run_config(["victim=yolov3_tiny"]).grid.cells() if (cell.lanes, cell.density) == (4, 1)]
+    part = [cell for cell in plan_of(["victim=yolov3_tiny"]).grid.cells() if (cell.lanes, cell.density) == (4, 1)]
     records = pa.concat_tables([*whole, patch("tv_3", cells=part)])
     source = Source(records, NONE)
     found = source.find_all(source.detectors[0], (STANDARD, "tv_3", "tv_5", NO_ATTACK), "rain")

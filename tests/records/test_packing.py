@@ -22,8 +22,7 @@ from cavbench.records import packing, reading, store
 from cavbench.records.finished import finished
 from cavbench.records.schema import schema
 from cavbench.run import runner
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
+from cavbench.run.config import plan_of
 from cavbench.scenarios import Cell
 from tests.command import import_path
 from tests.run.test_runner import Silent, comparable
@@ -60,7 +59,7 @@ class KilledError(BaseException):
 def unit(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
     """The records of one unit."""
     out = tmp_path_factory.mktemp("one")
-    units = runner.run(run_config([*WORDS, "attack=none", f"out={out}"][1:]), Silent())
+    units = runner.run(plan_of([*WORDS, "attack=none", f"out={out}"][1:]), Silent())
     return reading.read(out, units, track=TRACK)
 
 
@@ -274,9 +273,9 @@ def test_two_runs_that_pack_one_folder_and_a_kill_end_with_every_unit_once(
     _, err = second.communicate(timeout=120)
     assert second.returncode == 0, err
     monkeypatch.setattr(packing, "UNITS", 3)
-    runner.run(run_config([*RUN[1:], f"out={out}"]), Silent())
-    config = run_config([*RUN[1:], f"out={tmp_path / 'whole'}"])
-    keys = {one.fingerprint: one for one in plan(config)}
+    runner.run(plan_of([*RUN[1:], f"out={out}"]), Silent())
+    config = plan_of([*RUN[1:], f"out={tmp_path / 'whole'}"])
+    keys = {one.fingerprint: one for one in config.units()}
     assert finished(out, keys) == set(keys)
     assert len(names(out)) < len(keys)
     runner.run(config, Silent())

@@ -22,8 +22,7 @@ from cavbench.records import store as results
 from cavbench.records.finished import finished
 from cavbench.records.generations import AXES_OF_V1, generations
 from cavbench.records.schema import schema
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
+from cavbench.run.config import plan_of
 from cavbench.run.unit import Unit
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
@@ -43,7 +42,7 @@ def read(out: Path, units: Sequence[str] | None = None) -> pa.Table:
 
 @pytest.fixture(scope="module")
 def units(toy_folder: Path) -> list[Unit]:
-    return plan(run_config([*WORDS, "reference=false"]))
+    return plan_of([*WORDS, "reference=false"]).units()
 
 
 @pytest.fixture

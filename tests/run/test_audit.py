@@ -15,7 +15,7 @@ from cavbench.errors import UserError
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.records import reading
 from cavbench.records.schema import AUDIT, IDENTITY
-from cavbench.run.audit import SALTS, audit_config
+from cavbench.run.audit import SALTS, audit_of
 from cavbench.scenarios import SeedBlock
 from cavbench.statistics.estimates import Array
 from cavbench.statistics.unpaired import NOTABLE, POWER, Finds, finds, unpaired
@@ -75,9 +75,9 @@ def test_a_defence_that_knows_the_public_scenarios_is_caught_and_the_honest_vict
 
 def test_every_audit_draws_other_scenarios_and_can_be_repeated() -> None:
     words = ["attack=noise", "victim=dqn", "episodes=10"]
-    first, second = audit_config(words), audit_config(words)
+    first, second = audit_of(words), audit_of(words)
     assert first.drawn.grid.seeds() != second.drawn.grid.seeds()
-    again = audit_config([*words, f"salt={first.salt}"])
+    again = audit_of([*words, f"salt={first.salt}"])
     assert again.drawn.grid.seeds() == first.drawn.grid.seeds()
     assert again.drawn.grid.cells() == first.public.grid.cells()
     assert first.public.grid.seeds() == range(SeedBlock.REPORT, SeedBlock.REPORT + 10)
@@ -94,7 +94,7 @@ def test_every_audit_draws_other_scenarios_and_can_be_repeated() -> None:
 )
 def test_an_audit_that_says_nothing_is_refused(words: list[str], why: str) -> None:
     with pytest.raises(UserError, match=why):
-        audit_config(words)
+        audit_of(words)
 
 
 @pytest.mark.parametrize("comparisons", [1, 4])

@@ -21,8 +21,7 @@ from cavbench.driving.victims.networks import QPolicy
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
 from cavbench.records import reading
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
+from cavbench.run.config import plan_of, training_of
 from cavbench.run.replay import find, replay
 from cavbench.run.runner import run
 from tests.run.test_runner import Silent
@@ -92,8 +91,8 @@ def test_a_chain_is_listed_with_the_parameters_of_its_links() -> None:
 
 
 def test_a_chain_is_recorded_and_replayed_and_its_code_counts(tmp_path: Path) -> None:
-    config = run_config([*WORDS, "defense=tracker+shield", "workers=1", f"out={tmp_path}"])
-    (unit,) = plan(config)
+    config = plan_of([*WORDS, "defense=tracker+shield", "workers=1", f"out={tmp_path}"])
+    (unit,) = config.units()
     assert {"cavbench.defenses.driving.shield", "cavbench.defenses.driving.tracker"} <= set(unit.modules)
     run(config, Silent())
     (records,) = reading.read_all(tmp_path).values()
@@ -105,8 +104,8 @@ def test_a_chain_is_recorded_and_replayed_and_its_code_counts(tmp_path: Path) ->
         with pytest.raises(UserError) as refused:
             replay(tmp_path, find(records, {"attack": "none"}) | {"defense_params": params})
         assert "\n" not in str(refused.value)
-    other = run_config([*WORDS, "defense=tracker+shield", "defense.shield.band=5", f"out={tmp_path}"])
-    assert plan(other)[0].fingerprint != unit.fingerprint
+    other = plan_of([*WORDS, "defense=tracker+shield", "defense.shield.band=5", f"out={tmp_path}"])
+    assert other.units()[0].fingerprint != unit.fingerprint
 
 
 def test_a_policy_that_promises_nothing_has_no_share_of_assured_frames() -> None:
@@ -127,13 +126,13 @@ def test_a_driver_is_trained_behind_a_chain_and_drives_behind_it(
 
     def trained(*words: str) -> list[str]:
         console = Console(width=400, record=True)
-        train(["victim=dqn", *SHORT, *words], console)
+        train(training_of(["victim=dqn", *SHORT, *words]), console)
         return shlex.split(console.export_text().partition("To use it: ")[2])[2:]
 
     plain, world = trained(), "victim.trained_in=max_steps=20"
     behind = trained("defense=tracker+shield", *parameters)
     hardened = trained("defense=advtrain+tracker+shield", "defense.advtrain.decisions=48", world, *parameters)
-    units = [plan(run_config([*WORDS[1:], "world.max_steps=20", *used]))[0] for used in (plain, behind, hardened)]
+    units = [plan_of([*WORDS[1:], "world.max_steps=20", *used]).units()[0] for used in (plain, behind, hardened)]
     assert len({unit.weights_sha256 for unit in units}) == 3
     assert 'victim.behind="tracker+shield tracker.assumed_budget=0.08 shield.band=3.0"' in behind
     assert {"defense=advtrain+tracker+shield", "defense.shield.band=3.0"} <= set(hardened)
@@ -153,5 +152,5 @@ def test_a_driver_is_trained_behind_a_chain_and_drives_behind_it(
 )
 def test_what_nobody_can_be_trained_behind_is_refused_in_one_line(words: list[str], said: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=said) as refused:
-        train(["victim=dqn", *words, f"out={tmp_path}"], Console(quiet=True))
+        train(training_of(["victim=dqn", *words, f"out={tmp_path}"]), Console(quiet=True))
     assert "\n" not in str(refused.value)

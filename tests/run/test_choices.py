@@ -12,7 +12,7 @@ from cavbench.checks import complaints
 from cavbench.core.track import track
 from cavbench.errors import UserError
 from cavbench.records import reading
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from tests.command import Said
 from tests.plugins.distributions import install
 
@@ -120,6 +120,6 @@ def test_a_choice_is_checked_as_any_component_is() -> None:
 )
 def test_a_bad_choice_is_refused_in_one_line(line: str, reason: str) -> None:
     with pytest.raises(UserError) as raised:
-        run_config(line.split())
+        plan_of(line.split())
     assert reason in str(raised.value)
     assert "\n" not in str(raised.value)

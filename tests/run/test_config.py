@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from cavbench.core.registry import load
 from cavbench.envs.highway.axes import STANDARD_V1, STANDARD_V2
 from cavbench.errors import UserError
-from cavbench.run.config import RunConfig, component, run_config, train_config
+from cavbench.run.config import component, plan_of, training_of
+from cavbench.run.plan import Plan
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
 
-def read(line: str) -> RunConfig:
-    return run_config(line.split())
+def read(line: str) -> Plan:
+    return plan_of(line.split())
 
 
 def test_the_defaults_are_the_clean_dqn_on_the_standard_grid() -> None:
@@ -89,11 +90,11 @@ def test_a_clean_pair_is_the_same_under_every_threat_model() -> None:
 
 
 def test_a_path_is_not_parsed() -> None:
-    assert run_config(["out=/some/a,b=c {d}/[e]"]).out == Path("/some/a,b=c {d}/[e]")
+    assert plan_of(["out=/some/a,b=c {d}/[e]"]).out == Path("/some/a,b=c {d}/[e]")
 
 
 def test_plain_text_needs_no_quotes() -> None:
-    config = run_config(["defense=advtrain", "defense.attack_params=steps=3 step_size=0.7"])
+    config = plan_of(["defense=advtrain", "defense.attack_params=steps=3 step_size=0.7"])
     assert config.pairs[0].defense.component.attack_params == "steps=3 step_size=0.7"
 
 
@@ -163,9 +164,9 @@ def test_bad_options_are_refused_in_one_line(line: str) -> None:
 
 
 def test_a_training_takes_one_component_of_each_kind_and_several_seeds() -> None:
-    config = train_config(["victim=dqn", "victim.batch=64", "seed=3"])
+    config = training_of(["victim=dqn", "victim.batch=64", "seeds=3"])
     assert (config.victim.component.batch, config.defense.name, config.seeds) == (64, "none", (3,))
     with pytest.raises(UserError, match="one network per seed"):
-        train_config(["victim=dqn,ddpg"])
+        training_of(["victim=dqn,ddpg"])
     with pytest.raises(UserError, match=r"unknown key 'threat\.budget'"):
-        train_config(["attack=paad", "threat.budget=0.2"])
+        training_of(["attack=paad", "threat.budget=0.2"])

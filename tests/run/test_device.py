@@ -13,8 +13,7 @@ import torch
 
 from cavbench.core import device
 from cavbench.errors import UserError
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
+from cavbench.run.config import plan_of
 from tests.command import Said
 from tests.plugins import other_device
 from tests.tree import ROOT
@@ -45,7 +44,7 @@ def test_a_gpu_that_is_not_there_is_refused_before_any_work(bench: Callable[...,
 
 @without_gpu
 def test_auto_without_a_gpu_is_the_processor_and_the_same_unit() -> None:
-    assert plan(run_config([*SMALL, "device=auto"])) == plan(run_config([*SMALL]))
+    assert plan_of([*SMALL, "device=auto"]).units() == plan_of([*SMALL]).units()
 
 
 @pytest.mark.parametrize(
@@ -57,14 +56,14 @@ def test_auto_without_a_gpu_is_the_processor_and_the_same_unit() -> None:
 )
 def test_devices_that_cannot_be_are_refused(words: tuple[str, ...], why: str) -> None:
     with pytest.raises(UserError, match=why):
-        run_config([*SMALL, *words])
+        plan_of([*SMALL, *words])
 
 
 def test_records_of_a_gpu_say_so_and_are_units_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = plan(run_config([*SMALL]))[0]
+    here = plan_of([*SMALL]).units()[0]
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "GPU 7")
-    there = plan(run_config([*SMALL, "device=auto"]))[0]
+    there = plan_of([*SMALL, "device=auto"]).units()[0]
     assert there.job.device == "cuda"
     assert there.fingerprint != here.fingerprint
     machine = str(there.constants(1.0)["machine"])

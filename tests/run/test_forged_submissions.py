@@ -19,13 +19,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from cavbench.cli import submit as cli
-from cavbench.cli.terminal import Console
 from cavbench.core.track import track
 from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.records.schema import schema
 from cavbench.run import claims, received, verification
-from cavbench.run.plan import plan
+from cavbench.terminal import Console
 from tests.command import Said
 
 Bench = Callable[..., Said]
@@ -61,7 +60,7 @@ def made(bench: Bench, kept: Made, monkeypatch: pytest.MonkeyPatch) -> Made:
         assert bench("submit", PAIR, f"results={kept.results}", f"out={kept.submission}").code == 0
         with received.received(kept.submission) as found:
             claim = claims.of(list(found.records.values()))
-        kept.units = {unit.fingerprint: unit for unit in plan(claim.config)}
+        kept.units = {unit.fingerprint: unit for unit in claim.plan.units()}
         kept.records = reading.read(kept.results, track=TRACK)
 
     def run(config: Any, watcher: object, choose: Callable[[Mapping[str, Any]], object]) -> None:

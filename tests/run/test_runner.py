@@ -20,16 +20,14 @@ from cavbench.errors import Notice, UnfinishedError, UserError
 from cavbench.records import reading
 from cavbench.records.schema import PROBES
 from cavbench.run import runner
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
-from cavbench.run.unit import Preparation, Unit
+from cavbench.run.config import plan_of
+from cavbench.run.task import Task
 from tests.command import Said
 from tests.plugins.distributions import install
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 
 SMALL = "attack=nudge victim=toy world=toy lanes=3,4 density=1 weather=clear,fog episodes=4 seeds=0,1"
-Work = Unit | Preparation
 BESIDE = ("attack_ms", "created_at", "wall_s", *(field.name for field in PROBES))
 """Columns in which two runs of the same unit may differ; nobody can foresee which moments are probed."""
 
@@ -38,7 +36,7 @@ class Silent:
     """A watcher that stores what it receives, and can stop the run."""
 
     def __init__(self, stop_after: int | None = None) -> None:
-        self.done: list[Work] = []
+        self.done: list[Task] = []
         self.told: list[tuple[str, float, str]] = []
         self.shares: list[tuple[float, int]] = []
         self.warnings: list[str] = []
@@ -49,23 +47,23 @@ class Silent:
     def begin(self, *, episodes: int, finished: int) -> None:
         self.episodes, self.there = episodes, finished
 
-    def working(self, works: Sequence[Work]) -> None:
+    def working(self, tasks: Sequence[Task]) -> None:
         if len(self.done) == self.stop_after:
             raise KeyboardInterrupt
 
-    def preparing(self, work: str, share: float, text: str, episodes: int = 0) -> None:
+    def preparing(self, task: str, share: float, text: str, episodes: int = 0) -> None:
         if episodes:
             self.shares.append((share, episodes))
         else:
-            self.told.append((work, share, text))
+            self.told.append((task, share, text))
 
-    def finished(self, work: Work, wall_s: float) -> None:
-        self.done.append(work)
+    def finished(self, task: Task, wall_s: float) -> None:
+        self.done.append(task)
 
     def failed(self, line: str) -> None:
         self.failures.append(line)
 
-    def printed(self, work: object, lines: Sequence[str]) -> None:
+    def printed(self, task: object, lines: Sequence[str]) -> None:
         self.said += lines
 
     def warn(self, line: str) -> None:
@@ -74,7 +72,7 @@ class Silent:
 
 def run(out: Path, *more: str, line: str = SMALL, watcher: Silent | None = None) -> tuple[pa.Table, Silent]:
     words = dict(word.split("=", 1) for word in [*line.split(), "executor=serial", f"out={out}", "record=0", *more])
-    config = run_config([f"{key}={value}" for key, value in words.items()])
+    config = plan_of([f"{key}={value}" for key, value in words.items()])
     watcher = watcher or Silent()
     return reading.read(out, runner.run(config, watcher), track=track("driving")), watcher
 
@@ -117,8 +115,8 @@ def test_all_pairs_drive_the_same_scenarios(tmp_path: Path) -> None:
 
 
 def test_two_pairs_share_their_clean_control(tmp_path: Path) -> None:
-    config = run_config([*SMALL.replace("attack=nudge", "attack=nudge,noise").split(), "threat.budget=0.1,0.2"])
-    clean = [unit for unit in plan(config) if unit.pair.is_clean and unit.pair.victim.name == "toy"]
+    config = plan_of([*SMALL.replace("attack=nudge", "attack=nudge,noise").split(), "threat.budget=0.1,0.2"])
+    clean = [unit for unit in config.units() if unit.pair.is_clean and unit.pair.victim.name == "toy"]
     assert len(config.pairs) == 4
     assert len(clean) == 2 * 2 * 2
 
@@ -129,8 +127,8 @@ def test_baselines_can_be_switched_off(tmp_path: Path) -> None:
 
 
 def test_continuous_victims_have_continuous_baselines() -> None:
-    config = run_config(["attack=steer", "victim=toy", "victim.actions=continuous", "world=toy"])
-    kinds = {(unit.pair.victim.name, unit.pair.victim.component.action_type) for unit in plan(config)}
+    config = plan_of(["attack=steer", "victim=toy", "victim.actions=continuous", "world=toy"])
+    kinds = {(unit.pair.victim.name, unit.pair.victim.component.action_type) for unit in config.units()}
     assert kinds == {("toy", "continuous"), ("blind", "continuous"), ("random", "continuous")}
 
 
@@ -168,7 +166,7 @@ def test_an_interrupted_run_keeps_finished_units_and_continues(tmp_path: Path) -
 
 
 def test_a_grid_in_blocks_drives_the_same_episodes_and_the_first_block_of_every_cell_first(tmp_path: Path) -> None:
-    whole = run_config([*SMALL.split(), "executor=serial", f"out={tmp_path / 'whole'}", "record=0"])
+    whole = plan_of([*SMALL.split(), "executor=serial", f"out={tmp_path / 'whole'}", "record=0"])
     blocks = replace(whole, grid=replace(whole.grid, block=2), out=tmp_path / "blocks")
     watcher = Silent()
     runner.run(blocks, watcher)
@@ -180,10 +178,10 @@ def test_a_grid_in_blocks_drives_the_same_episodes_and_the_first_block_of_every_
         return comparable(records).filter(pc.equal(records["attack"], "none")).drop("unit").sort_by(order)
 
     assert clean(blocks.out).equals(clean(whole.out))
-    starts = [work.seeds.start for work in watcher.done if isinstance(work, Unit)]
+    starts = [task.unit.seeds.start for task in watcher.done]
     assert starts == sorted(starts)
     assert len(set(starts)) == 2
-    shards = [plan(replace(blocks, shard=(part, 3))) for part in (1, 2, 3)]
+    shards = [replace(blocks, shard=(part, 3)).units() for part in (1, 2, 3)]
     assert sum(map(len, shards)) == len({unit.fingerprint for units in shards for unit in units}) == len(starts)
 
 
@@ -216,18 +214,18 @@ def test_a_missing_policy_is_reported_before_any_work(tmp_path: Path, monkeypatc
 
 
 def test_a_record_names_its_grid_only_if_cell_and_seeds_match() -> None:
-    whole = plan(run_config(["victim=toy", "world=toy", "lanes=3"]))
-    short = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=99"]))
-    other = plan(run_config(["victim=toy", "world=toy", "lanes=2"]))
-    as_few_as_approaches = plan(run_config(["victim=toy", "world=toy", "lanes=3", "episodes=3"]))
+    whole = plan_of(["victim=toy", "world=toy", "lanes=3"]).units()
+    short = plan_of(["victim=toy", "world=toy", "lanes=3", "episodes=99"]).units()
+    other = plan_of(["victim=toy", "world=toy", "lanes=2"]).units()
+    as_few_as_approaches = plan_of(["victim=toy", "world=toy", "lanes=3", "episodes=3"]).units()
     assert {unit.grid for unit in whole} == {"toy-v1"}
     assert {unit.grid for unit in (*short, *other, *as_few_as_approaches)} == {"custom"}
 
 
 def test_a_block_of_a_grid_has_its_name() -> None:
     words = ["attack=noise", "victim=dqn", "grid=standard-v2", "reference=false", "seeds=0"]
-    assert {unit.grid for unit in plan(run_config([*words, "lanes=3", "episodes=20"]))} == {"standard-v2"}
-    assert {unit.grid for unit in plan(run_config([*words, "lanes=3", "episodes=15"]))} == {"custom"}
+    assert {unit.grid for unit in plan_of([*words, "lanes=3", "episodes=20"]).units()} == {"standard-v2"}
+    assert {unit.grid for unit in plan_of([*words, "lanes=3", "episodes=15"]).units()} == {"custom"}
 
 
 def test_a_unit_in_which_an_attack_changed_the_victim_is_refused_with_its_package(
@@ -276,7 +274,7 @@ class Poison(DrivingAttack):
 def test_shards_drive_every_unit_once(tmp_path: Path) -> None:
     whole, _ = run(tmp_path / "whole")
     parts = [run(tmp_path / "parts", f"shard={part}/3")[1].done for part in (1, 2, 3)]
-    units = [work.fingerprint for done in parts for work in done]
+    units = [task.unit.fingerprint for done in parts for task in done]
     assert sorted(units) == sorted(set(whole["unit"].to_pylist()))
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
     merged = reading.read(tmp_path / "parts", set(units), track=track("driving"))
@@ -286,7 +284,7 @@ def test_shards_drive_every_unit_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("shard", ["0/3", "4/3", "1", "a/b"])
 def test_a_shard_that_there_is_not_is_refused(shard: str) -> None:
     with pytest.raises(UserError, match="shard must be PART/PARTS"):
-        run_config([*SMALL.split(), f"shard={shard}"])
+        plan_of([*SMALL.split(), f"shard={shard}"])
 
 
 def test_a_clock_that_jumps_during_a_run_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

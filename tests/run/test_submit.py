@@ -17,7 +17,7 @@ from cavbench.core import registry
 from cavbench.core.track import track
 from cavbench.records import reading
 from cavbench.run.claims import _names_a_file
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from cavbench.run.submission import weights_of
 from tests.command import Said
 
@@ -191,7 +191,7 @@ def test_a_patch_is_crafted_again_not_taken(bench: Bench, tmp_path: Path) -> Non
 
 def test_a_detector_is_submitted_with_the_weights_of_its_own_training_seed(toy_folder: Path) -> None:
     words = "attack=eot victim=yolov5 victim.trained=3 world=camera"
-    (pair,) = run_config(words.split()).pairs
+    (pair,) = plan_of(words.split()).pairs
     assert {name.rpartition("/")[2] for name in weights_of(pair, [0, 1])} >= {"seed3.safetensors", "seed3.json"}
     # Its parameter `path` is empty: it names no file of this machine.
     assert not _names_a_file(json.loads(pair.victim.params))

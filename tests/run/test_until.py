@@ -11,9 +11,10 @@ import pytest
 from cavbench.core.track import track
 from cavbench.errors import UnfinishedError, UserError
 from cavbench.records import reading
-from cavbench.run import rounds, runner
-from cavbench.run.audit import audit_config
-from cavbench.run.config import RunConfig, run_config
+from cavbench.run import rounds, runner, stops
+from cavbench.run.audit import audit_of
+from cavbench.run.config import plan_of
+from cavbench.run.plan import SCENARIOS, Plan
 from cavbench.run.replay import repeat
 from cavbench.statistics.sequential import confidence_sequence, shown_higher
 from tests.run.test_runner import Silent, comparable
@@ -27,9 +28,9 @@ WORDS = (
 )
 
 
-def config(out: Path, *more: str) -> RunConfig:
+def config(out: Path, *more: str) -> Plan:
     words = dict(word.split("=", 1) for word in (*WORDS, *more))
-    return run_config([*(f"{key}={value}" for key, value in words.items()), f"out={out}"])
+    return plan_of([*(f"{key}={value}" for key, value in words.items()), f"out={out}"])
 
 
 @pytest.mark.parametrize("name", list(SCORES))
@@ -57,12 +58,12 @@ def test_an_attack_that_cannot_be_the_strongest_is_ruled_out_and_the_strongest_h
     asked = config(tmp_path, "attack.scale=0.1,0.2,1.0", "until=0.01")
     rng, ruled_out = np.random.default_rng(0), 0
     for _ in range(10):
-        rows = [rounds._Row(pair) for pair in asked.pairs]
+        rows = [rounds.Row(pair, 0.01, asked.grid.episodes) for pair in asked.pairs]
         traffic = rng.random((2, 2, 60))
         for row, score in zip(rows, (0.6, 0.2, 0.2), strict=True):
             own = np.clip(0.3 * traffic + score + 0.1 * rng.standard_normal(traffic.shape), 0, 1)
             row.parts = list(np.split(own, 6, -1))
-        rounds._look(asked, rows)
+        rounds.look(rows)
         weak, *strong = rows
         assert weak.stop is not None
         assert weak.stop.why == "ruled out"
@@ -74,11 +75,11 @@ def test_an_attack_that_cannot_be_the_strongest_is_ruled_out_and_the_strongest_h
 def test_a_run_stops_when_its_row_is_known_and_says_where(tmp_path: Path) -> None:
     asked = config(tmp_path)
     units = runner.run(asked, Silent())
-    (stop,) = rounds.read(tmp_path, [pair.id for pair in asked.pairs])
+    (stop,) = stops.read(tmp_path, [pair.id for pair in asked.pairs])
     records = reading.read(tmp_path, units, track=track("driving"))
     assert set(records["grid"].to_pylist()) == {"sequential"}
     assert stop.why == "narrow"
-    assert rounds.SCENARIOS <= stop.scenarios < stop.most == 60
+    assert SCENARIOS <= stop.scenarios < stop.most == 60
     assert len(set(records["seed"].to_pylist())) == stop.scenarios
     assert stop.high - stop.low <= 2 * 0.15
     attacked = [row["safe_progress"] for row in records.to_pylist() if row["attack"] == "nudge"]
@@ -107,7 +108,7 @@ def test_a_run_that_was_killed_stops_where_it_would_have(tmp_path: Path) -> None
 def test_a_grid_that_is_done_stops_a_row(tmp_path: Path) -> None:
     asked = config(tmp_path, "until=0.001", "episodes=15")
     runner.run(asked, Silent())
-    (stop,) = rounds.read(tmp_path, [asked.pairs[0].id])
+    (stop,) = stops.read(tmp_path, [asked.pairs[0].id])
     assert (stop.why, stop.scenarios, stop.most) == ("grid done", 15, 15)
 
 
@@ -126,20 +127,20 @@ def test_what_cannot_be_is_refused(tmp_path: Path, more: str, why: str) -> None:
 
 def test_fixed_scenarios_and_audits_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="has a fixed set of scenarios: leave out until"):
-        run_config(["victim=yolov3_tiny", "attack=grey_patch", "until=0.1", f"out={tmp_path}"])
+        plan_of(["victim=yolov3_tiny", "attack=grey_patch", "until=0.1", f"out={tmp_path}"])
     with pytest.raises(UserError, match="leave out until"):
-        audit_config([*WORDS, f"out={tmp_path}"])
+        audit_of([*WORDS, f"out={tmp_path}"])
 
 
 def test_a_pair_that_fails_has_stopped_and_the_others_go_on_as_without_it(tmp_path: Path) -> None:
     runner.run(config(tmp_path / "alone"), Silent())
     asked = config(tmp_path / "both", "attack.mood=calm,raise")
-    alone = rounds.read(tmp_path / "alone", [asked.pairs[0].id])
+    alone = stops.read(tmp_path / "alone", [asked.pairs[0].id])
     for resumed in (False, True):
         watcher = Silent()
         with pytest.raises(UnfinishedError):
             runner.run(asked, watcher)
-        calm, failed = rounds.read(tmp_path / "both", [pair.id for pair in asked.pairs])
+        calm, failed = stops.read(tmp_path / "both", [pair.id for pair in asked.pairs])
         assert [calm] == alone
         assert (failed.why, failed.scenarios) == ("failed", 0)
         assert bool(watcher.done) is not resumed

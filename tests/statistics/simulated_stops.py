@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cavbench.run.rounds import SCENARIOS
+from cavbench.run.plan import SCENARIOS
 from cavbench.statistics.estimates import Array, t_quantile
 from cavbench.statistics.sequential import confidence_sequence
 

@@ -24,7 +24,7 @@ from cavbench.driving.victims.dqn import DQN
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.errors import UserError
 from cavbench.identity.fingerprint import sources
-from cavbench.run.config import run_config, train_config
+from cavbench.run.config import plan_of, training_of
 from cavbench.zoo.store import SHIPPED
 
 TINY = DQN(hidden=8)
@@ -210,8 +210,8 @@ def test_the_command_of_a_card_trains_it_again_and_uses_it(
     zoo.save(QPolicy(5, 5, 8), recipe, seed=7, world=where, card={})
     entry = zoo.card(recipe, 7)
     assert made_by(entry["command"]).key == recipe.key
-    assert train_config(shlex.split(entry["command"])[2:]).seeds == (7,)
-    (pair,) = run_config(shlex.split(recipe.use)[2:]).pairs
+    assert training_of(shlex.split(entry["command"])[2:]).seeds == (7,)
+    (pair,) = plan_of(shlex.split(recipe.use)[2:]).pairs
     assert (pair.victim.component, pair.defense.component) == (victim, defense or pair.defense.component)
 
 
@@ -219,7 +219,7 @@ def made_by(command: str) -> zoo.Recipe:
     """The recipe that a `bench train` command makes."""
     program, train, *options = shlex.split(command)
     assert (program, train) == ("bench", "train")
-    config = train_config(options)
+    config = training_of(options)
     world = config.world.component
     trained_in = zoo.trained_in(world, default=track(world.tracks()[0]).world)
     parts = {

@@ -26,7 +26,7 @@ from cavbench.detection.victims.yolov5 import YOLOv5, YOLOv5Network
 from cavbench.envs.camera.bank import TrainingScenes
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.errors import UserError
-from cavbench.run.config import component, run_config
+from cavbench.run.config import component, plan_of
 from tests.detection.drawn_street import DrawnStreet
 from tests.plugins.toy_camera import SIGN, RedDetector, RedStreet
 
@@ -238,12 +238,12 @@ def test_impossible_options_are_refused_in_one_line(victim: YOLOv5) -> None:
 
 
 def test_one_name_selects_the_defence_of_each_track() -> None:
-    driving = run_config(["defense=advtrain", "victim=dqn"]).pairs[0]
-    detection = run_config(["defense=advtrain", "victim=yolov3_tiny"]).pairs[0]
+    driving = plan_of(["defense=advtrain", "victim=dqn"]).pairs[0]
+    detection = plan_of(["defense=advtrain", "victim=yolov3_tiny"]).pairs[0]
     assert (driving.defense.name, detection.defense.name) == ("advtrain", "advtrain_detection")
     assert component("defense", "advtrain_detection", {"skip": "0.5"}).skip == 0.5
     with pytest.raises(UserError, match="does not fit victim 'dqn'"):
-        run_config(["defense=advtrain_detection", "victim=dqn"])
+        plan_of(["defense=advtrain_detection", "victim=dqn"])
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from cavbench.envs.camera.world import StopSignApproach
 from cavbench.errors import UserError
 from cavbench.formats.torch_operations import operation
 from cavbench.formats.trial import RefusedError
-from cavbench.run.config import component, run_config
+from cavbench.run.config import component, plan_of
 from tests.plugins.toy_camera import RedScenes
 
 FACTS = StopSignApproach().facts
@@ -223,10 +223,10 @@ def test_a_gradient_goes_through_a_program_and_its_border(program: str) -> None:
 
 def test_a_gradient_attack_on_an_onnx_detector_is_refused_before_any_work() -> None:
     with pytest.raises(UserError, match="victim 'detector' is a black box that supports 'scores' at most"):
-        run_config(["attack=eot", "victim=detector", "victim.path=nowhere.onnx"])
-    run_config(["attack=noise_patch", "victim=detector", "victim.path=nowhere.onnx"])
-    run_config(["attack=eot", "victim=detector", "victim.path=nowhere.pt2"])
-    run_config(["attack=square_patch", "victim=detector", "victim.path=nowhere.onnx"])
+        plan_of(["attack=eot", "victim=detector", "victim.path=nowhere.onnx"])
+    plan_of(["attack=noise_patch", "victim=detector", "victim.path=nowhere.onnx"])
+    plan_of(["attack=eot", "victim=detector", "victim.path=nowhere.pt2"])
+    plan_of(["attack=square_patch", "victim=detector", "victim.path=nowhere.onnx"])
     sent = pickle.loads(pickle.dumps(choose("victim", "detector", path="nowhere.onnx").component))
     assert (sent.answers, sent.libraries) == ("scores", ("onnxruntime",))
 

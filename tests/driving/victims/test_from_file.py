@@ -25,8 +25,7 @@ from cavbench.driving.rollout import Columns
 from cavbench.driving.victims.in_process import in_process
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
-from cavbench.run.config import run_config
-from cavbench.run.plan import plan
+from cavbench.run.config import plan_of
 
 FACTS = HighwayWorld().facts
 
@@ -134,7 +133,7 @@ def sb3_file(path: Path, algo: str, *, continuous: bool = False, **policy: objec
 
 def driven(*words: str) -> Columns:
     """The measurements of the first unit of these options, without the wall time."""
-    unit = next(unit for unit in plan(run_config([*SHORT.split(), *words])))
+    unit = next(unit for unit in plan_of([*SHORT.split(), *words]).units())
     return {name: column for name, column in drive(unit.job, []).columns.items() if name != "attack_ms"}
 
 
@@ -166,8 +165,8 @@ def test_a_dqn_in_an_onnx_file_decides_like_the_zoos(onnx: str, attack: str) -> 
 
 def test_a_gradient_attack_on_a_black_box_is_refused_before_any_work() -> None:
     with pytest.raises(UserError, match="victim 'onnx' is a black box that supports 'scores' at most"):
-        run_config(["attack=pgd", "victim=onnx", "victim.path=nowhere.onnx"])
-    run_config(["attack=zo", "victim=onnx", "victim.path=nowhere.onnx"])
+        plan_of(["attack=pgd", "victim=onnx", "victim.path=nowhere.onnx"])
+    plan_of(["attack=zo", "victim=onnx", "victim.path=nowhere.onnx"])
 
 
 @pytest.mark.parametrize(("algo", "continuous", "policy"), FAITHFUL)

@@ -22,7 +22,7 @@ from cavbench.driving.victims.in_process import in_process
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
 from cavbench.run import runner
-from cavbench.run.config import run_config
+from cavbench.run.config import plan_of
 from tests.driving.victims.test_from_file import saved, sb3_model, spaces
 
 sb3 = pytest.importorskip("stable_baselines3")
@@ -244,7 +244,7 @@ def test_a_file_is_refused_before_anything_is_driven(tmp_path: Path) -> None:
             return lambda *given, **named: heard.append(name)
 
     with pytest.raises(UserError, match=r"this world shows Box\(-1, 1, \(10, 5\)\)"):
-        runner.run(run_config([*words.split(), f"out={tmp_path}"]), Watch())  # type: ignore[arg-type]
+        runner.run(plan_of([*words.split(), f"out={tmp_path}"]), Watch())  # type: ignore[arg-type]
     assert not heard
 
 

@@ -1,4 +1,4 @@
-"""The console of the command line. Names in records, files and packages come from strangers: it prints text, nothing else."""
+"""The console. Names in records, files and packages come from strangers: it prints text, nothing else."""
 
 from __future__ import annotations
 

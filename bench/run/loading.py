@@ -1,0 +1,66 @@
+"""Loads the networks of a run before anything is driven. What makes the scores doubtful is said here."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from itertools import chain
+from typing import Protocol
+
+from cavbench.errors import RefusedNetworkError, UserError, message
+from cavbench.run import networks
+from cavbench.run.executor import Executor, Watcher
+from cavbench.run.failures import Failures
+from cavbench.run.networks import Weights
+from cavbench.run.plan import Plan
+from cavbench.run.unit import is_foreign
+
+
+class LoadWatcher(Watcher, Protocol):
+    """Receives what is found when networks are loaded."""
+
+    def failed(self, line: str) -> None:
+        """A task failed; the run goes on."""
+
+    def warn(self, line: str) -> None:
+        """Something went wrong that does not affect the records."""
+
+
+def load(plan: Plan, back_end: Executor, watcher: LoadWatcher, failures: Failures) -> Weights:
+    """The hashes of the networks. Built-in components are loaded here, plug-ins where they are driven.
+
+    Args:
+        plan: the run.
+        back_end: the executor.
+        watcher: is told what makes the scores doubtful.
+        failures: collects what failed.
+
+    Raises:
+        UserError: if a network is missing.
+        UnfinishedError: if no requested pair can be driven.
+    """
+    weights: dict[str, tuple[str, str]] = {}
+    doubts: dict[str, None] = {}
+    foreign = []
+    for task in plan.loadings:
+        if any(is_foreign(part) for part in task.pair.parts):
+            foreign.append(task)
+            continue
+        try:
+            weights[task.unit.networks], found = networks.tried(task)
+        except RefusedNetworkError as error:
+            raise UserError(f"{task} is refused: {message(error)}") from error
+        doubts |= dict.fromkeys(found)
+    with closing(back_end.map(foreign, watcher)) as finished:
+        for task, outcome in chain.from_iterable(finished):
+            if outcome.weights is not None:
+                weights[task.unit.networks] = outcome.weights
+                doubts |= dict.fromkeys(outcome.warnings)
+            elif outcome.bad_input:
+                raise UserError(f"{task} {outcome.why}")
+            elif line := failures.add(task, outcome):
+                watcher.failed(line)
+    for line in doubts:
+        watcher.warn(line)
+    if not plan.can_drive(weights):
+        raise failures.error((), 0)
+    return weights
