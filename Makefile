@@ -8,7 +8,7 @@ HAS_BROWSER := (for name in chromium chromium-browser google-chrome; do command 
 RUN_STAMP := $(VENV)/installed-to-run
 DEV_STAMP := $(VENV)/installed-to-develop
 
-.PHONY: run test lint tree docs bench soak licences wheel-check install install-dev browser debian-browser clean
+.PHONY: run test lint tree docs page bench soak licences wheel-check install install-dev browser debian-browser clean
 
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
@@ -29,10 +29,14 @@ tree:
 
 # The site, in docs/_build/html. A broken link, a page missing from the contents, an unknown component or a sentence of more than 30 words
 # (docs/prose.py) is an error.
-docs: install-dev
+docs: install-dev page
 	rm -rf docs/_build
 	$(BIN)/python docs/prose.py
 	$(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
+
+# The leaderboard of the published records: leaderboard/index.html, .json, .csv and .tex. From there, so that no folder `results` counts.
+page: install-dev
+	cd leaderboard && ../$(BIN)/bench report html=index.html >/dev/null
 
 # The wheel in an environment of its own: installs it, and runs a first command. Takes minutes and 2 GB.
 wheel-check: install-dev

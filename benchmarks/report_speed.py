@@ -31,7 +31,7 @@ import pyarrow.parquet as pq
 
 from cavbench.core.contracts import Facts
 from cavbench.core.track import Track, track
-from cavbench.envs.highway.axes import STANDARD_V1
+from cavbench.envs.highway.axes import STANDARD_V2
 from cavbench.records import packing, store
 from cavbench.records.finished import finished
 from cavbench.records.schema import schema
@@ -41,7 +41,7 @@ from cavbench.statistics.episodes import as_text
 SEEDS, ATTACKS = 3, 8
 ROW_GROUP = 100_000
 SCHEMA = schema(track("driving"))
-FACTS = json.dumps(Facts(axes=STANDARD_V1.axes, decision_hz=15, max_steps=450).written())
+FACTS = json.dumps(Facts(axes=STANDARD_V2.axes, decision_hz=15, max_steps=450).written())
 POLICY = {f"parameter_{number}": 0.125 for number in range(15)}
 MEASURE = """
 import resource, subprocess, sys, time
@@ -104,7 +104,7 @@ def _constants(number: int, defense: str, attack: str, seed: int, cell: Cell) ->
         "threat_access": "oblivious" if clean else "gradients",
         "threat_queries": 0 if clean else 1000,
         "threat_share": 1.0,
-        "grid": "standard-v1",
+        "grid": "standard-v2",
         "cell": as_text(cell),
         "world_facts": FACTS,
         "attack_shipped_by": "cavbench 0.1.0",
@@ -120,7 +120,7 @@ def _constants(number: int, defense: str, attack: str, seed: int, cell: Cell) ->
 def named(count: int) -> Iterator[tuple[str, str, int, Cell]]:
     """Defence, attack, training seed and cell of so many units."""
     attacks = ["none", *(f"attack_{number}" for number in range(ATTACKS))]
-    of_victim = list(itertools.product(attacks, range(SEEDS), STANDARD_V1.cells()))
+    of_victim = list(itertools.product(attacks, range(SEEDS), STANDARD_V2.cells()))
     for number in range(count):
         yield (f"defense_{number // len(of_victim)}", *of_victim[number % len(of_victim)])
 

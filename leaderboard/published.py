@@ -1,29 +1,41 @@
-"""Our own published records, shipped with the package.
+"""Our own published records, shipped with the package: one file a row of the leaderboard, and its face beside it.
 
-    python -m cavbench.leaderboard.published RESULTS leaderboard/data/NAME.parquet
-    python -m cavbench.leaderboard.published RESULTS leaderboard/data/NAME.parquet --add
+    python -m cavbench.leaderboard.published RESULTS          # publishes the newest records of a results folder, row by row
+    python -m cavbench.leaderboard.published RESULTS --add    # adds them to those that a row has
+    python -m cavbench.leaderboard.published                  # writes the faces of all rows again
 
-The first publishes the newest records of a results folder, the second adds them to those of the file. A file holds one track.
+A row is a defended victim on a grid. Its records are `data/GRID/NAME.parquet`, its face is `rows/GRID/NAME.json`
+(`cavbench.leaderboard.faces`). So a new row is two new files, and no other one changes. The records of all baselines of a grid, which
+no leaderboard ranks, are one file, `data/GRID/baselines.parquet`.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from importlib.resources import as_file, files
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from cavbench.core.track import Track, tracks
-from cavbench.errors import UserError
+from cavbench.core.track import Track, track, tracks
 from cavbench.files import whole
+from cavbench.identity.fingerprint import canonical
+from cavbench.leaderboard.comparisons.comparison import DEFENDED, IDENTITY, NO_ATTACK
+from cavbench.leaderboard.comparisons.reading import groups
+from cavbench.leaderboard.faces import write_face
 from cavbench.records import reading
-from cavbench.records.generations import check
-from cavbench.records.schema import schema
+from cavbench.records.columns import track_of
+from cavbench.records.schema import AUDIT, schema
 
+HOME = "cavbench.leaderboard"
+BASELINES = "baselines"
+"""The file of a grid with the victims that others are compared with."""
 SERIES = ("pair", "training_seed", "grid")
 """The columns that records are renewed by."""
 MEASURED = frozenset({"return", "distance_m", "min_ttc_s", "mean_speed", "linf", "l2", "linf_m", "linf_mps"})
@@ -35,55 +47,98 @@ SINGLE = ("linf", "l2", "linf_m", "linf_mps", "mean_speed")
 """Columns that are published in single precision, which makes a file a quarter smaller. No score is computed from them."""
 
 
-def published(track: Track) -> pa.Table:
-    """Every record of a track in `leaderboard/data/*.parquet`, an empty table if none is shipped."""
-    with as_file(files("cavbench.leaderboard") / "data") as folder:
-        paths = [path for path in sorted(folder.glob("*.parquet")) if check(path)[0].name == track.name]
-        tables = [reading.upgraded(path) for path in paths]
-    return pa.concat_tables([schema(track).empty_table(), *tables])
+def published(of: Track) -> pa.Table:
+    """Every record of a track in `leaderboard/data`, an empty table if none is shipped."""
+    with as_file(files(HOME) / "data") as folder:
+        paths = [path for path in sorted(folder.glob("*/*.parquet")) if track_of(path).name == of.name]
+        tables = [reading.read_file(path) for path in paths]
+    return pa.concat_tables([schema(of).empty_table(), *tables])
 
 
 def every_track() -> dict[str, pa.Table]:
     """The published records of every track that has some."""
-    found = {track.name: published(track) for track in tracks()}
+    found = {one.name: published(one) for one in tracks()}
     return {name: records for name, records in found.items() if records.num_rows}
 
 
-def publish(folder: Path, file: Path, *, add: bool = False) -> int:
-    """Write the newest records of a results folder as one file of published records.
+def publish(folder: Path, home: Path, *, add: bool = False) -> dict[str, int]:
+    """Publish the newest records of a results folder: a file of records and a face for each row.
 
     Args:
         folder: what `bench run out=` was given.
-        file: where to write, usually in `leaderboard/data`.
-        add: keep the file's records of all pairs, training seeds and grids of which the folder has fewer episodes.
+        home: where `data` and `rows` are, usually the folder `leaderboard`.
+        add: keep the records that a row has of all pairs, training seeds and grids of which the folder has fewer episodes.
+            Those of baselines are always kept.
 
     Returns:
-        How many episodes the file has then.
+        How many episodes each file has then, by `GRID/NAME`.
 
     Raises:
-        UserError: if the folder has records of no track, or of several, or of another one than the file.
+        UserError: if the folder has no records.
     """
-    found = reading.read_all(folder)
-    if len(found) > 1:
-        raise UserError(f"{folder} has records of the tracks {' and '.join(found)}; publish one track at a time")
-    ((name, records),) = found.items()
-    if add:
-        if check(file)[0].name != name:
-            raise UserError(f"{folder} has records of the track {name}, {file} has others")
-        records = added(reading.upgraded(file), records)
+    found = {}
+    for track_name, records in reading.read_all(folder).items():
+        for grid, defended, part in _rows(records, track(track_name)):
+            file = _file(home / "data" / grid, defended)
+            if file.exists() and (add or defended is None):
+                part = added(reading.read_file(file), part)
+            write_records(part, file)
+            if defended is not None:
+                write_face(file, home)
+            found[f"{grid}/{file.stem}"] = int(part.num_rows)
+    return found
+
+
+def _rows(records: pa.Table, of: Track) -> Iterator[tuple[str, Mapping[str, object] | None, pa.Table]]:
+    """The grid and the records of each row with what is defended; None for all baselines of a grid together.
+
+    The records of an audit, which no score contains, are with those of the first grid of what was audited.
+    """
+    baselines: dict[str, list[pa.Table]] = {}
+    for defended, part in groups(records, DEFENDED):
+        identities = [identity for identity, _ in groups(part, IDENTITY)]
+        is_baseline = all(one["attack"] == NO_ATTACK and of.baseline_of(one, one) for one in identities)
+        grids = sorted({str(one["grid"]) for one in identities} - {AUDIT}) or [AUDIT]
+        for place, grid in enumerate(grids):
+            wanted = [grid, AUDIT] if place == 0 else [grid]
+            own = part.filter(pc.is_in(part["grid"], pa.array(wanted)))
+            if is_baseline:
+                baselines.setdefault(grid, []).append(own)
+            else:
+                yield grid, defended, own
+    for grid, several in baselines.items():
+        yield grid, None, pa.concat_tables(several)
+
+
+def _file(folder: Path, defended: Mapping[str, object] | None) -> Path:
+    """Where the records of a row are: `VICTIM+DEFENCE.parquet`, with a short hash where another row has that name."""
+    if defended is None:
+        return folder / f"{BASELINES}.parquet"
+    names = [str(defended["victim"])] + [str(defended["defense"])] * (defended["defense"] != "none")
+    plain = folder / f"{'+'.join(names)}.parquet"
+    if not plain.exists():
+        return plain
+    there = pq.read_table(plain, columns=list(DEFENDED)).slice(0, 1).to_pylist()
+    if there == [dict(defended)]:
+        return plain
+    return plain.with_stem(f"{plain.stem}-{hashlib.sha256(canonical(defended).encode()).hexdigest()[:8]}")
+
+
+def write_records(records: pa.Table, file: Path) -> None:
+    """Write the records of a row: what the code says of their columns is left out, which is half of a small file."""
     records = rounded(records)
+    records = records.cast(pa.schema([column.remove_metadata() for column in records.schema])).combine_chunks()
+    file.parent.mkdir(parents=True, exist_ok=True)
     with whole(file) as made:
-        apart = [name for name in records.column_names if name in MEASURED]
-        others = [name for name in records.column_names if name not in MEASURED]
         pq.write_table(
             records,
             made,
             compression="zstd",
             compression_level=19,
-            use_byte_stream_split=apart,
-            use_dictionary=others,
+            use_byte_stream_split=[name for name in records.column_names if name in MEASURED],
+            use_dictionary=[name for name in records.column_names if name not in MEASURED],
+            write_statistics=False,
         )
-    return int(records.num_rows)
 
 
 def rounded(records: pa.Table) -> pa.Table:
@@ -108,10 +163,25 @@ def added(old: pa.Table, new: pa.Table) -> pa.Table:
     return pa.concat_tables([tables[0].filter(of_old), tables[1].filter(of_new)])
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Publish the newest records of a results folder.")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--add", action="store_true", help="add them to the records of the file")
+def row_files(home: Path) -> list[Path]:
+    """The records of all rows; not those of baselines."""
+    return [path for path in sorted((home / "data").glob("*/*.parquet")) if path.stem != BASELINES]
+
+
+def main() -> None:
+    """The command of this module."""
+    parser = argparse.ArgumentParser(description="Publish the newest records of a results folder, row by row.")
+    parser.add_argument("folder", type=Path, nargs="?", help="results folder; without one the faces are written again")
+    parser.add_argument("--add", action="store_true", help="add them to the records of the rows")
     words = parser.parse_args()
-    Console().print(f"{publish(words.folder, words.file, add=words.add)} episodes in {words.file}")
+    with as_file(files(HOME)) as home:
+        if words.folder is None:
+            for file in row_files(home):
+                write_face(file, home)
+            return
+        for name, episodes in publish(words.folder, home, add=words.add).items():
+            Console().print(f"{name}: {episodes} episodes")
+
+
+if __name__ == "__main__":
+    main()

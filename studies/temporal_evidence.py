@@ -19,7 +19,7 @@ from torch import Tensor
 
 from cavbench.attacks.detection.eot import EOT
 from cavbench.attacks.detection.noise_patch import NoisePatch
-from cavbench.attacks.detection.suites import STANDARD_DETECTION_1
+from cavbench.attacks.detection.suites import STANDARD_DETECTION_3
 from cavbench.core import registry
 from cavbench.defenses.detection.temporal import TemporalFusion
 from cavbench.detection import Approach, Detector, PatchAttack, PatchThreat, Predictions, Wrapped
@@ -37,7 +37,7 @@ from cavbench.run.process import settle
 WORLD, LOOP, THREAT = StopSignApproach(), StopSignCrossing(), PatchThreat()
 MEASURES = ("stop_score", "confidence_mean", "average_precision", "decoy_confidence", "false_stops", "ran")
 SPEED_MPS, DRAWS = 10.0, range(50)
-STRONGER = STANDARD_DETECTION_1.members[1].params
+STRONGER = STANDARD_DETECTION_3.members[1].params
 
 
 class Once(Wrapped):

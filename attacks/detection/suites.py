@@ -6,6 +6,4 @@ from pathlib import Path
 
 from cavbench.core.suites import Suite
 
-STANDARD_DETECTION_1 = Suite.read(Path(__file__).with_name("standard-detection-1.toml"))
-STANDARD_DETECTION_2 = Suite.read(Path(__file__).with_name("standard-detection-2.toml"))
 STANDARD_DETECTION_3 = Suite.read(Path(__file__).with_name("standard-detection-3.toml"))

@@ -6,5 +6,4 @@ from pathlib import Path
 
 from cavbench.core.suites import Suite
 
-STANDARD_1 = Suite.read(Path(__file__).with_name("standard-1.toml"))
 STANDARD_2 = Suite.read(Path(__file__).with_name("standard-2.toml"))

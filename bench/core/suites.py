@@ -1,7 +1,7 @@
 """Suites: fixed, versioned lists of attacks, found by their entry points `cavbench.suites` and written as TOML.
 
 `attack=standard` means every member of the newest suite `standard-N`, on another track than driving of the newest
-`standard-TRACK-N`; `attack=standard-1` is fixed. Each member that fits the
+`standard-TRACK-N`; `attack=standard-2` is fixed. Each member that fits the
 victim is run and recorded as the ordinary pair that it is.
 """
 
@@ -61,7 +61,7 @@ class Suite:
     """A list of attacks with a version; it is never changed, a new list gets a new version.
 
     Args:
-        name: name of its entry point, such as `standard-1`.
+        name: name of its entry point, such as `standard-2`.
         track: track of the victims.
         meaning: one sentence.
         access: the access that its members need, allowed by default in a run of the suite.
@@ -109,7 +109,7 @@ class Suite:
 
 
 def names() -> list[str]:
-    """The names of all suites: `standard-1`, and `standard` for the newest version."""
+    """The names of all suites: `standard-2`, and `standard` for the newest version."""
     versioned = list(registry.entries(registry.SUITES))
     return sorted({*versioned, *(_family(name) for name in versioned)})
 

@@ -155,14 +155,10 @@ class Track(ABC):
     """The columns of its records, in addition to those of all tracks (`cavbench.records.schema`)."""
     probes: ClassVar[tuple[pa.Field, ...]] = ()
     """Further columns, which may be null, for the flags of a leaderboard."""
-    of_older: ClassVar[Mapping[str, str]] = {}
-    """For probes that may not be null: the measurement that stands for them in records from before they were measured."""
-    scored_with: ClassVar[str] = ""
-    """A probe that is null in records with a stand-in for the metric (`of_older`): they are not comparable with newer ones."""
     norms: ClassVar[tuple[str, ...]] = ()
     """The norms of its threat models; records with another one are refused. Empty: any name."""
-    facts_of_v1: ClassVar[Mapping[str, object]] = {}
-    """Facts of its world for records of format 1, which do not contain them; empty for a newer track."""
+    facts: ClassVar[Mapping[str, object]] = {}
+    """Facts of its worlds (`world_facts`), with values of their types: records with facts of other types are refused."""
     metric: ClassVar[str]
     """The ranking metric: a measurement in [0, 1], higher is better for the victim."""
     metric_title: ClassVar[str]

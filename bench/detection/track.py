@@ -192,8 +192,6 @@ class DetectionTrack(Track):
     unrepeatable: ClassVar[tuple[str, ...]] = ("patch", "crafting_s")
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
     probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, *DECOYS, *PRINTED, *CLOSED_LOOP, *CERTIFIED, NAN_GRADIENTS)
-    of_older: ClassVar[Mapping[str, str]] = {"stop_score": "confidence_mean"}
-    scored_with: ClassVar[str] = "decoy_confidence"
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")
     metric: ClassVar[str] = "stop_score"
     metric_title: ClassVar[str] = "stop score"
@@ -234,23 +232,6 @@ class DetectionTrack(Track):
     enough_episodes: ClassVar[int] = 3
     other_input: ClassVar[str] = "a grey image"
     many_draws: ClassVar[str] = "The victim is random, and a patch is crafted on many images, each with its own draw."
-    facts_of_v1: ClassVar[Mapping[str, object]] = {
-        "decision_hz": 0,
-        "max_steps": 0,
-        "actions": [],
-        "axes": [
-            {"name": "lanes", "kind": "int", "meaning": "number of lanes", "choices": [3, 4, 5]},
-            {"name": "density", "kind": "float", "meaning": "density of the cars", "choices": [1.0, 2.0]},
-            {
-                "name": "weather",
-                "kind": "str",
-                "meaning": "the air and the light",
-                "choices": ["clear", "rain", "fog", "night"],
-                "default": "clear",
-                "perceptual": True,
-            },
-        ],
-    }
 
     work: ClassVar[str] = "cavbench.detection.drive"
     preparation: ClassVar[str] = "cavbench.detection.crafting"

@@ -141,27 +141,10 @@ class DrivingTrack(Track):
     excess: ClassVar[str] = "excess_max"
     step_ms: ClassVar[str] = "attack_ms"
     other_input: ClassVar[str] = "another episode's observation"
-    facts_of_v1: ClassVar[Mapping[str, object]] = {
+    facts: ClassVar[Mapping[str, object]] = {
         "decision_hz": 15,
         "max_steps": 450,
-        "actions": ["LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER"],
-        "axes": [
-            {"name": "lanes", "kind": "int", "meaning": "number of lanes", "low": 2, "high": 8},
-            {"name": "density", "kind": "float", "meaning": "traffic density", "above": 0.0, "high": 4.0},
-            {
-                "name": "weather",
-                "kind": "str",
-                "meaning": "how far the ego sees and how noisy it measures",
-                "choices": ["clear", "rain", "fog"],
-                "default": "clear",
-                "perceptual": True,
-            },
-        ],
-        "features": {
-            "names": ["x", "y", "vx", "vy"],
-            "units": ["m", "m", "m/s", "m/s"],
-            "floors": [0.5, 0.2, 0.3, 0.2],
-        },
+        "features": {"names": ["x"], "units": ["m"], "floors": [0.5]},
     }
 
     work: ClassVar[str] = "cavbench.driving.drive"

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from cavbench.core.track import Track
 from cavbench.errors import UserError, notice
 from cavbench.records import validity
-from cavbench.records.generations import check
+from cavbench.records.columns import track_of
 from cavbench.records.packing import packed_files
-from cavbench.records.reading import upgraded
 from cavbench.records.schema import schema
 from cavbench.records.store import path_of, write_packed
 from cavbench.scenarios import Cell
@@ -100,13 +99,13 @@ def finished(out: Path, units: Mapping[str, Wanted]) -> set[str]:
 def _incomplete(path: Path, key: str, unit: Wanted) -> str:
     """Why a file does not hold the records of a unit; empty if it does."""
     try:
-        found, generation = check(path)
+        found = track_of(path)
         if found.name != unit.track.name:
             return f"it is of the {found.name} track"
         # From its footer: a file may state more rows than fit into the memory.
         if (rows := pq.read_metadata(path).num_rows) != len(unit.seeds):
             return f"it has {rows} rows, the unit has {len(unit.seeds)} episodes"
-        records = pq.read_table(path) if generation.equals(schema(found)) else upgraded(path)
+        records = pq.read_table(path)
     except UserError as error:
         return "it " + str(error).removeprefix(f"the record {path} ").partition(";")[0]
     # Its footer says what it should hold.
@@ -160,14 +159,9 @@ def _packed(out: Path, path: Path, units: Mapping[str, Wanted]) -> set[str]:
         wanted = {key for key in inside if key in units}
         if not wanted:
             return set()
-        track, generation = check(path)
-        text = [column.name for column in generation if pa.types.is_string(column.type)]
-        if generation.equals(schema(track)):
-            records = pq.read_table(path, read_dictionary=text)
-        else:
-            records = upgraded(path)
-            place = records.schema.get_field_index("unit")
-            records = records.set_column(place, "unit", records["unit"].dictionary_encode())
+        track = track_of(path)
+        text = [column.name for column in schema(track) if pa.types.is_string(column.type)]
+        records = pq.read_table(path, read_dictionary=text)
     except (pa.ArrowException, OSError, UserError):
         if path.exists():
             notice(

@@ -32,7 +32,7 @@ def packed_files(out: Path) -> list[Path]:
 def pack(out: Path) -> None:
     """Pack the files of single units in a results folder, `UNITS` to a file; fewer are left as they are.
 
-    Files of older formats, and those that hold anything else than the unit of their name, are left, too.
+    Files that hold anything else than the unit of their name are left, too.
 
     Raises:
         UserError: if a packed file cannot be written.
@@ -84,7 +84,7 @@ def copy(results: Path, units: Collection[str], out: Path) -> None:
 
 
 def _single(path: Path) -> tuple[Track, pa.Table] | None:
-    """The track and the records of a file that holds the unit of its name in the current format; None if it is anything else."""
+    """The track and the records of a file that holds the unit of its name; None if it is anything else."""
     try:
         records = pq.ParquetFile(path).read(use_threads=False)
     except (pa.ArrowException, OSError):

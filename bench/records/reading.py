@@ -14,13 +14,14 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cavbench.core import track as of
 from cavbench.core.track import Track
 from cavbench.errors import UserError, notice, short
 from cavbench.records import validity
-from cavbench.records.generations import check, glance, selection
+from cavbench.records.columns import glance, track_of
 from cavbench.records.packing import units_in
 from cavbench.records.schema import IDENTITY, PROVENANCE, schema
 from cavbench.records.store import FOLDER, MANY, path_of
@@ -43,7 +44,7 @@ def read_all(out: Path) -> dict[str, pa.Table]:
 
 
 def _read_all(out: Path) -> dict[str, pa.Table]:
-    present = {check(path)[0].name for path in _paths(out)}
+    present = {track_of(path).name for path in _paths(out)}
     return {track.name: _read(out, None, track) for track in of.tracks() if track.name in present}
 
 
@@ -64,7 +65,7 @@ def read(out: Path, units: Collection[str] | None = None, *, track: Track) -> pa
 
 def _read(out: Path, units: Collection[str] | None, track: Track) -> pa.Table:
     paths = _paths(out) if units is None else _paths_of(out, set(units))
-    known = [(path, generation) for path in paths for found, generation in [check(path)] if found.name == track.name]
+    known = [path for path in paths if track_of(path).name == track.name]
     if not known:
         raise UserError(_NOTHING.format(out=out))
     names = ", ".join(f'"{name}"' for name in schema(track).names)
@@ -78,15 +79,14 @@ def _read(out: Path, units: Collection[str] | None, track: Track) -> pa.Table:
     return _valid(records.cast(schema(track)), out, track)
 
 
-def upgraded(path: Path) -> pa.Table:
-    """All records of one file, of whatever format, as a table of its track's schema.
+def read_file(path: Path) -> pa.Table:
+    """All records of one file, as a table of its track's schema.
 
     Raises:
         UserError: if the file is truncated or foreign.
     """
-    track, generation = check(path)
-    with _records(path.parent, [(path, generation)], track) as connection:
-        return connection.sql("select * exclude (file) from records").to_arrow_table().cast(schema(track))
+    columns = schema(track_of(path))
+    return pq.read_table(path).cast(columns)
 
 
 def _paths(out: Path) -> list[Path]:
@@ -166,17 +166,14 @@ def read_compact(out: Path, measurements: Collection[str]) -> dict[str, pa.Table
 
 
 def _read_all_compact(out: Path, measurements: Collection[str]) -> dict[str, pa.Table]:
-    known: dict[str, list[tuple[Path, pa.Schema]]] = {}
+    known: dict[str, list[Path]] = {}
     for path in _paths(out):
-        track, generation = glance(path)
-        known.setdefault(track.name, []).append((path, generation))
+        known.setdefault(glance(path).name, []).append(path)
     present = [track for track in of.tracks() if track.name in known]
     return {track.name: _read_compact(out, known[track.name], track, measurements) for track in present}
 
 
-def _read_compact(
-    out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track, measurements: Collection[str]
-) -> pa.Table:
+def _read_compact(out: Path, known: Sequence[Path], track: Track, measurements: Collection[str]) -> pa.Table:
     """Read one row per unit, with its episodes as lists, then expand the lists: most of a record is shared by its unit."""
     shared = [field.name for field in (*IDENTITY, *PROVENANCE) if field.name not in ("unit", "seed")]
     wanted = [field.name for field in track.measurements if field.name in measurements]
@@ -219,31 +216,26 @@ def _laid_out(column: pa.Array, rows: NDArray[np.int64]) -> pa.Array:
 
 
 @contextmanager
-def _records(out: Path, known: Sequence[tuple[Path, pa.Schema]], track: Track) -> Iterator[duckdb.DuckDBPyConnection]:
+def _records(out: Path, known: Sequence[Path], track: Track) -> Iterator[duckdb.DuckDBPyConnection]:
     """A connection with the view `records` of the files of one track; UserError with the name of an unreadable file."""
-    by_columns: dict[pa.Schema, list[str]] = {}
-    for path, generation in known:
-        by_columns.setdefault(generation, []).append("'" + glob.escape(str(path)).replace("'", "''") + "'")
-    parts = [
-        f"select {selection(track, generation)}, filename as file "
-        f"from read_parquet([{', '.join(paths)}], filename = true, hive_partitioning = false)"
-        for generation, paths in by_columns.items()
-    ]
+    names = ", ".join(f'"{name}"' for name in schema(track).names)
+    paths = ", ".join("'" + glob.escape(str(path)).replace("'", "''") + "'" for path in known)
+    files = f"read_parquet([{paths}], filename = true, hive_partitioning = false)"
     try:
         with duckdb.connect() as connection:
             # After two seconds it would write a progress bar to standard output, between our tables.
             connection.execute("set enable_progress_bar = false")
             # A file of somebody else may state other bounds of its values than it has, to hide rows from one reader only.
             connection.execute(f"set disabled_optimizers = '{_BY_STATISTICS}'")
-            connection.sql("create view records as " + " union all by name ".join(parts))
+            connection.sql(f"create view records as select {names}, filename as file from {files}")
             connection.execute("set variable latest = ?", [_latest()])
             future = "select file from records where created_at > getvariable('latest') limit 1"
             if ahead := connection.execute(future).fetchall():
                 notice(f"the record {ahead[0][0]} is dated in the future: such records count as older than all others")
             yield connection
     except duckdb.Error as error:
-        for path, _ in known:
-            check(path, thoroughly=True)
+        for path in known:
+            track_of(path, thoroughly=True)
         raise UserError(f"the records in {out} cannot be read: {str(error).splitlines()[0]}") from error
 
 

@@ -6,8 +6,8 @@ import pyarrow as pa
 
 from cavbench.core.track import Track
 
-VERSION = "2"
-"""Version of the format. 1 had the columns lanes, density and weather; 2 has `cell` and `world_facts`."""
+VERSION = "1"
+"""Version of the format."""
 AUDIT = "audit"
 """`grid` of records on scenarios that were drawn for an audit; no score contains them."""
 SEQUENTIAL = "sequential"
@@ -164,4 +164,4 @@ NAN_GRADIENTS = field(
     "share, 0 to 1",
     nullable=True,
 )
-"""A later probe: older records end before it, so a track lists it last."""
+"""A probe of tracks whose attacks take gradients."""

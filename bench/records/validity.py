@@ -111,7 +111,7 @@ def _not_a_date(records: pa.Table) -> Iterator[tuple[int, str]]:
 
 def _unreadable(records: pa.Table, track: Track) -> Iterator[tuple[int, str]]:
     """Problems of texts and cells; each distinct value is checked once."""
-    yield from _refused(records, ("cell", "world_facts"), partial(_cell, example={**FACTS, **track.facts_of_v1}))
+    yield from _refused(records, ("cell", "world_facts"), partial(_cell, example={**FACTS, **track.facts}))
     yield from _refused(records, ("threat_access",), partial(_known, known=get_args(Access)))
     if track.norms:
         yield from _refused(records, ("threat_norm",), partial(_known, known=track.norms))
@@ -147,7 +147,7 @@ def _cell(cell: str, facts: str, example: Mapping[str, object]) -> None:
     for name, value in example.items():
         if name in FACTS and name not in world:
             raise ValueError(f"world_facts has no {name}")
-        if name in world and name != "axes" and not _alike(world[name], value):
+        if name in world and not _alike(world[name], value):
             raise ValueError(f"world_facts has a wrong {name}: {short(str(world[name]))}")
         # Where a world has decisions, the example has some per second, and an episode has at least one.
         if name in FACTS and isinstance(value, int) and value and not world[name]:

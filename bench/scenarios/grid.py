@@ -29,7 +29,7 @@ class Grid:
     """A named, versioned set of scenarios in a world: all combinations of values, with `episodes` seeds per cell.
 
     Args:
-        name: name on the command line, for instance `standard-v1`; `custom` for one composed there.
+        name: name on the command line, for instance `standard-v2`; `custom` for one composed there.
         world: name of its world.
         axes: axes of that world.
         values: at least one value for each axis.

@@ -157,23 +157,6 @@ def task_intervals(scores: Array, *, share: bool) -> list[Interval]:
     ]
 
 
-def scenario_covariance(scores: Array) -> Array:
-    """[C, C] what two cells add to the variance of a mean over cells by the scenarios that they share.
-
-    The `scenario` of `components` for a set of cells is the mean of its block, or 0 if that is negative.
-
-    Args:
-        scores: [R, C, E], as in `interval`.
-    """
-    _check(scores)
-    runs, _, scenarios = scores.shape
-    by_scenario = scores.mean(0) - scores.mean((0, 2))[:, None]
-    rest = scores - scores.mean(2, keepdims=True) - by_scenario
-    of_scenarios = runs * by_scenario @ by_scenario.T / max(scenarios - 1, 1)
-    of_rest = np.einsum("rce,rde->cd", rest, rest) / max((runs - 1) * (scenarios - 1), 1)
-    return np.asarray((of_scenarios - of_rest) / (runs * scenarios))
-
-
 def _symmetric(estimate: float, margin: float) -> Interval:
     return Interval(estimate, estimate - margin, estimate + margin)
 

@@ -23,10 +23,12 @@ from cavbench.cli.listing import fits
 from cavbench.core import registry
 from cavbench.core.parameters import parameters
 from cavbench.core.registry import GROUPS, Kind
+from cavbench.core.track import tracks
 from cavbench.errors import UserError
+from cavbench.leaderboard.ranking.columns import all_columns
 
-LEADERBOARD = ("leaderboard/index.html", "leaderboard/index.json", "leaderboard/index.csv")
-"""Files of the repository that are copied to the same path in the site, with the films beside them."""
+LEADERBOARD = tuple(f"leaderboard/index.{kind}" for kind in ("html", "json", "csv", "tex"))
+"""Files that `make page` builds; they are copied to the same path in the site, with the films beside them."""
 
 logger = logging.getLogger(__name__)
 
@@ -65,6 +67,26 @@ class PagesDirective(TocTree):
         pages = sorted(path.stem for path in (Path(self.env.srcdir) / folder).glob("*.md"))
         self.content = StringList([f"{page} <{folder}/{page}>" for page in pages], source=self.env.docname)
         return super().run()
+
+
+class ColumnsDirective(SphinxDirective):
+    """The columns of the leaderboard, from the one list that makes them (`cavbench.leaderboard.ranking.columns`)."""
+
+    def run(self) -> list[nodes.Node]:
+        return self.parse_text_to_nodes(described_columns())
+
+
+def described_columns() -> str:
+    """The columns of every track's leaderboard as a table in Markdown."""
+    lines = ["| column | in tables | meaning |", "|---|---|---|"]
+    found = [column for track in tracks() for column in all_columns(track)]
+    for name in dict.fromkeys(column.name for column in found):
+        alike = [column for column in found if column.name == name]
+        names = f"`{name}`, `{name}_low`, `{name}_high`" if alike[0].interval else f"`{name}`"
+        titles = " or ".join(dict.fromkeys(column.title for column in alike if column.shown))
+        meanings = "; ".join(dict.fromkeys(column.meaning for column in alike))
+        lines.append(f"| {names} | {titles} | {meanings} |")
+    return "\n".join(lines)
 
 
 def described(kind: Kind, name: str) -> str:
@@ -158,6 +180,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("terms", TermsDirective)
     app.add_directive("published-rows", PublishedRowsDirective)
     app.add_directive("pages", PagesDirective)
+    app.add_directive("leaderboard-columns", ColumnsDirective)
     app.add_html_math_renderer("mathml", inline_renderers=(_formula, None), block_renderers=(_formula, None))
     app.connect("autodoc-process-docstring", _google_style)
     # Before Sphinx collects downloads.

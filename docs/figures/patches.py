@@ -5,7 +5,7 @@ from __future__ import annotations
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from cavbench.attacks.detection.suites import STANDARD_DETECTION_1
+from cavbench.attacks.detection.suites import STANDARD_DETECTION_3
 from cavbench.core.pair import Pair, choose
 from cavbench.detection import PatchThreat
 from cavbench.detection.crafting import prepare
@@ -16,7 +16,7 @@ from cavbench.run import artefacts
 from cavbench.run.unit import Unit
 
 KEPT = user_cache_path("cavbench") / "figures"
-STRONGER = {**STANDARD_DETECTION_1.members[1].params, "restarts": 1}
+STRONGER = {**STANDARD_DETECTION_3.members[1].params, "restarts": 1}
 """Parameters of the stronger `eot` of the standard suite, with one start: shifts only."""
 SHARE = PatchThreat().budget
 """Side of a patch as a share of the sign's side."""

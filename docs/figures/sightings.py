@@ -22,7 +22,7 @@ from cavbench.envs.camera.axes import APPROACH_V1, AXES
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.leaderboard.comparisons.comparison import Comparison, parameters
 from cavbench.leaderboard.comparisons.pairing import beside
-from cavbench.leaderboard.comparisons.reading import comparable, read_comparisons
+from cavbench.leaderboard.comparisons.reading import read_comparisons
 from cavbench.leaderboard.published import published
 from docs.figures import style
 from docs.figures.patches import SHARE
@@ -117,7 +117,7 @@ def patched(attack: str, defense: str = "none") -> Comparison:
 @cache
 def _comparisons() -> list[Comparison]:
     own = track("detection")
-    return read_comparisons(comparable(published(own), own), own)
+    return read_comparisons(published(own), own)
 
 
 def clean(pair: Comparison) -> pa.Table:

@@ -29,8 +29,6 @@ def measurements(of: Track) -> set[str]:
     """The measurements of a track that leaderboards read, of columns that hold no lists."""
     needed = {of.metric, of.failure, of.place, of.queries, of.gradients} | {one.column for one in headline(of)}
     needed |= {f"{of.artefact[0]}_sha256"} if of.artefact else set()
-    # The thesis' tables compare what older records have.
-    needed |= set(of.of_older.values())
     return needed & {field.name for field in of.measurements if not pa.types.is_list(field.type)}
 
 
@@ -86,17 +84,6 @@ def read_tracks(records: Mapping[str, pa.Table]) -> list[Comparison]:
     ordered = sorted(records.items(), key=lambda item: (-item[1].num_rows, item[0]))
     found = [one for name, table in ordered for one in read_comparisons(table, track(name))]
     return [one for one in found if one.is_attacked or not one.is_baseline]
-
-
-def comparable(records: pa.Table, of: Track) -> pa.Table:
-    """The records without older ones, scored by a stand-in for the metric, of defended victims that have newer ones on a grid."""
-    if of.scored_with not in records.column_names:
-        return records
-    newer = np.flatnonzero(records[of.scored_with].is_valid().to_numpy())
-    codes = codes_of(records, CONTROL)
-    keep = ~np.isin(codes, codes[newer])
-    keep[newer] = True
-    return records.filter(pa.array(keep))
 
 
 def _rank(one: Comparison) -> tuple[object, ...]:

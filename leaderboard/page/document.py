@@ -21,19 +21,17 @@ from cavbench.leaderboard.comparisons.naming import labels
 from cavbench.leaderboard.comparisons.reading import headline
 from cavbench.leaderboard.page.cards import card
 from cavbench.leaderboard.ranking.boards import Board, Row
+from cavbench.leaderboard.ranking.columns import Column, Value, columns
 from cavbench.leaderboard.ranking.curves import Curve
 from cavbench.leaderboard.ranking.families import budgets, efforts
 from cavbench.leaderboard.ranking.flags import FLAGS
 from cavbench.leaderboard.ranking.remarks import comparison_remarks
 from cavbench.scenarios import Axes, Cell
 from cavbench.statistics.doubts import Remark
-from cavbench.statistics.estimates import Array, Interval, scenario_covariance, t_quantile, task_intervals
+from cavbench.statistics.estimates import Array, Interval, share_interval, task_intervals
 
-VERSION = 3
-"""Of the schema; a reader that knows it can read every later document of the same version. Version 1 had the values of three
-fixed axes in each cell; version 2 had interquartile means."""
-DEGREES = (1, 1.25, 1.5, 1.75, 2, 2.5, 3, 4, 5, 6, 8, 10, 14, 20, 30, 60, 120, 1e6)
-"""Degrees of freedom for which the document has quantiles of Student's t; between them 1 / df interpolates."""
+VERSION = 1
+"""Of the schema; a reader that knows it can read every later document of the same version."""
 Labels = Mapping[str, Mapping[tuple[object, object], str]]
 """What a component is called: by its kind, then by its name and parameters."""
 
@@ -71,7 +69,6 @@ def document(
             for kind, family in _families(comparisons)
             if (aligned := align(family)) and (found := Curve.of(family, aligned))
         ],
-        "t": [[df, round(float(t_quantile(np.array(df))), 5)] for df in DEGREES],
     }
 
 
@@ -89,11 +86,6 @@ def _track(track: Track) -> dict[str, Any]:
         "baseline": contrast.title if contrast and contrast.side == "victim" else "",
         "queries_title": track.queries_title,
         "artefact": track.artefact[0] if track.artefact else "",
-        "columns": [
-            {"name": one.column, "title": " ".join(one.heading.split()), "digits": one.digits}
-            for one in track.measures
-            if one.ranked
-        ],
     }
 
 
@@ -166,7 +158,8 @@ def _board(board: Board, keys: Mapping[int, int], called: Labels, folder: Path |
         "grid": board.grid,
         "threat": {**_threat(board.threat), "allowed": allowed},
         "axes": _axes(first.axes, cells),
-        "rows": [{**_row(row, keys, called), "clip": clip(row, board, folder, link)} for row in board.rows],
+        "columns": [_column(one) for one in columns(board)],
+        "rows": [{**_row(row, board, keys, called), "clip": clip(row, board, folder, link)} for row in board.rows],
         "baselines": [
             {
                 "name": name,
@@ -196,24 +189,28 @@ def _threat(values: Sequence[object]) -> dict[str, object]:
     return {name.removeprefix("threat_"): value for name, value in zip(THREAT, values, strict=True)}
 
 
-def _row(row: Row, keys: Mapping[int, int], called: Labels) -> dict[str, Any]:
-    worst = row.worst
+def _column(one: Column) -> dict[str, Any]:
+    """What a column of the rows is; its values are in `values` of a row, and in those of its cells if it has some there."""
+    said = {name: getattr(one, name) for name in ("name", "title", "meaning", "kind", "digits", "interval", "shown")}
+    return {**said, "by_cell": one.by_cell is not None}
+
+
+def _row(row: Row, board: Board, keys: Mapping[int, int], called: Labels) -> dict[str, Any]:
+    worst, first = row.worst, row.attacks[0]
+    listed = columns(board)
     scored = _cells(worst.cells, worst.scores)
-    failed = worst.failed.mean((0, 2)).tolist()
-    for cell, attack, rival, share in zip(scored["cells"], worst.attacks, worst.rival, failed, strict=True):
-        cell |= {"pair": keys[id(attack)], "baseline": _number(float(rival.mean())), "failed": _number(share)}
-    first = row.attacks[0]
-    lowest, lowest_score = worst.worst_cell
+    by_cell = {one.name: one.by_cell(worst).tolist() for one in listed if one.by_cell}
+    for place, (cell, attack, rival) in enumerate(zip(scored["cells"], worst.attacks, worst.rival, strict=True)):
+        cell |= {"pair": keys[id(attack)], "baseline": _number(float(rival.mean()))}
+        cell["values"] = {name: _number(values[place]) for name, values in by_cell.items()}
+
+    def label(one: Comparison, kind: str) -> str:
+        return called[kind][one.identity[kind], one.identity[f"{kind}_params"]]
+
     return {
-        "group": row.group,
         "flagged": row.flagged,
         **_named(first, ("defense", "victim"), called),
-        "score": _interval(worst.score),
-        "failed": _interval(worst.failure),
-        "worst_cell": {"cell": dict(lowest), **(_interval(lowest_score) or {})},
-        "clean": _interval(worst.clean),
-        "certified": worst.certified,
-        "lead": _interval(worst.lead),
+        "values": {one.name: _value(one.value(row, label)) for one in listed},
         "strongest": keys[id(first)],
         "pairs": [keys[id(attack)] for attack in row.attacks],
         "marginal": [_interval(row.marginal.get(attack)) for attack in row.attacks],
@@ -268,9 +265,8 @@ def _remarks(found: Sequence[Remark]) -> list[dict[str, str]]:
 
 
 def _cells(cells: Sequence[Cell], scores: Array) -> dict[str, Any]:
-    """Each cell's estimate and interval, with all that a reader needs to compute them for some of the cells together."""
+    """Each cell's estimate and interval, and those of all cells that share a value of an axis."""
     means = scores.mean(2)
-    covariance = scenario_covariance(scores)
     return {
         "cells": [
             {
@@ -281,7 +277,12 @@ def _cells(cells: Sequence[Cell], scores: Array) -> dict[str, Any]:
             for place, (cell, found) in enumerate(zip(cells, task_intervals(scores, share=True), strict=True))
         ],
         "scenarios": scores.shape[2],
-        "covariance": [[float(f"{value:.3g}") for value in row[: n + 1]] for n, row in enumerate(covariance.tolist())],
+        "parts": [
+            {"axis": name, "value": value, **(_interval(share_interval(scores[:, places])) or {})}
+            for name in (cells[0] if cells else ())
+            for value in dict.fromkeys(cell[name] for cell in cells)
+            if 1 < len(places := [n for n, cell in enumerate(cells) if cell[name] == value]) < len(cells)
+        ],
     }
 
 
@@ -289,6 +290,13 @@ def _interval(found: Interval | None) -> dict[str, Any] | None:
     if found is None:
         return None
     return {"estimate": _number(found.estimate), "low": _number(found.low), "high": _number(found.high)}
+
+
+def _value(found: Value) -> object:
+    """What a row has in a column, as JSON."""
+    if isinstance(found, Interval):
+        return _interval(found) if np.isfinite(found.estimate) else None
+    return _number(found) if isinstance(found, float) else found
 
 
 def _number(value: float) -> float | None:

@@ -1,4 +1,4 @@
-"""`bench report html=PAGE`: the leaderboards as one HTML file that opens from disk, and as JSON and CSV beside it."""
+"""`bench report html=PAGE`: the leaderboards as one HTML file that opens from disk, and as JSON, CSV and LaTeX beside it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cavbench.errors import UserError
 from cavbench.files import check_folder, whole
 from cavbench.leaderboard.comparisons.reading import measurements
 from cavbench.leaderboard.page.document import document
-from cavbench.leaderboard.page.table import table
+from cavbench.leaderboard.page.table import latex, table
 from cavbench.leaderboard.published import every_track
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.ranking.flags import FLAGS
@@ -37,7 +37,7 @@ NAME = "leaderboard.html"
 
 
 def write(out: Path | None, page: Path, console: Console) -> None:
-    """Write the page, the JSON and the CSV of a results folder, and print the ranking.
+    """Write the page, the JSON, the CSV and the LaTeX tables of a results folder, and print the ranking.
 
     Args:
         out: results folder; None takes the records that are published with the package.
@@ -55,12 +55,14 @@ def write(out: Path | None, page: Path, console: Console) -> None:
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=follow_parent) as beside:
         beside.submit(chapters.prepare)
         records = _read(out)
-        thesis = beside.submit(chapters.chapters, chapters.needed(records))
+        # The published rows are no records of a user: the thesis' tables have records of their own.
+        thesis = beside.submit(chapters.chapters, {} if out is None else chapters.needed(records))
         boards, comparisons = read_boards(records)
         made = document(boards, comparisons, out, _link(out, page))
         texts = {
             _files(page)[0]: json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
             _files(page)[1]: table(made),
+            _files(page)[2]: latex(made),
             page: html(made, sum(map(len, records.values())), thesis.result(), _link(out, page)),
         }
     try:
@@ -88,16 +90,18 @@ def _copy_films(made: Mapping[str, Any], folder: Path) -> None:
             file.write(film)
 
 
-def _files(page: Path) -> tuple[Path, Path, Path]:
-    """The JSON, the CSV and the page."""
-    return page.with_suffix(".json"), page.with_suffix(".csv"), page
+def _files(page: Path) -> tuple[Path, Path, Path, Path]:
+    """The JSON, the CSV, the LaTeX tables and the page."""
+    return page.with_suffix(".json"), page.with_suffix(".csv"), page.with_suffix(".tex"), page
 
 
 def _read(out: Path | None) -> dict[str, pa.Table]:
     """The records of a folder, or the published ones."""
     if out is None:
         return every_track()
-    return reading.read_compact(out, {name for track in tracks() for name in measurements(track)})
+    return reading.read_compact(
+        out, {name for track in tracks() for name in measurements(track)} | chapters.MEASUREMENTS
+    )
 
 
 def html(made: Mapping[str, Any], episodes: int, thesis: Sequence[chapters.Chapter], recordings: str) -> str:
@@ -127,6 +131,9 @@ def html(made: Mapping[str, Any], episodes: int, thesis: Sequence[chapters.Chapt
         version=made["cavbench"],
         episodes=f"{episodes:,}",
         tracks={name: made["tracks"][name] for name in ranked},
+        columns=list(
+            {one["title"]: one for board in made["boards"] for one in board["columns"] if one["shown"]}.values()
+        ),
         flags=[{"title": title, "meaning": find.__doc__} for title, find in FLAGS.values()],
         thesis=thesis,
     )

@@ -11,9 +11,9 @@ import pyarrow as pa
 
 from cavbench.core import registry
 from cavbench.core.contracts import Access
-from cavbench.core.track import Track, track
+from cavbench.core.track import Track
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
-from cavbench.leaderboard.comparisons.reading import comparable, read_tracks
+from cavbench.leaderboard.comparisons.reading import read_tracks
 from cavbench.leaderboard.ranking.flags import Flag, Subject, flags
 from cavbench.leaderboard.ranking.remarks import row_remarks
 from cavbench.leaderboard.ranking.worst import Panel, Worst, margin
@@ -202,5 +202,5 @@ def _baselines(attacks: Sequence[Comparison]) -> dict[str, Episodes]:
 
 def read_boards(records: Mapping[str, pa.Table]) -> tuple[list[Board], list[Comparison]]:
     """The leaderboards that records make, by track, and all that was driven and can be compared."""
-    comparisons = read_tracks({name: comparable(table, track(name)) for name, table in records.items()})
+    comparisons = read_tracks(records)
     return boards(comparisons), comparisons

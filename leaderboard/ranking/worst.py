@@ -219,8 +219,17 @@ class Worst:
     @cached_property
     def clean(self) -> Interval | None:
         """The same cells and scenarios without an attack; None where a part of them was not driven."""
-        found = self._control(lambda one: one.clean, self._metric)
+        found = self._clean
         return None if found is None or np.isnan(found).any() else share_interval(found)
+
+    @property
+    def clean_by_cell(self) -> Array:
+        """[C'] the mean of each cell without an attack, NaN where it was not driven."""
+        return np.full(len(self.places), np.nan) if self._clean is None else self._clean.mean((0, 2))
+
+    @cached_property
+    def _clean(self) -> Array | None:
+        return self._control(lambda one: one.clean, self._metric)
 
     @cached_property
     def certified(self) -> float | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import pyarrow as pa
@@ -10,13 +9,14 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from cavbench.core.track import Track
+from cavbench.leaderboard.comparisons.comparison import Comparison
 from cavbench.leaderboard.comparisons.naming import Varying, component, varying
 from cavbench.leaderboard.published import every_track
 from cavbench.leaderboard.ranking.boards import Board, Row, read_boards
+from cavbench.leaderboard.ranking.columns import Called, columns
+from cavbench.leaderboard.ranking.columns import Column as Ranked
 from cavbench.leaderboard.ranking.flags import FLAGS
-from cavbench.leaderboard.terminal.columns import written
-from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, cell_name, fitted
+from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, fitted
 from cavbench.leaderboard.terminal.text import (
     ATTACKED,
     BASELINE,
@@ -29,7 +29,7 @@ from cavbench.leaderboard.terminal.text import (
     strip,
     verdict,
 )
-from cavbench.statistics.estimates import share_interval
+from cavbench.statistics.estimates import Interval, share_interval
 
 ADDED = 0.01
 """What an attack must add to be named."""
@@ -112,29 +112,21 @@ def _shown(board: Board) -> dict[str, Varying]:
     return {kind: varying([row.attacks[0] for row in board.rows], kind) for kind in ("defense", "victim")}
 
 
+STYLES = {"score": ATTACKED, "clean": CLEAN}
+"""The columns that the terminal shows with their intervals, in the colours of the strip."""
+
+
 def _columns(board: Board) -> list[Column[Row]]:
-    shown, measure, contrast = _shown(board), board.track.metric_title, board.track.contrast
-    columns: list[Column[Row]] = [
-        Column("rank", lambda row: f"{FLAGGED} {row.group}" if row.flagged else str(row.group)),
-        Column("defence", lambda row: component(row.attacks[0], "defense", shown["defense"]), "left", folds=True),
-        Column("victim", lambda row: component(row.attacks[0], "victim", shown["victim"]), "left", folds=True),
-        Column(f"{measure}\nworst [95 %]", lambda row: estimate(row.worst.score, style=ATTACKED), "left"),
-        *_failures(board.track),
-        *_measures(board),
-        Column("worst\ncell", lambda row: number(row.worst.worst_cell[1].estimate, 2)),
-        Column("\n ", lambda row: Text(cell_name(row.worst.worst_cell[0]), style="dim"), "left", spare=2),
-        Column("\nclean", lambda row: estimate(row.worst.clean, style=CLEAN), "left", spare=3),
-    ]
-    if any(row.worst.certified is not None for row in board.rows):
-        columns.append(Column("certi-\nfied", lambda row: number(row.worst.certified, 2)))
-    if contrast and contrast.side == "victim":
-        columns.append(Column(contrast.short, lambda row: verdict(row.worst.lead)))
+    """The columns of the ranking that have a heading for the terminal, and a strip."""
+    shown = _shown(board)
+
+    def called(one: Comparison, kind: str) -> str:
+        return component(one, kind, shown[kind]) if kind in shown else str(one.identity[kind])
+
     return [
-        *columns,
-        Column("strongest\nattack", lambda row: str(row.identity["attack"]), "left"),
-        Column("flags", _fired),
+        *(_column(one, called) for one in columns(board) if one.short),
         Column(
-            axis(measure),
+            axis(board.track.metric_title),
             lambda row: strip({ATTACKED: row.worst.score, CLEAN: row.worst.clean}, STRIP),
             "left",
             spare=9,
@@ -142,22 +134,26 @@ def _columns(board: Board) -> list[Column[Row]]:
     ]
 
 
-def _failures(track: Track) -> list[Column[Row]]:
-    """How often the victim fails under the strongest attack."""
-    measure = next((one for one in track.measures if one.column == track.failure), None)
-    if measure is None:
-        return []
-    return [Column(measure.heading, lambda row: share(row.worst.failure.estimate if row.worst.failure else None))]
+def _column(one: Ranked, called: Called) -> Column[Row]:
+    def shown(row: Row) -> Text | str:
+        found = one.value(row, called)
+        if one.name == "rank":
+            return f"{FLAGGED} {found}" if row.flagged else str(found)
+        if one.name == "flags":
+            return _fired(row)
+        if one.name in STYLES:
+            return estimate(found if isinstance(found, Interval) else None, style=STYLES[one.name])
+        if one.kind == "difference":
+            return verdict(found if isinstance(found, Interval) else None)
+        if isinstance(found, str):
+            return Text(found, style="dim" if one.spare else "")
+        value = found.estimate if isinstance(found, Interval) else found
+        return share(value) if one.kind == "share" else number(value, one.digits)
 
-
-def _measures(board: Board) -> list[Column[Row]]:
-    """The ranked measures that some record has, under the attack that is the strongest in most cells."""
-    measures = [one for one in board.track.measures if one.ranked]
-    return [
-        Column(one.heading, lambda row, one=one: str(written(one, row.attacks[0].measured(one))), spare=one.spare)  # type: ignore[misc]
-        for one in measures
-        if any(not math.isnan(row.attacks[0].measured(one).estimate) for row in board.rows)
-    ]
+    left = one.name in STYLES or (one.kind == "text" and one.name != "flags")
+    return Column(
+        one.short, shown, "left" if left else "right", spare=one.spare, folds=one.name in ("defense", "victim")
+    )
 
 
 def _fired(row: Row) -> Text:

@@ -95,7 +95,7 @@ def strip(points: Mapping[str, Interval | None], width: int) -> Text:
 
 
 def size(comparisons: Sequence[Comparison]) -> str:
-    """How much was driven: "standard-v1: 18 cells of 20 scenarios, 3 training seeds"."""
+    """How much was driven: "standard-v2: 18 cells of 20 scenarios, 3 training seeds"."""
     track = comparisons[0].track
     if len({one.own.shape[1:] for one in comparisons}) > 1:
         return "several grids"

@@ -18,6 +18,8 @@ from cavbench.leaderboard.thesis.numbers import THESIS, printed
 from cavbench.leaderboard.thesis.policy_records import clear
 from cavbench.records.schema import schema
 
+MEASUREMENTS = frozenset({"return", "safe_progress", "confidence_mean", "location"})
+"""The columns of records that the tables read."""
 Chapter = dict[str, Any]
 """`name`, `heading` and `tables`, each with its `title`, `headings`, `rows` and `notes`."""
 

@@ -14,16 +14,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cavbench.core.registry import Kind
-from cavbench.core.track import track
 from cavbench.detection.track import REFERENCE_PATCHES, DetectionTrack
 from cavbench.identity.fingerprint import canonical
 from cavbench.leaderboard.comparisons.comparison import IDENTITY, NO_ATTACK, Comparison, parameters
 from cavbench.leaderboard.comparisons.reading import SCENARIO, groups, read_comparisons
-from cavbench.leaderboard.published import published
+from cavbench.leaderboard.thesis.shipped import shipped as shipped_records
 
 ATTACK, WORLD, DETECTOR = "eot", "camera", "yolov3_tiny"
-FAMILY = ("yolov3_tiny", "yolov5")
-"""The published detectors that stand beside the YOLOv5 of the thesis."""
 CONTROLS = (*REFERENCE_PATCHES, NO_ATTACK)
 WEATHERS = {"sun": "clear", "rain": "rain"}
 """The thesis' and ours."""
@@ -141,7 +138,7 @@ class Source:
         ours = (pc.field("world") == WORLD) & (pc.field("defense") == "none")
         self.track = ByConfidence()
         if shipped is None:
-            shipped = published(track(DetectionTrack.name)).filter(pc.is_in(pc.field("victim"), pa.array(FAMILY)))
+            shipped = shipped_records("patches")
         tables = (records, shipped)
         self.tables = [table.select(COLUMNS).filter(ours) for table in tables]
         self.detectors = _detectors(self.tables)
@@ -262,7 +259,7 @@ def _crafting(attack_params: str) -> str:
 
 def usual_crafting() -> str | None:
     """The attack's default parameters as in the published records, most of which were run with them; None without any."""
-    records = published(track(DetectionTrack.name))
+    records = shipped_records("patches")
     counts = records.filter(pc.field("attack") == ATTACK)["attack_params"].value_counts()
     most = max(counts.to_pylist(), key=lambda one: one["counts"], default=None)
     return _crafting(most["values"]) if most else None

@@ -16,7 +16,7 @@ from cavbench.driving.track import BEST_BLIND, DrivingTrack
 from cavbench.leaderboard.comparisons.baselines import Baselines
 from cavbench.leaderboard.comparisons.comparison import ATTACKER, DEFENDED, IDENTITY, parameters
 from cavbench.leaderboard.comparisons.reading import SCENARIO, groups, newest
-from cavbench.leaderboard.published import published
+from cavbench.leaderboard.thesis.shipped import shipped as shipped_records
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import Episodes
 from cavbench.statistics.estimates import Interval, interval, share_interval
@@ -101,7 +101,7 @@ class Source:
 
     def __init__(self, records: pa.Table, shipped: pa.Table | None = None) -> None:
         self.track = track(DrivingTrack.name)
-        tables = (records, published(self.track) if shipped is None else shipped)
+        tables = (records, shipped_records("policies") if shipped is None else shipped)
         self.tables = [clear(table).select(COLUMNS) for table in tables]
         self.missing: list[tuple[Wanted, tuple[Cell, ...]]] = []
         self._driven = cache(self._groups)

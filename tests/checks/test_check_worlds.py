@@ -47,7 +47,7 @@ RULES = {
     "silent": ("axes", "the axis 'gap' has no meaning: add a short description"),
     "defaulted": ("axes", "the axis 'gap' does not allow its own value"),
     "gridless": ("grids", "register its grid as an entry point in cavbench.grids"),
-    "borrowing": ("grids", "the grid 'standard-v1' belongs to the world 'highway'"),
+    "borrowing": ("grids", "the grid 'standard-v2' belongs to the world 'highway'"),
     "otheraxes": ("grids", "use the same Axes object for both"),
     "lying": ("facts", "facts.axes differ from the world's axes"),
     "general": ("features", "facts is a Facts, not a cavbench.driving.DrivingFacts"),

@@ -16,7 +16,7 @@ from cavbench.detection.victims import yolov5_file
 from cavbench.detection.victims.from_file import _listed
 from cavbench.errors import UserError
 from cavbench.formats.trial import hashed
-from cavbench.records import generations
+from cavbench.records import columns
 
 GIB = 2**30
 
@@ -59,7 +59,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "weights": (".safetensors", yolov5_file.read),
     "a checkpoint": (".pt", yolov5_file.read),
     "JSON": (".json", bounded.read_json),
-    "a record": (".parquet", generations.check),
+    "a record": (".parquet", columns.track_of),
 }
 
 

@@ -16,7 +16,7 @@ SMALL = ["lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0"]
 
 def test_the_newest_version_is_meant_by_the_plain_name() -> None:
     assert suites.suite("standard") is suites.suite("standard-2")
-    assert {"standard", "standard-1", "standard-2"} <= set(suites.names())
+    assert {"standard", "standard-2"} <= set(suites.names())
     with pytest.raises(UserError, match="unknown suite 'standard-9'"):
         suites.suite("standard-9")
 
@@ -42,7 +42,7 @@ def test_each_track_has_its_standard() -> None:
 def test_a_member_is_the_pair_that_its_own_options_make() -> None:
     words = ["attack=pgd", "attack.objective=target", "attack.target_action=4", "threat.access=dynamics", *SMALL]
     (alone,) = plan_of(words).pairs
-    assert alone.id in {pair.id for pair in plan_of(["attack=standard-1", *SMALL]).pairs}
+    assert alone.id in {pair.id for pair in plan_of(["attack=standard-2", *SMALL]).pairs}
 
 
 def test_members_above_the_threat_model_are_skipped_with_a_line() -> None:
@@ -64,8 +64,8 @@ def test_a_suite_and_attacks_by_name_can_be_mixed() -> None:
 def test_what_cannot_be_is_refused_in_one_line() -> None:
     with pytest.raises(UserError, match=r"suite standard-2 have fixed parameters, got attack\.steps"):
         plan_of(["attack=standard", "attack.steps=3", *SMALL])
-    with pytest.raises(UserError, match="suite 'standard-1' is for the driving track; suites for the detection track"):
-        plan_of(["attack=standard-1", "victim=yolov5"])
+    with pytest.raises(UserError, match="suite 'standard-2' is for the driving track; suites for the detection track"):
+        plan_of(["attack=standard-2", "victim=yolov5"])
 
 
 def test_a_file_that_is_no_suite_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -216,7 +216,7 @@ def test_a_run_without_recordings_drives_its_units_in_batches() -> None:
         "weather=clear",
         "seeds=0",
         "reference=false",
-        "grid=standard-v1",
+        "episodes=100",
     )
     sizes = []
     for record in ("record=0", "record=1"):

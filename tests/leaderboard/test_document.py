@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import re
 import shlex
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
+from rich.console import Console
 from typer.main import get_command
 
 from cavbench.cli.main import app
@@ -23,18 +25,22 @@ from cavbench.core.track import tracks
 from cavbench.errors import UserError
 from cavbench.leaderboard.comparisons.naming import labels, varying
 from cavbench.leaderboard.comparisons.reading import measurements, read_tracks
+from cavbench.leaderboard.page import document as document_module
 from cavbench.leaderboard.page.cards import run_command
 from cavbench.leaderboard.page.document import document, schema
-from cavbench.leaderboard.page.table import CSV
-from cavbench.leaderboard.page.write import NAME, write
+from cavbench.leaderboard.page.table import BOARD, latex, table
+from cavbench.leaderboard.page.write import NAME, html, write
 from cavbench.leaderboard.ranking.boards import read_boards
+from cavbench.leaderboard.ranking.columns import Column, columns
 from cavbench.leaderboard.ranking.flags import FLAGS
+from cavbench.leaderboard.terminal import ranking
 from cavbench.records import reading
 from cavbench.run.config import plan_of
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import as_text
+from cavbench.statistics.estimates import share_interval
 from tests.leaderboard.full_house import driving
-from tests.leaderboard.synthetic import CLEAR, drive
+from tests.leaderboard.synthetic import CLEAR, GRID, drive
 
 
 def test_the_document_keeps_to_its_schema(site: Path) -> None:
@@ -44,8 +50,8 @@ def test_the_document_keeps_to_its_schema(site: Path) -> None:
     validator.validate(made)
     ranked = {key for board in made["boards"] for row in board["rows"] for key in row["pairs"]}
     assert {pair["key"] for pair in made["pairs"]} >= ranked
-    del made["boards"][0]["rows"][0]["score"]
-    with pytest.raises(jsonschema.ValidationError, match="'score' is a required property"):
+    del made["boards"][0]["rows"][0]["values"]
+    with pytest.raises(jsonschema.ValidationError, match="'values' is a required property"):
         validator.validate(made)
 
 
@@ -67,14 +73,62 @@ def test_the_table_has_a_line_a_ranked_row(site: Path) -> None:
     with (site / "leaderboard.csv").open() as file:
         lines = list(csv.DictReader(file))
     rows = [row for board in made["boards"] for row in board["rows"]]
-    assert list(lines[0]) == list(CSV)
-    assert [float(line["score"]) for line in lines] == [row["score"]["estimate"] for row in rows]
-    assert [line["flagged"] == "true" for line in lines] == [row["flagged"] for row in rows]
+    assert list(lines[0])[: len(BOARD)] == list(BOARD)
+    assert [float(line["score"]) for line in lines] == [row["values"]["score"]["estimate"] for row in rows]
+    assert [float(line["score_low"]) for line in lines] == [row["values"]["score"]["low"] for row in rows]
+    assert [bool(line["flags"]) for line in lines] == [row["flagged"] for row in rows]
+    assert all(line["average_precision"] == "" for line in lines if line["track"] == "driving")
+
+
+def test_one_list_of_columns_makes_the_terminal_the_json_the_csv_and_the_latex(
+    site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = Column(name="spread", title="Spread", short="spread", meaning="of cells", value=lambda row, called: 0.123456)
+    for module in (document_module, ranking):
+        monkeypatch.setattr(module, "columns", lambda board: [*columns(board), more])
+    found, comparisons = read_boards(reading.read_all(site / "results"))
+    made = document(found, comparisons, None)
+    jsonschema.validate(made, schema())
+    said = Console(record=True, width=200, file=io.StringIO())
+    ranking.print_boards(found, said)
+    assert "spread" in said.export_text()
+    assert made["boards"][0]["rows"][0]["values"]["spread"] == 0.1235
+    assert {line["spread"] for line in csv.DictReader(io.StringIO(table(made)))} == {"0.1235"}
+    assert latex(made).count("Spread") == len(made["boards"])
+    assert '"Spread"' in html(made, 1, [], "")
+
+
+def test_latex_tables_have_a_line_a_row_and_no_letter_that_means_something_to_it(site: Path) -> None:
+    made = json.loads((site / "leaderboard.json").read_text())
+    text = (site / "leaderboard.tex").read_text()
+    assert text == latex(made)
+    assert text.count(r"\begin{tabular}") == len(made["boards"])
+    heads_and_rows = sum(1 + len(board["rows"]) for board in made["boards"])
+    assert text.count(r" \\") == heads_and_rows
+    for line in text.splitlines():
+        if line.endswith(r" \\"):
+            assert line.count(" & ") in {
+                len([column for column in board["columns"] if column["shown"]]) - 1 for board in made["boards"]
+            }
+            assert not re.search(r"(?<!\\)[%#_]", line)
+
+
+def test_cells_that_share_a_value_of_an_axis_have_an_interval(site: Path) -> None:
+    made = json.loads((site / "leaderboard.json").read_text())
+    (board, *_), _ = read_boards(reading.read_all(site / "results"))
+    for row, said in zip(board.rows, made["boards"][0]["rows"], strict=True):
+        for part in said["parts"]:
+            places = [n for n, cell in enumerate(row.worst.cells) if cell[part["axis"]] == part["value"]]
+            expected = share_interval(row.worst.scores[:, places])
+            assert [part["low"], part["estimate"], part["high"]] == pytest.approx(
+                [expected.low, expected.estimate, expected.high], abs=1e-4
+            )
+    assert {(part["axis"], part["value"]) for part in said["parts"]} >= {("weather", "fog"), ("lanes", 3)}
 
 
 def test_the_terminal_says_the_ranking(site: Path) -> None:
     text = (site / "terminal.txt").read_text()
-    assert "driving in highway, standard-v1, relative 0.1, access scores, 1000 queries" in text
+    assert f"driving in highway, {GRID.name}, relative 0.1, access scores, 1000 queries" in text
     assert "best blind policy" in text
     assert "flagged masked dqn: an attack without gradients beats those with them" in " ".join(text.split())
     assert max(map(len, text.splitlines()[:-4])) <= 120
@@ -131,8 +185,8 @@ def _value(params: dict[str, Any], name: str) -> object:
     return params[link][inner] if inner else params[name]
 
 
-def test_every_published_run_command_makes_the_same_pair_on_the_same_scenarios() -> None:
-    made = json.loads((files("cavbench.leaderboard") / "index.json").read_text())
+def test_every_published_run_command_makes_the_same_pair_on_the_same_scenarios(published_site: Path) -> None:
+    made = json.loads((published_site / "index.json").read_text())
     assert len(made["pairs"]) > 100
     for pair in made["pairs"]:
         card = pair["card"]
@@ -159,8 +213,6 @@ def test_every_published_run_command_makes_the_same_pair_on_the_same_scenarios()
 def test_a_folder_without_records_is_refused_and_so_is_a_place_that_cannot_be_written(
     tmp_path: Path, site: Path
 ) -> None:
-    from rich.console import Console
-
     with pytest.raises(UserError, match="there are no records in"):
         write(tmp_path, tmp_path / NAME, Console())
     (tmp_path / "file").touch()

@@ -6,12 +6,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from cavbench.envs.highway.axes import STANDARD_V1
 from cavbench.leaderboard.comparisons.reading import read_tracks
 from cavbench.leaderboard.ranking.boards import Board, boards
 from cavbench.leaderboard.ranking.flags import FLAGS, Flag
 from tests.leaderboard.full_house import PGD, SEEN
-from tests.leaderboard.synthetic import CLEAR, approach, baseline_drivers, drive, probed
+from tests.leaderboard.synthetic import CLEAR, GRID, approach, baseline_drivers, drive, probed
 
 HALF = CLEAR[:3]
 
@@ -175,7 +174,7 @@ def test_a_flagged_row_ranks_below_those_without_whatever_its_score() -> None:
 
 
 def test_the_worst_attack_of_each_cell_counts() -> None:
-    dense = [cell for cell in STANDARD_V1.cells() if cell.density == 2]
+    dense = [cell for cell in GRID.cells() if cell.density == 2]
     (row,) = board(clean(), zo(0.4), probed(drive(attack="pgd", skill=0.1, cells=dense, queries=9.0), **PGD)).rows
     attacks = {cell: one.identity["attack"] for cell, one in zip(row.worst.cells, row.worst.attacks, strict=True)}
     assert {cell.density for cell, attack in attacks.items() if attack == "pgd"} == {2.0}
@@ -232,7 +231,7 @@ def test_a_stray_partial_run_changes_no_row(stray: dict[str, object]) -> None:
     """Three episodes of one cell, or one training seed, of an attack that takes everything."""
     records = [clean(), zo(0.5), pgd(0.4), BLIND]
     more = zo(0.0, attack_params={"steps": 99}, cells=HALF[:1], **stray)
-    rows = [next(one for one in boards(read_tracks({"driving": pa.concat_tables(tables)})) if one.grid == "standard-v1").rows
+    rows = [next(one for one in boards(read_tracks({"driving": pa.concat_tables(tables)})) if one.grid == GRID.name).rows
             for tables in (records, [*records, more])]  # fmt: skip
     (before,), (after,) = rows
     assert (after.worst.score, after.worst.failure, after.flags) == (

@@ -14,7 +14,6 @@ from rich.console import Console
 
 from cavbench.core.track import track
 from cavbench.driving.track import BEST_BLIND
-from cavbench.envs.highway.axes import STANDARD_V1
 from cavbench.leaderboard.comparisons.comparison import Comparison
 from cavbench.leaderboard.comparisons.reading import read_comparisons
 from cavbench.leaderboard.ranking.boards import read_boards
@@ -24,7 +23,7 @@ from cavbench.records.schema import schema
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import as_text
 from cavbench.statistics.estimates import Interval
-from tests.leaderboard.synthetic import CLEAR, baseline_drivers, drive
+from tests.leaderboard.synthetic import CLEAR, GRID, baseline_drivers, drive
 
 SCHEMA = schema(track("driving"))
 ZO = {"objective": "expected", "steps": 50}
@@ -173,7 +172,7 @@ def test_clean_runs_and_baseline_drivers_alone_can_be_reported() -> None:
 
 
 def test_one_cell_one_episode_has_no_interval_but_a_number() -> None:
-    cells = STANDARD_V1.cells()[:1]
+    cells = GRID.cells()[:1]
     one = {"cells": cells, "runs": (0,), "episodes": 1}
     assert "nan" not in printed(pa.concat_tables([drive(**one), drive(attack="zo", **one)]))  # type: ignore[arg-type]
 

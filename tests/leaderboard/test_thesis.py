@@ -5,30 +5,24 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rich.console import Console
 
-from cavbench.core.track import Track, track, tracks
-from cavbench.errors import UserError
-from cavbench.leaderboard.published import publish, published, rounded
+from cavbench.core.track import track
 from cavbench.leaderboard.thesis import policy_records
 from cavbench.leaderboard.thesis.numbers import printed
 from cavbench.leaderboard.thesis.policy_records import Source, Wanted
 from cavbench.leaderboard.thesis.report import thesis_report
 from cavbench.leaderboard.thesis.trend import trend
-from cavbench.records import store as results
 from cavbench.records.schema import schema
 from cavbench.run.config import plan_of
-from tests.leaderboard.synthetic import CLEAR, approach, baseline_drivers, drive
+from tests.leaderboard.synthetic import CLEAR, baseline_drivers, drive
 
 SCHEMA = schema(track("driving"))
 TARGET = {"objective": "target", "target_action": 3, "target_acceleration": 1.0, "target_steering": 0.5}
@@ -80,7 +74,7 @@ def test_every_printed_number_stands_in_the_report() -> None:
 
 
 def test_a_missing_number_is_a_dash_and_a_command_that_the_command_line_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policy_records, "published", lambda track: schema(track).empty_table())
+    monkeypatch.setattr(policy_records, "shipped_records", lambda chapter: schema(track("driving")).empty_table())
     text = report()
     commands = re.findall(r"missing: (bench run .*)", text.split("Chapter 4")[1])
     assert "—" in text
@@ -133,96 +127,14 @@ def test_published_records_fill_what_the_user_has_not_and_are_marked() -> None:
     assert (clean.shipped, under_attack.shipped) == (False, True)
 
 
-@pytest.mark.parametrize("own", [one for one in tracks() if one.name in ("driving", "detection")])
-def test_published_records_have_the_schema_of_records(own: Track) -> None:
-    assert published(own).num_rows
-    assert published(own).schema.equals(schema(own))
-
-
-@pytest.mark.parametrize(
-    ("name", "recorded", "score"),
-    [("driving", drive(cells=CLEAR), "safe_progress"), ("detection", approach(0.9), "confidence_mean")],
-)
-def test_what_is_published_is_what_was_recorded(tmp_path: Path, name: str, recorded: pa.Table, score: str) -> None:
-    results.prepare(tmp_path)
-    results.write(tmp_path, recorded)
-    assert publish(tmp_path, tmp_path / "published.parquet") == recorded.num_rows
-    shipped = pq.read_table(tmp_path / "published.parquet")
-    assert shipped.schema.equals(schema(track(name)))
-    assert sorted(shipped[score].to_pylist()) == sorted(recorded[score].to_pylist())
-
-
-def test_times_are_published_with_three_digits() -> None:
-    times = {"wall_s": [1.23456, None], "attack_ms": [1234.5, 0.0], "safe_progress": [0.123456, 1.0]}
-    assert rounded(pa.table(times)).to_pydict() == {
-        "wall_s": [1.23, None],
-        "attack_ms": [1230.0, 0.0],
-        "safe_progress": [0.123456, 1.0],
-    }
-
-
-def test_perturbations_are_published_in_single_precision_and_scores_as_they_are() -> None:
-    exact = {"l2": [1 / 3, None], "safe_progress": [1 / 3, 1.0]}
-    assert rounded(pa.table(exact)).to_pydict() == {
-        "l2": [float(np.float32(1 / 3)), None],
-        "safe_progress": [1 / 3, 1.0],
-    }
-
-
-def scores_of(records: pa.Table, run: int) -> list[float]:
-    """The scores of a training seed, sorted."""
-    return sorted(records["safe_progress"].filter(pc.equal(records["training_seed"], run)).to_pylist())
-
-
-def test_added_records_renew_a_training_seed_and_leave_the_others(tmp_path: Path) -> None:
-    """A folder with fewer episodes of a pair and seed than the file renews nothing of it."""
-    file = tmp_path / "published.parquet"
-    first = drive(cells=CLEAR, skill=0.3)
-    again, few = drive(cells=CLEAR, runs=(1,), skill=0.9), drive(cells=CLEAR[:1], runs=(2,), skill=0.8)
-    for number, records in enumerate((first, again, few)):
-        folder = tmp_path / str(number)
-        results.prepare(folder)
-        results.write(folder, records)
-        assert publish(folder, file, add=number > 0) == first.num_rows
-    shipped = pq.read_table(file)
-    assert [scores_of(shipped, run) for run in (0, 1, 2)] == [
-        scores_of(first, 0),
-        scores_of(again, 1),
-        scores_of(first, 2),
-    ]
-    assert scores_of(again, 1) != scores_of(first, 1)
-
-
-def test_records_of_another_track_are_not_added(tmp_path: Path) -> None:
-    file = tmp_path / "published.parquet"
-    for number, records in enumerate((drive(cells=CLEAR[:1]), approach(0.9))):
-        folder = tmp_path / str(number)
-        results.prepare(folder)
-        results.write(folder, records)
-        if number == 0:
-            publish(folder, file)
-    with pytest.raises(UserError, match="has others"):
-        publish(folder, file, add=True)
-
-
-def test_records_of_two_tracks_are_not_published_as_one_file(tmp_path: Path) -> None:
-    results.prepare(tmp_path)
-    for unit, several in enumerate((drive(cells=CLEAR[:1]), approach(0.9))):
-        records = several.slice(0, 1)  # A unit has each episode once.
-        named = pa.array([str(unit) * 64] * records.num_rows)
-        results.write(tmp_path, records.set_column(0, records.schema.field(0), named))
-    with pytest.raises(UserError, match="detection and driving"):
-        publish(tmp_path, tmp_path / "published.parquet")
-
-
 def test_the_report_reads_published_records(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policy_records, "published", lambda track: drive(cells=CLEAR))
+    monkeypatch.setattr(policy_records, "shipped_records", lambda chapter: drive(cells=CLEAR))
     assert "†" in report().split("Table 4.2")[1]
 
 
 @pytest.fixture
 def nothing_published(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policy_records, "published", lambda track: schema(track).empty_table())
+    monkeypatch.setattr(policy_records, "shipped_records", lambda chapter: schema(track("driving")).empty_table())
 
 
 @pytest.mark.usefixtures("nothing_published")

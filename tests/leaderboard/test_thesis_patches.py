@@ -40,8 +40,8 @@ SUN_AND_RAIN = {theirs: (ours, LOCATIONS[1]) for theirs, ours in WEATHERS.items(
 
 @pytest.fixture(autouse=True)
 def nothing_published(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (patch_records, policy_records):
-        monkeypatch.setattr(module, "published", lambda track: schema(track).empty_table())
+    monkeypatch.setattr(patch_records, "shipped_records", lambda chapter: NONE)
+    monkeypatch.setattr(policy_records, "shipped_records", lambda chapter: schema(track("driving")).empty_table())
 
 
 def patch(row: str = STANDARD, left: Left = 0.1, victim: str = "yolov3_tiny", **more: object) -> pa.Table:
@@ -222,7 +222,7 @@ def test_a_smaller_patch_is_compared_with_baselines_of_its_own_size() -> None:
 
 
 def test_published_records_fill_in_where_they_are_of_the_same_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patch_records, "published", lambda track: everything())
+    monkeypatch.setattr(patch_records, "shipped_records", lambda chapter: everything())
     assert report().count("†") > 20
     tables = pa.concat_tables([controls(), patch()])
     same, other = Source(tables), Source(pa.concat_tables([controls(), patch(changes={"steps": 10})]))
@@ -313,7 +313,7 @@ def test_the_claims_of_table_3_3() -> None:
 @pytest.mark.parametrize(("width", "detectors"), [(80, 1), (80, 2), (100, 2)])
 def test_no_number_is_cut_off(width: int, detectors: int, monkeypatch: pytest.MonkeyPatch) -> None:
     records = pa.concat_tables([everything(victim) for victim in ("yolov3_tiny", "yolov5")[:detectors]])
-    monkeypatch.setattr(patch_records, "published", lambda track: records)
+    monkeypatch.setattr(patch_records, "shipped_records", lambda chapter: records)
     lines = report(width=width).splitlines()
     assert max(map(len, lines)) <= width
     assert "…" not in re.sub(r"[−+]\S*…[−+]\S*", "", "\n".join(lines))

@@ -92,7 +92,7 @@ class Gridless(Bad):
 class Borrowing(Bad):
     """Its grid belongs to another world."""
 
-    grid: ClassVar[str] = "standard-v1"
+    grid: ClassVar[str] = "standard-v2"
 
 
 @dataclass(frozen=True, kw_only=True)

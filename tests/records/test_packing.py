@@ -208,13 +208,13 @@ def test_a_truncated_packed_file_is_set_aside(folder: Path, wanted: dict[str, Wa
 
 def test_a_folder_that_is_packed_while_it_is_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = everything(folder)[0]
-    check = reading.check
+    check = reading.track_of
 
     def packs(*words: object, **more: object) -> object:
         packing.pack(folder)
         return check(*words, **more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(reading, "check", packs)
+    monkeypatch.setattr(reading, "track_of", packs)
     assert reading.read(folder, track=TRACK).equals(before)
 
 

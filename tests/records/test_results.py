@@ -16,11 +16,10 @@ import pytest
 
 from cavbench.core.track import Columns, track
 from cavbench.errors import Notice, UserError
-from cavbench.records import generations as footers
+from cavbench.records import columns as footers
 from cavbench.records import reading
 from cavbench.records import store as results
 from cavbench.records.finished import finished
-from cavbench.records.generations import AXES_OF_V1, generations
 from cavbench.records.schema import schema
 from cavbench.run.config import plan_of
 from cavbench.run.unit import Unit
@@ -207,9 +206,9 @@ UNFINISHED: dict[str, tuple[Callable[[pa.Table, pa.Table], pa.Table], str]] = {
         lambda own, other: replaced(own, "return", float("nan")),
         "return must be between -1e+15 and 1e+15, got nan",
     ),
-    "impossible, in an older format": (
-        lambda own, other: replaced(own, "return", float("nan")).drop_columns(["threat_share"]),
-        "return must be between -1e+15 and 1e+15, got nan",
+    "without a column": (
+        lambda own, other: own.drop_columns(["threat_share"]),
+        "it has columns that this version does not write",
     ),
     "another pair": (lambda own, other: replaced(own, "pair", "other-none-toy"), "it has the rows of another pair"),
     "another cell": (
@@ -374,34 +373,6 @@ def test_reading_a_folder_keeps_the_newest_code_and_each_scenario_once(written: 
     same_pair = [row for row in records if (row["pair"], row["cell"]) == (old[0]["pair"], old[0]["cell"])]
     assert {row["code_digest"] for row in same_pair} == {"newer"}
     assert sorted(row["seed"] for row in same_pair) == sorted({row["seed"] for row in newer + longer})
-
-
-def test_records_without_a_share_of_frames_read_as_all_frames(written: Path, units: list[Unit]) -> None:
-    today = read(written)
-    before = next(one for one in generations(TRACK) if "threat_share" not in one.names)
-    path = results.path_of(written, units[0].fingerprint)
-    pq.write_table(pq.read_table(path).select(before.names).cast(before), path)
-    assert read(written).equals(today)
-    assert set(today["threat_share"].to_pylist()) == {1.0}
-
-
-def test_records_of_format_1_are_converted(written: Path, units: list[Unit]) -> None:
-    """Format 1 had one column each for lanes, density and weather, and no facts of the world."""
-    today = read(written)
-    second, *_, first = [one for one in generations(TRACK) if "lanes" in one.names]
-    for number, unit in enumerate(units):
-        path = results.path_of(written, unit.fingerprint)
-        older = []
-        for row in pq.read_table(path).to_pylist():
-            cell = json.loads(row["cell"])
-            older.append(row | {axis.name: cell[axis.name] for axis in AXES_OF_V1})
-        pq.write_table(pa.Table.from_pylist(older, second if number % 2 else first), path)
-    upgraded = read(written)
-    assert upgraded.schema.equals(SCHEMA)
-    assert upgraded["cell"].to_pylist() == today["cell"].to_pylist()
-    assert upgraded["return"].to_pylist() == today["return"].to_pylist()
-    assert set(upgraded["world_facts"].to_pylist()) == {json.dumps(TRACK.facts_of_v1, separators=(",", ":"))}
-    assert None in upgraded["same_answer"].to_pylist()
 
 
 def test_rows_are_not_hidden_by_what_a_file_says_of_its_values(written: Path, units: list[Unit]) -> None:

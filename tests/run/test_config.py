@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cavbench.core.registry import load
-from cavbench.envs.highway.axes import STANDARD_V1, STANDARD_V2
+from cavbench.envs.highway.axes import STANDARD_V2
 from cavbench.errors import UserError
 from cavbench.run.config import component, plan_of, training_of
 from cavbench.run.plan import Plan
@@ -61,7 +62,8 @@ def test_a_grid_in_blocks_keeps_its_name_for_whole_blocks_of_all_cells() -> None
     for words in ("episodes=15", "episodes=40", "lanes=3"):
         assert read(f"attack=noise grid=standard-v2 {words}").grid.name == "custom"
     assert len(read("attack=noise grid=standard-v2 episodes=15").grid.blocks()) == 1
-    assert STANDARD_V1.blocks() == (STANDARD_V1.seeds(),)
+    whole = replace(STANDARD_V2, block=0)
+    assert whole.blocks() == (whole.seeds(),)
 
 
 def test_comma_lists_sweep_over_names_parameters_and_threats() -> None:

@@ -17,7 +17,7 @@ from cavbench.core.track import Measure
 from cavbench.envs.highway.axes import AXES
 from cavbench.scenarios import Cell
 from cavbench.statistics.episodes import Episodes, as_text, difference, measured, shared
-from cavbench.statistics.estimates import components, interval, scenario_covariance, share_interval, task_intervals
+from cavbench.statistics.estimates import components, interval, share_interval, task_intervals
 
 quick = settings(max_examples=40, deadline=None)
 shapes = st.tuples(st.integers(1, 5), st.integers(1, 6), st.integers(1, 8))
@@ -98,15 +98,6 @@ def test_a_policy_that_is_lucky_in_every_cell_is_one_policy() -> None:
     eighteen = np.repeat(one_cell, 18, 1)
     assert interval(eighteen) == interval(one_cell)
     assert interval(eighteen).high - interval(eighteen).low > 1
-
-
-@given(scores)
-@quick
-def test_the_covariance_of_cells_gives_the_component_of_any_of_them(values: np.ndarray) -> None:
-    covariance = scenario_covariance(values)
-    for some in (np.arange(values.shape[1]), np.arange(values.shape[1])[::2]):
-        expected = components(values[:, some].mean(1)).scenario
-        assert max(float(covariance[np.ix_(some, some)].mean()), 0.0) == pytest.approx(float(expected), abs=1e-12)
 
 
 @given(scores)

@@ -26,41 +26,23 @@ function estimate(found) {
   return found == null ? ["—"] : [el("b", {}, fixed(found.estimate)), " ", el("small", {}, bounds(found))];
 }
 
-/* ---- statistics: those of bench/statistics/estimates.py, for the selected cells ---- */
+/* ---- scores of the selected cells. Intervals are those of the document: they are computed in one place, bench/statistics ---- */
 const average = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
-function tQuantile(freedom) {
-  const after = data.t.findIndex(([df]) => df >= freedom);
-  if (after <= 0) return data.t[after < 0 ? data.t.length - 1 : 0][1];
-  const [[low, from], [high, to]] = [data.t[after - 1], data.t[after]];
-  return to + ((from - to) * (1 / freedom - 1 / high)) / (1 / low - 1 / high);
-}
-function interval(one, places) {
-  const runs = one.cells[0].runs.length, scenarios = one.scenarios;
-  const means = Array.from({ length: runs }, (_, run) => average(places.map((place) => one.cells[place].runs[run])));
-  const share = Math.min(1, Math.max(0, average(means)));
-  const parts = [];
-  if (runs > 1) parts.push([means.reduce((sum, value) => sum + (value - share) ** 2, 0) / (runs * (runs - 1)), runs - 1]);
-  const block = average(places.flatMap((x) => places.map((y) => one.covariance[Math.max(x, y)][Math.min(x, y)])));
-  if (scenarios > 1) parts.push([Math.max(0, block), scenarios - 1]);
-  if (!parts.length) return { estimate: share, low: null, high: null };
-  const variance = parts.reduce((sum, [part]) => sum + part, 0);
-  const freedom = parts.reduce((sum, [part, df]) => sum + part ** 2 / df, 0);
-  const joint = variance > 0 ? tQuantile(variance ** 2 / freedom) ** 2 * variance : 0;
-  const apart = parts.reduce((sum, [part, df]) => sum + tQuantile(df) ** 2 * part, 0);
-  const spread = share * (1 - share), square = data.t[data.t.length - 1][1] ** 2, alone = square / (runs * scenarios * places.length);
-  const unseen = runs > 1 ? (square / runs) * 0.2 * Math.max(0, 1 - share / 0.1) : 0;
-  const ratio = Math.max(spread > 0 ? (joint + apart) / 2 / spread : alone, unseen);
-  const centre = (share + ratio / 2) / (1 + ratio), half = Math.sqrt(ratio * spread + ratio ** 2 / 4) / (1 + ratio);
-  return { estimate: share, low: Math.max(0, Math.min(centre - half, share)), high: Math.min(1, Math.max(centre + half, share)) };
+/* Of all cells, of one cell, or of all cells with one value of an axis; the mean of other cells has no interval. */
+function overCells(one, left, whole) {
+  if (!left.length) return null;
+  if (left.length === one.cells.length) return whole;
+  if (left.length === 1) return left[0];
+  const part = one.parts.find(({ axis, value }) => {
+    const own = one.cells.filter(({ cell }) => cell[axis] === value);
+    return own.length === left.length && own.every((cell) => left.includes(cell));
+  });
+  return part ?? { estimate: average(left.map((cell) => cell.estimate)), low: null, high: null };
 }
 function kept(cells) {
   return cells.filter(({ cell }) => Object.entries(state.axes).every(([axis, values]) => values.has(cell[axis])));
 }
-function over(one, whole) {
-  const left = kept(one.cells);
-  if (!left.length) return null;
-  return left.length === one.cells.length ? whole : interval(one, left.map((cell) => one.cells.indexOf(cell)));
-}
+const over = (one, whole) => overCells(one, kept(one.cells), whole);
 function mean(one, name, whole) {
   const left = kept(one.cells);
   return left.length === one.cells.length ? whole : average(left.map((cell) => cell[name]));
@@ -283,42 +265,72 @@ function chosen(one) {
 function render() {
   const board = current();
   if (!board) return;
-  const rows = ranked(board.rows.filter(chosen).map((row) => ({ row, score: over(row, row.score) })).filter((one) => one.score));
+  const rows = ranked(board.rows.filter(chosen).map((row) => ({ row, score: over(row, row.values.score) })).filter((one) => one.score));
   const baselines = board.baselines.map((baseline) => ({ baseline, score: over(baseline, baseline.score) })).filter((one) => one.score);
   const metric = said().title;
   const total = new Set(board.rows.flatMap((row) => row.cells.map(({ cell }) => place(cell)))).size;
   const left = new Set(board.rows.flatMap((row) => kept(row.cells).map(({ cell }) => place(cell)))).size;
   at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, mean with its 95 % interval.` + (left === total ? "" : " Ranks and flags refer to all cells.") +
+    (rows.some(({ row, score }) => score.low == null && row.values.score.low != null) ? " No interval was computed for these cells together." : "") +
     (rows.some((one) => one.row.flagged) ? " Below the double line, a flag (⚑) casts doubt on each row: it ranks below all rows without one, whatever its score." : "") +
     " Rows of one rank are not told apart from its first." +
     (rows.length ? "" : " No row was driven in the selected cells.");
 
-  const whole = left === total;
-  const columns = [
-    { name: "Rank", show: (one) => (one.row ? String(one.row.group) : ""), value: (one) => one.row?.group ?? null },
-    { name: "Defence", class: "name", show: (one) => (one.row ? el("a", { href: address({ row: one.row, pair: null }) }, one.row.defense.label) : one.baseline.name), value: (one) => one.row?.defense.label ?? one.baseline.name },
-    { name: "Victim", show: (one) => one.row?.victim.label ?? "", value: (one) => one.row?.victim.label ?? "" },
-    { name: "Worst case", show: (one) => estimate(one.score), value: (one) => one.score.estimate, interval: (one) => one.score, best: (one) => one.row?.group === 1, number: true },
-    { name: "0 – 1", class: "drawn", show: (one) => strip(one.score, baselineOf(one)) },
-    ...(said().failure ? [{ name: capital(said().failure_title), show: (one) => (one.row ? percent(failedOf(one)) : ""), value: (one) => (one.row ? failedOf(one) : null), interval: (one) => (whole ? one.row?.failed : null), number: true }] : []),
-    ...said().columns.filter(({ name }) => rows.some((one) => measureOf(one, name)?.estimate != null)).map(({ name, title, digits }) =>
-      ({ name: capital(title), show: (one) => fixed(measureOf(one, name)?.estimate, digits), value: (one) => measureOf(one, name)?.estimate ?? null, interval: (one) => measureOf(one, name), number: true })),
-    { name: "Worst cell", show: (one) => worstCell(one), value: (one) => lowest(one)?.estimate ?? null, interval: lowest, number: true },
-    { name: "Clean", show: (one) => (whole ? fixed(one.row?.clean?.estimate) : fixed(cleanOf(one)?.estimate)), value: (one) => (whole ? one.row?.clean?.estimate : cleanOf(one)?.estimate) ?? null, interval: (one) => (whole ? one.row?.clean : cleanOf(one)), number: true },
-    ...(board.rows.some((row) => row.certified !== null) ? [{ name: "Certified", show: (one) => fixed(one.row?.certified), value: (one) => one.row?.certified ?? null, number: true }] : []),
-    ...(said().baseline ? [{ name: `Against ${said().baseline.replace(/^the /, "")}`, show: (one) => (one.row ? lead(one, whole) : ""), value: (one) => leadOf(one, whole)?.estimate ?? null, interval: (one) => leadOf(one, whole), number: true }] : []),
-    { name: "Strongest attack", class: "name", show: (one) => (one.row ? cardLink(pairs.get(one.row.strongest), pairs.get(one.row.strongest).attack.label) : ""), value: (one) => (one.row ? pairs.get(one.row.strongest).attack.label : "") },
-    ...(board.rows.some((row) => row.clip) ? [{ name: "Film", show: (one) => (one.row?.clip ? el("a", { href: address({ row: one.row, pair: null }), "aria-label": `Film of ${one.row.defense.label} · ${one.row.victim.label}` }, "▶ film") : "") }] : []),
-    { name: "Flags", class: "doubts", show: (one) => (one.row ? doubts(one.row) : ""), value: (one) => (one.row ? one.row.flags.filter((flag) => flag.fired).map((flag) => flag.name).join(" ") : "") },
-  ];
+  const columns = board.columns.filter(({ shown }) => shown).flatMap((column) => {
+    const made = rankColumn(column);
+    if (column.name === "score") return [made, { name: "0 – 1", class: "drawn", show: (one) => strip(one.score, baselineOf(one)) }];
+    if (column.name === "flags" && board.rows.some((row) => row.clip)) return [FILM, made];
+    return [made];
+  });
   draw("ranks", columns, [...rows, ...baselines], (one, before, unsorted) =>
-    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", one.row?.group === 1 ? "best" : "", unsorted && before && one.row?.group !== before.row?.group ? "group" : "", unsorted && before?.row && one.row && one.row.flagged !== before.row.flagged ? "divided" : ""].filter(Boolean).join(" "));
+    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", rankOf(one) === 1 ? "best" : "", unsorted && before && rankOf(one) !== rankOf(before) ? "group" : "", unsorted && before?.row && one.row && one.row.flagged !== before.row.flagged ? "divided" : ""].filter(Boolean).join(" "));
 
   drawPairs(board, metric);
   drawMatrix(board);
   drawCurves(board);
   drawHeat(board);
   history.replaceState(null, "", address());
+}
+/* ---- the ranking: which columns there are, the document says (leaderboard/ranking/columns.py) ---- */
+const rankOf = (one) => one.row?.values.rank;
+const FILM = { name: "Film", show: ({ row }) => (row?.clip ? el("a", { href: address({ row, pair: null }), "aria-label": `Film of ${row.defense.label} · ${row.victim.label}` }, "▶ film") : "") };
+const LOOKS = {
+  defense: (row, text) => el("a", { href: address({ row, pair: null }) }, text),
+  strongest_attack: (row, text) => cardLink(pairs.get(row.strongest), text),
+  flags: (row) => doubts(row),
+};
+function rankColumn(column) {
+  const { name, kind, interval: ends } = column;
+  const found = (one) => (one.row ? valueOf(column, one.row) : name === "defense" ? one.baseline.name : name === "score" ? one.score : null);
+  return {
+    name: column.title,
+    class: { defense: "name", strongest_attack: "name", flags: "doubts" }[name],
+    number: kind !== "text" && name !== "rank",
+    show: (one) => (one.row && LOOKS[name] ? LOOKS[name](one.row, found(one)) : one.row || found(one) ? shown(column, found(one), name === "score") : ""),
+    value: (one) => (ends ? found(one)?.estimate ?? null : found(one)),
+    ...(ends ? { interval: found } : {}),
+    ...(name === "score" ? { best: (one) => rankOf(one) === 1 } : {}),
+  };
+}
+/* What a row has in a column, of the selected cells where the column has a value for each. */
+function valueOf(column, row) {
+  const found = row.values[column.name], left = kept(row.cells);
+  if (left.length === row.cells.length) return found;
+  if (column.name === "score") return over(row, found);
+  if (column.name === "worst_cell_score") return lowest(left);
+  if (column.name === "worst_cell") return joined(Object.values(lowest(left).cell));
+  if (!column.by_cell) return found;
+  const known = left.map((cell) => cell.values[column.name]).filter((value) => value != null);
+  return known.length ? { estimate: average(known), low: null, high: null } : null;
+}
+const lowest = (cells) => cells.reduce((least, cell) => (cell.estimate < least.estimate ? cell : least));
+function shown({ kind, digits, interval }, found, bounded) {
+  if (kind === "text") return found ?? "";
+  if (found == null) return "—";
+  const value = interval ? found.estimate : found;
+  if (kind === "difference") return [el("b", {}, signed(found)), " ", el("small", {}, found.low == null ? "" : `${fixed(found.low)} … ${fixed(found.high)}`)];
+  const written = kind === "share" ? percent(value) : fixed(value, digits);
+  return bounded && interval ? [el("b", {}, written), " ", el("small", {}, bounds(found))] : written;
 }
 function sameDefended(a, b) {
   return ["defense", "victim"].every((kind) => JSON.stringify([a[kind].name, a[kind].params]) === JSON.stringify([b[kind].name, b[kind].params]));
@@ -327,37 +339,12 @@ function controlOf(row) {
   const strongest = pairs.get(row.strongest);
   return data.pairs.find((pair) => pair.attack.name === "none" && pair.track === strongest.track && sameDefended(pair, strongest)) ?? null;
 }
-function cleanOf(one) {
-  const control = one.row ? controlOf(one.row) : null;
-  return control ? over(control, control.score) : null;
-}
 function besideBaseline(row) {
   return kept(row.cells).filter((cell) => cell.baseline != null);
 }
 function baselineOf(one) {
   const cells = one.row ? besideBaseline(one.row) : [];
   return cells.length ? average(cells.map((cell) => cell.baseline)) : null;
-}
-function leadOf(one, whole) {
-  if (!one.row) return null;
-  if (whole) return one.row.lead;
-  const differences = besideBaseline(one.row).map((cell) => average(cell.runs) - cell.baseline);
-  return differences.length ? { estimate: average(differences), low: null, high: null } : null;
-}
-function lead(one, whole) {
-  const found = leadOf(one, whole);
-  return found ? [el("b", {}, signed(found)), " ", el("small", {}, found.low == null ? "" : `${fixed(found.low)} … ${fixed(found.high)}`)] : "—";
-}
-/* A measure of all cells, under the strongest attack of a row. */
-const measureOf = ({ row }, name) => (row ? pairs.get(row.strongest).measures[name] : null);
-const failedOf = ({ row }) => mean(row, "failed", row.failed?.estimate ?? null);
-function lowest(one) {
-  const cells = one.row ? kept(one.row.cells) : [];
-  return cells.length ? cells.reduce((least, cell) => (cell.estimate < least.estimate ? cell : least)) : null;
-}
-function worstCell(one) {
-  const cell = lowest(one);
-  return cell ? [el("b", {}, fixed(cell.estimate)), " ", el("small", {}, joined(Object.values(cell.cell)))] : "";
 }
 function doubts(row) {
   const fired = row.flags.filter((flag) => flag.fired);
@@ -479,7 +466,7 @@ function drawCurves(board) {
   // Only cells that every point of every line has: otherwise a line would compare different roads.
   const sets = found.flatMap(({ row, parts }) => [...parts.map(({ of }) => of), controlOf(row)].filter(Boolean).map((one) => new Set(kept(one.cells).map(({ cell }) => place(cell)))));
   const common = new Set([...(sets[0] ?? [])].filter((name) => sets.every((set) => set.has(name))));
-  const on = (one) => interval(one, one.cells.flatMap(({ cell }, n) => (common.has(place(cell)) ? [n] : [])));
+  const on = (one) => overCells(one, one.cells.filter(({ cell }) => common.has(place(cell))), one.values?.score ?? one.score);
   const budget = !common.size ? [] : found.map(({ row, parts }) => ({
     name: `${row.defense.label} · ${row.victim.label}`,
     points: [...(controlOf(row) ? [{ x: 0, ...on(controlOf(row)) }] : []), ...parts.map(({ x, of }) => ({ x, ...on(of) }))],
@@ -567,17 +554,14 @@ function rowCard(row) {
   const name = `${row.defense.label} · ${row.victim.label}`, strongest = pairs.get(row.strongest);
   const film = row.clip ? el("figure", { class: "film" }, el("img", { src: row.clip, alt: `The same scenario without an attack, and under ${strongest.attack.name}`, onerror: (event) => event.target.closest("figure").remove() }), el("figcaption", {}, "The same scenario without an attack (above), and attacked (below)")) : null;
   return [name, el("p", { class: "quiet" }, threatText(current().threat)), film, el("dl", {},
-    ...fact("score", ...estimate(row.score), `, rank ${row.group}${row.flagged ? ", flagged" : ""}`),
-    ...(row.failed ? fact(said().failure_title, `${percent(row.failed.estimate)} (${bounds(row.failed)})`) : []),
-    ...fact("worst cell", ...worstCell({ row })),
-    ...(row.clean ? fact("without an attack", ...estimate(row.clean)) : []),
-    ...(row.certified === null ? [] : fact("certified under every attack", `at least ${fixed(row.certified)}`)),
+    ...current().columns.filter((column) => column.shown && !["defense", "victim", "strongest_attack", "flags"].includes(column.name))
+      .flatMap((column) => (row.values[column.name] == null ? [] : fact(column.title, ...[shown(column, row.values[column.name], true)].flat()))),
     ...fact("attacks", ...row.pairs.map((key) => el("div", {}, cardLink(pairs.get(key), attackName(pairs.get(key))), " ", ...estimate(pairs.get(key).score), " ", el("small", { class: "quiet" }, part(pairs.get(key), row))))),
     ...fact("flags", doubts(row)),
     ...works(strongest.card, ["defense", "victim", "world"]),
     ...fact("strongest attack", pairs.get(row.strongest).attack.label),
     ...provenance(strongest),
-    ...fact("cite", ...command(bibtex(`${name} under ${threatName(current().threat)}, ${current().grid}: ${data.tracks[state.track].title} ${fixed(row.score.estimate)} [${bounds(row.score)}]`, rowName(row)))),
+    ...fact("cite", ...command(bibtex(`${name} under ${threatName(current().threat)}, ${current().grid}: ${data.tracks[state.track].title} ${fixed(row.values.score.estimate)} [${bounds(row.values.score)}]`, rowName(row)))),
     ...fact("address", ...command(here())))];
 }
 function pairCard(pair) {
