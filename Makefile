@@ -50,15 +50,14 @@ install: $(RUN_STAMP)
 
 install-dev: $(DEV_STAMP)
 
-# Every distribution has its hash in a lock (locks/lock.py), but torch: its builds for CPU and CUDA have one version and other files.
-# It comes last, when all that it needs is there; the resolver may otherwise choose a build with gigabytes of CUDA.
+# Every distribution has its hash in a lock (locks/lock.py). torch has one for its CPU build, and one for that of the package index.
 LOCKED := $(BIN)/python -m pip install --quiet --require-hashes --no-deps --no-build-isolation
 
-$(RUN_STAMP): pyproject.toml setup.py constraints.txt locks/build.txt locks/run.txt
+$(RUN_STAMP): pyproject.toml setup.py constraints.txt locks/build.txt locks/run.txt locks/torch.txt locks/torch-cpu.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(LOCKED) -r locks/build.txt
 	$(LOCKED) -r locks/run.txt
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
+	$(BIN)/python locks/install_torch.py
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
 	touch $@
 
@@ -83,6 +82,7 @@ debian-browser:
 clean:
 	rm -rf $(VENV) build dist docs/_build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-# Random kills, bad places and a long run, with a table of figures for docs/reliability.md; an hour and a half. Not part of `test`.
+# Random kills, bad places, bad command lines, changed files and a long run, with a table of figures for docs/reliability.md; three hours
+# on two idle cores. Not part of `test`.
 soak: install-dev
-	$(BIN)/python -m tests.soak kills=100 minutes=60
+	$(BIN)/python -m tests.soak kills=100 inputs=1000 fuzzing=60 minutes=60

@@ -5,8 +5,8 @@
     python -m cavbench.leaderboard.published                  # writes the faces of all rows again
 
 A row is a defended victim on a grid. Its records are `data/GRID/NAME.parquet`, its face is `rows/GRID/NAME.json`
-(`cavbench.leaderboard.faces`). So a new row is two new files, and no other one changes. The records of all baselines of a grid, which
-no leaderboard ranks, are one file, `data/GRID/baselines.parquet`.
+(`cavbench.leaderboard.faces`). So a new row is two new files, and no other one changes. The records of all baselines of a grid,
+which no leaderboard ranks, are one file, `data/GRID/baselines.parquet`.
 """
 
 from __future__ import annotations

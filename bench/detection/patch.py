@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from cavbench import bounded
 from cavbench.errors import UserError
 
 MOMENTS = 20
@@ -81,7 +81,7 @@ class Patch:
         """
         try:
             size = int.from_bytes(content[:8], "little")
-            header = json.loads(content[8 : 8 + size])["__metadata__"]
+            header = bounded.parsed(content[8 : 8 + size])["__metadata__"]
             tensors = load(content)
             patch = cls(
                 texels=tensors.get("patch"),

@@ -81,9 +81,10 @@ def _messages(message: Any) -> Iterator[Any]:
 
 def _beside(tensor: Any, path: Path, name: str, most: int) -> bytes:
     """The bytes of a tensor that lies in another file, of at most so many bytes."""
-    said = {entry.key: entry.value for entry in tensor.external_data}
+    # What is no text in UTF-8 is given as bytes.
+    said = {str(entry.key): str(entry.value) for entry in tensor.external_data}
     place = said.get("location", "")
-    what = f"{name} is refused: its tensor {short(tensor.name)!r}"
+    what = f"{name} is refused: its tensor {short(str(tensor.name))!r}"
     if len(said) < len(tensor.external_data) or not said.keys() <= KEYS:
         raise UserError(f"{what} says where it lies twice, or in words that are not known: {short(', '.join(said))!r}")
     if any(tensor.HasField(one) if one in ("raw_data", "segment") else getattr(tensor, one) for one in CONTENTS):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import faulthandler
+import gc
 import importlib
 import os
 import select
@@ -15,6 +16,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import FileIO
+from pathlib import Path
 from types import FrameType
 
 from cavbench.errors import EscapeError, Notice, reason
@@ -23,6 +25,8 @@ from cavbench.isolation.settings import RECURSION, Settings
 
 HARM_S = 120
 """Seconds that the import of a module, or reading a file, may take."""
+STUCK_S = 15.0
+"""Seconds without work after which a copy is taken for stuck, and made once more."""
 END_S = 5.0
 """Seconds that the hooks may take that a module leaves for the end of the process."""
 SURVIVED, ENDED = b"survived", b"."
@@ -110,16 +114,22 @@ def harm(act: Callable[[], object], seconds: float = HARM_S, *, stays: bool = Fa
     """
     if sys.platform != "linux":
         return ""
+    found = _tried(act, seconds, stays, STUCK_S)
+    # A lock that another thread held at the moment of the copy is never released there; a second copy hardly meets it again.
+    return _tried(act, seconds, stays, seconds) or "" if found is None else found
+
+
+def _tried(act: Callable[[], object], seconds: float, stays: bool, stuck: float) -> str | None:
+    """What `harm` says of one copy of this process; None if the copy does nothing for `stuck` seconds."""
     read, write = os.pipe()
-    with warnings.catch_warnings():
-        # Python warns of threads in the parent; the child does this one thing and ends.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        child = os.fork()
+    child = _copied()
     if not child:
         _act_and_end(act, write, stays)
     os.close(write)
     with os.fdopen(read, "rb", buffering=0) as pipe:
-        said = _said(pipe, seconds)
+        deadline = time.monotonic() + seconds
+        said = _reported(pipe, child, deadline, stuck)
+        late = time.monotonic() >= deadline
         reported = bool(said and said.startswith(SURVIVED))
         last = reported and (not stays or said.endswith(ENDED) or _said(pipe, END_S) is not None)  # type: ignore[union-attr]
     if said == b"":
@@ -132,12 +142,51 @@ def harm(act: Callable[[], object], seconds: float = HARM_S, *, stays: bool = Fa
         os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     if said is None:
-        return f"does not end within {seconds:g} s"
+        return f"does not end within {seconds:g} s" if late else None
     if not reported:
         code = os.waitstatus_to_exitcode(status)
         return "closes files of the process" if code == CLOSED else f"ends the process ({ended(code)})"
     found = said.removeprefix(SURVIVED).partition(b"\n")[0].decode(errors="replace")
     return found or ("" if last else f"leaves a hook for the end of the process that does not end within {END_S:g} s")
+
+
+def _copied() -> int:
+    """Copy this process: 0 in the copy, its number here.
+
+    In the copy, garbage of this process is never collected: what it does at its end may wait for a thread that is not there.
+    """
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        with warnings.catch_warnings():
+            # Python warns of threads in the parent; the child does this one thing and ends.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            child = os.fork()
+        if not child:
+            gc.freeze()
+    finally:
+        if collects:
+            gc.enable()
+    return child
+
+
+def _reported(pipe: FileIO, child: int, deadline: float, stuck: float) -> bytes | None:
+    """What the copy writes until it ends or reports; None at the deadline, or if it does nothing for `stuck` seconds."""
+    work, since = _work(child), time.monotonic()
+    while (now := time.monotonic()) < min(deadline, since + stuck):
+        if (said := _said(pipe, min(deadline, since + stuck, now + 1) - now)) is not None:
+            return said
+        if (done := _work(child)) != work:
+            work, since = done, time.monotonic()
+    return None
+
+
+def _work(process: int) -> list[str]:
+    """The time of a core that a process and its ended children used: four counters of the kernel."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2].split()[11:15]
+    except OSError:
+        return []
 
 
 def _wait(child: int, seconds: float) -> None:

@@ -191,7 +191,7 @@ def _read_compact(out: Path, known: Sequence[Path], track: Track, measurements: 
     _check_distinct(units, out)
     rows = np.repeat(np.arange(units.num_rows), pc.list_value_length(units["seed"]).to_numpy())
     names = [name for name in schema(track).names if name in units.column_names]
-    return _valid(pa.table({name: _laid_out(units[name].chunk(0), rows) for name in names}), out, track)
+    return _valid(pa.table({name: _laid_out(units[name].combine_chunks(), rows) for name in names}), out, track)
 
 
 def _check_distinct(units: pa.Table, out: Path) -> None:
@@ -211,7 +211,7 @@ def _laid_out(column: pa.Array, rows: NDArray[np.int64]) -> pa.Array:
         return column.flatten()
     if pa.types.is_string(column.type):
         encoded = column.dictionary_encode()
-        return pa.DictionaryArray.from_arrays(encoded.indices.to_numpy()[rows], encoded.dictionary)
+        return pa.DictionaryArray.from_arrays(encoded.indices.take(pa.array(rows)), encoded.dictionary)
     return column.take(pa.array(rows))
 
 

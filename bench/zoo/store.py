@@ -14,6 +14,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -28,7 +29,7 @@ from torch import Tensor
 
 from cavbench import bounded
 from cavbench.core.contracts import World
-from cavbench.errors import UserError
+from cavbench.errors import UserError, message
 from cavbench.files import whole
 from cavbench.identity.fingerprint import canonical, code_digest, libraries, machine
 from cavbench.zoo.recipe import DIGITS, Part, Recipe, check_world
@@ -164,14 +165,25 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
             "the file was changed; restore it or train it again"
         )
     try:
-        network: N = build(**entry["shape"])
         tensors: Mapping[str, Tensor] = load_tensors(blob)
-        if begun := entry.get("start"):
+        begun = entry.get("start")
+        if not begun:
+            _check_sizes(build, entry["shape"], tensors)
+        network: N = build(**entry["shape"])
+        if begun:
             _check_start(recipe, seed, begun, network)
             tensors = _completed(tensors, begun["tensors"], network)
         network.load_state_dict(tensors)
-    except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
-        reason = str(error).splitlines()[0]
+    except (
+        SafetensorError,
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ) as error:
+        reason = message(error) or type(error).__name__
         raise UserError(f"the weights {path} do not fit {recipe.name!r}: {reason}") from None
     network.weights_sha256 = sha256
     network.requires_grad_(False).eval()
@@ -199,7 +211,13 @@ def missing(recipe: Recipe, seed: int) -> str:
 def _check_parameters(recipe: Recipe, seed: int, entry: Mapping[str, Any]) -> None:
     """Check the parameters of an entry: the digest does not notice a default that has changed since."""
     for part in recipe.parts:
-        made = entry.get("recipe", {}).get(part.kind, {}).get("parameters", {})
+        made: Any = entry
+        for key in ("recipe", part.kind, "parameters"):
+            made = made.get(key, {})
+            if not isinstance(made, dict):
+                raise UserError(
+                    f"the card of {recipe.name!r}, training seed {seed}, is damaged: {key} is no JSON object"
+                )
         for name, value in part.parameters.items():
             if name in made and canonical(made[name]) != canonical(value):
                 raise UserError(
@@ -212,6 +230,23 @@ def _unchanged(state: Mapping[str, Tensor], start: Network) -> list[str]:
     """The names of the tensors that are those of the start, bit for bit."""
     own = start.state_dict()
     return [key for key, value in state.items() if key in own and torch.equal(value, own[key])]
+
+
+def _check_sizes(build: Callable[..., Network], shape: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Refuse a card whose network has other sizes than the stored tensors, before it is built: a stranger may have written it.
+
+    Raises:
+        ValueError: names a tensor.
+    """
+    if not isinstance(build, type):
+        return
+    # No memory is taken on this device. What cannot be built there is built as it is.
+    with suppress(RuntimeError), torch.device("meta"):
+        wanted = build(**shape).state_dict()
+        for name in sorted(wanted.keys() & tensors.keys()):
+            if wanted[name].shape != tensors[name].shape:
+                sizes = [list(one[name].shape) for one in (tensors, wanted)]
+                raise ValueError(f"{name} has the sizes {sizes[0]}, the card says {sizes[1]}")
 
 
 def _check_start(recipe: Recipe, seed: int, begun: Mapping[str, Any], start: Network) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from cavbench.core.contracts import Access, QueryBudgetError
 from cavbench.detection import PatchOracle, PatchThreat
 from cavbench.detection.access import PatchEnforcer
-from cavbench.detection.patch import MOMENTS
+from cavbench.detection.patch import MOMENTS, Patch
 from cavbench.detection.threat import GREY
 from cavbench.errors import UserError
 from tests.plugins.toy_camera import RedDetector
@@ -114,3 +114,12 @@ def test_reported_patches_must_have_one_size() -> None:
         door.report(torch.zeros(3, 9, 9))
     with pytest.raises(UserError, match="a patch must be"):
         door.report(torch.zeros(1, 3, 8, 8))
+
+
+@pytest.mark.parametrize("value", ["[" * 50_000 + "]" * 50_000, "3", '"one"', "1e999", '"1", "queries": "2"'])
+def test_a_patch_file_of_another_form_is_refused_in_one_line(value: str) -> None:
+    content = Patch(torch.rand(3, 4, 4), queries=7).written("{}")
+    size = int.from_bytes(content[:8], "little")
+    header = content[8 : 8 + size].replace(b'"queries":"7"', f'"queries":{value}'.encode())
+    with pytest.raises(UserError, match="truncated or foreign"):
+        Patch.read(len(header).to_bytes(8, "little") + header + content[8 + size :])

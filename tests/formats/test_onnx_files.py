@@ -260,3 +260,11 @@ def test_settings_in_a_model_do_not_reach_onnx_runtime(tmp_path: Path) -> None:
 def test_what_is_no_model_is_refused(content: bytes, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"it is not an ONNX model, or a damaged one|is refused: it has fields"):
         load(written(tmp_path, content))
+
+
+@pytest.mark.parametrize("said", [{"offset": "0"}, {"checksum": "0"}])
+def test_text_that_is_not_utf8_says_nowhere(said: dict[str, str], tmp_path: Path) -> None:
+    content = model(beside(**said)).SerializeToString()
+    path = written(tmp_path, content.replace(b"location", b"loc\xfftion"))
+    numbers(tmp_path / "weights", 1)
+    assert "in words that are not known" in refusal(path)

@@ -1,19 +1,26 @@
-"""Every distribution that is installed has a hash in a lock, and a licence that somebody has looked at."""
+"""What is installed has a hash in a lock, pip takes no other file, and each has a licence that somebody has looked at."""
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 import sysconfig
 import tomllib
+import venv
+import zipfile
 from importlib import metadata
+from pathlib import Path
 
 import pytest
 
+from locks.install_torch import pinned
 from locks.licences import complaints, licence, plain
 from tests.tree import ROOT as TREE
 
-NOT_LOCKED = {"torch", "cavbench"}
-"""The builds of torch differ from index to index."""
+ELSEWHERE = {"torch", "cavbench"}
+"""torch has locks of its own."""
 
 
 def lock(name: str) -> dict[str, str]:
@@ -23,12 +30,12 @@ def lock(name: str) -> dict[str, str]:
     found = {}
     for part in re.split(r"^(?=[^\s#])", text, flags=re.MULTILINE)[1:]:
         first, *hashes = part.replace("\\\n", "\n").strip().splitlines()
-        pinned = re.fullmatch(r"([\w.-]+)==([\w.!+-]+)( ; .+)?", first.strip())
-        assert pinned, first
+        exact = re.fullmatch(r"([\w.-]+)==([\w.!+-]+)( ; .+)?", first.strip())
+        assert exact, first
         assert hashes
         assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", line.strip()) for line in hashes)
         # One distribution may have several versions, for several Pythons.
-        found[plain(pinned[1])] = f"{found.get(plain(pinned[1]), '')} {pinned[2]}".strip()
+        found[plain(exact[1])] = f"{found.get(plain(exact[1]), '')} {exact[2]}".strip()
     return found
 
 
@@ -40,16 +47,77 @@ def required(extra: str = "") -> set[str]:
 
 def test_the_locks_hold_all_that_is_required_in_the_versions_of_the_constraints() -> None:
     run, develop, build = lock("run"), lock("develop"), lock("build")
-    assert required() - NOT_LOCKED <= run.keys()
+    assert required() - ELSEWHERE <= run.keys()
     extras = ("reference", "gym", "art", "onnx", "ray", "render", "docs", "dev")
-    assert set().union(*map(required, extras)) - NOT_LOCKED <= develop.keys()
+    assert set().union(*map(required, extras)) - ELSEWHERE <= develop.keys()
     assert run.items() <= develop.items()
     assert build.items() <= run.items()
     assert not {name for name in develop if re.match(r"torch$|nvidia-|cuda-|triton", name)}
     pins = re.findall(r"^([\w.-]+)==(\S+)$", (TREE / "constraints.txt").read_text(), re.M)
     for name, version in pins:
-        if plain(name) not in NOT_LOCKED:
+        if plain(name) not in ELSEWHERE:
             assert version in develop[plain(name)].split(), name
+
+
+def test_both_builds_of_torch_are_locked_in_the_version_of_the_constraints() -> None:
+    version = pinned()
+    index, cpu = lock("torch"), lock("torch-cpu")
+    assert cpu == {"torch": f"{version}+cpu"}
+    assert index["torch"] == version
+    assert all(re.match(r"torch$|nvidia-|cuda-|triton", name) for name in index)
+    # Linux on two kinds of processor, and three Pythons, besides macOS and Windows.
+    hashes = re.search(r"^torch==.*?(?=^\S)", (TREE / "locks" / "torch.txt").read_text() + "end", re.M | re.S)
+    assert hashes
+    assert hashes[0].count("sha256:") >= 6
+
+
+def offered(folder: Path, name: str, version: str) -> None:
+    """An empty wheel with the name of another, in a folder."""
+    folder.mkdir(exist_ok=True)
+    begin = f"{name.replace('-', '_')}-{version}"
+    with zipfile.ZipFile(folder / f"{begin}-py3-none-any.whl", "w") as wheel:
+        wheel.writestr(f"{begin}.dist-info/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        wheel.writestr(f"{begin}.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        wheel.writestr(f"{begin}.dist-info/RECORD", "")
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Python of an environment with nothing but pip."""
+    place = tmp_path_factory.mktemp("bare")
+    venv.create(place, with_pip=True, symlinks=True)
+    return place / ("Scripts" if sys.platform == "win32" else "bin") / "python"
+
+
+@pytest.mark.parametrize("name", ["torch", "torch-cpu"])
+def test_a_file_that_calls_itself_torch_is_refused(name: str, bare: Path, tmp_path: Path) -> None:
+    for distribution, version in lock(name).items():
+        offered(tmp_path / "wheels", distribution, version)
+    told = installed(bare, tmp_path)
+    assert told.returncode == 1
+    assert "DO NOT MATCH THE HASHES" in told.stderr
+    assert f"torch {lock(name)['torch']} was not installed" in told.stderr
+    assert not list(bare.parent.parent.rglob("torch-*"))
+
+
+def test_a_build_of_torch_without_a_lock_is_one_line(bare: Path, tmp_path: Path) -> None:
+    offered(tmp_path / "wheels", "torch", f"{pinned()}+other")
+    told = installed(bare, tmp_path)
+    assert told.returncode == 1
+    assert told.stderr.startswith(f"no lock has torch {pinned()}+other, the build that pip takes here. ")
+
+
+def test_a_torch_that_is_there_stays(tmp_path: Path) -> None:
+    told = installed(Path(sys.executable), tmp_path)
+    assert (told.returncode, told.stdout, told.stderr) == (0, "", "")
+
+
+def installed(python: Path, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Install torch where only the folder `wheels` offers it."""
+    pip = {"PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(folder / "wheels")}
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")} | pip
+    command = (str(python), str(TREE / "locks" / "install_torch.py"))
+    return subprocess.run(command, env=environment, check=False, capture_output=True, text=True)
 
 
 def test_all_that_is_installed_states_a_licence_that_may_be_used() -> None:

@@ -1,12 +1,15 @@
 """Kills real commands at random moments, continues them, and compares the end with an undisturbed run: `make soak`.
 
-    python -m tests.soak kills=30 minutes=2 seed=0
+    python -m tests.soak kills=100 inputs=1000 fuzzing=60 minutes=60 seed=0
+    python -m tests.soak kills=10 inputs=200 fuzzing=10 minutes=2 only=run,craft
 
+Then come bad places, bad command lines, changed files (`fuzzing`: minutes) and a long run (`minutes`); 0 leaves a part out.
 Prints a table of figures. Not part of the test suite.
 """
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 import signal
@@ -20,8 +23,9 @@ import psutil
 
 from tests.command import started
 from tests.plugins.distributions import install_toy
-from tests.soak.conditions import CONDITIONS
+from tests.soak.conditions import CONDITIONS, bad_input
 from tests.soak.endurance import endure
+from tests.soak.fuzzing.campaign import fuzz
 from tests.soak.subjects import SUBJECTS, Subject
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
@@ -102,31 +106,54 @@ def _works(process: psutil.Process) -> bool:
 
 def main(words: list[str]) -> None:
     """Run all parts, and print their figures."""
-    given = dict(word.split("=", 1) for word in words)
-    draw = random.Random(int(given.get("seed", "0")))
-    chosen = given.get("only", ",".join(SUBJECTS)).split(",")
+    given = {
+        "kills": "100",
+        "inputs": "1000",
+        "fuzzing": "60",
+        "minutes": "60",
+        "seed": "0",
+        "only": ",".join(SUBJECTS),
+    }
+    given |= dict(word.split("=", 1) for word in words)
     with tempfile.TemporaryDirectory() as folder:
         site = Path(folder) / "site"
         site.mkdir()
         install_toy(site)
-        share = -(-int(given.get("kills", "100")) // len(chosen))
-        for name in chosen:
-            root = Path(folder) / name
-            root.mkdir()
-            counts = kill_and_continue(SUBJECTS[name], share, site, root, draw)
-            say(f"{name}: {share} kills", counts)
+        show(f"{os.cpu_count()} cores, {os.getloadavg()[0]:.0f} processes waiting")
+        kill_all(site, Path(folder), given["only"].split(","), int(given["kills"]), random.Random(int(given["seed"])))
         for name, condition in CONDITIONS.items():
-            place = Path(folder) / name
-            place.mkdir()
-            print(f"{name}: {condition(site, place)}", flush=True)  # noqa: T201
-        print(f"endurance: {endure(site, Path(folder) / 'endurance', float(given.get('minutes', '60')))}")  # noqa: T201
+            show(f"{name}: {condition(site, _made(Path(folder) / name))}")
+        if count := int(given["inputs"]):
+            show(f"bad input: {bad_input(_made(Path(folder) / 'bad input'), count)}")
+        for line in fuzz(float(given["fuzzing"]), number=int(given["seed"])) if float(given["fuzzing"]) else ():
+            show(line)
+        if minutes := float(given["minutes"]):
+            show(f"endurance: {endure(site, Path(folder) / 'endurance', minutes)}")
+        show(f"{os.getloadavg()[0]:.0f} processes waiting")
+
+
+def kill_all(site: Path, folder: Path, chosen: list[str], kills: int, draw: random.Random) -> None:
+    """Kill each command equally often."""
+    share = -(-kills // len(chosen))
+    for name in chosen if kills else ():
+        say(f"{name}: {share} kills", kill_and_continue(SUBJECTS[name], share, site, _made(folder / name), draw))
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
 
 
 def say(title: str, counts: Counter[str]) -> None:
     """Print a line of figures."""
     wrong = ("lost", "other result", "processes left", "temporary files left")
     signals = ", ".join(f"{name} {count}" for name, count in sorted(counts.items()) if name not in wrong)
-    print(f"{title} ({signals}): " + ", ".join(f"{name} {counts[name]}" for name in wrong), flush=True)  # noqa: T201
+    show(f"{title} ({signals}): " + ", ".join(f"{name} {counts[name]}" for name in wrong))
+
+
+def show(line: str) -> None:
+    """Print a line of figures with the time."""
+    print(f"{time.strftime('%H:%M')} {line}", flush=True)  # noqa: T201
 
 
 if __name__ == "__main__":

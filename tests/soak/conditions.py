@@ -25,7 +25,6 @@ from tests.command import Said, ran, started
 from tests.soak.bad_inputs import bad_inputs
 from tests.soak.subjects import RUN, SUBJECTS, Condition
 
-BAD_INPUTS = 1000
 NEW_PROCESS = 20
 """One in so many bad inputs also runs in a new process."""
 
@@ -80,8 +79,8 @@ def clock_skew(site: Path, place: Path) -> str:
     )
 
 
-def bad_input(site: Path, place: Path) -> str:
-    """Every bad command line ends with one line and a code other than 0.
+def bad_input(place: Path, count: int) -> str:
+    """Every one of so many bad command lines ends with one line and a code other than 0.
 
     They run in copies of one process that has imported everything; every twentieth also in a new one, which must say the same.
     """
@@ -89,15 +88,15 @@ def bad_input(site: Path, place: Path) -> str:
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     wrong, other = [], 0
-    for number, argv in enumerate(bad_inputs(BAD_INPUTS, seed=0, folder=place)):
+    for number, argv in enumerate(bad_inputs(count, seed=0, folder=place)):
         said = _in_a_copy(argv)
         if said.code == 0 or len(said.err.strip().splitlines()) != 1 or "Traceback" in said.err:
             wrong.append(argv)
         if number % NEW_PROCESS == 0:
-            other += said != ran(site, *argv)
+            other += said != ran(place, *argv)
     return (
-        f"{BAD_INPUTS} bad inputs, {len(wrong)} not refused in one line{f', for instance {wrong[0]}' if wrong else ''}; "
-        f"{other} of {math.ceil(BAD_INPUTS / NEW_PROCESS)} that also ran in a new process said something else there"
+        f"{count} bad inputs, {len(wrong)} not refused in one line{f', for instance {wrong[0]}' if wrong else ''}; "
+        f"{other} of {math.ceil(count / NEW_PROCESS)} that also ran in a new process said something else there"
     )
 
 
@@ -143,5 +142,4 @@ CONDITIONS: Mapping[str, Condition] = {
     "read-only folder": read_only,
     "two writers": two_writers,
     "clock a day ahead": clock_skew,
-    "bad input": bad_input,
 }

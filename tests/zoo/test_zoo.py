@@ -7,6 +7,7 @@ import re
 import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -76,6 +77,36 @@ def test_weights_that_do_not_fit_are_refused_in_one_line(saved: Path) -> None:
     with pytest.raises(UserError, match="do not fit 'dqn'") as error:
         TINY.load(3, FACTS)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"recipe": 3},
+        {"recipe": {"victim": [1]}},
+        {"recipe": {"victim": {"parameters": 5}}},
+        {"shape": 3},
+        {"shape": {"hidden": "8"}},
+        {"shape": {"hidden": 200_000}},
+        {"start": {"sha256": 4}},
+    ],
+)
+def test_a_card_of_another_form_is_refused_in_one_line_and_takes_no_memory(
+    change: dict[str, Any], saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    linear = torch.nn.Linear.__init__
+
+    def init(self: torch.nn.Linear, *sizes: int, **others: Any) -> None:
+        linear(self, *sizes, **others)
+        made.append(0 if self.weight.is_meta else self.weight.numel())
+
+    monkeypatch.setattr(torch.nn.Linear, "__init__", init)
+    changed(saved, lambda entry: entry.update(change))
+    with pytest.raises(UserError) as error:
+        TINY.load(3, FACTS)
+    assert "\n" not in str(error.value)
+    assert sum(made) < 10_000
 
 
 def test_a_broken_card_is_named(saved: Path) -> None:
