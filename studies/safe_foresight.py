@@ -3,7 +3,7 @@
     python studies/safe_foresight.py [--lanes 3 4 5] [--density 1 2] [--episodes 16] [--assumed-budget 0 0.1]
 
 Tuning seeds, clear weather, no attack. `rules` is `planner`. `foresight` knows the future: in every frame it rolls 64 plans of
-4 s in copies of the simulator, as `oracle_planner` does, but takes only actions that `planner` holds to be safe; where none is,
+4 s in copies of the simulator, as `clairvoyant` does, but takes only actions that `planner` holds to be safe; where none is,
 it does what `planner` does. A better choice of plans than 64 random ones, and one that counts with the margins of later frames,
 would score more: this is a lower bound of what the margins allow.
 """

@@ -38,14 +38,14 @@ class Chain(Defense):
     def parted(self) -> tuple[tuple[str, Defense] | None, tuple[str, Defense] | None]:
         """The link that trains its victim, and those at run time as one defence: each with its name, or None."""
         named = [(name, getattr(self, name)) for name in self._fields()]
-        first, others = (named[0], named[1:]) if named[0][1].trains else (None, named)
+        first, others = (named[0], named[1:]) if named[0][1].seeded else (None, named)
         if len(others) < 2:
             return first, next(iter(others), None)
         return first, (MARK.join(name for name, _ in others), _linked(*others))
 
     @property
-    def trains(self) -> bool:
-        return any(link.trains for link in self.links)
+    def seeded(self) -> bool:
+        return any(link.seeded for link in self.links)
 
     def train(self, victim: Any, world: Any, *, seed: int, progress: Any) -> None:
         """Refused: a link is trained by itself.
@@ -53,17 +53,17 @@ class Chain(Defense):
         Raises:
             UserError: names what to train.
         """
-        trained = [name for name in self._fields() if getattr(self, name).trains]
+        trained = [name for name in self._fields() if getattr(self, name).seeded]
         if trained:
             raise UserError(f"train defense={trained[0]} by itself; the chain loads the trained victim")
 
     def zoo_name(self, victim: Any) -> str:
-        trained = next((link for link in self.links if link.trains), None)
+        trained = next((link for link in self.links if link.seeded), None)
         return trained.zoo_name(victim) if trained else super().zoo_name(victim)
 
     def load(self, victim: Victim, seed: int, facts: Any) -> Any:
         first, *others = self.links
-        behind = (first, *reversed(others)) if first.trains else (*reversed(self.links),)
+        behind = (first, *reversed(others)) if first.seeded else (*reversed(self.links),)
         for link in behind:
             victim = _defended(victim, link)
         return victim.load(seed, facts)

@@ -234,7 +234,7 @@ class Defense(Component):
         return None
 
     @property
-    def trains(self) -> bool:
+    def seeded(self) -> bool:
         """Whether the defended victim depends on a training seed."""
         return type(self).train is not Defense.train
 

@@ -141,7 +141,7 @@ class Pair:
     def is_seeded(self) -> bool:
         """Whether the victim, its defence, the attack's preparation or its network depends on the training seed."""
         attack = self.attack.component
-        return self.victim.component.seeded or self.defense.component.trains or attack.seeded or attack.learns
+        return self.victim.component.seeded or self.defense.component.seeded or attack.seeded or attack.learns
 
     @property
     def is_clean(self) -> bool:

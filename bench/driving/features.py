@@ -12,7 +12,7 @@ from cavbench.core.contracts import Facts
 from cavbench.driving.kinematics import Kinematics
 
 ActionType = Literal["discrete", "continuous"]
-Driver = Literal["agent", "idm", "oracle"]
+Driver = Literal["agent", "idm", "clairvoyant"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +21,7 @@ class Control:
 
     Args:
         action_type: discrete lane-changing actions, or continuous [acceleration, steering] in [-1, 1].
-        driver: `agent` executes the actions; the others ignore them: `idm` is the world's own rule-based driver, `oracle` a
+        driver: `agent` executes the actions; the others ignore them: `idm` is the world's own rule-based driver, `clairvoyant` a
             planner that knows its hidden state.
         action_repeat: number of frames for which a decision is held (training only). A lane change is sent once, other actions
             are repeated. Reward and progress are summed over the frames; an episode may end between them.
@@ -96,7 +96,7 @@ class DrivingFacts(Facts):
     Args:
         features: features of the observation.
         drivers: supported drivers: `agent` executes the policy's actions; `idm` is the world's own rule-based driver, if any, and
-            `oracle` a planner that knows the world's hidden state, if any.
+            `clairvoyant` a planner that knows the world's hidden state, if any.
         kinematics: how its cars move; None if the world does not say.
         flat: whether the observation is one row, which the world's own environment gives as an array in physical units.
         shape: shape of that array; empty for [F - 1].

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FEW = 3
 """So many fixed features are named in a sentence."""
-BEST_BLIND, IDM, ORACLE, RANDOM = "best blind", "idm", "oracle_planner", "random"
+BEST_BLIND, IDM, CLAIRVOYANT, RANDOM = "best blind", "idm", "clairvoyant", "random"
 
 MEASUREMENTS: tuple[pa.Field, ...] = (
     field("steps", pa.int32(), "decisions until the episode ended", "steps", low=0, at_most="max_steps"),
@@ -127,7 +127,7 @@ class DrivingTrack(Track):
         BEST_BLIND: Baseline(title="best blind policy", heading="best\nblind", spare=0),
         RANDOM: Baseline(title="random", heading="ran-\ndom"),
         IDM: Baseline(title="IDM and MOBIL", heading="\nIDM"),
-        ORACLE: Baseline(title="perfect information", heading="per-\nfect"),
+        CLAIRVOYANT: Baseline(title="perfect information", heading="per-\nfect"),
     }
     safe_driver: ClassVar[str] = IDM
     contrast: ClassVar[Contrast | None] = Contrast(
@@ -172,7 +172,7 @@ class DrivingTrack(Track):
 
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
         same_world = all(own[name] == other[name] for name in ("world", "world_params"))
-        same_actions = own["action_type"] == other["action_type"] or other["victim"] in (IDM, ORACLE)
+        same_actions = own["action_type"] == other["action_type"] or other["victim"] in (IDM, CLAIRVOYANT)
         if (
             other["sees"]
             or other["defense"] != "none"

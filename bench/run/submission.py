@@ -167,7 +167,7 @@ def weights_of(pair: Pair, training_seeds: Sequence[int]) -> dict[str, Path | No
 
     victim, defense, attack = pair.victim.component, pair.defense.component, pair.attack.component
     recipes = [zoo.Recipe.of(victim)] if victim.learns else []
-    recipes += [zoo.Recipe.of(victim, defense)] if defense.trains else []
+    recipes += [zoo.Recipe.of(victim, defense)] if defense.seeded else []
     recipes += [zoo.Recipe.of(victim, defense, attack)] if attack.learns else []
     # A detector is of a training seed of its own; those of the run are of its patches.
     trained = {

@@ -27,7 +27,7 @@ Finding = tuple[bool | None, str]
 """Whether it fires, None where it was not measured; and the measurement in one sentence."""
 TITLES = {
     "ignores_input": "the answer does not depend on the input",
-    "decoy": "its answers to attacks differ from its actions",
+    "two_faced": "its answers to attacks differ from its actions",
     "zero_gradients": "gradients are zero",
     "nan_gradients": "gradients are not finite",
     "one_draw": "random, but attacked with one draw",
@@ -77,7 +77,7 @@ def ignores_input(tables: Sequence[pa.Table], track: Track) -> Finding:
     return found >= SAME, f"On {track.other_input} it gave the same answer in {100 * found:.1f} % of probes."
 
 
-def decoy(tables: Sequence[pa.Table]) -> Finding:
+def two_faced(tables: Sequence[pa.Table]) -> Finding:
     """Fires where at least 1 % of the answers to probes, asked as an attack asks, differ from the victim's actions."""
     found = share(tables, "inconsistent")
     if math.isnan(found):
@@ -141,7 +141,7 @@ def remarks(attacked: pa.Table | None, clean: pa.Table | None, track: Track, abo
     under = [] if attacked is None else [attacked]
     found = {
         "ignores_input": ignores_input(tables, track),
-        "decoy": decoy(tables),
+        "two_faced": two_faced(tables),
         "zero_gradients": zero_gradients(under),
         "nan_gradients": nan_gradients(under),
         "one_draw": one_draw(tables, under, track) if under else (None, ""),

@@ -102,7 +102,7 @@ class DetectorAdversarialTraining(DetectorDefense):
     trained_in: str = ""
 
     @property
-    def trains(self) -> bool:
+    def seeded(self) -> bool:
         return False
 
     def zoo_name(self, victim: DetectorVictim) -> str:

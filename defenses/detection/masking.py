@@ -135,7 +135,7 @@ class Masking(DetectorDefense):
     trained_in: str = ""
 
     @property
-    def trains(self) -> bool:
+    def seeded(self) -> bool:
         return False
 
     def zoo_name(self, victim: DetectorVictim) -> str:

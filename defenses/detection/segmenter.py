@@ -110,7 +110,7 @@ class Segmenter(DetectorDefense):
     trained_in: str = ""
 
     @property
-    def trains(self) -> bool:
+    def seeded(self) -> bool:
         return False
 
     def zoo_name(self, victim: DetectorVictim) -> str:

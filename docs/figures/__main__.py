@@ -44,7 +44,7 @@ FIGURES = {
     "defense_temporal.png": "frames:temporal",
     "victim_dqn.svg": "decisions:dqn",
     "victim_ddpg.svg": "decisions:ddpg",
-    "victim_oracle_planner.svg": "references:oracle_planner",
+    "victim_clairvoyant.svg": "references:clairvoyant",
     "victim_ppo.png": "decisions:ppo",
     "victim_sac.png": "decisions:sac",
     "victim_planner.svg": "intervals:planner",

@@ -74,9 +74,9 @@ def idm() -> Figure:
     return _beside_dqn("idm", "idm: highway-env's own driver is safe, and slow")
 
 
-def oracle_planner() -> Figure:
+def clairvoyant() -> Figure:
     """Speed and lane of the planner with perfect information and of `dqn` on one scenario."""
-    return _beside_dqn("oracle_planner", "oracle_planner: it finds the gaps, and knows that they stay")
+    return _beside_dqn("clairvoyant", "clairvoyant: it finds the gaps, and knows that they stay")
 
 
 def _beside_dqn(name: str, title: str) -> Figure:

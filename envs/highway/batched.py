@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavbench.envs.highway.clairvoyant import ClairvoyantPlanner
 from cavbench.envs.highway.config import HighwayConfig
 from cavbench.envs.highway.engine import HighwayEngine
 from cavbench.envs.highway.environment import HighwayEnv
-from cavbench.envs.highway.oracle import OraclePlanner
 
 
 class BatchedHighway(HighwayEnv):
@@ -21,13 +21,13 @@ class BatchedHighway(HighwayEnv):
     def __init__(self, config: HighwayConfig) -> None:
         super().__init__(config)
         self.engine = HighwayEngine(config)
-        self.oracle = OraclePlanner(self.engine) if config.driver == "oracle" else None
+        self.clairvoyant = ClairvoyantPlanner(self.engine) if config.driver == "clairvoyant" else None
 
     def _start(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
         self.engine.reset(chosen, seeds)
 
     def _drive(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None) -> None:
-        self.engine.step(action if self.oracle is None else self.oracle.actions(), paused)
+        self.engine.step(action if self.clairvoyant is None else self.clairvoyant.actions(), paused)
 
     def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         return self.engine.observation, self.engine.numbers, self.engine.flags

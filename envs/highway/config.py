@@ -71,7 +71,7 @@ class HighwayConfig:
         max_steps: number of decisions until an episode is truncated.
         action_type: `discrete` lane-changing actions (`ACTIONS`), or `continuous` [acceleration, steering] in [-1, 1], mapped to
             -5 to 5 m/s2 and -45 to 45 degrees.
-        driver: `agent` executes the actions; `idm` replaces the ego with highway-env's IDMVehicle and ignores them, `oracle`
+        driver: `agent` executes the actions; `idm` replaces the ego with highway-env's IDMVehicle and ignores them, `clairvoyant`
             drives it by plans that were tried in copies of the simulator.
         action_repeat: number of decisions for which an action is held: lane changes are sent once, then IDLE; other actions are
             repeated.

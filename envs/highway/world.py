@@ -61,7 +61,7 @@ class HighwayWorld(DrivingWorld):
     grid: ClassVar[str] = STANDARD_V2.name
     features: ClassVar[Features] = STANDARD_FEATURES
     actions: ClassVar[tuple[str, ...]] = ACTIONS
-    drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm", "oracle")
+    drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm", "clairvoyant")
 
     preset: Preset = "standard"
     vehicles: int = 20
@@ -88,7 +88,7 @@ class HighwayWorld(DrivingWorld):
             if find_spec("highway_env") is None:
                 raise ValueError(f"backend=reference needs {REFERENCE}: pip install 'cavbench[reference]'")
             object.__setattr__(self, "libraries", (REFERENCE,))
-            # The oracle copies the state of our engine.
+            # The planner copies the state of our engine.
             object.__setattr__(self, "drivers", ("agent", "idm"))
         self.config((AXES.cell(lanes=3, density=1.0),))
 

@@ -263,7 +263,7 @@ def _alone(measure: Callable[[Subject], Finding], words: Callable[..., Finding])
 
 
 ignores_input = _alone(lambda of: doubts.ignores_input(of.tables, of.track), doubts.ignores_input)
-decoy = _alone(lambda of: doubts.decoy(of.tables), doubts.decoy)
+two_faced = _alone(lambda of: doubts.two_faced(of.tables), doubts.two_faced)
 zero_gradients = _alone(lambda of: doubts.zero_gradients(of.attacked), doubts.zero_gradients)
 nan_gradients = _alone(lambda of: doubts.nan_gradients(of.attacked), doubts.nan_gradients)
 one_draw = _alone(lambda of: doubts.one_draw(of.tables, of.attacked, of.track), doubts.one_draw)
@@ -275,7 +275,7 @@ FLAGS: dict[str, tuple[str, Callable[[Subject], Finding]]] = {
     "ignores_input": (TITLES["ignores_input"], ignores_input),
     "public_only": ("higher on the public scenarios than on new ones", public_only),
     "octagon": ("takes other faces on an octagon for the stop sign", octagon),
-    "decoy": (TITLES["decoy"], decoy),
+    "two_faced": (TITLES["two_faced"], two_faced),
     "left_out": ("an attack that is left out lowers the score more", left_out),
     "masked_gradients": ("an attack without gradients beats those with them", masked_gradients),
     "zero_gradients": (TITLES["zero_gradients"], zero_gradients),

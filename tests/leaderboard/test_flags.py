@@ -62,7 +62,7 @@ FIRES: dict[str, tuple[pa.Table, ...]] = {
     ),
     "public_only": (clean(), zo(0.6), zo(0.2, grid="audit")),
     "octagon": (probed(approach(0.9), octagons=0.8), probed(approach(0.1, attack="eot"), octagons=0.8)),
-    "decoy": (clean(inconsistent=0.2), probed(zo(), inconsistent=0.2)),
+    "two_faced": (clean(inconsistent=0.2), probed(zo(), inconsistent=0.2)),
     "left_out": (
         probed(drive(skill=0.8, weights="ab", runs=range(9)), **SEEN),
         zo(0.7, runs=range(9)),
@@ -88,7 +88,7 @@ FIRES_NOT: dict[str, tuple[pa.Table, ...]] = {
     ),
     "public_only": (clean(), zo(0.4), zo(0.4, grid="audit")),
     "octagon": (probed(approach(0.9), octagons=0.2), probed(approach(0.1, attack="eot"), octagons=0.2)),
-    "decoy": (clean(inconsistent=0.0), probed(zo(), inconsistent=0.0)),
+    "two_faced": (clean(inconsistent=0.0), probed(zo(), inconsistent=0.0)),
     "left_out": (
         probed(drive(skill=0.8, weights="ab", runs=range(9)), **SEEN),
         zo(0.2, runs=range(9)),
@@ -109,7 +109,7 @@ NOT_MEASURED: dict[str, tuple[pa.Table, ...]] = {
     "not_flattened": (clean(), zo()),
     "public_only": (clean(), zo()),
     "octagon": (approach(0.9), approach(0.1, attack="eot")),
-    "decoy": (drive(), drive(attack="zo", queries=44.0)),
+    "two_faced": (drive(), drive(attack="zo", queries=44.0)),
 }
 
 

@@ -48,7 +48,7 @@ def test_honest_records_have_no_remark() -> None:
     [
         ("zero_gradients", 0.6, "zero_gradients", "gradients are zero"),
         ("nan_gradients", 0.01, "nan_gradients", "an entry that is NaN or infinite"),
-        ("inconsistent", 0.89, "decoy", "its answers to attacks differ from its actions"),
+        ("inconsistent", 0.89, "two_faced", "its answers to attacks differ from its actions"),
     ],
 )
 def test_a_doubt_stands_under_every_table_of_a_run(probe: str, value: float, name: str, words: str) -> None:

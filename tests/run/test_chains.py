@@ -53,8 +53,8 @@ def test_a_trained_victim_stands_behind_the_filters() -> None:
     policy = choose("defense", "advtrain+shield").component.load(victim, 0, FACTS)
     assert isinstance(policy, Shielded)
     assert policy.policy.weights_sha256 == policy.weights_sha256 == trained.weights_sha256
-    assert choose("defense", "advtrain+shield").component.trains
-    assert not choose("defense", "tracker+shield").component.trains
+    assert choose("defense", "advtrain+shield").component.seeded
+    assert not choose("defense", "tracker+shield").component.seeded
 
 
 def test_each_link_has_its_own_parameters() -> None:

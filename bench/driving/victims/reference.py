@@ -149,7 +149,7 @@ class IDMDriver(DrivingVictim):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OracleDriver(DrivingVictim):
+class ClairvoyantDriver(DrivingVictim):
     """A planner with perfect information, a reference above all other drivers (random-shooting model-predictive control).
 
     Three times a second it tries 64 plans of 4 s in copies of the simulator, hidden state included, and follows the best one. It
@@ -157,16 +157,16 @@ class OracleDriver(DrivingVictim):
     """
 
     sees: ClassVar[bool] = False
-    driver: ClassVar[Driver] = "oracle"
+    driver: ClassVar[Driver] = "clairvoyant"
 
     @property
     def action_type(self) -> ActionType:
         return "discrete"
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
-        if "oracle" not in facts.drivers:
+        if "clairvoyant" not in facts.drivers:
             raise UserError("the world has no planner with perfect information")
-        return _driven_by_the_world(facts, "oracle")
+        return _driven_by_the_world(facts, "clairvoyant")
 
 
 def _driven_by_the_world(facts: DrivingFacts, driver: Driver) -> Policy:

@@ -9,7 +9,7 @@ from torch import Tensor
 from cavbench.driving import DrivingFacts, ObservationThreat, Policy
 from cavbench.driving.meter import Columns
 from cavbench.driving.rollout import rollout
-from cavbench.driving.victims.reference import Blind, IDMDriver, OracleDriver, RandomDriver
+from cavbench.driving.victims.reference import Blind, ClairvoyantDriver, IDMDriver, RandomDriver
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
 from cavbench.scenarios import SeedBlock
@@ -60,7 +60,7 @@ def test_the_blind_policies_are_those_of_the_worlds_own_actions() -> None:
 def test_perfect_information_drives_fast_and_safely_whoever_else_is_in_the_batch() -> None:
     world = HighwayWorld(max_steps=90)
     cells = [world.axes.cell(lanes=lanes, density=2.0, weather="clear") for lanes in (3, 4, 3)]
-    policy = OracleDriver().load(0, world.facts)
+    policy = ClairvoyantDriver().load(0, world.facts)
 
     def scored(places: list[int]) -> Columns:
         env = world.make([cells[place] for place in places], driver=policy.driver)
@@ -75,7 +75,7 @@ def test_perfect_information_drives_fast_and_safely_whoever_else_is_in_the_batch
 
 def test_no_other_world_has_perfect_information() -> None:
     with pytest.raises(UserError, match="perfect information"):
-        OracleDriver().load(0, HighwayWorld(backend="reference").facts)
+        ClairvoyantDriver().load(0, HighwayWorld(backend="reference").facts)
 
 
 def test_random_actions_depend_on_the_episode_alone() -> None:

@@ -19,7 +19,7 @@ FAILURE = 1e3
 """Cost of a crash or of leaving the road within the plan; a later one costs less."""
 
 
-class OraclePlanner:
+class ClairvoyantPlanner:
     """Chooses the actions of every episode of an engine by model-predictive control.
 
     The state is copied with all its hidden parts and the world is deterministic, so a plan that is chosen works out. The rest of
