@@ -18,7 +18,7 @@ from cavbench.detection.trial import try_detector
 from cavbench.detection.victims.from_file import DetectorFile
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.errors import UserError
-from tests.detection.victims.test_detector_files import NAMES, RedCells, torch_file
+from tests.detection.victims.test_from_file import NAMES, RedCells, torch_file
 from tests.plugins.toy_camera import RED_V1, RedDetector, RedStreet, RedVictim
 
 WORLD = RedStreet()

@@ -46,7 +46,7 @@ from cavbench.records.store import FOLDER
 from cavbench.run import received
 from cavbench.run.config import run_config, train_config
 from cavbench.run.submission import DESCRIPTION, FORMAT
-from tests.detection.victims import test_detector_files as detectors
+from tests.detection.victims import test_from_file as detectors
 from tests.driving.victims import test_from_file as drivers
 from tests.formats import test_onnx_files as models
 from tests.soak.fuzzing.changes import (

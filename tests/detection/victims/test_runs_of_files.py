@@ -10,7 +10,7 @@ import pytest
 from cavbench.records import reading
 from cavbench.run.replay import replay
 from tests.detection.test_detection import Bench
-from tests.detection.victims.test_detector_files import NAMES, onnx_file, torch_file
+from tests.detection.victims.test_from_file import NAMES, onnx_file, torch_file
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 WORDS = (

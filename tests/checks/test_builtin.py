@@ -15,7 +15,7 @@ import pytest
 from cavbench.checks.builtin import with_entry
 from cavbench.core.checkout import entry_points
 from cavbench.errors import UserError
-from tests.checks.test_new import EVERY, TESTS, name_of
+from tests.checks.test_scaffold import EVERY, TESTS, name_of
 from tests.cli.test_cli import assert_one_line
 from tests.command import SETTINGS, Said, import_path
 from tests.plugins.distributions import install
