@@ -23,9 +23,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-import attacks
-import leaderboard
-from cavbench import bounded, zoo
+from cavbench import attacks, bounded, leaderboard, zoo
 from cavbench.archive import Archive
 from cavbench.core.pair import choose
 from cavbench.core.suites import Suite
@@ -44,7 +42,7 @@ from cavbench.formats.pickled_array import floats
 from cavbench.records import reading
 from cavbench.records.store import FOLDER
 from cavbench.run import received
-from cavbench.run.config import run_config, train_config
+from cavbench.run.config import plan_of, training_of
 from cavbench.run.submission import DESCRIPTION, FORMAT
 from tests.detection.victims import test_from_file as detectors
 from tests.driving.victims import test_from_file as drivers
@@ -337,7 +335,7 @@ def _read_zip(folder: Path) -> None:
 
 
 def _suite() -> Files:
-    path = ATTACKS / "standard-2.toml"
+    path = ATTACKS / "driving" / "standard-2.toml"
     return {path.name: path.read_bytes()}
 
 
@@ -355,7 +353,7 @@ RUN_WORDS = ("attack=pgd", "density=1.5", "weather=clear", "episodes=4", "worker
 
 
 def _read_words(folder: Path) -> None:
-    for name, reads in (("run", run_config), ("train", train_config)):
+    for name, reads in (("run", plan_of), ("train", training_of)):
         reads((folder / name).read_bytes().decode("utf-8", "surrogateescape").split("\0"))
 
 
