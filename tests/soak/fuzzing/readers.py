@@ -122,9 +122,9 @@ def _written(write: Callable[[Path], object], name: str) -> Files:
 
 def _unit(data: str, rows: int) -> tuple[str, pa.Table]:
     """The records of a unit that ships with the project."""
-    table = pq.read_table(DATA / data)
+    table = reading.read_file(DATA / data)
     unit = table["unit"][0].as_py()
-    return unit, reading.upgraded(DATA / data).filter(pa.compute.equal(table["unit"], unit)).slice(0, rows)
+    return unit, table.filter(pa.compute.equal(table["unit"], unit)).slice(0, rows)
 
 
 def _records(data: str) -> Files:
@@ -152,7 +152,7 @@ def _read_records(folder: Path) -> None:
 
 
 def _submission() -> Files:
-    unit, table = _unit("thesis.parquet", 3)
+    unit, table = _unit("standard-v2/dqn.parquet", 3)
     files = _written(lambda path: (path.parent.mkdir(), pq.write_table(table, path)), f"{FOLDER}/{unit}.parquet")
     about = {
         "format": FORMAT,
@@ -367,13 +367,13 @@ READERS: Mapping[str, Reader] = {
     for reader in (
         Reader(
             name="records of driving",
-            make=lambda: _records("thesis.parquet"),
+            make=lambda: _records("standard-v2/dqn.parquet"),
             change={"": changed_table},
             read=_read_records,
         ),
         Reader(
             name="records of detection",
-            make=lambda: _records("approaches.parquet"),
+            make=lambda: _records("approach-v1/fcos.parquet"),
             change={"": changed_table},
             read=_read_records,
         ),
