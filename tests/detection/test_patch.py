@@ -123,3 +123,23 @@ def test_a_patch_file_of_another_form_is_refused_in_one_line(value: str) -> None
     header = content[8 : 8 + size].replace(b'"queries":"7"', f'"queries":{value}'.encode())
     with pytest.raises(UserError, match="truncated or foreign"):
         Patch.read(len(header).to_bytes(8, "little") + header + content[8 + size :])
+
+
+def test_a_detector_whose_gradient_is_nan_in_one_pixel_is_attacked_through_the_others() -> None:
+    class Spotted(RedDetector):
+        def forward(self, pictures: Tensor) -> object:
+            return super().forward(pictures + 0.0 * (pictures - pictures.detach()).abs().sqrt() * spot)
+
+    pictures = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    spot = torch.zeros(3, 32, 32)
+    spot[0, 5, 6] = 1.0
+    gradients = []
+    for detector in (RedDetector(), Spotted()):
+        enforcer = PatchEnforcer(detector.eval(), PatchThreat(), "gradients", torch.Generator())
+        leaf = pictures.clone().requires_grad_(True)
+        enforcer.oracle.differentiable(leaf).objectness.sum().backward()
+        assert leaf.grad is not None
+        gradients.append(leaf.grad)
+    assert bool(gradients[0].any())
+    assert torch.equal(gradients[1], gradients[0].masked_fill(gradients[1] == 0, 0.0))
+    assert (enforcer.backwards, enforcer.nans) == (2, 2)
