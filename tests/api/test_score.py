@@ -24,7 +24,7 @@ from cavbench.errors import UserError
 from cavbench.records import reading
 from cavbench.run import runner
 from cavbench.run.config import plan_of
-from tests.driving.victims.test_from_file import sb3_model, spaces
+from tests.driving.victims.policy_files import sb3_model, spaces
 
 SHORT = HighwayWorld(max_steps=15)
 WHERE: dict[str, Any] = {"lanes": 3, "density": 1, "weather": "clear", "episodes": 2, "world": SHORT}

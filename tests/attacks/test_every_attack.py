@@ -1,4 +1,4 @@
-"""Properties of every attack with any parameters: it stays inside the threat model and changes nothing else."""
+"""Every built-in attack keeps the rules of `bench check`; attacks without a network keep them with any parameters."""
 
 from __future__ import annotations
 
@@ -16,6 +16,11 @@ from cavbench.attacks.driving.zo import ZOSignSGD
 from cavbench.driving import ActionType, DrivingAttack, ObservationThreat
 from cavbench.driving.threat import Norm
 from tests.attacks.driving.victims import FEATURES, observations, perturb, victim
+from tests.checks.rules import broken, built_in, each
+
+OWN_TESTS = {"art", "none"}
+"""`art` needs a choice: test_art.py checks some. `none` answers nothing: test_none.py drives with it."""
+ATTACKS = built_in("attack").keys() - OWN_TESTS
 
 OBJECTIVES = ("collision", "expected", "margin", "target")
 ZO_OBJECTIVES = (*OBJECTIVES, "thesis")
@@ -43,6 +48,11 @@ noise = st.builds(Noise, distribution=st.sampled_from(("uniform", "gaussian")), 
 attacks = st.one_of(zo, pgd, noise)
 action_types: st.SearchStrategy[ActionType] = st.sampled_from(("discrete", "continuous"))
 norms: st.SearchStrategy[Norm] = st.sampled_from(("relative", "linf"))
+
+
+@each(sorted(ATTACKS))
+def test_it_keeps_the_rules(name: str) -> None:
+    assert broken("attack", name) == {}
 
 
 @settings(max_examples=80, deadline=None)

@@ -1,4 +1,4 @@
-"""`bench check`: every built-in component passes, and every broken rule is found by its check."""
+"""`bench check` finds every broken rule, and says what to fix."""
 
 from __future__ import annotations
 
@@ -9,38 +9,13 @@ from typing import Any
 import pytest
 
 from cavbench.checks import examine
-from cavbench.core import registry
-from cavbench.core.registry import GROUPS, KINDS, Kind
+from cavbench.core.registry import Kind
+from tests.checks.rules import broken
 from tests.cli.test_cli import assert_one_line
 from tests.command import Said
 from tests.plugins.distributions import install
 
 Bench = Callable[..., Said]
-FROM_FILES = {"sb3", "torch", "onnx", "detector"}
-"""Victims that need a file of the user: `tests/driving/victims/test_from_file.py` and `test_detector_files.py` check them."""
-ADAPTERS = {"art"}
-"""Adapters, which need a choice: `tests/attacks/driving/test_art.py` checks some."""
-QUICK = {"noise", "noise_patch", "grey_patch", "blind", "random", "idm"}
-BUILT_IN: list[tuple[Kind, str]] = [
-    (kind, name)
-    for kind in KINDS
-    for name, claims in registry.entries(GROUPS[kind]).items()
-    if claims[0].distribution == "cavbench" and name not in FROM_FILES | ADAPTERS
-]
-
-
-def failures(kind: Kind, name: str, **values: str) -> dict[str, str]:
-    return {outcome.check: outcome.text for outcome in examine(kind, name, values) if outcome.status == "fail"}
-
-
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [pytest.param(*one, marks=pytest.mark.slow) if one[1] not in QUICK else one for one in BUILT_IN],
-)
-def test_every_built_in_component_keeps_the_rules(kind: Kind, name: str) -> None:
-    assert failures(kind, name) == {}
-
-
 CROOKED = '''
 import random
 from dataclasses import dataclass, field
@@ -316,7 +291,7 @@ def crooked(plugins: Path) -> None:
 @pytest.mark.usefixtures("crooked")
 @pytest.mark.parametrize(("kind", "name", "rule", "check", "part"), RULES, ids=[f"{r[1]}-{r[2]}" for r in RULES])
 def test_a_broken_rule_is_reported_with_its_fix(kind: Kind, name: str, rule: str, check: str, part: str) -> None:
-    found = failures(kind, name, rule=rule)
+    found = broken(kind, name, rule=rule)
     assert part in found[check]
     assert "\n" not in found[check]
 
@@ -324,13 +299,13 @@ def test_a_broken_rule_is_reported_with_its_fix(kind: Kind, name: str, rule: str
 @pytest.mark.usefixtures("crooked")
 @pytest.mark.parametrize(("kind", "name"), [("attack", "crooked"), ("attack", "bad_patch"), ("victim", "bad")])
 def test_a_component_that_breaks_no_rule_passes(kind: Kind, name: str) -> None:
-    assert failures(kind, name) == {}
+    assert broken(kind, name) == {}
 
 
 @pytest.mark.usefixtures("crooked")
 def test_rules_for_all_components_are_checked() -> None:
-    assert "Undocumented has no docstring" in failures("attack", "undocumented")["docs"]
-    unwritten = failures("attack", "unwritten")
+    assert "Undocumented has no docstring" in broken("attack", "undocumented")["docs"]
+    unwritten = broken("attack", "unwritten")
     assert "the parameters of attack 'unwritten' cannot be set on the command line" in unwritten["command line"]
     assert "keep only plain values in its fields" in unwritten["worker processes"]
 

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.attacks.detection.square_patch import SquarePatch
-from cavbench.checks import complaints
 from cavbench.core.pair import choose
 from cavbench.detection import Detector, PatchThreat
 from cavbench.detection.crafting import craft
@@ -26,6 +25,7 @@ from cavbench.errors import UserError
 from cavbench.formats.torch_operations import operation
 from cavbench.formats.trial import RefusedError
 from cavbench.run.config import component, plan_of
+from tests.checks.rules import broken
 from tests.plugins.toy_camera import RedScenes
 
 FACTS = StopSignApproach().facts
@@ -207,8 +207,8 @@ def test_the_zoos_yolov5_answers_the_same_from_both_kinds_of_files(tmp_path: Pat
 
 
 def test_victims_from_detector_files_keep_the_rules(program: str, black_box: str) -> None:
-    assert complaints("victim", "detector", path=program, names=NAMES, frame="32") == []
-    assert complaints("victim", "detector", path=black_box, names=NAMES) == []
+    assert broken("victim", "detector", path=program, names=NAMES, frame="32") == {}
+    assert broken("victim", "detector", path=black_box, names=NAMES) == {}
 
 
 def test_a_gradient_goes_through_a_program_and_its_border(program: str) -> None:

@@ -23,7 +23,7 @@ from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
 from cavbench.run import runner
 from cavbench.run.config import plan_of
-from tests.driving.victims.test_from_file import saved, sb3_model, spaces
+from tests.driving.victims.policy_files import saved, sb3_model, spaces
 
 sb3 = pytest.importorskip("stable_baselines3")
 WORLD = HighwayWorld(max_steps=15)

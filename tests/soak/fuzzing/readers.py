@@ -45,7 +45,7 @@ from cavbench.run import received
 from cavbench.run.config import plan_of, training_of
 from cavbench.run.submission import DESCRIPTION, FORMAT
 from tests.detection.victims import test_from_file as detectors
-from tests.driving.victims import test_from_file as drivers
+from tests.driving.victims import policy_files as drivers
 from tests.formats import test_onnx_files as models
 from tests.soak.fuzzing.changes import (
     changed,

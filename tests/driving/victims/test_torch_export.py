@@ -1,0 +1,44 @@
+"""Victims from programs of `torch.export` drive like the exported policy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cavbench.core.pair import choose
+from tests.checks.rules import broken
+from tests.driving.victims.policy_files import (
+    FACTS,
+    Scores,
+    driven,
+    torch_file,
+)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return torch_file(tmp_path_factory.mktemp("torch") / "policy.pt2")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attack", ["none", "zo", "pgd"])
+def test_an_exported_dqn_drives_exactly_like_the_zoos(exported: str, attack: str) -> None:
+    own, ours = driven(f"attack={attack}", "victim=torch", f"victim.path={exported}"), driven(f"attack={attack}")
+    for name in ours:
+        np.testing.assert_array_equal(own[name], ours[name], err_msg=name)
+
+
+@pytest.mark.slow
+def test_it_keeps_the_rules(exported: str) -> None:
+    assert broken("victim", "torch", path=exported) == {}
+
+
+def test_a_network_with_flat_input_receives_flat_observations(tmp_path: Path) -> None:
+    path = torch_file(tmp_path / "flat.pt2", Scores(flat=True), shape=(50,))
+    observation = torch.rand(2, 3, 10, 5)
+    flat = choose("victim", "torch", path=path).component.load(0, FACTS)
+    assert torch.equal(flat.scores(observation), choose("victim", "dqn").component.load(0, FACTS).scores(observation))
+    assert flat.scores(observation[:0]).shape == (0, 3, 5)

@@ -1,0 +1,12 @@
+"""Every built-in world keeps the rules of `bench check`: it drives, or shows its frames."""
+
+from __future__ import annotations
+
+from tests.checks.rules import broken, built_in, each
+
+WORLDS = built_in("world")
+
+
+@each(WORLDS)
+def test_it_keeps_the_rules(name: str) -> None:
+    assert broken("world", name) == {}
