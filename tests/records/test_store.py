@@ -312,10 +312,9 @@ def test_a_column_of_another_type_is_refused_by_every_reader(
         all_of_it()
 
 
-@pytest.mark.parametrize("compact", [False, True], ids=["show", "report"])
-def test_files_that_begin_alike_are_checked_once(compact: bool, written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_begin_alike_are_checked_once(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reading.read_compact(written, MEASURED)
-    monkeypatch.setattr(footers, "check", None)
+    monkeypatch.setattr(footers, "track_of", None)
     assert len(reading.read_compact(written, MEASURED)["driving"])
 
 
