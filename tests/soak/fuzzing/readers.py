@@ -23,9 +23,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-import attacks
-import leaderboard
-from cavbench import bounded, zoo
+from cavbench import attacks, bounded, leaderboard, zoo
 from cavbench.archive import Archive
 from cavbench.core.pair import choose
 from cavbench.core.suites import Suite
@@ -44,7 +42,7 @@ from cavbench.formats.pickled_array import floats
 from cavbench.records import reading
 from cavbench.records.store import FOLDER
 from cavbench.run import received
-from cavbench.run.config import run_config, train_config
+from cavbench.run.config import plan_of, training_of
 from cavbench.run.submission import DESCRIPTION, FORMAT
 from tests.detection.victims import test_detector_files as detectors
 from tests.driving.victims import test_from_file as drivers
@@ -62,7 +60,7 @@ from tests.soak.fuzzing.changes import (
 Files = Mapping[str, bytes]
 FACTS, CAMERA = HighwayWorld().facts, StopSignApproach().facts
 DATA = Path(leaderboard.__file__).parent / "data"
-ATTACKS = Path(attacks.__file__).parent
+ATTACKS = Path(attacks.__file__).parent / "driving"
 TINY = DQN(hidden=8)
 SEED = 3
 
@@ -126,7 +124,7 @@ def _unit(data: str, rows: int) -> tuple[str, pa.Table]:
     """The records of a unit that ships with the project."""
     table = pq.read_table(DATA / data)
     unit = table["unit"][0].as_py()
-    return unit, reading.upgraded(DATA / data).filter(pa.compute.equal(table["unit"], unit)).slice(0, rows)
+    return unit, reading.read_file(DATA / data).filter(pa.compute.equal(table["unit"], unit)).slice(0, rows)
 
 
 def _records(data: str) -> Files:
@@ -154,7 +152,7 @@ def _read_records(folder: Path) -> None:
 
 
 def _submission() -> Files:
-    unit, table = _unit("thesis.parquet", 3)
+    unit, table = _unit("standard-v2/ddpg.parquet", 3)
     files = _written(lambda path: (path.parent.mkdir(), pq.write_table(table, path)), f"{FOLDER}/{unit}.parquet")
     about = {
         "format": FORMAT,
@@ -355,7 +353,7 @@ RUN_WORDS = ("attack=pgd", "density=1.5", "weather=clear", "episodes=4", "worker
 
 
 def _read_words(folder: Path) -> None:
-    for name, reads in (("run", run_config), ("train", train_config)):
+    for name, reads in (("run", plan_of), ("train", training_of)):
         reads((folder / name).read_bytes().decode("utf-8", "surrogateescape").split("\0"))
 
 
@@ -369,13 +367,13 @@ READERS: Mapping[str, Reader] = {
     for reader in (
         Reader(
             name="records of driving",
-            make=lambda: _records("thesis.parquet"),
+            make=lambda: _records("standard-v2/ddpg.parquet"),
             change={"": changed_table},
             read=_read_records,
         ),
         Reader(
             name="records of detection",
-            make=lambda: _records("approaches.parquet"),
+            make=lambda: _records("approach-v1/fcos.parquet"),
             change={"": changed_table},
             read=_read_records,
         ),
