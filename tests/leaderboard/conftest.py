@@ -14,7 +14,6 @@ import pytest
 from filelock import FileLock
 from rich.console import Console
 
-import leaderboard
 from cavbench.leaderboard.page.write import write as write_page
 from tests.leaderboard.full_house import write as write_records
 from tests.leaderboard.synthetic import grid_is_known
@@ -51,7 +50,6 @@ def published_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
             done = subprocess.run(
                 [sys.executable, "report.py", "index.html"],
                 cwd=folder,
-                env={**os.environ, "PYTHONPATH": str(Path(leaderboard.__file__).parents[1])},
                 capture_output=True,
                 text=True,
             )
