@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from cavbench.driving.intervals.rooms import cars_of
 from cavbench.driving.metrics import safe_progress
 from cavbench.driving.victims.planner import IntervalPlanner, Planner
+from cavbench.envs.highway.clairvoyant import LIBRARY, PLANS, ClairvoyantPlanner
 from cavbench.envs.highway.ego import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from cavbench.envs.highway.engine import Flag, HighwayEngine, Number
-from cavbench.envs.highway.oracle import LIBRARY, PLANS, OraclePlanner
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import in_one_line
 from cavbench.run.process import settle
@@ -36,8 +36,8 @@ class Foresight:
     """Chooses the actions of an engine's episodes among those that are safe on intervals, by their simulated future."""
 
     def __init__(self, engine: HighwayEngine) -> None:
-        self.oracle = OraclePlanner(engine)
-        self.plan = self.oracle.plan
+        self.clairvoyant = ClairvoyantPlanner(engine)
+        self.plan = self.clairvoyant.plan
 
     def actions(self, step: int, safe: NDArray[np.bool_], otherwise: NDArray[np.int64]) -> NDArray[np.int64]:
         """The actions [B] in this step.
@@ -47,14 +47,14 @@ class Foresight:
             safe: bool [B, A], the actions that may be taken.
             otherwise: [B] what is done where there is none.
         """
-        tried = self.oracle.library[(step * PLANS + np.arange(PLANS)) % LIBRARY][None].repeat(len(safe), 0)
+        tried = self.clairvoyant.library[(step * PLANS + np.arange(PLANS)) % LIBRARY][None].repeat(len(safe), 0)
         if step:
             tried[:, 0] = np.roll(self.plan, -1, axis=1)
             tried[:, 0, -1] = IDLE
         for place, action in enumerate((FASTER, IDLE, SLOWER, LANE_LEFT, LANE_RIGHT), start=1):
             tried[:, place] = FASTER if action in (LANE_LEFT, LANE_RIGHT) else action
             tried[:, place, 0] = action
-        worth = self.oracle.worth(np.arange(len(tried)), tried)
+        worth = self.clairvoyant.worth(np.arange(len(tried)), tried)
         worth = np.where(np.take_along_axis(safe, tried[:, :, 0], 1), worth, FORBIDDEN)
         self.plan = tried[np.arange(len(tried)), worth.argmax(1)]
         return np.where(worth.max(1) > FORBIDDEN, self.plan[:, 0], otherwise)

@@ -1,4 +1,4 @@
-"""`bench help TERM`: explains a term, a column, an option, a component or a command."""
+"""`bench help TERM`: explains a term, a column, a parameter, a component or a command."""
 
 from __future__ import annotations
 

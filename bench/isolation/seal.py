@@ -12,7 +12,7 @@ class Seal:
     """The functions and methods of some modules as they are when the seal is made.
 
     Args:
-        modules: modules of `bench`; make the seal before any plug-in can be imported.
+        modules: modules of `cavbench`; make the seal before any plug-in can be imported.
     """
 
     def __init__(self, *modules: ModuleType) -> None:

@@ -213,8 +213,9 @@ def test_load_adds_a_defence() -> None:
 
 def test_importing_and_listing_load_no_torch() -> None:
     code = (
-        "import sys, bench, cavbench; dir(cavbench); sys.argv = ['bench', 'list']\n"
-        "try: cavbench.main()\n"
+        "import sys, cavbench; dir(cavbench); sys.argv = ['bench', 'list']\n"
+        "from cavbench.__main__ import main\n"
+        "try: main()\n"
         "except SystemExit as end: assert not end.code\n"
         "heavy = {'torch', 'numba', 'pandas', 'gymnasium', 'rerun'} & set(sys.modules); assert not heavy, heavy"
     )

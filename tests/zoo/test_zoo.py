@@ -151,7 +151,7 @@ SlowDQN.__qualname__ = "DQN"
 def as_of_bench(recipe: zoo.Recipe) -> zoo.Recipe:
     """The recipe of a test class as if it were part of bench."""
     (part,) = recipe.parts
-    return replace(recipe, parts=(replace(part, source="cavbench.DQN"),))
+    return replace(recipe, parts=(replace(part, source="bench.DQN"),))
 
 
 def test_a_new_parameter_with_a_default_refuses_no_shipped_policy(home: Path) -> None:

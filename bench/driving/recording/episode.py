@@ -26,7 +26,7 @@ class Episode:
     Args:
         steps: arrays [T, ...] by name, as in `cavbench.driving.rollout.Trace` but without the batch dimension.
         facts: facts of the world.
-        meta: columns of the episode's record (`cavbench.records.store.SCHEMA`); some may be missing.
+        meta: columns of the episode's record (`cavbench.records.schema.schema`); some may be missing.
     """
 
     steps: Mapping[str, NDArray[np.generic]]

@@ -60,7 +60,7 @@ from tests.soak.fuzzing.changes import (
 Files = Mapping[str, bytes]
 FACTS, CAMERA = HighwayWorld().facts, StopSignApproach().facts
 DATA = Path(leaderboard.__file__).parent / "data"
-ATTACKS = Path(attacks.__file__).parent
+ATTACKS = Path(attacks.__file__).parent / "driving"
 TINY = DQN(hidden=8)
 SEED = 3
 
@@ -122,9 +122,9 @@ def _written(write: Callable[[Path], object], name: str) -> Files:
 
 def _unit(data: str, rows: int) -> tuple[str, pa.Table]:
     """The records of a unit that ships with the project."""
-    table = reading.read_file(DATA / data)
+    table = pq.read_table(DATA / data)
     unit = table["unit"][0].as_py()
-    return unit, table.filter(pa.compute.equal(table["unit"], unit)).slice(0, rows)
+    return unit, reading.read_file(DATA / data).filter(pa.compute.equal(table["unit"], unit)).slice(0, rows)
 
 
 def _records(data: str) -> Files:
@@ -152,7 +152,7 @@ def _read_records(folder: Path) -> None:
 
 
 def _submission() -> Files:
-    unit, table = _unit("standard-v2/dqn.parquet", 3)
+    unit, table = _unit("standard-v2/ddpg.parquet", 3)
     files = _written(lambda path: (path.parent.mkdir(), pq.write_table(table, path)), f"{FOLDER}/{unit}.parquet")
     about = {
         "format": FORMAT,
@@ -335,7 +335,7 @@ def _read_zip(folder: Path) -> None:
 
 
 def _suite() -> Files:
-    path = ATTACKS / "driving" / "standard-2.toml"
+    path = ATTACKS / "standard-2.toml"
     return {path.name: path.read_bytes()}
 
 
@@ -367,7 +367,7 @@ READERS: Mapping[str, Reader] = {
     for reader in (
         Reader(
             name="records of driving",
-            make=lambda: _records("standard-v2/dqn.parquet"),
+            make=lambda: _records("standard-v2/ddpg.parquet"),
             change={"": changed_table},
             read=_read_records,
         ),
