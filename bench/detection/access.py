@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import NoReturn
 
 import torch
 from torch import Tensor
@@ -43,6 +44,10 @@ class PatchOracle:
     """Names of the detector's classes, by label."""
     reports: Reports
     """What was reported."""
+
+    def __reduce__(self) -> NoReturn:
+        # `copy.copy`, `copy.deepcopy` and `pickle` ask here. A deep copy would ask a copy of the detector, uncounted.
+        raise TypeError("an oracle cannot be copied")
 
     def index(self, name: str) -> int:
         """The label of a class.

@@ -42,7 +42,15 @@ class FilteredDetector(Wrapped):
 
     def predict(self, pictures: Tensor) -> Predictions:
         if self.defense.differentiable:
-            return self.inner.predict(self.defense.filter(pictures))
+            return self.inner.predict(self._filtered(pictures))
         with torch.no_grad():
-            change = self.defense.filter(pictures) - pictures
+            change = self._filtered(pictures) - pictures
         return self.inner.predict(pictures + change)
+
+    def _filtered(self, pictures: Tensor) -> Tensor:
+        seen = self.defense.filter(pictures)
+        # A sum would repeat a smaller answer, and the detector would see something else than the filter meant.
+        if getattr(seen, "shape", None) != pictures.shape:
+            name, shape = type(self.defense).__name__, tuple(pictures.shape)
+            raise ValueError(f"the filter {name} must answer images {shape} with a tensor of that shape")
+        return seen

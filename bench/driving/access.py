@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -65,6 +66,10 @@ class Oracle:
     """Whether the victim decides discretely or continuously."""
     draws: int
     """How often the victim is asked about each point: 1 unless it is random."""
+
+    def __reduce__(self) -> NoReturn:
+        # `copy.copy`, `copy.deepcopy` and `pickle` ask here. A deep copy would ask a copy of the victim, uncounted.
+        raise TypeError("an oracle cannot be copied; oracle.select(rows) makes one of some episodes")
 
     def select(self, rows: Tensor) -> Oracle:
         """An oracle of some of these episodes: B is then R, in what it has and in what it is asked. Only they pay queries.

@@ -96,10 +96,14 @@ class FilteredPolicy(PolicyWrapper):
         if self.defense.remembers():
             assert state is not None
             memory, inner = state.get("memory", None), state.get("policy", None)
-        if self.defense.differentiable:
-            return *self.defense.step(observation, memory), inner
-        with torch.no_grad():
+        with torch.set_grad_enabled(torch.is_grad_enabled() and self.defense.differentiable):
             seen, memory = self.defense.step(observation, memory)
+            # The sum below would repeat a smaller answer, and the policy would see something else than the filter meant.
+            if getattr(seen, "shape", None) != observation.shape:
+                name, shape = type(self.defense).__name__, tuple(observation.shape)
+                raise ValueError(f"the filter {name} must answer observations {shape} with a tensor of that shape")
+            if self.defense.differentiable:
+                return seen, memory, inner
             change = seen - observation
         return observation + change, memory, inner
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import pytest
 import torch
 from torch import Tensor
@@ -9,7 +11,7 @@ from torch import Tensor
 from cavbench.defenses.detection.jpeg import JPEG
 from cavbench.defenses.detection.median import MedianSmoothing
 from cavbench.detection import DetectorDefense
-from cavbench.detection.filter import FilteredDetector
+from cavbench.detection.filter import FilteredDetector, ImageFilter
 from tests.plugins.toy_camera import RedStreet, RedVictim
 
 BOTH = [MedianSmoothing(size=5), JPEG(quality=30)]
@@ -46,3 +48,21 @@ def test_images_of_a_batch_are_transformed_independently(defense: DetectorDefens
     door = guarded(defense)
     assert torch.equal(door.defense.filter(shown)[1:2], door.defense.filter(shown[1:2]))
     assert (door.names, door.stride) == (door.inner.names, door.inner.stride)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grey(ImageFilter):
+    def filter(self, pictures: Tensor) -> Tensor:
+        return pictures.mean(1, keepdim=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GreyDifferentiably(Grey):
+    differentiable = True
+
+
+@pytest.mark.parametrize("defense", [Grey(), GreyDifferentiably()])
+def test_an_answer_of_another_shape_is_refused_not_repeated(defense: ImageFilter) -> None:
+    detector = defense.load(RedVictim(), 0, RedStreet().facts)
+    with pytest.raises(ValueError, match=r"the filter Grey.* of that shape"):
+        detector(pictures())

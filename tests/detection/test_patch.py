@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+from collections.abc import Callable
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -143,3 +147,9 @@ def test_a_detector_whose_gradient_is_nan_in_one_pixel_is_attacked_through_the_o
     assert bool(gradients[0].any())
     assert torch.equal(gradients[1], gradients[0].masked_fill(gradients[1] == 0, 0.0))
     assert (enforcer.backwards, enforcer.nans) == (2, 2)
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_an_oracle_cannot_be_copied_with_the_detector_behind_it(duplicate: Callable[[PatchOracle], object]) -> None:
+    with pytest.raises(TypeError, match="cannot be copied"):
+        duplicate(oracle())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -142,6 +144,15 @@ def test_nothing_that_asks_or_pays_can_be_replaced_on_the_oracle(name: str) -> N
 
     with pytest.raises(AttributeError):
         drive(replace)
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_an_oracle_cannot_be_copied_with_the_victim_behind_it(duplicate: Callable[[Oracle], object]) -> None:
+    def duplicates(observation: Tensor, oracle: Oracle) -> None:
+        duplicate(oracle)
+
+    with pytest.raises(TypeError, match="cannot be copied"):
+        drive(duplicates)
 
 
 def test_catching_the_refusal_gives_no_answer_and_no_query() -> None:

@@ -126,3 +126,20 @@ def test_a_filter_knows_the_world_that_it_is_loaded_for_and_no_other() -> None:
 def test_a_filter_that_filters_nothing_misses_a_method() -> None:
     assert Nothing.missing() == ["filter or step"]
     assert Rounds.missing() == Counts.missing() == []
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstCar(ObservationFilter):
+    def filter(self, observation: Tensor) -> Tensor:
+        return observation[..., :1, :]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstCarDifferentiably(FirstCar):
+    differentiable = True
+
+
+@pytest.mark.parametrize("defense", [FirstCar(), FirstCarDifferentiably()])
+def test_an_answer_of_another_shape_is_refused_not_repeated(defense: ObservationFilter) -> None:
+    with pytest.raises(ValueError, match=r"the filter FirstCar.* of that shape"):
+        behind(defense, Echo()).scores(observations(2, 0))
