@@ -66,8 +66,13 @@ def scratch(parent: Path | None = None) -> Iterator[Path]:
     """
     parent = parent or Path(tempfile.gettempdir())
     _sweep_once(parent)
-    with tempfile.TemporaryDirectory(prefix=f".cavbench-{_owner()}", suffix=".tmp", dir=parent) as folder:
-        yield Path(folder)
+    folder, own = Path(tempfile.mkdtemp(prefix=f".cavbench-{_owner()}", suffix=".tmp", dir=parent)), os.getpid()
+    try:
+        yield folder
+    finally:
+        # A copy of this process (`os.fork`) leaves the folder to the process that made it, and still uses it.
+        if os.getpid() == own:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 @cache

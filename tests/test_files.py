@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cavbench.files import sweep, whole
+from cavbench.files import scratch, sweep, whole
 
 KILLED = """
 import os, signal, sys
@@ -57,3 +57,20 @@ def test_the_temporary_file_of_a_process_that_runs_is_kept(tmp_path: Path) -> No
         sweep(tmp_path)
         assert aside.exists()
         file.write(b"new")
+
+
+def test_a_copy_of_the_process_does_not_delete_the_temporary_folder(tmp_path: Path) -> None:
+    with scratch(tmp_path) as folder:
+        own = os.getpid()
+        try:
+            with scratch(tmp_path) as inner:
+                if (copy := os.fork()) == 0:
+                    raise InterruptedError
+                os.waitpid(copy, 0)
+                assert inner.is_dir()
+        finally:
+            if os.getpid() != own:
+                os._exit(0)
+        assert folder.is_dir()
+        assert not inner.exists()
+    assert list(tmp_path.iterdir()) == []

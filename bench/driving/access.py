@@ -14,6 +14,7 @@ from typing import NoReturn
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 
 from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.driving.dynamics import Dynamics
@@ -288,6 +289,9 @@ class Enforcer:
             TamperError: if the step is over.
         """
         permit(access, self.access)
+        # Another type could run code of the attack in the victim's turn, when nobody counts what it evaluates.
+        if type(observation) not in (Tensor, Parameter):
+            raise UserError(f"the attack asked about a {type(observation).__name__}, not about a torch.Tensor")
         if step != self._step:
             raise TamperError("the attack used the oracle of another step", "attack")
         asked, there = observation.shape[-3], len(self.spent if rows is None else rows)
@@ -322,7 +326,11 @@ class Enforcer:
             TamperError: if it reached the victim past the oracle, or changed counters or weights.
         """
         self._step += 1
-        if int(self.spent.sum()) != self.subject.evaluations - self._evaluations:
+        spent = self.spent.numpy()
+        if (
+            int(spent.sum()) != self.subject.evaluations - self._evaluations
+            or spent.max(initial=0) > self.threat.queries
+        ):
             raise TamperError("the attack changed the counts of its queries", "attack")
         if self.subject.watch and self.subject.watch.strays:
             raise TamperError("the attack evaluated the victim's network past the oracle", "attack")

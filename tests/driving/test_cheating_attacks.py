@@ -155,6 +155,27 @@ def test_an_oracle_cannot_be_copied_with_the_victim_behind_it(duplicate: Callabl
         drive(duplicates)
 
 
+class Sly(Tensor):
+    """A tensor that could run code of the attack where it is used."""
+
+
+def test_a_query_of_another_type_than_a_tensor_is_refused() -> None:
+    def ask(observation: Tensor, oracle: Oracle) -> None:
+        oracle.scores(observation.as_subclass(Sly))
+
+    with pytest.raises(UserError, match=r"asked about a Sly, not about a torch\.Tensor"):
+        drive(ask)
+
+
+def test_queries_on_the_account_of_another_episode_are_noticed() -> None:
+    def move(observation: Tensor, oracle: Oracle) -> None:
+        spent = oracle._enforcer.spent
+        spent[0], spent[-1] = spent[0] - 10**6, spent[-1] + 10**6
+
+    with pytest.raises(TamperError, match="the counts of its queries"):
+        drive(move)
+
+
 def test_catching_the_refusal_gives_no_answer_and_no_query() -> None:
     answers: list[Tensor] = []
 

@@ -27,7 +27,7 @@ from tests.tree import ROOT
         ({"max_steps": 0}, "max_steps must be at least 1"),
         ({"action_repeat": 0}, "action_repeat must be at least 1"),
         ({"action_type": "both"}, "action_type must be one of discrete, continuous, got 'both'"),
-        ({"driver": "human"}, "driver must be one of agent, idm, oracle, got 'human'"),
+        ({"driver": "human"}, "driver must be one of agent, idm, clairvoyant, got 'human'"),
         ({"target_speeds": (20.0,)}, "at least two increasing speeds"),
         ({"target_speeds": (30.0, 20.0)}, r"at least two increasing speeds from 0 to 40 m/s, got \(30, 20\)"),
         ({"target_speeds": (20.0, 50.0)}, "from 0 to 40 m/s"),
