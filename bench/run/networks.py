@@ -33,13 +33,20 @@ def tried(task: Task) -> tuple[tuple[str, str], tuple[str, ...]]:
     Raises:
         UserError: if a network cannot be loaded.
         RefusedNetworkError: if its score would be wrong.
+        TamperError: if a plug-in did what it may not do.
     """
+    # It needs torch, and a plan is made without.
+    from cavbench.isolation.watch import TamperError
+
     pair, seed, doubts = task.pair, task.unit.training_seed, _doubts(task)
     network = pair.network(seed)
     weights = weights_of(network)
     try:
         with contained():
             warnings = track_of(pair).try_network(network, pair, task.cells)
+    # Its message has a subject: "it wrote …".
+    except TamperError:
+        raise
     except UserError as error:
         raise RefusedNetworkError(f"it {message(error)}") from error
     # The network of a stranger may raise anything.

@@ -21,7 +21,16 @@ from toy_plugin import ToyWorld  # type: ignore[import-not-found]
 import cavbench.driving.probes
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Natural
-from cavbench.driving import DrivingAttack, DrivingDefense, DrivingFacts, DrivingVictim, Oracle, Policy
+from cavbench.driving import (
+    DrivingAttack,
+    DrivingDefense,
+    DrivingFacts,
+    DrivingVictim,
+    Oracle,
+    Policy,
+    PolicyWrapper,
+    State,
+)
 
 Deed = Literal[
     "none",
@@ -208,3 +217,19 @@ class Shrinks(DrivingDefense):
             case "victim":
                 object.__setattr__(victim, "actions", "continuous")
         return policy
+
+
+class Scribbling(PolicyWrapper):
+    """Writes what it is asked to a file, from the first question on."""
+
+    def scores(self, observation: Tensor, state: State = None) -> Tensor:
+        Path("memo").write_text(str(observation.sum()))
+        return self.policy.scores(observation, state)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scribbles(DrivingDefense):
+    """Keeps a file."""
+
+    def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
+        return Scribbling(victim.load(seed, facts)).eval()

@@ -52,7 +52,10 @@ SILENT = ("cache", "itself once")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     install_toy(folder)
-    points = {"cavbench.attacks": {"bends": "bending:Bends"}, "cavbench.defenses": {"shrinks": "bending:Shrinks"}}
+    points = {
+        "cavbench.attacks": {"bends": "bending:Bends"},
+        "cavbench.defenses": {"shrinks": "bending:Shrinks", "scribbles": "bending:Scribbles"},
+    }
     install(folder, "cavbench-bends", points, {"bending": (PLUGINS / "bending.py").read_text()}, "2.0")
     return folder
 
@@ -87,6 +90,19 @@ def test_a_memory_on_disk_is_refused_and_not_written(
     assert {path.name for path in tmp_path.iterdir()} == {"kept.txt", "out"}
     assert not Path("/tmp/bends-memo").exists()
     assert set(reading.read(tmp_path / "out", track=track("driving"))["attack"].to_pylist()) == {"noise", "none"}
+
+
+@pytest.mark.slow
+def test_a_defence_that_writes_a_file_when_it_is_tried_is_refused_in_plain_words(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("attack=noise", "defense=scribbles", "victim=toy", *CELL, "executor=serial")
+    said = ran(site, "run", *words, f"out={tmp_path / 'out'}")
+    assert said.code == 2
+    assert " is refused: it wrote memo while it was measured" in said.err
+    assert PACKAGE in said.err
+    assert not (tmp_path / "memo").exists()
 
 
 def scores(out: Path) -> dict[tuple[str, str], list[float]]:
