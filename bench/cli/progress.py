@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from types import TracebackType
 from typing import Self
 
 from rich.progress import DownloadColumn, TextColumn
 
-from cavbench.run.progress import bar
+from cavbench.run.progress import OnTerminal, bar
 from cavbench.terminal import Console
 
 
-class TrainingProgress:
+class TrainingProgress(OnTerminal):
     """Shows the progress of a training (`cavbench.core.contracts.Progress`): a bar on a terminal, a line every 10 % elsewhere."""
 
     def __init__(self, console: Console, label: str) -> None:
@@ -23,17 +22,6 @@ class TrainingProgress:
         self.bar = bar(console, TextColumn("{task.percentage:>3.0f}%"))
         self.task = self.bar.add_task(label, total=1.0)
 
-    def __enter__(self) -> Self:
-        if self.console.is_terminal:
-            self.bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self.console.is_terminal:
-            self.bar.stop()
-
     def __call__(self, share: float, text: str) -> None:
         self.bar.update(self.task, completed=share, description=f"{self.label}  {text}")
         if not self.console.is_terminal and int(share * 10) > self.tenths:
@@ -43,7 +31,7 @@ class TrainingProgress:
             self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-class DownloadProgress:
+class DownloadProgress(OnTerminal):
     """Shows the progress of a download, called with the bytes received and in total: a bar on a terminal, one line elsewhere."""
 
     def __init__(self, console: Console, label: str) -> None:
@@ -53,17 +41,9 @@ class DownloadProgress:
         self.task = self.bar.add_task(label, total=None)
 
     def __enter__(self) -> Self:
-        if self.console.is_terminal:
-            self.bar.start()
-        else:
+        if not self.console.is_terminal:
             self.console.print(f"downloading {self.label}", highlight=False, markup=False)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self.console.is_terminal:
-            self.bar.stop()
+        return super().__enter__()
 
     def __call__(self, done: int, total: int) -> None:
         self.bar.update(self.task, completed=done, total=total)

@@ -28,7 +28,25 @@ PRINTED_LINES = 5
 """Lines of a unit's output that are shown."""
 
 
-class RunProgress:
+class OnTerminal:
+    """A bar that is drawn within a `with` block, on a terminal only."""
+
+    console: Console
+    bar: Progress
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self.bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.console.is_terminal:
+            self.bar.stop()
+
+
+class RunProgress(OnTerminal):
     """Shows the progress of a run (`cavbench.run.runner.RunWatcher`): a bar on a terminal, one line per finished unit elsewhere.
 
     Args:
@@ -42,17 +60,6 @@ class RunProgress:
         self.total = self.done = 0
         self.working_on: dict[str, str] = {}
         self.under_way: dict[str, float] = {}
-
-    def __enter__(self) -> Self:
-        if self.console.is_terminal:
-            self.bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self.console.is_terminal:
-            self.bar.stop()
 
     def begin(self, *, episodes: int, finished: int) -> None:
         self.total, self.done = episodes, finished
