@@ -11,6 +11,7 @@ from typing import Any
 
 import pyarrow.compute as pc
 
+from cavbench.files import whole
 from cavbench.leaderboard.comparisons.comparison import parameters
 from cavbench.leaderboard.comparisons.naming import component, varying
 from cavbench.leaderboard.ranking.boards import read_boards
@@ -73,7 +74,8 @@ def write_face(file: Path, home: Path) -> Path:
     text = json.dumps(face(file), indent=1)
     # Lists of numbers on one line: a reviewer reads a change as one line.
     text = NUMBERS.sub(lambda found: " ".join(found[0].split()).replace("[ ", "[").replace(" ]", "]"), text)
-    target.write_text(text + "\n", encoding="utf-8")
+    with whole(target) as made:
+        made.write(f"{text}\n".encode())
     return target
 
 

@@ -12,6 +12,7 @@ from cavbench.checks.kits import Home
 from cavbench.core import checkout
 from cavbench.core.registry import GROUPS, Kind
 from cavbench.errors import UserError
+from cavbench.files import whole
 
 FIRST_PARTY = frozenset([__name__.partition(".")[0]])
 """The packages of cavbench that templates import from."""
@@ -51,9 +52,10 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> li
         entered = with_entry(project.read_text(encoding="utf-8"), GROUPS[cast(Kind, kind)], name, target)
         for path, text in {**paths, project: entered}.items():
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8")
+            with whole(path) as made:
+                made.write(text.encode())
     except OSError as error:
-        raise UserError(f"{error.filename} cannot be written: {error.strerror}") from error
+        raise UserError(f"{folder} cannot be written: {error.strerror}") from error
     code, page, test = paths
     return [code, project, page, test]
 
