@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import NamedTuple
 
 import pyarrow as pa
@@ -10,6 +11,7 @@ import pyarrow.compute as pc
 from rich.table import Table
 from rich.text import Text
 
+from cavbench import documents
 from cavbench.cli.progress import show_downloads
 from cavbench.core.pair import Pair
 from cavbench.core.track import Track
@@ -44,8 +46,13 @@ class Difference(NamedTuple):
     episodes: int
 
 
-def audit(both: Audit, console: Console) -> int:
+def audit(both: Audit, console: Console, *, as_json: bool = False) -> int:
     """Drive what is missing of both runs, and print the difference of each pair.
+
+    Args:
+        both: the public and the drawn run.
+        console: console to print to.
+        as_json: print one document (`cavbench.documents`) as well.
 
     Returns:
         0 if no pair scores significantly higher on the public scenarios, otherwise 1.
@@ -65,7 +72,25 @@ def audit(both: Audit, console: Console) -> int:
                 raise UserError(f"interrupted; {again}") from None
     track = both.public.track
     found = differences(both, reading.read(both.public.out, units, track=track), track)
-    return int(not verdict(found, track, console))
+    holds = verdict(found, track, console)
+    if as_json:
+        pairs = [_values(pair, one, track) for pair, one in found.items()]
+        documents.show("audit", {"salt": both.salt, "holds": holds, "pairs": pairs})
+    return int(not holds)
+
+
+def _values(pair: Pair, found: Difference, track: Track) -> dict[str, object]:
+    return {
+        "pair": pair.id,
+        "track": track.name,
+        "metric": track.metric,
+        "public": found.public,
+        "drawn": found.drawn,
+        "gain": asdict(found.gain),
+        "flagged": found.gain.low > 0,
+        "episodes": found.episodes,
+        "finds": asdict(found.finds),
+    }
 
 
 def verdict(found: Mapping[Pair, Difference], track: Track, console: Console) -> bool:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from cavbench import documents
 from cavbench.cli.listing import heading
 from cavbench.cli.words import split
 from cavbench.core import registry
+from cavbench.core.registry import Kind
 from cavbench.errors import UserError, short
 
 if TYPE_CHECKING:
@@ -28,8 +32,14 @@ MARKS = {
 }
 
 
-def print_checks(name: str, words: Sequence[str], console: Console) -> int:
+def print_checks(name: str, words: Sequence[str], console: Console, *, as_json: bool = False) -> int:
     """Run the checks of every component of this name, print them, and return 1 if any failed, otherwise 0.
+
+    Args:
+        name: of the component.
+        words: its parameters, and what to check it with.
+        console: console to print to.
+        as_json: print one document (`cavbench.documents`) instead.
 
     Raises:
         UserError: if no component has the name, its plug-in is broken, or an option cannot be parsed.
@@ -45,20 +55,29 @@ def print_checks(name: str, words: Sequence[str], console: Console) -> int:
     if strange := [key for key in given if key not in TRIED_WITH and key.partition(".")[0] not in kinds]:
         known = [*(f"{kind}.…" for kind in kinds), *TRIED_WITH]
         raise UserError(registry.unknown(f"key {strange[0]!r}", strange[0], known))
-    failed = False
+    found: dict[Kind, list[Outcome]] = {}
     for kind in kinds:
-        console.print(heading(kind, name))
         values = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{kind}.")}
-        with console.status("checking"):
+        if not as_json:
+            console.print(heading(kind, name))
+        with nullcontext() if as_json else console.status("checking"):
             tried_with = {key: given.get(key, "") for key in TRIED_WITH}
-            outcomes = list(examine(kind, name, values, **tried_with))
-        console.print(_table(outcomes))
-        counts = Counter(outcome.status for outcome in outcomes)
-        look = f"{counts['doubt']} to look at, " if counts["doubt"] else ""
-        summary = f"{counts['pass']} passed, {counts['fail']} to fix, {look}{counts['skip']} skipped\n"
-        console.print(Text(summary, style="bold red" if counts["fail"] else "green"))
-        failed = failed or counts["fail"] > 0
+            found[kind] = list(examine(kind, name, values, **tried_with))
+        if not as_json:
+            _print(found[kind], console)
+    failed = any(outcome.status == "fail" for outcomes in found.values() for outcome in outcomes)
+    if as_json:
+        components = [{"kind": kind, "outcomes": list(map(asdict, outcomes))} for kind, outcomes in found.items()]
+        documents.show("check", {"name": name, "passed": not failed, "components": components})
     return int(failed)
+
+
+def _print(outcomes: Sequence[Outcome], console: Console) -> None:
+    console.print(_table(outcomes))
+    counts = Counter(outcome.status for outcome in outcomes)
+    look = f"{counts['doubt']} to look at, " if counts["doubt"] else ""
+    summary = f"{counts['pass']} passed, {counts['fail']} to fix, {look}{counts['skip']} skipped\n"
+    console.print(Text(summary, style="bold red" if counts["fail"] else "green"))
 
 
 def _table(outcomes: Sequence[Outcome]) -> Table:

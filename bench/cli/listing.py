@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -12,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from cavbench import documents
 from cavbench.core import registry, suites
 from cavbench.core.contracts import ANY_TRACK
 from cavbench.core.registry import GROUPS, KINDS, Kind
@@ -76,11 +76,11 @@ def print_names(console: Console, kind: str = "", *, as_json: bool = False) -> N
     Args:
         console: console to print to.
         kind: attack, defense, victim, world or suite; empty for all.
-        as_json: whether to print a JSON list of objects with the fields of `Listed`.
+        as_json: print one document (`cavbench.documents`) instead, with the fields of `Listed`.
     """
     found = listed(kind)
     if as_json:
-        print(json.dumps([asdict(one) for one in found], indent=1))  # noqa: T201 - rich would wrap it
+        documents.show("list", {"components": [asdict(one) for one in found]})
         return
     foreign = any(not one.shipped_by.startswith("cavbench ") for one in found)
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
@@ -102,6 +102,38 @@ def print_names(console: Console, kind: str = "", *, as_json: bool = False) -> N
         before = one.kind
     console.print(table)
     console.print("\n`bench list NAME` describes a component and its parameters.", style="dim", highlight=False)
+
+
+def show_component(name: str) -> None:
+    """Print every component of this name, with its parameters or members, as one document (`cavbench.documents`).
+
+    Raises:
+        UserError: if no component has the name, or its plug-in is broken.
+    """
+    if name in suites.names():
+        members = [str(member.chosen) for member in suites.suite(name).members]
+        documents.show("list", {"components": [asdict(_suite(name)) | {"members": members}]})
+        return
+    found = []
+    for kind in registry.kinds_of(name):
+        claims = registry.entries(GROUPS[kind]).get(name) or (registry.find(GROUPS[kind], name, kind),)
+        found.append(asdict(_component(kind, name, claims)) | {"parameters": _parameters(kind, name)})
+    documents.show("list", {"components": found})
+
+
+def _parameters(kind: Kind, name: str) -> list[dict[str, str | None]]:
+    from cavbench.core.parameters import flattened
+
+    return [
+        {
+            "name": f"{kind}.{own}",
+            "type": one.type_name,
+            "default": None if one.required else one.default_text,
+            "allowed": one.allowed,
+            "meaning": one.meaning,
+        }
+        for own, one in flattened(registry.load(kind, name)).items()
+    ]
 
 
 def print_component(name: str, console: Console) -> None:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 app = typer.Typer(pretty_exceptions_enable=False)
 
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print one JSON document instead; all else goes to standard error.")
+]
 Words = Annotated[
     list[str] | None,
     typer.Argument(
@@ -93,7 +96,7 @@ def list_components(
     name: Annotated[
         str, typer.Argument(help="A component to describe, or a kind: attack, defense, victim, world, suite.")
     ] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """List the installed attacks, defences, victims and worlds with a line on each, or describe one."""
     from cavbench.cli import listing as cli_list
@@ -101,7 +104,7 @@ def list_components(
     if name in ("", "attack", "defense", "victim", "world", "suite"):
         cli_list.print_names(Console(), name, as_json=as_json)
     elif as_json:
-        raise UserError(f"--json lists components: bench list --json, or bench list attack --json, not {name}")
+        cli_list.show_component(name)
     else:
         cli_list.print_component(name, Console())
 
@@ -134,6 +137,7 @@ def check(
         list[str] | None,
         typer.Argument(metavar="[KEY=VALUE]...", help="Its parameters; victim=NAME and world=NAME to check it with."),
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Check that a component follows the rules of the benchmark, and print what to fix.
 
@@ -141,14 +145,14 @@ def check(
     """
     from cavbench.cli import check as cli_check
 
-    raise typer.Exit(cli_check.print_checks(name, words or [], Console()))
+    raise typer.Exit(cli_check.print_checks(name, words or [], Console(), as_json=as_json))
 
 
 Cells = Annotated[bool, typer.Option("--cells", help="Show every cell, parameter and threat model, too.")]
 
 
 @app.command(cls=RunHelp)
-def run(words: Words = None, cells: Cells = False) -> None:
+def run(words: Words = None, cells: Cells = False, as_json: AsJson = False) -> None:
     """Score attacks on defended victims over a grid of scenarios. Run the same command again to continue an interrupted run.
 
     For instance: bench run attack=zo defense=advtrain
@@ -158,11 +162,11 @@ def run(words: Words = None, cells: Cells = False) -> None:
     plan = plan_of(words or [], start)
     from cavbench.cli import run as cli_run
 
-    cli_run.run(plan, Console(), partial(_print_report, cells=cells))
+    cli_run.run(plan, Console(), partial(_print_report, cells=cells), as_json=as_json)
 
 
 @app.command(cls=RunHelp)
-def audit(words: Words = None) -> None:
+def audit(words: Words = None, as_json: AsJson = False) -> None:
     """Score pairs again on scenarios drawn at this moment. A pair that scores higher on the public ones is flagged, exit code 1.
 
     The options are those of bench run; salt=NUMBER repeats an audit. For instance: bench audit attack=pgd defense=advtrain
@@ -172,7 +176,7 @@ def audit(words: Words = None) -> None:
     asked = audit_of(words or [], start)
     from cavbench.cli import audit as cli_audit
 
-    raise typer.Exit(cli_audit.audit(asked, Console()))
+    raise typer.Exit(cli_audit.audit(asked, Console(stderr=as_json), as_json=as_json))
 
 
 TrainWords = Annotated[
@@ -232,6 +236,7 @@ def show(
     ] = None,
     out: Out = None,
     cells: Cells = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show a run: its configuration, provenance, table and recordings. out=FOLDER is the results folder, by default results."""
     from cavbench.cli import show as cli_show
@@ -240,7 +245,11 @@ def show(
     names, values = split(words or [], ("out",), names=1)
     folder = _folder(values, out) or Path("results")
     report = partial(_print_report, cells=cells)
-    cli_show.print_run(names[0] if names else str(folder), folder, Console(), report)
+    run = names[0] if names else str(folder)
+    if as_json:
+        cli_show.show_run(run, folder)
+    else:
+        cli_show.print_run(run, folder, Console(), report)
 
 
 @app.command()
@@ -329,22 +338,24 @@ def report(
     words: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME] [out=…] [html=…]",
-            help="Name of a report (run, leaderboard or thesis; without one run), a results folder, a page to write.",
+            metavar="[NAME] [out=…] [html=…] [json=…] [csv=…] [latex=…]",
+            help="Name of a report (run, leaderboard or thesis; without one run), a results folder, files to write.",
             autocompletion=completed,
         ),
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Print a report on all records of a results folder.
 
-    For instance: bench report thesis out=results
+    For instance: bench report thesis out=results, or bench report csv=scores.csv latex=scores.tex
 
-    With html=PAGE, write the leaderboards as one HTML file, with JSON and CSV files next to it. Without out=, the folder is
-    results; if it does not exist, a report shows the published records that it ships, if any.
+    With html=PAGE, write the leaderboards as one HTML file, with JSON and CSV files next to it. json=, csv= and latex= write such
+    a file alone: of the leaderboard, or of the report that is named (run has a line a pair). Without out=, the folder is results;
+    if it does not exist, a report shows the published records that it ships, if any.
     """
     from cavbench.cli import report as cli_report
 
-    cli_report.print_report(words or [], Console())
+    cli_report.print_report(words or [], Console(stderr=as_json), as_json=as_json)
 
 
 @app.command()

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from cavbench.cli.as_json import recordings, show_results
 from cavbench.core import registry, suites
 from cavbench.core.track import Track, track
 from cavbench.errors import UserError
@@ -48,6 +49,20 @@ def print_run(run: str, out: Path, console: Console, report: Report) -> None:
             console.print(Text(str(stop)), soft_wrap=True)
     for path in recordings(folder, name):
         console.print(Text(f"recording: bench view {path}"), soft_wrap=True)
+
+
+def show_run(run: str, out: Path) -> None:
+    """Print the same as one JSON document (`cavbench.documents`).
+
+    Raises:
+        UserError: if there is no such folder or pair.
+    """
+    folder, pair = located(run, out)
+    found, name = {}, None
+    for own, records in records_of(folder, pair):
+        name = pair_named(pair, records) if pair else None
+        found[own.name] = _with_controls(records.filter(pc.field("pair") == name), records, own) if name else records
+    show_results(folder, found, shown=name)
 
 
 def located(run: str, out: Path) -> tuple[Path, str]:
@@ -178,9 +193,3 @@ def _versions(libraries: str) -> str:
 def _listed(column: pa.ChunkedArray, digits: int | None = None) -> str:
     values: Iterable[Any] = sorted(set(column.to_pylist()))
     return ", ".join(f"{value:g}" if isinstance(value, float) else str(value)[:digits] for value in values)
-
-
-def recordings(folder: Path, pair: str | None) -> list[Path]:
-    """The recordings of a pair, or of all pairs."""
-    found = sorted((folder / "recordings").glob("*/*.rrd"))
-    return [path for path in found if pair in (None, path.parent.name)]

@@ -19,7 +19,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from rich.text import Text
 
-from cavbench.cli.show import located, pair_named, recordings, records_of
+from cavbench.cli.as_json import recordings
+from cavbench.cli.show import located, pair_named, records_of
 from cavbench.errors import UserError
 from cavbench.files import check_folder
 from cavbench.scenarios.axes import written

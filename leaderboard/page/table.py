@@ -1,4 +1,4 @@
-"""The ranked rows of a document as tables for other tools: `leaderboard.csv` and `leaderboard.tex`."""
+"""The rows of a document as tables for other tools: `leaderboard.csv` and `leaderboard.tex`, and those of a run."""
 
 from __future__ import annotations
 
@@ -11,6 +11,15 @@ from cavbench.errors import plain
 
 BOARD = ("track", "world", "grid", "threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share")
 """The columns of the CSV that say which leaderboard a row is on; those of the row follow (`ranking.columns`)."""
+ESTIMATES = ("score", "clean", "failed", "lead")
+"""What a pair has an interval of."""
+PAIRS = (
+    *("role", "attack", "defense", "victim", "world", "track", "grid"),
+    *("threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share"),
+    *(f"{name}{end}" for name in ESTIMATES for end in ("", "_low", "_high")),
+    *("kept", "queries", "training_seeds", "cells", "scenarios", "pair"),
+)
+"""The columns of the CSV of a run."""
 SPECIAL = {
     **{letter: f"\\{letter}" for letter in "&%$#_{}"},
     "\\": r"\textbackslash{}",
@@ -45,9 +54,51 @@ def table(made: Mapping[str, Any]) -> str:
     return out.getvalue()
 
 
+def pairs_table(made: Mapping[str, Any]) -> str:
+    """The pairs of a run as CSV: an interval takes three columns, a parameter of a component none of its own."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, PAIRS, lineterminator="\n")
+    writer.writeheader()
+    for one in made["pairs"]:
+        line = {name: one[name] for name in ("role", "track", "grid", "kept", "queries")}
+        line |= {kind: one[kind]["label"] for kind in ("attack", "defense", "victim")} | {"world": one["world"]["name"]}
+        line |= {f"threat_{name}": value for name, value in one["threat"].items() if f"threat_{name}" in PAIRS}
+        for name in ESTIMATES:
+            found = one[name] or {}
+            line |= zip(_ends(name), (found.get(end) for end in ("estimate", "low", "high")), strict=True)
+        line |= {"training_seeds": " ".join(map(str, one["card"]["training_seeds"])), "cells": len(one["cells"])}
+        line |= {"scenarios": one["scenarios"], "pair": one["card"]["pair"]}
+        writer.writerow({name: cell(value) for name, value in line.items()})
+    return out.getvalue()
+
+
+def pairs_latex(made: Mapping[str, Any]) -> str:
+    """The pairs of a run as LaTeX: a table a track, for the package booktabs."""
+    return "\n".join(_pairs_tabular(made, name) for name in made["tracks"])
+
+
+def _pairs_tabular(made: Mapping[str, Any], track: str) -> str:
+    said = made["tracks"][track]
+    heads = ["Victim", "Defence", "Attack", said["title"].capitalize()]
+    columns = [{"kind": "number", "digits": 2, "interval": True}]
+    failure = said["failure_title"].capitalize()
+    lines = []
+    for one in (one for one in made["pairs"] if one["track"] == track):
+        names = [_escaped(one[kind]["label"]) for kind in ("victim", "defense", "attack")]
+        kept = "" if one["kept"] is None else f"{one['kept']:.2f}"
+        failed = [_written(one["failed"], columns[0])] if failure else []
+        lines.append([*names, _written(one["score"], columns[0]), kept, *failed])
+    heads = [*heads, "Kept", *([failure] if failure else [])]
+    return _booktabs(f"{track}: mean and 95 % interval", "lll" + "r" * (len(heads) - 3), heads, lines)
+
+
+def _ends(name: str) -> list[str]:
+    return [name, f"{name}_low", f"{name}_high"]
+
+
 def _names(column: Mapping[str, Any]) -> list[str]:
     name = column["name"]
-    return [name, f"{name}_low", f"{name}_high"] if column["interval"] else [name]
+    return _ends(name) if column["interval"] else [name]
 
 
 def latex(made: Mapping[str, Any]) -> str:
@@ -60,12 +111,19 @@ def _tabular(board: Mapping[str, Any]) -> str:
     listed = [column for column in board["columns"] if column["shown"]]
     title = f"{board['track']}, {board['grid']}: {threat['norm']} {threat['budget']:g}, access {threat['access']}"
     lines = [[_written(row["values"][column["name"]], column) for column in listed] for row in board["rows"]]
+    kinds = "".join("l" if column["kind"] == "text" else "r" for column in listed)
+    heads = [_escaped(column["title"]) for column in listed]
+    return _booktabs(f"{title}, {threat['queries']} queries", kinds, heads, lines)
+
+
+def _booktabs(title: str, kinds: str, heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A table under a comment with its title; `kinds` are the letters of the columns."""
     return "\n".join(
         (
-            f"% {plain(title)}, {threat['queries']} queries",
-            f"\\begin{{tabular}}{{{''.join('l' if column['kind'] == 'text' else 'r' for column in listed)}}}",
+            f"% {plain(title)}",
+            f"\\begin{{tabular}}{{{kinds}}}",
             r"\toprule",
-            _line([_escaped(column["title"]) for column in listed]),
+            _line(heads),
             r"\midrule",
             *map(_line, lines),
             r"\bottomrule",

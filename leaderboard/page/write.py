@@ -19,6 +19,7 @@ import pyarrow as pa
 from rich.console import Console
 from rich.text import Text
 
+from cavbench import documents
 from cavbench.core.track import tracks
 from cavbench.errors import UserError
 from cavbench.files import check_folder, whole
@@ -58,9 +59,9 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         # The published rows are no records of a user: the thesis' tables have records of their own.
         thesis = beside.submit(chapters.chapters, {} if out is None else chapters.needed(records))
         boards, comparisons = read_boards(records)
-        made = document(boards, comparisons, out, _link(out, page))
+        made = documents.document("leaderboard", document(boards, comparisons, out, _link(out, page)))
         texts = {
-            _files(page)[0]: json.dumps(made, separators=(",", ":"), allow_nan=False) + "\n",
+            _files(page)[0]: documents.written(made, indent=None),
             _files(page)[1]: table(made),
             _files(page)[2]: latex(made),
             page: html(made, sum(map(len, records.values())), thesis.result(), _link(out, page)),

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from cavbench.cli import main as cli
 from cavbench.core.track import track
+from cavbench.documents import document as enveloped
 from cavbench.leaderboard.page.document import document
 from cavbench.leaderboard.page.table import table
 from cavbench.leaderboard.page.write import html
@@ -62,7 +63,7 @@ def test_colours_of_our_own_are_left() -> None:
 
 def test_the_table_has_no_formula_and_the_page_no_code(hostile: Path) -> None:
     boards, comparisons = read_boards(reading.read_all(hostile))
-    made = document(boards, comparisons, hostile)
+    made = enveloped("leaderboard", document(boards, comparisons, hostile))
     rows = list(csv.DictReader(io.StringIO(table(made))))
     assert {row["defense"] for row in rows} == {f"'{FORMULA}"}
     assert {row["strongest_attack"][:4] for row in rows} == {"?[2J"}

@@ -42,7 +42,6 @@ def said(tables: list[pa.Table]) -> tuple[object, str]:
     """The whole document, and what the terminal prints."""
     found, comparisons = read_boards({"driving": pa.concat_tables(tables)})
     made = document(found, comparisons, None)
-    del made["made"]
     console = Console(width=200, record=True, file=StringIO())
     print_boards(found, console)
     run_report({"driving": pa.concat_tables(tables)}, console)

@@ -20,7 +20,7 @@ import pytest
 from cavbench.core import registry
 from cavbench.core.contracts import Facts
 from cavbench.core.track import track
-from cavbench.leaderboard.page.document import schema as document_schema
+from cavbench.documents import schema as document_schema
 from cavbench.records.schema import schema
 from cavbench.records.store import FOLDER
 from cavbench.scenarios import Axes, Axis, Cell, Grid

@@ -22,12 +22,14 @@ from cavbench.cli.main import app
 from cavbench.cli.words import split
 from cavbench.core.pair import choose
 from cavbench.core.track import tracks
+from cavbench.documents import document as enveloped
+from cavbench.documents import schema
 from cavbench.errors import UserError
 from cavbench.leaderboard.comparisons.naming import labels, varying
 from cavbench.leaderboard.comparisons.reading import measurements, read_tracks
 from cavbench.leaderboard.page import document as document_module
 from cavbench.leaderboard.page.cards import run_command
-from cavbench.leaderboard.page.document import document, schema
+from cavbench.leaderboard.page.document import document
 from cavbench.leaderboard.page.table import BOARD, latex, table
 from cavbench.leaderboard.page.write import NAME, html, write
 from cavbench.leaderboard.ranking.boards import read_boards
@@ -87,7 +89,7 @@ def test_one_list_of_columns_makes_the_terminal_the_json_the_csv_and_the_latex(
     for module in (document_module, ranking):
         monkeypatch.setattr(module, "columns", lambda board: [*columns(board), more])
     found, comparisons = read_boards(reading.read_all(site / "results"))
-    made = document(found, comparisons, None)
+    made = enveloped("leaderboard", document(found, comparisons, None))
     jsonschema.validate(made, schema())
     said = Console(record=True, width=200, file=io.StringIO())
     ranking.print_boards(found, said)
