@@ -81,10 +81,14 @@ def group_codes(records: pa.Table, columns: Sequence[str]) -> NDArray[np.int64]:
     found = np.zeros(records.num_rows, np.int64)
     for name in columns:
         column = records[name].combine_chunks()
-        column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode(null_encoding="encode")
-        indices = column.indices.to_numpy(zero_copy_only=False)
-        found = _dense(found * max(len(column.dictionary), 1) + indices)
+        column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+        found = _dense(found * (len(column.dictionary) + 1) + of_texts(column))
     return found
+
+
+def of_texts(column: pa.DictionaryArray) -> NDArray[np.int64]:
+    """The place of each record's text in the dictionary, or the length of the dictionary where there is none."""
+    return pc.fill_null(column.indices, len(column.dictionary)).to_numpy(zero_copy_only=False)
 
 
 def _dense(numbers: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -17,7 +17,7 @@ from cavbench.core.contracts import Access
 from cavbench.core.track import Track
 from cavbench.errors import short
 from cavbench.records.schema import LARGEST, schema
-from cavbench.records.table import group_codes
+from cavbench.records.table import group_codes, of_texts
 from cavbench.scenarios import Axes
 
 JSON = ("attack_params", "defense_params", "victim_params", "world_params", "libraries")
@@ -115,7 +115,7 @@ def _too_long(records: pa.Table) -> Iterator[tuple[int, str]]:
         if not pa.types.is_string(texts.type):
             continue
         long = pc.fill_null(pc.greater(pc.binary_length(texts), LONGEST_TEXT), False).to_numpy(zero_copy_only=False)
-        rows = long[whole.indices.to_numpy()] if encoded else long
+        rows = np.append(long, False)[of_texts(whole)] if encoded else long
         if rows.any():
             yield int(rows.argmax()), f"{name} has more than {LONGEST_TEXT} bytes"
 
