@@ -31,7 +31,8 @@ from cavbench.leaderboard.comparisons.reading import groups
 from cavbench.leaderboard.faces import write_face
 from cavbench.records import reading
 from cavbench.records.columns import track_of
-from cavbench.records.schema import AUDIT, schema
+from cavbench.records.schema import AUDIT, encoded
+from cavbench.records.table import plain, together
 
 HOME = "cavbench.leaderboard"
 BASELINES = "baselines"
@@ -52,7 +53,7 @@ def published(of: Track) -> pa.Table:
     with as_file(files(HOME) / "data") as folder:
         paths = [path for path in sorted(folder.glob("*/*.parquet")) if track_of(path).name == of.name]
         tables = [reading.read_file(path) for path in paths]
-    return pa.concat_tables([schema(of).empty_table(), *tables])
+    return together([encoded(of).empty_table(), *tables])
 
 
 def every_track() -> dict[str, pa.Table]:
@@ -126,7 +127,7 @@ def _file(folder: Path, defended: Mapping[str, object] | None) -> Path:
 
 def write_records(records: pa.Table, file: Path) -> None:
     """Write the records of a row: what the code says of their columns is left out, which is half of a small file."""
-    records = rounded(records)
+    records = rounded(plain(records))
     records = records.cast(pa.schema([column.remove_metadata() for column in records.schema])).combine_chunks()
     file.parent.mkdir(parents=True, exist_ok=True)
     with whole(file) as made:

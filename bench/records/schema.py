@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import pyarrow as pa
 
 from cavbench.core.track import Track
@@ -13,6 +15,8 @@ AUDIT = "audit"
 SEQUENTIAL = "sequential"
 """`grid` of records that were driven in rounds until a score was known (`until=`): their number depends on what they showed."""
 TEXT, FLOAT, INT = pa.string(), pa.float64(), pa.int64()
+ENCODED = pa.dictionary(pa.int32(), TEXT)
+"""Text as it is read: each text once, and a number for each record."""
 
 
 LARGEST = 1e15
@@ -99,6 +103,20 @@ def schema(track: Track) -> pa.Schema:
     """The schema of a track's records; the metadata of each field holds its unit, meaning and range."""
     columns = (*IDENTITY, *track.measurements, *PROVENANCE, *track.probes)
     return pa.schema(columns, metadata={"cavbench": VERSION, "track": track.name})
+
+
+def encoded(track: Track, names: Sequence[str] | None = None) -> pa.Schema:
+    """The schema of a track's records as they are read: text is dictionary-encoded.
+
+    Args:
+        track: the track.
+        names: the columns; None is all.
+    """
+    whole = schema(track)
+    columns = [whole.field(name) for name in (whole.names if names is None else names)]
+    return pa.schema(
+        [one.with_type(ENCODED) if pa.types.is_string(one.type) else one for one in columns], metadata=whole.metadata
+    )
 
 
 PROBES: tuple[pa.Field, ...] = (

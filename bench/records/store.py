@@ -19,6 +19,7 @@ from cavbench.core.track import Columns, Track, tracks
 from cavbench.errors import UserError
 from cavbench.records import validity
 from cavbench.records.schema import schema
+from cavbench.records.table import plain
 
 FOLDER, MANY = "episodes", "packed-"
 """The folder of the records, and the beginning of the names of files with many units."""
@@ -83,7 +84,7 @@ def write_packed(out: Path, units: Sequence[pa.Table]) -> Path:
 def _written(path: Path, records: pa.Table) -> Path:
     try:
         with files.whole(path) as file:
-            pq.write_table(records, file, compression="zstd")
+            pq.write_table(plain(records), file, compression="zstd")
     except OSError as error:
         raise UserError(f"the record {path} cannot be written: {error.strerror}") from error
     return path

@@ -17,6 +17,7 @@ from cavbench.core.contracts import Access
 from cavbench.core.track import Track
 from cavbench.errors import short
 from cavbench.records.schema import LARGEST, schema
+from cavbench.records.table import group_codes, of_texts
 from cavbench.scenarios import Axes
 
 JSON = ("attack_params", "defense_params", "victim_params", "world_params", "libraries")
@@ -35,6 +36,26 @@ def complaint(records: pa.Table, track: Track) -> tuple[int, str] | None:
     """
     problems = [*_out_of_range(records, schema(track)), *_too_long(records), *_not_a_date(records)]
     return min(problems, default=None) or min(_unreadable(records, track), default=None)
+
+
+def unlike(records: pa.Table, unit: NDArray[np.int64], shared: Sequence[str]) -> tuple[int, str] | None:
+    """The first row that differs from its unit in a column that all rows of a unit share, and why; None if all agree.
+
+    Args:
+        records: text may be dictionary-encoded.
+        unit: a number for the unit of each row [N].
+        shared: names of columns.
+    """
+    found, first = np.unique(unit, return_index=True)
+    of_unit = np.empty(int(found.max(initial=-1)) + 1, np.int64)
+    of_unit[found] = first
+    for name in shared:
+        values = group_codes(records, (name,))
+        if (wrong := values != values[of_unit[unit]]).any():
+            row = int(wrong.argmax())
+            first_said, said = (short(str(records[name][at])) for at in (int(of_unit[unit[row]]), row))
+            return row, f"its rows differ in {name}: {first_said}, {said}"
+    return None
 
 
 def _out_of_range(records: pa.Table, columns: pa.Schema) -> Iterator[tuple[int, str]]:
@@ -94,7 +115,7 @@ def _too_long(records: pa.Table) -> Iterator[tuple[int, str]]:
         if not pa.types.is_string(texts.type):
             continue
         long = pc.fill_null(pc.greater(pc.binary_length(texts), LONGEST_TEXT), False).to_numpy(zero_copy_only=False)
-        rows = long[whole.indices.to_numpy()] if encoded else long
+        rows = np.append(long, False)[of_texts(whole)] if encoded else long
         if rows.any():
             yield int(rows.argmax()), f"{name} has more than {LONGEST_TEXT} bytes"
 

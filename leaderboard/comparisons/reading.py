@@ -18,6 +18,7 @@ from cavbench.leaderboard.comparisons.comparison import ATTACKER, DEFENDED, NO_A
 from cavbench.leaderboard.comparisons.pairing import with_control
 from cavbench.records.reading import times
 from cavbench.records.schema import AUDIT
+from cavbench.records.table import group_codes
 from cavbench.statistics.episodes import Episodes
 
 SCENARIO = ("training_seed", "cell", "seed")
@@ -118,7 +119,7 @@ def distinct(records: pa.Table, of: Track) -> pa.Table:
         return records
     seed, keep = records["training_seed"].to_numpy(), np.ones(records.num_rows, bool)
     defended, attacks = (
-        codes_of(records, (*CONTROL, "weights_sha256")),
+        group_codes(records, (*CONTROL, "weights_sha256")),
         records["attack"].to_numpy(zero_copy_only=False),
     )
     for code in np.unique(defended[suspect]):
@@ -156,7 +157,7 @@ def learns(attack: str) -> bool:
 
 def newest(records: pa.Table, identity: Sequence[str] = (*DEFENDED, *ATTACKER, "grid")) -> pa.Table:
     """The last record of each scenario, in the order given."""
-    codes = codes_of(records, (*identity, *SCENARIO))
+    codes = group_codes(records, (*identity, *SCENARIO))
     rising = np.sort(codes)
     if (rising[1:] > rising[:-1]).all():
         return records
@@ -182,7 +183,7 @@ def groups(
     kept = records if keep is None else records.filter(keep)
     if not kept.num_rows:
         return
-    codes = codes_of(kept, columns)
+    codes = group_codes(kept, columns)
     starts = np.flatnonzero(np.append(True, codes[1:] != codes[:-1]))
     together: dict[int, list[NDArray[np.int64]]] = {}
     for start, end in zip(starts, [*starts[1:], len(codes)], strict=True):
@@ -192,18 +193,3 @@ def groups(
         alone = len(stretches) == 1
         part = kept.slice(first[0], len(first)) if alone else kept.take(pa.array(np.concatenate(stretches)))
         yield part.select(list(columns)).slice(0, 1).to_pylist()[0], part
-
-
-def codes_of(records: pa.Table, columns: Sequence[str]) -> NDArray[np.int64]:
-    """A number for each record, the same for those that share the values of `columns`."""
-    codes = np.zeros(records.num_rows, np.int64)
-    kinds = 1
-    for name in columns:
-        column = records[name].combine_chunks()
-        column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
-        more = len(column.dictionary)
-        if kinds * more > 2**62:
-            distinct, codes = np.unique(codes, return_inverse=True)
-            kinds = len(distinct)
-        codes, kinds = codes * more + column.indices.to_numpy(), kinds * more
-    return codes

@@ -17,7 +17,7 @@ from cavbench.core import registry
 from cavbench.core.registry import KINDS, Kind
 from cavbench.core.sources import summary
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison, parameters
-from cavbench.leaderboard.comparisons.reading import codes_of
+from cavbench.records.table import group_codes
 
 PLAIN = re.compile(r"[\w./+-]+")
 
@@ -31,7 +31,7 @@ def card(one: Comparison, folder: Path | None) -> dict[str, object]:
     """
     records, identity = one.own.table, one.identity
     seeds = one.own.seeds
-    _, units = np.unique(codes_of(records, ["unit"]), return_index=True)
+    _, units = np.unique(group_codes(records, ["unit"]), return_index=True)
     pair = str(records["pair"][0].as_py())
     return {
         "pair": pair,

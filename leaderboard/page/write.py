@@ -100,9 +100,7 @@ def _read(out: Path | None) -> dict[str, pa.Table]:
     """The records of a folder, or the published ones."""
     if out is None:
         return every_track()
-    return reading.read_compact(
-        out, {name for track in tracks() for name in measurements(track)} | chapters.MEASUREMENTS
-    )
+    return reading.read_all(out, {name for track in tracks() for name in measurements(track)} | chapters.MEASUREMENTS)
 
 
 def html(made: Mapping[str, Any], episodes: int, thesis: Sequence[chapters.Chapter], recordings: str) -> str:

@@ -21,6 +21,7 @@ from cavbench.errors import Notice
 from cavbench.records import packing, reading, store
 from cavbench.records.finished import finished
 from cavbench.records.schema import schema
+from cavbench.records.table import plain
 from cavbench.run import runner
 from cavbench.run.config import plan_of
 from cavbench.scenarios import Cell
@@ -103,7 +104,7 @@ def names(out: Path) -> list[str]:
 
 def everything(out: Path) -> tuple[pa.Table, pa.Table]:
     measured = {field.name for field in TRACK.measurements if not pa.types.is_list(field.type)}
-    return reading.read(out, track=TRACK), reading.read_compact(out, measured)["driving"]
+    return reading.read(out, track=TRACK), plain(reading.read_all(out, measured)["driving"])
 
 
 def test_packed_records_are_read_as_before(folder: Path, wanted: dict[str, Wanted]) -> None:

@@ -16,11 +16,11 @@ import pytest
 
 from cavbench.core.track import Columns, track
 from cavbench.errors import Notice, UserError
-from cavbench.records import columns as footers
-from cavbench.records import reading
+from cavbench.records import reading, table
 from cavbench.records import store as results
 from cavbench.records.finished import finished
 from cavbench.records.schema import schema
+from cavbench.records.table import together
 from cavbench.run.config import plan_of
 from cavbench.run.unit import Unit
 
@@ -149,7 +149,7 @@ def test_an_invalid_value_is_reported_with_its_record(written: Path, units: list
     place = records.schema.get_field_index(name)
     wrong = pa.array([value] * records.num_rows, records.schema.field(name).type)
     pq.write_table(records.set_column(place, records.schema.field(name), wrong), path)
-    for reads in (read, lambda out: reading.read_compact(out, MEASURED)):
+    for reads in (read, lambda out: reading.read_all(out, MEASURED)):
         if reads is not read and name == "action_counts":  # compact records have no lists
             continue
         with pytest.raises(UserError) as raised:
@@ -255,7 +255,7 @@ def test_what_is_no_file_is_not_read(written: Path, units: list[Unit], make: Cal
     path = results.path_of(written, units[0].fingerprint)
     path.unlink()
     make(path)
-    for reads in (read, lambda out: reading.read_compact(out, MEASURED)):
+    for reads in (read, lambda out: reading.read_all(out, MEASURED)):
         with pytest.raises(UserError, match=f"the record {path} is not a file"):
             reads(written)
     with pytest.warns(Notice, match="does not count as finished: it is not a file"):
@@ -275,7 +275,7 @@ def test_a_file_that_states_more_rows_than_the_unit_has_is_not_read(
 @pytest.mark.parametrize("compact", [False, True], ids=["show", "report"])
 def test_a_row_or_a_column_twice_is_refused_by_every_reader(written: Path, units: list[Unit], compact: bool) -> None:
     def all_of_it() -> object:
-        return reading.read_compact(written, MEASURED) if compact else reading.read_all(written)
+        return reading.read_all(written, MEASURED) if compact else reading.read_all(written)
 
     path = results.path_of(written, units[0].fingerprint)
     own = pq.read_table(path)
@@ -292,7 +292,7 @@ def test_a_row_or_a_column_twice_is_refused_by_every_reader(written: Path, units
 def test_a_file_without_rows_is_read_the_same_by_every_reader(written: Path, units: list[Unit]) -> None:
     for path in written.glob("episodes/*.parquet"):
         pq.write_table(pq.read_table(path).slice(0, 0), path)
-    assert len(reading.read_all(written)["driving"]) == len(reading.read_compact(written, MEASURED)["driving"]) == 0
+    assert len(reading.read_all(written)["driving"]) == len(reading.read_all(written, MEASURED)["driving"]) == 0
 
 
 @pytest.mark.parametrize("compact", [False, True], ids=["show", "report"])
@@ -301,7 +301,7 @@ def test_a_column_of_another_type_is_refused_by_every_reader(
     name: str, compact: bool, written: Path, units: list[Unit]
 ) -> None:
     def all_of_it() -> object:
-        return reading.read_compact(written, MEASURED) if compact else reading.read_all(written)
+        return reading.read_all(written, MEASURED) if compact else reading.read_all(written)
 
     all_of_it()
     path = results.path_of(written, units[0].fingerprint)
@@ -312,10 +312,33 @@ def test_a_column_of_another_type_is_refused_by_every_reader(
         all_of_it()
 
 
-def test_files_that_begin_alike_are_checked_once(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    reading.read_compact(written, MEASURED)
-    monkeypatch.setattr(footers, "track_of", None)
-    assert len(reading.read_compact(written, MEASURED)["driving"])
+@pytest.mark.parametrize("name", ["cell", "defense", "training_seed", "wall_s", "threat_budget"])
+def test_rows_that_differ_from_their_unit_are_refused_by_every_reader(
+    written: Path, units: list[Unit], name: str
+) -> None:
+    path = results.path_of(written, units[0].fingerprint)
+    own, other = pq.read_table(path), pq.read_table(results.path_of(written, units[1].fingerprint))
+    value = other[name][0].as_py() if name == "cell" else {"defense": "tracker"}.get(name, 7)
+    field = own.schema.field(name)
+    values = pa.array([*own[name].to_pylist()[:-1], value], field.type)
+    pq.write_table(own.set_column(own.column_names.index(name), field, values), path)
+    for reads in (reading.read_all, read, lambda out: reading.read_all(out, MEASURED)):
+        with pytest.raises(UserError, match=f"the record {path} is invalid: its rows differ in {name}: "):
+            reads(written)
+
+
+def test_a_text_that_a_dictionary_lists_twice_is_one_text(written: Path) -> None:
+    own = reading.read_all(written)["driving"]
+    name = own["pair"][0].as_py()
+    twice = pa.DictionaryArray.from_arrays(pa.array([0, 1] * 30, pa.int32()).slice(0, len(own)), pa.array([name] * 2))
+    whole = together([own.set_column(own.column_names.index("pair"), "pair", twice)])
+    assert whole["pair"].chunk(0).dictionary.to_pylist() == [name]
+
+
+def test_a_file_that_states_too_many_rows_is_not_read(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table, "MOST_ROWS", 2)
+    with pytest.raises(UserError, match="states more than 2 rows; delete it and run again to recreate it"):
+        reading.read_all(written)
 
 
 @pytest.mark.parametrize("name", ["recordings", "set_aside", "stops", "patches", "verifying", "episodes"])
@@ -326,19 +349,19 @@ def test_a_file_with_the_name_of_a_folder_is_found_before_any_work(name: str, tm
 
 
 def test_a_copied_file_counts_once(written: Path, units: list[Unit]) -> None:
-    before = read(written), reading.read_compact(written, MEASURED)
+    before = read(written), reading.read_all(written, MEASURED)
     path = results.path_of(written, units[0].fingerprint)
     for name in ("0-copy.parquet", "z-copy.parquet"):
         shutil.copy(path, path.parent / name)
     assert read(written).equals(before[0])
     assert read(written, [units[0].fingerprint]).num_rows == 3
-    for name, records in reading.read_compact(written, MEASURED).items():
+    for name, records in reading.read_all(written, MEASURED).items():
         assert records.num_rows == before[1][name].num_rows
 
 
 @pytest.mark.parametrize("name", ["victim=other", "a*b", "[ab]", "it's"])
 def test_the_name_of_a_results_folder_is_no_pattern_and_no_column(written: Path, units: list[Unit], name: str) -> None:
-    before = read(written), reading.read_compact(written, MEASURED)["driving"]
+    before = read(written), reading.read_all(written, MEASURED)["driving"]
     for beside in ("aXb", "a"):
         results.prepare(written / beside)
         for unit in units:
@@ -346,7 +369,7 @@ def test_the_name_of_a_results_folder_is_no_pattern_and_no_column(written: Path,
             rewritten(path, lambda own: own.slice(0, 1), results.path_of(written / beside, unit.fingerprint))
     shutil.copytree(written / "episodes", written / name / "episodes")
     assert read(written / name).equals(before[0])
-    assert reading.read_compact(written / name, MEASURED)["driving"].equals(before[1])
+    assert reading.read_all(written / name, MEASURED)["driving"].equals(before[1])
     assert len(finished(written / name, {unit.fingerprint: unit for unit in units})) == len(units)
 
 
@@ -363,7 +386,7 @@ def test_a_record_from_the_future_is_not_the_newest(written: Path, units: list[U
     ):
         assert read(written).equals(today)
     with pytest.warns(Notice):
-        assert "future" not in reading.read_compact(written, MEASURED)["driving"]["code_digest"].to_pylist()
+        assert "future" not in reading.read_all(written, MEASURED)["driving"]["code_digest"].to_pylist()
     for unit in units:
         results.path_of(written, unit.fingerprint).unlink()
     with pytest.warns(Notice):

@@ -34,7 +34,7 @@ def rows(plugins: Path, bench: Callable[..., Said], tmp_path: Path) -> dict[str,
     # The run sees the noise of the process' generators only; a defence that hides its noise is refused, the others are driven.
     assert said.code == 2, said.err
     assert "hiding + toy, seed 0 is refused: it answers otherwise when it is asked the same again" in said.err
-    (board,) = read_boards(reading.read_compact(out, measurements(track("driving"))))[0]
+    (board,) = read_boards(reading.read_all(out, measurements(track("driving"))))[0]
     return {str(row.identity["defense"]): row for row in board.rows}
 
 

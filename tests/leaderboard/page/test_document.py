@@ -138,7 +138,7 @@ def test_the_terminal_says_the_ranking(site: Path) -> None:
 
 def test_compact_records_give_the_same_as_those_in_memory(site: Path) -> None:
     needed = {name for each in tracks() for name in measurements(each)}
-    compact = read_tracks(reading.read_compact(site / "results", needed))
+    compact = read_tracks(reading.read_all(site / "results", needed))
     whole = read_tracks(reading.read_all(site / "results"))
     scores = [{(one.track, *map(str, one.identity.values())): one.score for one in each} for each in (compact, whole)]
     assert scores[0] == scores[1]

@@ -41,6 +41,7 @@ from cavbench.formats.onnx_file import whole
 from cavbench.formats.pickled_array import floats
 from cavbench.records import reading
 from cavbench.records.store import FOLDER
+from cavbench.records.table import plain
 from cavbench.run import received
 from cavbench.run.config import plan_of, training_of
 from cavbench.run.submission import DESCRIPTION, FORMAT
@@ -124,7 +125,7 @@ def _unit(data: str, rows: int) -> tuple[str, pa.Table]:
     """The records of a unit that ships with the project."""
     table = pq.read_table(DATA / data)
     unit = table["unit"][0].as_py()
-    return unit, reading.read_file(DATA / data).filter(pa.compute.equal(table["unit"], unit)).slice(0, rows)
+    return unit, plain(reading.read_file(DATA / data)).filter(pa.compute.equal(table["unit"], unit)).slice(0, rows)
 
 
 def _records(data: str) -> Files:
@@ -135,12 +136,11 @@ def _records(data: str) -> Files:
 def _read_records(folder: Path) -> None:
     """Read records as tables do, and as leaderboards do: what the latter refuses, the former refuses, too.
 
-    Not the other way round: a leaderboard takes what the rows of a unit share from one of them, and DuckDB reads past damage in a
-    footer that PyArrow refuses.
+    Not the other way round: a leaderboard does not read lists.
     """
     numbers = {field.name for track in tracks() for field in track.measurements if not pa.types.is_list(field.type)}
     said = []
-    for reads in (reading.read_all, lambda out: reading.read_compact(out, numbers)):
+    for reads in (reading.read_all, lambda out: reading.read_all(out, numbers)):
         try:
             said.append({name: table.num_rows for name, table in reads(folder).items()})
         except UserError as error:
