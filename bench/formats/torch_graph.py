@@ -92,31 +92,31 @@ class Step:
 
 
 class Graph(nn.Module):
-    """The operations of a program as a module from its input to its outputs.
+    """The operations of a program as a module from its inputs to its outputs.
 
     Args:
         graph: `Graph` of the format.
-        given: name of the input.
+        given: names of the inputs.
         weights: the tensors that the program computes with, by the names of their values.
 
     Raises:
         RefusedError: if it contains anything but operations of ATen.
     """
 
-    def __init__(self, graph: Mapping[str, Any], given: str, weights: Mapping[str, Tensor]) -> None:
+    def __init__(self, graph: Mapping[str, Any], given: Sequence[str], weights: Mapping[str, Tensor]) -> None:
         super().__init__()
-        self.given = given
+        self.given = tuple(given)
         self.names = {f"weight_{number}": name for number, name in enumerate(weights)}
         for place, name in self.names.items():
             self.register_buffer(place, weights[name])
         self.steps = _steps(graph)
         self.outputs = [_tensor_name(value) for value in graph["outputs"]]
 
-    def forward(self, given: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
         values: dict[str, Any] = {name: self._buffers[place] for place, name in self.names.items()}
-        values[self.given] = given
+        values |= dict(zip(self.given, given, strict=True))
         versions = self._versions()
-        _run(self.steps, values, given.device)
+        _run(self.steps, values, given[0].device)
         # Also by a view of a weight: all tensors that share their memory count together.
         if self._versions() != versions:
             raise RefusedError("it changes its own weights: export it in eval mode")
@@ -124,20 +124,32 @@ class Graph(nn.Module):
         assert all(isinstance(one, Tensor) for one in found)
         return found
 
+    def unread(self) -> list[str]:
+        """The names of the inputs that nothing is computed from."""
+        read = set(self.outputs)
+        for step in self.steps:
+            read |= _names([*step.args, *step.kwargs.values()])
+        return [name for name in self.given if name not in read]
+
     def _versions(self) -> list[int]:
         """How often each weight was changed in place."""
         return [weight._version for weight in self._buffers.values() if weight is not None]
 
 
 class Single(nn.Module):
-    """A graph with one output, as a module that returns it."""
+    """A graph with one input, as a module that returns one of its outputs.
 
-    def __init__(self, graph: Graph) -> None:
+    Args:
+        graph: the graph.
+        output: number of the output.
+    """
+
+    def __init__(self, graph: Graph, output: int = 0) -> None:
         super().__init__()
-        self.graph = graph
+        self.graph, self.output = graph, output
 
     def forward(self, given: Tensor) -> Tensor:
-        (found,) = self.graph(given)
+        found: Tensor = self.graph(given)[self.output]
         return found
 
 
@@ -167,6 +179,14 @@ def _given(argument: Any, values: Mapping[str, Any], device: torch.device) -> An
     if isinstance(argument, list):
         return [_given(one, values, device) for one in argument]
     return device if isinstance(argument, Device) else argument
+
+
+def _names(arguments: Sequence[Any]) -> set[str]:
+    """The names of the values among arguments."""
+    found: set[str] = set()
+    for one in arguments:
+        found |= {one.name} if isinstance(one, Value) else _names(one) if isinstance(one, list) else set()
+    return found
 
 
 def _keep(names: Any, results: Any, values: dict[str, Any]) -> None:

@@ -41,26 +41,56 @@ INERT = {"torch._export.serde.serialize._reconstruct_fake_tensor"}
 
 
 @dataclass(frozen=True)
-class Program:
-    """A program with one input.
+class Value:
+    """A tensor that a program takes or returns.
 
     Args:
-        graph: the program as a module.
-        shape: the shape of its input; None for an axis of any size.
-        dtype: the type of its input; None for a type that is not read.
+        name: its name in the program; of an input that of the argument.
+        shape: its shape; None for an axis of any size.
+        dtype: its type; None for a type that is not read.
     """
 
-    graph: Graph
+    name: str
     shape: tuple[int | None, ...]
     dtype: torch.dtype | None
 
+    def __str__(self) -> str:
+        sides = ", ".join("any" if side is None else str(side) for side in self.shape)
+        return f"{str(self.dtype or 'an unknown type').removeprefix('torch.')} [{sides}]"
 
-def read(path: Path, name: str) -> Program:
+
+@dataclass(frozen=True)
+class Program:
+    """A program.
+
+    Args:
+        graph: the program as a module.
+        inputs: what it takes, in order.
+        outputs: what it returns, in order.
+    """
+
+    graph: Graph
+    inputs: tuple[Value, ...]
+    outputs: tuple[Value, ...]
+
+    @property
+    def shape(self) -> tuple[int | None, ...]:
+        """The shape of its first input."""
+        return self.inputs[0].shape
+
+    @property
+    def dtype(self) -> torch.dtype | None:
+        """The type of its first input."""
+        return self.inputs[0].dtype
+
+
+def read(path: Path, name: str, *, several: bool = False) -> Program:
     """Read a program.
 
     Args:
         path: the file.
         name: its name in errors.
+        several: whether it may have several inputs.
 
     Raises:
         UserError: if the file is not such a program, or holds anything else than tensors and operations on tensors.
@@ -68,7 +98,10 @@ def read(path: Path, name: str) -> Program:
     members = _members(Archive.read(path, name), name)
     try:
         _check_samples(members, name)
-        return _program(members, name)
+        program = _program(members, name)
+        if not program.inputs or (len(program.inputs) > 1 and not several):
+            raise UserError(f"{name} takes {len(program.inputs)} inputs, it must take one tensor")
+        return program
     except RefusedError as error:
         raise UserError(f"{name} is refused: {error}") from error
     # Any part of the JSON may be missing or of another type.
@@ -132,11 +165,15 @@ def _program(members: Mapping[str, bytes], name: str) -> Program:
     outputs = [next(iter(spec)) for spec in module["signature"]["output_specs"]]
     if mutations := sorted({kind for kind in outputs if kind != "user_output"}):
         raise RefusedError(f"it changes its own state ({', '.join(mutations)}): export it in eval mode")
-    if len(user) != 1:
-        raise UserError(f"{name} takes {len(user)} inputs, it must take one tensor")
-    meta = module["graph"]["tensor_values"][user[0]]
+    values = module["graph"]["tensor_values"]
+    graph = Graph(module["graph"], user, inputs)
+    taken, returned = (tuple(_value(one, values[one]) for one in names) for names in (user, graph.outputs))
+    return Program(graph, taken, returned)
+
+
+def _value(name: str, meta: Mapping[str, Any]) -> Value:
     shape = tuple(int(side["as_int"]) if "as_int" in side else None for side in meta["sizes"])
-    return Program(Graph(module["graph"], user[0], inputs), shape, DTYPES.get(meta["dtype"]))
+    return Value(name, shape, DTYPES.get(meta["dtype"]))
 
 
 def _tensors(members: Mapping[str, bytes], folder: str, prefix: str) -> dict[str, Tensor]:

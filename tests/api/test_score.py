@@ -132,6 +132,12 @@ def test_a_list_of_objects_holds_trainings(score: Callable[..., Any]) -> None:
     assert set(found.records["training_seed"]) == {0, 1}
 
 
+def test_one_network_meets_every_training_of_an_attack_that_learns(score: Callable[..., Any]) -> None:
+    found = score(Brakes(), "two_stage", seeds=[0, 1], baselines=False).records
+    assert sorted(set(found["training_seed"][found["attack"] == "two_stage"])) == [0, 1]
+    assert found["weights_sha256"].nunique() == 1
+
+
 @pytest.mark.parametrize("algorithm", ["dqn", "ppo", "td3"])
 def test_a_model_of_stable_baselines3_answers_like_predict(algorithm: str, score: Callable[..., Any]) -> None:
     model = sb3_model(algorithm, spaces(continuous=algorithm == "td3"))

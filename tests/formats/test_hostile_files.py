@@ -278,9 +278,15 @@ CRAFTED: dict[str, tuple[Callable[[Members, Path], None], str]] = {
     "a sparse tensor": (calls("torch.ops.aten.to_sparse.default"), "'torch.ops.aten.to_sparse.default', which is not"),
     "another layer's weights": (changes_a_weight, "changes its own weights: export it in eval mode"),
     "a view of a weight": (changes_a_view, "changes its own weights: export it in eval mode"),
-    "an LSTM, whose sizes torch does not check": (
-        calls("torch.ops.aten.lstm.input"),
-        "'torch.ops.aten.lstm.input', which is not",
+    "an LSTM without weights, whose sizes torch does not check": (
+        calls(
+            "torch.ops.aten.lstm.input",
+            {"as_tensor": {"name": "observation"}},
+            {"as_tensors": [{"name": "observation"}] * 2},
+            {"as_tensors": []},
+            *[{"as_bool": True}, {"as_int": 1}, {"as_float": 0.0}, *[{"as_bool": False}] * 3],
+        ),
+        "is refused: a recurrent network has weights or states of another size than its layers",
     ),
 }
 
@@ -351,6 +357,40 @@ def test_a_recurrent_network_needs_the_weights_of_all_its_layers(
             call(input, hidden, wrong, *rest)
     with pytest.raises(RefusedError, match="a recurrent network has weights or states"):
         call(input, hidden, weights, True, 2**60, *rest[2:])
+
+
+@pytest.mark.parametrize("bidirectional", [False, True])
+@pytest.mark.parametrize("batch_first", [False, True])
+def test_an_lstm_needs_weights_and_states_of_the_sizes_of_its_layers(bidirectional: bool, batch_first: bool) -> None:
+    made = nn.LSTM(5, 7, 2, bidirectional=bidirectional)
+    found, call = operation("torch.ops.aten.lstm.input")
+    weights, layers = made._flat_weights, 4 if bidirectional else 2
+    input, rest = torch.rand(3, 4, 5), [True, 2, 0.0, False, bidirectional, batch_first]
+    state = torch.rand(layers, 3 if batch_first else 4, 7)
+    for own, other in zip(
+        call(input, [state, state], weights, *rest), found(input, [state, state], weights, *rest), strict=True
+    ):
+        assert torch.equal(own, other)
+    for states in (
+        [state],
+        [state[1:], state],
+        [state, state[:, 1:]],
+        [state, state[..., 1:]],
+        [state, state.double()],
+    ):
+        with pytest.raises(RefusedError, match="a recurrent network has weights or states"):
+            call(input, states, weights, *rest)
+    for wrong in (weights[4:], [*weights[4:], *weights[:4]], [*weights[:-1], weights[-1][:1]], []):
+        with pytest.raises(RefusedError, match="a recurrent network has weights or states"):
+            call(input, [state, state], wrong, *rest)
+    for sequence in (input[0], input[:0], input.double()):
+        with pytest.raises(RefusedError, match="a recurrent network has weights or states"):
+            call(sequence, [state, state], weights, *rest)
+
+
+def test_memory_that_a_program_does_not_fill_is_zero() -> None:
+    _, call = operation("torch.ops.aten.empty_like.default")
+    assert not call(torch.full((1000,), 7.0)).any()
 
 
 def test_sizes_that_fit_are_computed_as_by_torch() -> None:

@@ -59,13 +59,22 @@ class FilePolicy(Policy):
         return self
 
     def forward(self, observation: Tensor) -> Tensor:
+        shown = self._shown(observation)
+        return self._answered(self.network(shown) if len(shown) else None, observation)
+
+    def _shown(self, observation: Tensor) -> Tensor:
+        """What the network is given for observations [..., V, F]: [N, *shape]."""
         leading = observation.shape[:-2]
         shown = self._native(observation)
         if (own := tuple(shown.shape[len(leading) :])) != self.shape and (math.prod(own),) != self.shape:
             raise UserError(f"the policy takes observations {self.shape}, this world shows {own}")
-        if not leading.numel():
+        return shown.reshape(leading.numel(), *self.shape)
+
+    def _answered(self, output: Tensor | None, observation: Tensor) -> Tensor:
+        """The scores of observations [..., V, F] from the output of the network [N, A]; None if there is no observation."""
+        leading = observation.shape[:-2]
+        if output is None:
             return observation.new_zeros(*leading, self.width)
-        output = self.network(shown.reshape(-1, *self.shape))
         if output.is_complex():
             raise UserError("answers complex numbers; scores are real numbers")
         output = output.to(observation.dtype)
@@ -80,6 +89,23 @@ class FilePolicy(Policy):
 
     def _native(self, observation: Tensor) -> Tensor:
         return observation if self.native is None else self.native(observation)
+
+
+class Typed(nn.Module):
+    """A network that is given its input as numbers of its own precision.
+
+    Args:
+        network: the network.
+        dtype: what it takes.
+    """
+
+    def __init__(self, network: nn.Module, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.network, self.dtype = network, dtype
+
+    def forward(self, observation: Tensor) -> Tensor:
+        answer: Tensor = self.network(observation.to(self.dtype))
+        return answer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +221,7 @@ class FileDriver(DrivingVictim):
         for batch in TRIED:
             try:
                 with torch.no_grad():
-                    scores = policy.scores(torch.zeros(batch, *observation))
+                    scores = policy.scores(torch.zeros(batch, *observation), policy.initial(torch.arange(batch)))
             except RefusedError as error:
                 raise UserError(f"{self.path} is refused: {error}") from error
             except Exception as error:

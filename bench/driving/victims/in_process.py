@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy
-from cavbench.driving.victims.from_file import FilePolicy, check_trained_in
+from cavbench.driving.victims.from_file import FilePolicy, Typed, check_trained_in
+from cavbench.driving.victims.remembering import RememberingPolicy
 from cavbench.driving.victims.sb3_model import LIBRARY, critic_of, is_model, is_sampling_part, network_of
 from cavbench.driving.victims.spaces import CONTROLS, UNKNOWN
 from cavbench.driving.victims.torchrl_actor import ActorNetwork, is_actor
@@ -58,11 +59,13 @@ class InProcess(DrivingVictim):
         return len(self.policies) > 1
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
-        """A copy of the policy of a training seed, so that no run can change the user's object.
+        """A copy of the policy of a training seed, or of the only policy, so that no run can change the user's object.
 
         Raises:
             UserError: if there are fewer policies.
         """
+        # As a policy from a file, one policy is that of any seed: an attack may have several trainings.
+        seed = seed if self.seeded else 0
         if seed >= len(self.policies):
             raise UserError(f"there is no policy of training seed {seed}: {len(self.policies)} were given")
         return copy.deepcopy(self.policies[seed])
@@ -164,38 +167,53 @@ def _of_model(model: object, facts: DrivingFacts, observation: Tensor) -> Policy
 def _of_module(module: nn.Module, facts: DrivingFacts, observation: Tensor, actions: str | None) -> Policy:
     """The policy of a network that takes observations [N, V, F], flattened or not, or flat ones in a flat world."""
     name = type(module).__name__
-    network = ActorNetwork(module) if is_actor(module) else copy.deepcopy(module)
-    network = network.cpu().eval()
-    # The weights of another precision compute in float32, as the world does.
-    if any(weight.is_floating_point() and weight.dtype != torch.float32 for weight in network.parameters()):
-        network = network.float()
     native = facts.native(observation)
+    network, shape, answer = _fitting(name, module, native)
+    if isinstance(network, ActorNetwork):
+        network.check(native.reshape(-1, *shape))
+    options: dict[str, Any] = {
+        "shape": shape,
+        "action_type": _action_type(name, answer.shape[1], facts, actions),
+        "width": answer.shape[1],
+        "sha256": state_digest(network),
+        "native": facts.native if facts.flat else None,
+    }
+    if isinstance(network, ActorNetwork) and network.memory:
+        return RememberingPolicy(network, network.memory, **options)
+    return FilePolicy(network, **options)
+
+
+def _fitting(name: str, module: nn.Module, native: Tensor) -> tuple[nn.Module, tuple[int, ...], Tensor]:
+    """A copy of a network, the shape of the observations that it takes, and its answer to some.
+
+    Raises:
+        UserError: if it takes none, or two shapes that it answers differently.
+    """
+    network = (ActorNetwork(module) if is_actor(module) else copy.deepcopy(module)).cpu().eval()
+    others = {weight.dtype for weight in network.parameters() if weight.is_floating_point()} - {torch.float32}
+    # The weights of another precision compute in float32, as the world does, unless the network itself asks for their own.
+    networks = [copy.deepcopy(network).float(), network] if others else [network]
+    networks += [Typed(network, others.pop())] if len(others) == 1 and not is_actor(module) else []
     first, flat = tuple(native.shape[1:]), (native[0].numel(),)
-    answers: dict[tuple[int, ...], Tensor] = {}
-    complaints = []
-    for shape in dict.fromkeys([first, flat]):
-        answer = _answer(network, native.reshape(-1, *shape))
-        if isinstance(answer, Tensor):
-            answers[shape] = answer
-        else:
-            complaints.append(f"on {[len(native), *shape]} {answer}")
-    if not answers:
+    complaints: list[str] = []
+    for one in networks:
+        found = {shape: _answer(one, native.reshape(-1, *shape)) for shape in dict.fromkeys([first, flat])}
+        answers = {shape: answer for shape, answer in found.items() if isinstance(answer, Tensor)}
+        complaints = complaints or [f"on {[len(native), *shape]} {found[shape]}" for shape in found]
+        if answers:
+            shape, answer = next(iter(answers.items()))
+            break
+    else:
         wanted = f"{[len(native), *first]} or {[len(native), *flat]}"
         raise UserError(
             f"{name} must map observations {wanted} to scores or actions [{len(native)}, A]: {'; '.join(complaints)}"
         )
-    shape, answer = next(iter(answers.items()))
     if any(other.shape != answer.shape or not torch.allclose(other, answer, atol=SAME) for other in answers.values()):
         raise UserError(
             f"{name} answers observations {list(first)} and flattened ones {list(flat)} differently; say which it takes: "
             f"nn.Sequential(nn.Flatten(), network), or nn.Sequential(nn.Unflatten(1, {first}), network)"
         )
-    if isinstance(network, ActorNetwork):
-        network.check(native.reshape(-1, *shape))
-    kind = _action_type(name, answer.shape[1], facts, actions)
-    return FilePolicy(
-        network, shape, kind, answer.shape[1], state_digest(network), None, native=facts.native if facts.flat else None
-    )
+    return one, shape, answer
 
 
 def _answer(network: nn.Module, observation: Tensor) -> Tensor | str:

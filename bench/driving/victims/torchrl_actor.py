@@ -7,18 +7,28 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import GRUModule, LSTMModule, set_recurrent_mode
 
+from cavbench.driving.victims.remembering import Memory, empty
 from cavbench.driving.victims.spaces import UNBOUNDED
 from cavbench.errors import UserError
 
 VALUES = ("action_value", "logits", "probs")
 """Names of entries with a value for each discrete action, in order of preference."""
 ACTION = "action"
+FIRST = "is_init"
+"""The entry that says whether an episode begins."""
+BEGUN = "begun"
+"""The entry of a memory that is true after the first decision."""
+LEARNING = ("VecNorm", "VecNormV2")
+"""Transforms whose statistics change when they are called. A lock of theirs also stays locked after a failed call."""
+Carried = dict[Any, tuple[Any, tuple[int, ...]]]
+"""For each entry that is read: the entry that is written for the next call, and its shape."""
 INSTEAD = "give the torch.nn.Module from observation to values or actions instead"
 
 
@@ -27,13 +37,53 @@ def is_actor(given: object) -> bool:
     return isinstance(given, TensorDictModuleBase)
 
 
+def carried(actor: nn.Module, read: Sequence[Any], written: Sequence[Any]) -> Carried:
+    """What an actor writes for its own next call.
+
+    An entry `key` is carried on if the actor writes `("next", key)`, or if an `LSTMModule` or a `GRUModule` reads it as its state
+    and writes it again. Its shape is what that module says.
+
+    Args:
+        actor: the module.
+        read, written: its keys.
+
+    Raises:
+        UserError: if no module says the shape of an entry.
+    """
+    shapes: dict[Any, tuple[int, ...]] = {}
+    for part in actor.modules():
+        if isinstance(part, LSTMModule | GRUModule):
+            network = part.lstm if isinstance(part, LSTMModule) else part.gru
+            sizes = [getattr(network, "proj_size", 0) or network.hidden_size, network.hidden_size]
+            shapes |= {
+                unravel_key(key): (network.num_layers, size)
+                for key, size in zip(part.in_keys[1:-1], sizes, strict=False)
+            }
+    found: Carried = {}
+    for key in read:
+        path = (key,) if isinstance(key, str) else tuple(key)
+        # What is no memory may be written again, too: by a transform that normalises the observation.
+        again = [key] if key in shapes else []
+        later = next((one for one in (("next", *path), *again) if one in written), None)
+        if later is None or _last(key) == FIRST:
+            continue
+        if key not in shapes:
+            raise UserError(
+                f"{type(actor).__name__} remembers {_listed([key])}, whose shape only an LSTMModule or a GRUModule says; give a "
+                "cavbench.driving.Policy with `initial` and `advance`"
+            )
+        found[key] = (later, shapes[key])
+    return found
+
+
 class ActorNetwork(nn.Module):
     """What an actor writes on an observation, without its exploration: the most probable action, not a sample.
 
-    The values of discrete actions (`action_value`, `logits` or `probs`) are read if it writes them, otherwise its action.
+    The values of discrete actions (`action_value`, `logits` or `probs`) are read if it writes them, otherwise its action. What it
+    reads and writes for its own next call, such as the state of an `LSTMModule`, is its memory (`carried`).
 
     Args:
-        actor: the module, with one input.
+        actor: the module, with one input besides its memory.
 
     Raises:
         UserError: if it reads or writes something else.
@@ -47,17 +97,29 @@ class ActorNetwork(nn.Module):
         for part in self.actor.modules():
             if isinstance(part, TensorDictModuleBase):
                 part.reset_out_keys()
-        self.given = self._given(self.actor.in_keys)
-        self.key = self._key([unravel_key(key) for key in self.actor.out_keys])
+        self._check_statistics()
+        read, written = ([unravel_key(key) for key in keys] for keys in (self.actor.in_keys, self.actor.out_keys))
+        self.carried = carried(self.actor, read, written)
+        self.marks = [key for key in read if _last(key) == FIRST]
+        self.given = self._given([key for key in read if key not in (*self.carried, *self.marks)])
+        memory = {later for later, _ in self.carried.values()}
+        self.key = self._key([key for key in written if key not in memory])
+
+    def _check_statistics(self) -> None:
+        """Refuse a normalisation that goes on learning: its answers would depend on all that it was asked before."""
+        for part in self.actor.modules():
+            if type(part).__name__ in LEARNING and type(part).__module__.startswith("torchrl."):
+                raise UserError(
+                    f"{self.name} holds a {type(part).__name__}, which goes on learning its statistics when it is called: put "
+                    "transform.to_observation_norm() in its place"
+                )
 
     def _given(self, keys: Sequence[Any]) -> Any:
         if len(keys) != 1:
-            memory = (
-                " (a recurrent policy is a cavbench.driving.Policy with `initial` and `advance`)"
-                if len(keys) > 1
-                else ""
+            raise UserError(
+                f"{self.name} reads {_listed(keys)}, a driver is given one observation, and the memory of an LSTMModule or "
+                f"GRUModule; {INSTEAD}, or a cavbench.driving.Policy with `initial` and `advance`"
             )
-            raise UserError(f"{self.name} reads {_listed(keys)}, a driver is given one observation{memory}; {INSTEAD}")
         return keys[0]
 
     def _key(self, keys: Sequence[Any]) -> Any:
@@ -70,12 +132,40 @@ class ActorNetwork(nn.Module):
             f"{self.name} writes {_listed(keys)}; a driver writes one of {', '.join((*VALUES, ACTION))}; {INSTEAD}"
         )
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """Values [N, A] of discrete actions or continuous actions [N, 2], of observations [N, *shape]."""
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            written = self.actor(TensorDict({self.given: observation}, batch_size=observation.shape[:1]))
+    @property
+    def memory(self) -> Memory:
+        """What it remembers of an episode, by names in order; empty for an actor without a memory."""
+        dtype = next((weight.dtype for weight in self.parameters() if weight.is_floating_point()), torch.float32)
+        begun = {BEGUN: ((), torch.bool)} if self.carried or self.marks else {}
+        return {**begun, **{f"memory{place}": (shape, dtype) for place, (_, shape) in enumerate(self.carried.values())}}
+
+    def forward(
+        self, observation: Tensor, memory: TensorDictBase | None = None
+    ) -> Tensor | tuple[Tensor, TensorDictBase]:
+        """Values [N, A] of discrete actions or continuous actions [N, 2], of observations [N, *shape].
+
+        With a memory of batch size [N]: a pair of these and the memory after them.
+        """
+        written = self._written(observation, memory)
         answer: Tensor = written[self.key]
-        return answer
+        if memory is None:
+            return answer
+        after = {f"memory{place}": written[later] for place, (later, _) in enumerate(self.carried.values())}
+        begun = torch.ones(len(observation), dtype=torch.bool, device=observation.device)
+        return answer, TensorDict({BEGUN: begun, **after}, batch_size=observation.shape[:1])
+
+    def _written(self, observation: Tensor, memory: TensorDictBase | None) -> TensorDictBase:
+        """All that the actor writes; with an empty memory if there is none."""
+        if memory is None:
+            memory = empty(self.memory, torch.arange(len(observation), device=observation.device))
+        entries: dict[Any, Tensor] = {key: memory[f"memory{place}"] for place, key in enumerate(self.carried)}
+        for key in self.marks:
+            entries[key] = ~memory[BEGUN].unsqueeze(-1)
+        given = TensorDict(batch_size=observation.shape[:1], device=observation.device)
+        for key, value in {self.given: observation, **entries}.items():
+            given.set(key, value)
+        with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(False):
+            return self.actor(given)
 
     @torch.no_grad()
     def check(self, observation: Tensor) -> None:
@@ -87,8 +177,7 @@ class ActorNetwork(nn.Module):
         Raises:
             UserError: if it does not take the action of the highest value, or its actions are indices or on another scale.
         """
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            written = self.actor(TensorDict({self.given: observation}, batch_size=observation.shape[:1]))
+        written = self._written(observation, None)
         self._check_scale()
         keys = [key for key in written.keys(True, True) if _last(key) == ACTION]
         if not keys:

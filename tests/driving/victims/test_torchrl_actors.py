@@ -16,11 +16,11 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical, OneHot
+from torchrl.envs import VecNorm
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
     Actor,
     EGreedyModule,
-    LSTMModule,
     OneHotCategorical,
     ProbabilisticActor,
     QValueActor,
@@ -65,6 +65,15 @@ def exploring() -> TensorDictSequential:
     return TensorDictSequential(actor, EGreedyModule(spec=Categorical(5), eps_init=1.0, eps_end=1.0))
 
 
+def normalised() -> TensorDictSequential:
+    """Behind the statistics that a VecNorm has learned, as its actor was in training."""
+    learning = VecNorm(in_keys=["observation"])
+    for _ in range(3):
+        learning(TensorDict({"observation": SHOWN.flatten(1) * 3 + 1}, batch_size=[len(SHOWN)]))
+    actor = QValueActor(network(5, flat=False), in_keys=["observation"], spec=Categorical(5))
+    return TensorDictSequential(learning.to_observation_norm(), actor)
+
+
 ACTORS: dict[str, Callable[[], TensorDictModuleBase]] = {
     "values": lambda: module(network(5), "action_value"),
     "another name": lambda: module(network(5), "q"),
@@ -79,6 +88,7 @@ ACTORS: dict[str, Callable[[], TensorDictModuleBase]] = {
     "Categorical": categorical,
     "OneHotCategorical": lambda: categorical(OneHotCategorical),
     "OneHotCategorical, its action only": lambda: categorical(OneHotCategorical).select_out_keys("action"),
+    "normalised": normalised,
     "flat": lambda: module(network(5, flat=False), "action_value"),
 }
 
@@ -113,8 +123,8 @@ REFUSED: dict[str, tuple[Callable[[], nn.Module], str]] = {
         "reads observation, mask, a driver is given one observation",
     ),
     "a memory": (
-        lambda: LSTMModule(input_size=50, hidden_size=5, in_key="observation", out_key="logits"),
-        "a recurrent policy is a cavbench.driving.Policy with `initial` and `advance`",
+        lambda: TensorDictModule(nn.GRUCell(50, 5), in_keys=["observation", "h"], out_keys=["logits", ("next", "h")]),
+        "remembers h, whose shape only an LSTMModule or a GRUModule says; give a cavbench.driving.Policy",
     ),
     "nothing of an action": (
         lambda: module(network(4, NormalParamExtractor()), "loc", "scale"),
@@ -136,6 +146,10 @@ REFUSED: dict[str, tuple[Callable[[], nn.Module], str]] = {
     "another scale in its spec": (
         lambda: Actor(network(2), in_keys=["observation"], spec=Bounded(-3.0, 3.0, (2,))),
         r"has actions up to -3, controls are in \[-1, 1\]",
+    ),
+    "a normalisation that goes on learning": (
+        lambda: TensorDictSequential(VecNorm(in_keys=["observation"]), module(network(5), "action_value")),
+        r"holds a VecNorm, which goes on learning its statistics when it is called: put transform.to_observation_norm\(\)",
     ),
     "other rows": (
         lambda: module(nn.Sequential(nn.Flatten(-2), nn.Linear(25, 5)), "action_value"),

@@ -288,6 +288,39 @@ def test_a_network_of_another_precision_computes_in_float32(dtype: torch.dtype) 
     torch.testing.assert_close(scores, network(observation.to(dtype)).float(), rtol=0, atol=0.02)
 
 
+class Exact(nn.Module):
+    """Computes in float64 whatever it is given."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(50, 5).double()
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.linear(observation.flatten(1).double())
+
+
+class Half(Exact):
+    """Computes in the precision that it is given, and holds a constant of its own in half precision."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(50, 5).half()
+        self.shift = [torch.zeros(50, dtype=torch.float16)]
+
+    def forward(self, observation: Tensor) -> Tensor:
+        shown = observation.flatten(1)
+        assert shown.dtype == torch.float16
+        return self.linear(shown + self.shift[0])
+
+
+@pytest.mark.parametrize("kind", [Exact, Half])
+def test_a_network_that_needs_its_own_precision_keeps_it(kind: type[Exact]) -> None:
+    network, observation = kind(), torch.from_numpy(OBSERVATION)
+    scores = loaded(network).scores(observation)
+    assert scores.dtype == torch.float32
+    assert torch.equal(scores, network(observation.to(network.linear.weight.dtype)).float())
+
+
 @pytest.mark.parametrize(("algorithm", "part"), [("sac", "actor"), ("sac", "policy"), ("ppo", "policy")])
 def test_a_part_of_a_model_that_samples_its_actions_is_refused(algorithm: str, part: str) -> None:
     model = sb3_model(algorithm, spaces(continuous=True))
