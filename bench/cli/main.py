@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from cavbench.core.track import Track
 
+KINDS = ("attack", "defense", "victim", "world", "threat")
 app = typer.Typer(pretty_exceptions_enable=False)
 
 AsJson = Annotated[
@@ -430,12 +431,27 @@ def _typed(error: typer.TyperException) -> str:
     options = [option for one in context.command.get_params(context) for option in one.opts if option.startswith("-")]
     match type(error).__name__:
         case "NoSuchOption":
+            if word := _without_dashes(str(error.option_name), context.info_name):  # type: ignore[attr-defined]
+                return f"unknown option {short(error.option_name)!r}: write it without dashes, {word}"  # type: ignore[attr-defined]
             return f"unknown option {short(error.option_name)!r}; known: {', '.join(options)}"  # type: ignore[attr-defined]
         case "MissingParameter":
             name = str(error.param.metavar or error.param.name.upper())  # type: ignore[attr-defined]
             return f"{name.split()[0].rstrip('.')} is missing; `bench {context.info_name} --help` says what it is"
         case _:
             return message
+
+
+def _without_dashes(option: str, command: str) -> str:
+    """The word that was meant by `--attack pgd`; empty if the command has no such key."""
+    from cavbench.cli.completion import known_keys
+
+    key = option.lstrip("-").replace("-", "_")
+    if command not in ("run", "audit", "train") or (key not in known_keys() and key.partition(".")[0] not in KINDS):
+        return ""
+    joined = [word.partition("=")[2] for word in sys.argv if word.startswith(f"{option}=")]
+    behind = sys.argv[sys.argv.index(option) + 1 :][:1] if option in sys.argv else []
+    values = joined or [word for word in behind if "=" not in word and not word.startswith("-")] or ["VALUE"]
+    return f"{key}={short(values[0])}"
 
 
 def _is_full(error: Exception) -> bool:
