@@ -163,7 +163,7 @@ def run(words: Words = None, cells: Cells = False, as_json: AsJson = False) -> N
     plan = plan_of(words or [], start)
     from cavbench.cli import run as cli_run
 
-    cli_run.run(plan, Console(), partial(_print_report, cells=cells), as_json=as_json)
+    raise typer.Exit(cli_run.run(plan, Console(), partial(_print_report, cells=cells), as_json=as_json))
 
 
 @app.command(cls=RunHelp)
@@ -357,6 +357,26 @@ def report(
     from cavbench.cli import report as cli_report
 
     cli_report.print_report(words or [], Console(stderr=as_json), as_json=as_json)
+
+
+@app.command()
+def compare(
+    sources: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="A B", help="Results folders, published, rows such as dqn+advtrain, or commits."),
+    ] = None,
+    cells: Annotated[bool, typer.Option("--cells", help="Show every cell, not only those that changed.")] = False,
+    as_json: AsJson = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown instead.")] = False,
+) -> None:
+    """Show what is better and what is worse in B than in A, scenario by scenario.
+
+    For instance: bench compare results published, bench compare dqn+advtrain dqn+shield, bench compare HEAD~1 published,
+    or bench compare results:dqn results:dqn+shield
+    """
+    from cavbench.cli import compare as cli_compare
+
+    cli_compare.print_comparison(sources or [], Console(), cells=cells, as_json=as_json, as_markdown=as_markdown)
 
 
 @app.command()

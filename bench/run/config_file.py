@@ -150,8 +150,8 @@ def _named(entry: object, path: Path) -> Iterator[str]:
     folder, name = "", entry
     if isinstance(entry, dict) and len(entry) == 1:
         ((folder, name),) = entry.items()
-    parts = [part for part in (folder, name) if part != ""]
-    if not parts or not all(isinstance(part, str) and PART.fullmatch(part) for part in parts):
+    parts = [part for part in (folder, name) if isinstance(part, str) and PART.fullmatch(part)]
+    if len(parts) < 1 + (folder != ""):
         raise UserError(f"{path}: a defaults list takes NAME, FOLDER: NAME or _self_, got {short(str(entry))}")
     yield "/".join(parts)
 
