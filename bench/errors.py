@@ -118,4 +118,10 @@ def plain(text: str) -> str:
     )
 
 
+def in_markdown(text: str) -> str:
+    """Text on one line that Markdown, its tables and HTML show as it is."""
+    return _MEANT.sub(lambda found: f"&#{ord(found[0])};", " ".join(plain(text).split()))
+
+
+_MEANT = re.compile(r"[\\`*_\[\]<>|#&~]")
 _OBEYED = re.compile(r"[^\n\t\x20-\x7e]")

@@ -29,12 +29,13 @@ def _words_before() -> list[str]:
 def _fitting(incomplete: str) -> list[str]:
     key, equals, value = incomplete.partition("=")
     if not equals:
-        return [f"{known}=" for known in _keys() if known.startswith(key)]
+        return [f"{known}=" for known in known_keys() if known.startswith(key)]
     before, comma, last = value.rpartition(",")
     return [f"{key}={before}{comma}{known}" for known in _values(key) if known.startswith(last)]
 
 
-def _keys() -> list[str]:
+def known_keys() -> list[str]:
+    """The keys of `bench run`, without the parameters of components."""
     from cavbench.cli.options_help import settings
     from cavbench.core import registry
     from cavbench.run.options import RunOptions

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from cavbench.core.track import Track
 
+KINDS = ("attack", "defense", "victim", "world", "threat")
 app = typer.Typer(pretty_exceptions_enable=False)
 
 AsJson = Annotated[
@@ -162,7 +163,7 @@ def run(words: Words = None, cells: Cells = False, as_json: AsJson = False) -> N
     plan = plan_of(words or [], start)
     from cavbench.cli import run as cli_run
 
-    cli_run.run(plan, Console(), partial(_print_report, cells=cells), as_json=as_json)
+    raise typer.Exit(cli_run.run(plan, Console(), partial(_print_report, cells=cells), as_json=as_json))
 
 
 @app.command(cls=RunHelp)
@@ -359,6 +360,26 @@ def report(
 
 
 @app.command()
+def compare(
+    sources: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="A B", help="Results folders, published, rows such as dqn+advtrain, or commits."),
+    ] = None,
+    cells: Annotated[bool, typer.Option("--cells", help="Show every cell, not only those that changed.")] = False,
+    as_json: AsJson = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown instead.")] = False,
+) -> None:
+    """Show what is better and what is worse in B than in A, scenario by scenario.
+
+    For instance: bench compare results published, bench compare dqn+advtrain dqn+shield, bench compare HEAD~1 published,
+    or bench compare results:dqn results:dqn+shield
+    """
+    from cavbench.cli import compare as cli_compare
+
+    cli_compare.print_comparison(sources or [], Console(), cells=cells, as_json=as_json, as_markdown=as_markdown)
+
+
+@app.command()
 def fetch(
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Files to download.")] = None,
 ) -> None:
@@ -430,12 +451,27 @@ def _typed(error: typer.TyperException) -> str:
     options = [option for one in context.command.get_params(context) for option in one.opts if option.startswith("-")]
     match type(error).__name__:
         case "NoSuchOption":
+            if word := _without_dashes(str(error.option_name), context.info_name):  # type: ignore[attr-defined]
+                return f"unknown option {short(error.option_name)!r}: write it without dashes, {word}"  # type: ignore[attr-defined]
             return f"unknown option {short(error.option_name)!r}; known: {', '.join(options)}"  # type: ignore[attr-defined]
         case "MissingParameter":
             name = str(error.param.metavar or error.param.name.upper())  # type: ignore[attr-defined]
             return f"{name.split()[0].rstrip('.')} is missing; `bench {context.info_name} --help` says what it is"
         case _:
             return message
+
+
+def _without_dashes(option: str, command: str) -> str:
+    """The word that was meant by `--attack pgd`; empty if the command has no such key."""
+    from cavbench.cli.completion import known_keys
+
+    key = option.lstrip("-").replace("-", "_")
+    if command not in ("run", "audit", "train") or (key not in known_keys() and key.partition(".")[0] not in KINDS):
+        return ""
+    joined = [word.partition("=")[2] for word in sys.argv if word.startswith(f"{option}=")]
+    behind = sys.argv[sys.argv.index(option) + 1 :][:1] if option in sys.argv else []
+    values = joined or [word for word in behind if "=" not in word and not word.startswith("-")] or ["VALUE"]
+    return f"{key}={short(values[0])}"
 
 
 def _is_full(error: Exception) -> bool:

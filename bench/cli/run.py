@@ -8,6 +8,7 @@ import pyarrow as pa
 from rich.text import Text
 
 from cavbench.cli.as_json import show_results
+from cavbench.cli.gates import NOT_PASSED, Gate
 from cavbench.cli.progress import show_downloads
 from cavbench.core.track import Track
 from cavbench.errors import UnfinishedError, UserError
@@ -18,8 +19,8 @@ from cavbench.run.progress import RunProgress
 from cavbench.terminal import Console
 
 
-def run(plan: Plan, console: Console, report: Callable[[Track, pa.Table], None], *, as_json: bool = False) -> None:
-    """Carry out the unfinished part of a run, and print its table.
+def run(plan: Plan, console: Console, report: Callable[[Track, pa.Table], None], *, as_json: bool = False) -> int:
+    """Carry out the unfinished part of a run, print its table, and return its exit code: 3 if it does not pass its gates.
 
     Args:
         plan: the run.
@@ -30,6 +31,7 @@ def run(plan: Plan, console: Console, report: Callable[[Track, pa.Table], None],
     Raises:
         UserError: after Ctrl-C, or at the end if a component failed.
     """
+    gate = Gate(plan)
     show_downloads()
     with RunProgress(Console(stderr=True)) as progress:
         for line in plan.skipped:
@@ -42,19 +44,23 @@ def run(plan: Plan, console: Console, report: Callable[[Track, pa.Table], None],
         except KeyboardInterrupt:
             kept = f"{progress.done} of {progress.total} episodes are kept"
             raise UserError(f"interrupted; {kept}: run the same command again to continue") from None
+    records = reading.read(plan.out, units, track=plan.track) if units else None
+    errors = unfinished.lines if unfinished else ()
     if as_json:
-        records = {plan.track.name: reading.read(plan.out, units, track=plan.track)} if units else {}
-        show_results(plan.out, records, unfinished.lines if unfinished else ())
-        if unfinished is not None:
-            raise unfinished
-        return
-    if units:
-        report(plan.track, reading.read(plan.out, units, track=plan.track))
-    for stop in stops.read(plan.out, [pair.id for pair in plan.pairs]) if plan.until else ():
-        console.print(Text(str(stop)), soft_wrap=True)
+        show_results(plan.out, {} if records is None else {plan.track.name: records}, errors)
+    else:
+        _print(plan, records, console, report)
+    passed = gate.passes(records, errors, Console(stderr=True))
     if unfinished is not None:
         raise unfinished
-    console.print(
-        Text(f"Records in {plan.out}: `bench show {plan.out}` shows their configuration and provenance."),
-        soft_wrap=True,
-    )
+    if not as_json:
+        folder = f"Records in {plan.out}: `bench show {plan.out}` shows their configuration and provenance."
+        console.print(Text(folder), soft_wrap=True)
+    return 0 if passed else NOT_PASSED
+
+
+def _print(plan: Plan, records: pa.Table | None, console: Console, report: Callable[[Track, pa.Table], None]) -> None:
+    if records is not None:
+        report(plan.track, records)
+    for stop in stops.read(plan.out, [pair.id for pair in plan.pairs]) if plan.until else ():
+        console.print(Text(str(stop)), soft_wrap=True)

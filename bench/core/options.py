@@ -63,12 +63,13 @@ class Options:
             hint = "" if twice[0] == "out" else f"; separate its values with commas: {short(twice[0])}=a,b"
             raise UserError(f"{short(twice[0])} is given twice{hint}")
         # Paths bypass hydra: its grammar gives a meaning to many characters that occur in them.
-        self.out = next((word.partition("=")[2] for word in words if word.startswith("out=")), None)
-        if self.out == "":
-            raise UserError("out has an empty value; write out=FOLDER")
+        paths = {item.name: item.metadata["path"] for item in fields(settings) if "path" in item.metadata}
+        self.paths = {key: word.partition("=")[2] for key, word in zip(keys, words, strict=True) if key in paths}
+        if empty := [key for key, path in self.paths.items() if not path]:
+            raise UserError(f"{empty[0]} has an empty value; write {empty[0]}={paths[empty[0]]}")
         self.values: dict[str, tuple[str, ...]] = {}
         self.broken: dict[str, str] = {}
-        for override in _parsed([word for word in words if not word.startswith("out=")]):
+        for override in _parsed([word for key, word in zip(keys, words, strict=True) if key not in paths]):
             key = override.key_or_group
             self._check_key(key)
             self.values[key] = _elements(override)
@@ -114,7 +115,7 @@ class Options:
             overrides.append(f"{key}={whole if key in lists else values[0]}")
         found = OmegaConf.to_container(_composed(OmegaConf.structured(self.schema), overrides, self.schema))
         assert isinstance(found, dict)
-        return {str(key): value for key, value in found.items()} | ({"out": self.out} if self.out else {})
+        return {str(key): value for key, value in found.items()} | self.paths
 
     def cell_values(self, axes: Axes) -> dict[str, tuple[Value, ...]]:
         """The given values on the axes of the world of the run.
@@ -175,6 +176,7 @@ class Options:
                 )
         found: dict[str, Chosen[Any]] = {}
         for name, owned in known.items():
+            _check_lists(kind, owned, swept)
             keys = [key for key in swept if key.partition(".")[0] in owned]
             for values in itertools.product(*(swept[key] for key in keys)):
                 with self._left_out(name):
@@ -425,6 +427,20 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
     composed = _composed(config, overrides, schema)[kind]
     arguments = OmegaConf.to_object(composed)
     return _read(kind, owned, arguments)
+
+
+def _check_lists(kind: str, owned: Mapping[str, Parameter], swept: Mapping[str, Sequence[str]]) -> None:
+    """Refuse a comma list, which sweeps, for a parameter whose value is a list."""
+    for key, values in swept.items():
+        if key in owned and _takes_lists(owned[key].hint) and not all(value.startswith("[") for value in values):
+            listed = short(",".join(values))
+            raise UserError(f"{kind}.{key} takes a list, which goes in brackets: write {kind}.{key}=[{listed}]")
+
+
+def _takes_lists(hint: Any) -> bool:
+    """Whether every value of a type is a list, or nothing."""
+    hints = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    return all(get_origin(one) in (tuple, list) for one in hints if one is not types.NoneType)
 
 
 def _read(kind: str, owned: dict[str, Parameter], arguments: Any) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from cavbench.core.pair import Chosen, Pair, check_track
 from cavbench.core.registry import KINDS, Kind
 from cavbench.core.suites import combined
 from cavbench.errors import UserError, short
+from cavbench.run import config_file
+from cavbench.run.gates import Gates
 from cavbench.run.options import RunOptions, TrainOptions
 from cavbench.run.plan import Plan, check_seeds
 from cavbench.scenarios import Grid
@@ -64,6 +66,7 @@ def plan_of(words: Sequence[str], start: Callable[[], None] = lambda: None) -> P
     Raises:
         UserError: if an option cannot be parsed or is not allowed.
     """
+    words = config_file.expanded(words)
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     given = Options(words, kinds=KINDS, settings=RunOptions, axes=list(axes))
     given.check_names()
@@ -92,7 +95,26 @@ def plan_of(words: Sequence[str], start: Callable[[], None] = lambda: None) -> P
             unit_memory=settings["unit_memory"],
             until=settings["until"],
             device=settings["device"],
+            gates=_gates(settings),
+            words=_repeating(words, given, standard, settings["seeds"]),
         )
+
+
+def _gates(settings: Mapping[str, Any]) -> Gates:
+    """The gates of a run."""
+    paths = {name: Path(settings[name]).expanduser() for name in ("against", "junit") if settings[name]}
+    return Gates(fail_below=settings["fail_below"], **paths)
+
+
+def _repeating(words: Sequence[str], given: Options, grid: Grid, seeds: Sequence[int] | None) -> dict[str, str]:
+    """The words of a run by key, with the names and the grid that were not typed: so they repeat it where defaults differ."""
+    typed = {key: value for key, _, value in (word.partition("=") for word in words)}
+    found: dict[str, str] = {kind: ",".join(dict.fromkeys(one.name for one in given.chosen(kind))) for kind in KINDS}
+    # A suite is written with its version.
+    found["attack"] = ",".join([*filter(None, [found["attack"]]), *(suite.name for suite in given.suites)])
+    found["grid"] = grid.name
+    found["seeds"] = ",".join(map(str, range(grid.training_seeds) if seeds is None else seeds))
+    return found | {key: value for key, value in typed.items() if key not in KINDS}
 
 
 def _shard(text: str) -> tuple[int, int]:

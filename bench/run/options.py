@@ -15,9 +15,9 @@ def half_of_memory() -> float:
     return machine_bytes() / 2e9
 
 
-def _meaning(meaning: str, default: str) -> dict[str, str]:
-    """Metadata of a field: its meaning, and its default as help shows it."""
-    return {"meaning": meaning, "default": default}
+def _meaning(meaning: str, default: str, path: str = "") -> dict[str, str]:
+    """Metadata of a field: its meaning, its default as help shows it, and of a path whether it is a FOLDER or a FILE."""
+    return {"meaning": meaning, "default": default} | ({"path": path} if path else {})
 
 
 @dataclass
@@ -46,7 +46,7 @@ class RunOptions:
     workers: int | None = field(default=None, metadata=_meaning("Worker processes.", "one per core"))
     ray: RayOptions = field(default_factory=RayOptions)
     device: str = field(default="cpu", metadata=_meaning("Where victims compute: cpu, cuda (a GPU), or auto.", "cpu"))
-    out: str = field(default="results", metadata=_meaning("Results folder.", "results"))
+    out: str = field(default="results", metadata=_meaning("Results folder.", "results", "FOLDER"))
     record: int | None = field(default=None, metadata=_meaning("Episodes to record in each cell.", "1, in the first"))
     reference: bool = field(default=True, metadata=_meaning("Drive the baselines, too.", "true"))
     shard: str = field(default="1/1", metadata=_meaning("PART/PARTS: 3/10 drives the third of ten parts.", "1/1"))
@@ -60,6 +60,14 @@ class RunOptions:
     until: float | None = field(
         default=None, metadata=_meaning("Drive in rounds until each score is known to +- this.", "off")
     )
+    config: str | None = field(
+        default=None, metadata=_meaning("YAML file with these options, or the folder of a run.", "none", "FILE.yaml")
+    )
+    fail_below: float | None = field(default=None, metadata=_meaning("Exit code 3 if a pair scores below this.", "off"))
+    against: str | None = field(
+        default=None, metadata=_meaning("Exit code 3 if a pair is significantly worse than there.", "off", "FOLDER")
+    )
+    junit: str | None = field(default=None, metadata=_meaning("Write JUnit XML with a case a pair.", "none", "FILE"))
 
 
 @dataclass
@@ -67,4 +75,4 @@ class TrainOptions:
     """The options of `bench train`, with types and defaults."""
 
     seeds: list[int] = field(default_factory=lambda: [0], metadata=_meaning("Training seeds.", "0"))
-    out: str | None = field(default=None, metadata=_meaning("Zoo to save to.", "your own zoo"))
+    out: str | None = field(default=None, metadata=_meaning("Zoo to save to.", "your own zoo", "FOLDER"))

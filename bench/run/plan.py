@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,7 @@ from cavbench.core.track import Track, track_of
 from cavbench.errors import short
 from cavbench.identity.fingerprint import canonical
 from cavbench.records.schema import SEQUENTIAL
+from cavbench.run.gates import Gates
 from cavbench.run.networks import Weights, hashes
 from cavbench.run.options import EXECUTORS, half_of_memory
 from cavbench.run.task import Limits, Task
@@ -48,6 +49,8 @@ class Plan:
         unit_memory: GB of memory that a worker process may use; 0 for no limit.
         device: where victims compute: `auto` is a GPU if there is one, and becomes `cpu` or `cuda` here.
         until: half the width of the interval at which a row has enough scenarios (`cavbench.run.rounds`); None drives them all.
+        gates: what it must reach to pass.
+        words: the options that repeat the run, by key (`cavbench.run.config_file`); empty for a run from Python.
 
     Raises:
         ValueError: if a number is out of range.
@@ -69,6 +72,8 @@ class Plan:
     unit_memory: float = field(default_factory=half_of_memory)
     until: float | None = None
     device: str = CPU
+    gates: Gates = field(default_factory=Gates)
+    words: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import closing
 from typing import Protocol
 
+from cavbench.run import config_file
 from cavbench.run.batches import batches
 from cavbench.run.executor import Executor, Finished
 from cavbench.run.executors import EXECUTORS
@@ -50,6 +51,8 @@ def run(plan: Plan, watcher: RunWatcher, choose: Choice | None = None) -> list[s
     """
     failures = Failures(plan.broken)
     results = Results(plan.out)
+    if plan.words:
+        config_file.write(plan.out, plan.words)
     for line in plan.broken:
         watcher.failed(line)
     with closing(EXECUTORS[plan.executor](plan)) as back_end:

@@ -52,8 +52,11 @@ class Components:
     runs: int
     scenarios: int
 
-    def margin(self) -> Array:
-        """Half the width of the 95 % interval of each mean; NaN with one run and one scenario.
+    def margin(self, tail: Array | float = 1 - _TAIL) -> Array:
+        """Half the width of the interval of each mean, of 95 % by default; NaN with one run and one scenario.
+
+        Args:
+            tail: the probability of each side that the interval leaves out; one for all means, or one for each.
 
         The square is the mean of two: Satterthwaite's (1946), a t-quantile with the degrees of freedom of the sum, which is too
         narrow if few runs make most of the variance; and the sum of the squared margins of the two parts (the modified large
@@ -62,28 +65,30 @@ class Components:
         own = max(self.runs - 1, 0), max(self.scenarios - 1, 0)
         if not any(own):
             return np.full_like(self.training, np.nan)
-        return margin_of([(part, df) for part, df in zip((self.training, self.scenario), own, strict=True) if df])
+        return margin_of([(part, df) for part, df in zip((self.training, self.scenario), own, strict=True) if df], tail)
 
 
-def margin_of(parts: Sequence[tuple[Array, int]]) -> Array:
-    """Half the width of the 95 % interval of a mean whose variance is a sum (`Components.margin`).
+def margin_of(parts: Sequence[tuple[Array, int]], tail: Array | float = 1 - _TAIL) -> Array:
+    """Half the width of the interval of a mean whose variance is a sum (`Components.margin`).
 
     Args:
         parts: each part of the variance with its degrees of freedom.
+        tail: as there.
     """
     variance = np.asarray(sum(part for part, _ in parts))
     freedom = np.asarray(sum(np.square(part) / df for part, df in parts))
     effective = np.divide(np.square(variance), freedom, out=np.ones_like(variance), where=freedom > 0)
-    joint = np.square(t_quantile(effective)) * variance
-    apart = sum(np.square(t_quantile(df)) * part for part, df in parts)
+    joint = np.square(t_quantile(effective, tail)) * variance
+    apart = sum(np.square(t_quantile(df, tail)) * part for part, df in parts)
     return np.asarray(np.sqrt((joint + apart) / 2))
 
 
-def t_quantile(freedom: Array | float, tail: float = 1 - _TAIL) -> Array:
+def t_quantile(freedom: Array | float, tail: Array | float = 1 - _TAIL) -> Array:
     """The quantile of Student's t that is exceeded with probability `tail`."""
     from scipy.special import stdtrit
 
-    return np.asarray(stdtrit(freedom, 1 - tail))
+    # 1 - tail has no digits of a tail that is far out.
+    return np.asarray(np.where(np.asarray(tail) > 1e-4, stdtrit(freedom, 1 - tail), -stdtrit(freedom, tail)))
 
 
 def components(means: Array) -> Components:

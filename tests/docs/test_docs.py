@@ -11,11 +11,13 @@ from itertools import takewhile
 from pathlib import Path
 
 import pytest
+import yaml
 
 from cavbench.cli.explain import GLOSSARY
 from cavbench.core.options import Options
 from cavbench.core.registry import GROUPS, KINDS, Kind, all_grids, entries
 from cavbench.run import options
+from cavbench.run.config_file import expanded
 from docs.figures.__main__ import FIGURES
 from docs.prose import findings
 from tests.tree import ROOT
@@ -81,6 +83,16 @@ def test_every_command_in_the_documentation_names_what_exists() -> None:
                 assert any(words[0] in entries(GROUPS[kind]) for kind in KINDS) or words[0] in (*KINDS, "standard")
             checked += 1
     assert checked > 100
+
+
+def test_the_workflow_runs_a_command_whose_file_is_beside_it() -> None:
+    steps = yaml.safe_load((DOCS / "ci" / "robustness.yml").read_text())["jobs"]["robustness"]["steps"]
+    (line,) = [step["run"] for step in steps if step.get("run", "").startswith("bench ")]
+    _, name, *words = shlex.split(line)
+    assert name == "run"
+    found = expanded([word.replace("config=", f"config={DOCS / 'ci'}/") for word in words])
+    _check_names(found, train=False)
+    assert {"fail_below=0.6", "against=baseline", "junit=robustness.xml"} <= set(found)
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])

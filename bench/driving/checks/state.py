@@ -64,4 +64,5 @@ def named(state: State) -> str:
     """A remark with the entries of a state."""
     if state is None:
         return "it has no memory"
-    return f"its memory: {', '.join(sorted(map(str, state.keys())))}"
+    entries = ", ".join(sorted(map(str, state.keys())))
+    return f"its memory: {entries}" if entries else "its memory has no entries"
