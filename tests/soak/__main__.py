@@ -3,7 +3,8 @@
     python -m tests.soak kills=100 inputs=1000 plugins=60 fuzzing=60 minutes=60 seed=0
     python -m tests.soak kills=10 inputs=200 plugins=10 fuzzing=10 minutes=2 only=run,craft
 
-Then come bad places, bad command lines, plug-ins that misbehave (`plugins`), changed files (`fuzzing`: minutes) and a long run (`minutes`); 0 leaves a part out.
+Then come bad places, bad command lines, plug-ins that misbehave (`plugins`), changed files (`fuzzing`: minutes) and a long run
+(`minutes`); 0 leaves a part out.
 Prints a table of figures. Not part of the test suite.
 """
 
