@@ -82,7 +82,7 @@ debian-browser:
 clean:
 	rm -rf $(VENV) build dist docs/_build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-# Random kills, bad places, bad command lines, changed files and a long run, with a table of figures for docs/reliability.md; three hours
+# Random kills, bad places, bad command lines, bad plug-ins, changed files and a long run, with a table of figures for docs/reliability.md; three hours
 # on two idle cores. Not part of `test`.
 soak: install-dev
-	$(BIN)/python -m tests.soak kills=100 inputs=1000 fuzzing=60 minutes=60
+	$(BIN)/python -m tests.soak kills=100 inputs=1000 plugins=60 fuzzing=60 minutes=60

@@ -94,10 +94,10 @@ def started(folder: Path, *words: str) -> subprocess.Popen[str]:
     )
 
 
-def ran(folder: Path, *words: str) -> Said:
+def ran(folder: Path, *words: str, timeout: float = 300) -> Said:
     """Run the command line in a new process, to its end."""
     process = started(folder, *words)
-    out, err = process.communicate(timeout=300)
+    out, err = process.communicate(timeout=timeout)
     return Said(process.returncode, out, err)
 
 

@@ -1,9 +1,10 @@
 """Kills real commands at random moments, continues them, and compares the end with an undisturbed run: `make soak`.
 
-    python -m tests.soak kills=100 inputs=1000 fuzzing=60 minutes=60 seed=0
-    python -m tests.soak kills=10 inputs=200 fuzzing=10 minutes=2 only=run,craft
+    python -m tests.soak kills=100 inputs=1000 plugins=60 fuzzing=60 minutes=60 seed=0
+    python -m tests.soak kills=10 inputs=200 plugins=10 fuzzing=10 minutes=2 only=run,craft
 
-Then come bad places, bad command lines, changed files (`fuzzing`: minutes) and a long run (`minutes`); 0 leaves a part out.
+Then come bad places, bad command lines, plug-ins that misbehave (`plugins`), changed files (`fuzzing`: minutes) and a long run
+(`minutes`); 0 leaves a part out.
 Prints a table of figures. Not part of the test suite.
 """
 
@@ -26,6 +27,7 @@ from tests.plugins.distributions import install_toy
 from tests.soak.conditions import CONDITIONS, bad_input
 from tests.soak.endurance import endure
 from tests.soak.fuzzing.campaign import fuzz
+from tests.soak.rogues import sweep
 from tests.soak.subjects import SUBJECTS, Subject
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
@@ -109,6 +111,7 @@ def main(words: list[str]) -> None:
     given = {
         "kills": "100",
         "inputs": "1000",
+        "plugins": "60",
         "fuzzing": "60",
         "minutes": "60",
         "seed": "0",
@@ -125,6 +128,8 @@ def main(words: list[str]) -> None:
             show(f"{name}: {condition(site, _made(Path(folder) / name))}")
         if count := int(given["inputs"]):
             show(f"bad input: {bad_input(_made(Path(folder) / 'bad input'), count)}")
+        if count := int(given["plugins"]):
+            show(f"plug-ins: {sweep(_made(Path(folder) / 'plug-ins'), count, int(given['seed']))}")
         for line in fuzz(float(given["fuzzing"]), number=int(given["seed"])) if float(given["fuzzing"]) else ():
             show(line)
         if minutes := float(given["minutes"]):
