@@ -21,5 +21,11 @@ def _leaderboard(records: Mapping[str, pa.Table], folder: Path | None) -> dict[s
     return document(boards, comparisons, folder)
 
 
+def _beside(records: Mapping[str, pa.Table], folder: Path | None) -> dict[str, Any]:
+    boards, comparisons = read_boards(records, every_track())
+    return document(boards, comparisons, folder)
+
+
 RUN = Report(content=run_content, csv=pairs_table, latex=pairs_latex)
 LEADERBOARD = Report(content=_leaderboard, csv=table, latex=latex)
+BESIDE = Report(content=_beside, csv=table, latex=latex)

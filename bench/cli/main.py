@@ -340,7 +340,7 @@ def report(
         list[str] | None,
         typer.Argument(
             metavar="[NAME] [out=…] [html=…] [json=…] [csv=…] [latex=…]",
-            help="Name of a report (run, leaderboard or thesis; without one run), a results folder, files to write.",
+            help="Name of a report (run, cells, leaderboard, beside, flags, thesis; by default run), a results folder, files.",
             autocompletion=completed,
         ),
     ] = None,

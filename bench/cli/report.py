@@ -19,6 +19,8 @@ from cavbench.records import reading
 
 PAGES = "cavbench.pages"
 FILES = ("json", "csv", "latex")
+PUBLISHED = ("leaderboard", "flags", "thesis")
+"""Reports that show published records where there is no results folder."""
 KEYS = ("out", "html", *FILES)
 
 
@@ -38,7 +40,7 @@ def print_report(words: Sequence[str], console: Console, *, as_json: bool = Fals
     out = Path(values.get("out", "results")).expanduser()
     targets = {key: Path(values[key]).expanduser() for key in FILES if key in values}
     name = names[0] if names else "leaderboard" if "html" in values or targets else "run"
-    published = "out" not in values and not out.exists() and name != "run"
+    published = "out" not in values and not out.exists() and name in PUBLISHED
     source = "published records (there is no folder results)" if published else f"records of the folder {out}"
     for key, target in targets.items():
         _check(key, target)

@@ -1,4 +1,4 @@
-"""Reads from the source of a component which tracks it works on, without importing it."""
+"""Reads from the source of a component which tracks it works on, and what it asks for, without importing it."""
 
 from __future__ import annotations
 
@@ -29,10 +29,20 @@ def tracks_of(target: str) -> list[str]:
 
     They are the values of `track: ... = "..."` in the bodies of the class and its bases, where these can be followed by name.
     """
+    return sorted({track for one in _ancestry(target) for track in one.tracks})
+
+
+def access_of(target: str) -> str:
+    """The access that the attack `module:Class` declares, or the nearest of its bases; empty if the source does not tell."""
+    return next((one.access for one in _ancestry(target) if one.access), "")
+
+
+def _ancestry(target: str) -> Iterator[_Class]:
+    """A class and its bases, the class first, where these can be followed by name."""
     module, _, name = target.partition(":")
-    waiting, seen, found = [(module, name)], set(), set[str]()
+    waiting, seen = [(module, name)], set()
     while waiting:
-        module, name = place = waiting.pop()
+        module, name = place = waiting.pop(0)
         if place in seen:
             continue
         seen.add(place)
@@ -40,11 +50,10 @@ def tracks_of(target: str) -> list[str]:
         if name not in classes:
             waiting += [imported[name]] if name in imported else []
             continue
-        found |= classes[name].tracks
+        yield classes[name]
         for parent, parent_class in classes[name].bases:
             origin = ".".join(filter(None, imported.get(parent, (parent, "")))) if parent else module
             waiting.append((origin, parent_class))
-    return sorted(found)
 
 
 def summary(target: str) -> str:
@@ -63,26 +72,30 @@ def summary(target: str) -> str:
 
 @dataclass(frozen=True)
 class _Class:
-    """What is read of a class: its docstring, tracks, and bases as (module or alias, name); "" is the class's own module."""
+    """What is read of a class: its docstring, tracks, the access that it declares ("" for none), and its bases as (module or
+    alias, name); "" is the class's own module."""
 
     docstring: str
     tracks: frozenset[str]
+    access: str
     bases: tuple[tuple[str, str], ...]
 
     @classmethod
     def read(cls, node: ast.ClassDef) -> _Class:
-        tracks, bases = set(), []
+        tracks, access, bases = set(), "", []
         for line in node.body:
             match line:
                 case ast.AnnAssign(target=ast.Name(id="track"), value=ast.Constant(value=str(track))):
                     tracks.add(track)
+                case ast.AnnAssign(target=ast.Name(id="access"), value=ast.Constant(value=str(declared))):
+                    access = declared
         for base in node.bases:
             match base.value if isinstance(base, ast.Subscript) else base:
                 case ast.Name(id=name):
                     bases.append(("", name))
                 case ast.Attribute(value=ast.Name(id=parent), attr=name):
                     bases.append((parent, name))
-        return cls(ast.get_docstring(node) or "", frozenset(tracks), tuple(bases))
+        return cls(ast.get_docstring(node) or "", frozenset(tracks), access, tuple(bases))
 
 
 @cache

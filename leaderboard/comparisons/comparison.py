@@ -42,6 +42,7 @@ class Comparison:
             whose training seed changes nothing in the victim.
         audit: the same attack on the same defended victim, on scenarios that an audit drew; None where there was none.
         baselines: the same scenarios by name of a baseline (`Track.baseline_of`), in the cells that it has.
+        mine: whether the records are a user's own, where they stand beside published ones.
     """
 
     identity: Mapping[str, Any]
@@ -50,6 +51,7 @@ class Comparison:
     clean: Episodes | None
     baselines: Mapping[str, Episodes]
     audit: Episodes | None = None
+    mine: bool = False
 
     @property
     def is_attacked(self) -> bool:
@@ -70,6 +72,11 @@ class Comparison:
     def defended(self) -> tuple[object, ...]:
         """What is attacked: the values of `DEFENDED`."""
         return tuple(self.identity[name] for name in DEFENDED)
+
+    @property
+    def ranked_as(self) -> tuple[object, ...]:
+        """The row of a leaderboard that it is in: what is attacked, in a user's own records or in others."""
+        return (*self.defended, self.mine)
 
     @cached_property
     def settings(self) -> dict[str, object]:

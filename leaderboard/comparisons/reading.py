@@ -21,6 +21,8 @@ from cavbench.records.schema import AUDIT
 from cavbench.records.table import group_codes
 from cavbench.statistics.episodes import Episodes
 
+MAKING = "crafting_s"
+"""Seconds that an artefact took, on tracks that have one."""
 SCENARIO = ("training_seed", "cell", "seed")
 CONTROL = (*DEFENDED, "grid")
 """The columns that attacked episodes share with their clean control."""
@@ -29,7 +31,7 @@ CONTROL = (*DEFENDED, "grid")
 def measurements(of: Track) -> set[str]:
     """The measurements of a track that leaderboards read, of columns that hold no lists."""
     needed = {of.metric, of.failure, of.place, of.queries, of.gradients} | {one.column for one in headline(of)}
-    needed |= {f"{of.artefact[0]}_sha256"} if of.artefact else set()
+    needed |= {f"{of.artefact[0]}_sha256", MAKING} if of.artefact else set()
     return needed & {field.name for field in of.measurements if not pa.types.is_list(field.type)}
 
 

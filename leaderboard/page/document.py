@@ -24,6 +24,7 @@ from cavbench.leaderboard.page.pairs import (
     threat,
     value,
 )
+from cavbench.leaderboard.ranking.attackers import Attacker, attackers
 from cavbench.leaderboard.ranking.boards import Board, Row
 from cavbench.leaderboard.ranking.columns import Column, columns
 from cavbench.leaderboard.ranking.curves import Curve
@@ -118,6 +119,7 @@ def _board(board: Board, keys: Mapping[int, int], called: Labels, folder: Path |
         "axes": _axes(first.axes, driven),
         "columns": [_column(one) for one in columns(board)],
         "rows": [{**_row(row, board, keys, called), "clip": clip(row, board, folder, link)} for row in board.rows],
+        "attackers": [_attacker(one, keys) for one in attackers(board)],
         "baselines": [
             {
                 "name": name,
@@ -127,6 +129,12 @@ def _board(board: Board, keys: Mapping[int, int], called: Labels, folder: Path |
             for name, drive in board.baselines.items()
         ],
     }
+
+
+def _attacker(one: Attacker, keys: Mapping[int, int]) -> dict[str, Any]:
+    measured = {name: number(getattr(one, name)) for name in ("added", "alone", "strongest", "queries", "seconds")}
+    counts = {"rank": one.group, "name": one.name, "rows": one.rows, "variants": one.variants}
+    return {**counts, **measured, "pairs": [keys[id(attack)] for attack in one.attacks]}
 
 
 def _axes(axes: Axes, driven: set[Cell]) -> list[dict[str, Any]]:
@@ -163,6 +171,7 @@ def _row(row: Row, board: Board, keys: Mapping[int, int], called: Labels) -> dic
 
     return {
         "flagged": row.flagged,
+        "mine": row.mine,
         **named(first, ("defense", "victim"), called),
         "values": {one.name: value(one.value(row, label)) for one in listed},
         "strongest": keys[id(first)],

@@ -48,10 +48,12 @@ def controls(comparisons: Sequence[Comparison]) -> list[Comparison]:
     found: dict[tuple[object, ...], Comparison] = {}
     for one in comparisons:
         if one.is_attacked and one.clean:
-            known = found.get(one.defended)
+            known = found.get(one.ranked_as)
             if known is None or known.own.table.num_rows < one.clean.table.num_rows:
-                control = Comparison(identity_of(one.clean), one.track, one.clean, one.clean, one.baselines)
-                found[one.defended] = control
+                identity = identity_of(one.clean)
+                found[one.ranked_as] = Comparison(
+                    identity, one.track, one.clean, one.clean, one.baselines, mine=one.mine
+                )
     return list(found.values())
 
 
@@ -74,6 +76,7 @@ def pair(one: Comparison, key: int, called: Labels, folder: Path | None, role: R
     failed = next((measure for measure in track.measures if measure.column == track.failure), None)
     return {
         "key": key,
+        "mine": one.mine,
         "role": role or ("attacked" if one.is_attacked else "clean"),
         "track": track.name,
         **named(one, ("attack", "defense", "victim"), called),

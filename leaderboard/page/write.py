@@ -37,13 +37,25 @@ from cavbench.run.process import follow_parent
 NAME = "leaderboard.html"
 
 
-def write(out: Path | None, page: Path, console: Console) -> None:
+def write_beside(out: Path | None, page: Path, console: Console) -> None:
+    """The same with the published rows beside those of a results folder, which are marked.
+
+    Raises:
+        UserError: as `write`; and if there is no results folder, or nothing was attacked.
+    """
+    if out is None:
+        raise UserError("there is no folder results; choose another with out=")
+    write(out, page, console, published=every_track())
+
+
+def write(out: Path | None, page: Path, console: Console, *, published: Mapping[str, pa.Table] | None = None) -> None:
     """Write the page, the JSON, the CSV and the LaTeX tables of a results folder, and print the ranking.
 
     Args:
         out: results folder; None takes the records that are published with the package.
         page: where to write; in a folder it is called `leaderboard.html`.
         console: where to print.
+        published: records whose rows stand beside those of the folder.
 
     Raises:
         UserError: if there are no records, or nothing can be written.
@@ -58,7 +70,7 @@ def write(out: Path | None, page: Path, console: Console) -> None:
         records = _read(out)
         # The published rows are no records of a user: the thesis' tables have records of their own.
         thesis = beside.submit(chapters.chapters, {} if out is None else chapters.needed(records))
-        boards, comparisons = read_boards(records)
+        boards, comparisons = read_boards(records, published)
         made = documents.document("leaderboard", document(boards, comparisons, out, _link(out, page)))
         texts = {
             _files(page)[0]: documents.written(made, indent=None),

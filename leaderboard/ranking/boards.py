@@ -12,6 +12,8 @@ import pyarrow as pa
 from cavbench.core import registry
 from cavbench.core.contracts import Access
 from cavbench.core.track import Track
+from cavbench.errors import UserError
+from cavbench.leaderboard.comparisons.beside import beside
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.reading import read_tracks
 from cavbench.leaderboard.ranking.flags import Flag, Subject, flags
@@ -46,6 +48,11 @@ class Row:
     def identity(self) -> Mapping[str, object]:
         """Of what is defended, and of its strongest attack."""
         return self.attacks[0].identity
+
+    @property
+    def mine(self) -> bool:
+        """Whether it is of the records of a user, beside published ones."""
+        return self.attacks[0].mine
 
     @property
     def flagged(self) -> bool:
@@ -129,12 +136,12 @@ def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
     _, world, world_params, grid, *threat = key
     allowed = [one for one in attacked if _within(one, key)]
     rows = []
-    for defended in dict.fromkeys(one.defended for one in attacked if _key(one) == key):
-        panel = Panel.of([one for one in allowed if one.defended == defended])
+    for defended in dict.fromkeys(one.ranked_as for one in attacked if _key(one) == key):
+        panel = Panel.of([one for one in allowed if one.ranked_as == defended])
         found = panel.strongest()
         assert found is not None, "the attack whose seeds the panel has has a cell"
         own = found.order
-        same = [one for one in attacked if one.defended == defended and one.identity["grid"] == grid]
+        same = [one for one in attacked if one.ranked_as == defended and one.identity["grid"] == grid]
         others = [one for one in same if one.identity["threat_norm"] == threat[0]]
         doubts = tuple(flags(Subject(track, own, others, found)))
         rows.append(Row(own, found, panel.marginal(found), panel.left_out, doubts))
@@ -157,7 +164,7 @@ def _within(one: Comparison, key: Key) -> bool:
 
 def ranked(rows: Iterable[Row]) -> Iterator[Row]:
     """Best first, flagged ones last, in groups: a group's rows are not significantly below its first."""
-    ordered = sorted(rows, key=lambda row: (row.flagged, -round(row.worst.score.estimate, 9), row.attacks[0].defended))
+    ordered = sorted(rows, key=lambda row: (row.flagged, -round(row.worst.score.estimate, 9), row.attacks[0].ranked_as))
     group, leader = 0, None
     for row in ordered:
         if leader is None or row.flagged != leader.flagged or _below(row.worst, leader.worst):
@@ -200,7 +207,23 @@ def _baselines(attacks: Sequence[Comparison]) -> dict[str, Episodes]:
     return named
 
 
-def read_boards(records: Mapping[str, pa.Table]) -> tuple[list[Board], list[Comparison]]:
-    """The leaderboards that records make, by track, and all that was driven and can be compared."""
+def read_boards(
+    records: Mapping[str, pa.Table], published: Mapping[str, pa.Table] | None = None
+) -> tuple[list[Board], list[Comparison]]:
+    """The leaderboards that records make, and all that was driven and can be compared.
+
+    Args:
+        records: by track.
+        published: other records, by track; None for none. Leaderboards have the rows of both, the first marked as a user's own,
+            and only those leaderboards are made that have such a row.
+
+    Raises:
+        UserError: if `published` is given and no attack is in `records`.
+    """
     comparisons = read_tracks(records)
-    return boards(comparisons), comparisons
+    if published is None:
+        return boards(comparisons), comparisons
+    both = beside(comparisons, read_tracks(published))
+    if not any(one.is_attacked for one in comparisons):
+        raise UserError("nothing was attacked: there is no row to stand beside the published ones")
+    return boards(both), both

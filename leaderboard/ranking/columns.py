@@ -80,7 +80,7 @@ def _names() -> Iterator[Column]:
     yield Column(
         name="rank",
         title="Rank",
-        short="rank",
+        short="\nrank",
         meaning="rank group, from 1; flagged rows rank below all others",
         value=lambda row, called: row.group,
         kind="count",
@@ -136,6 +136,7 @@ def _scores(track: Track) -> Iterator[Column]:
         meaning="the lowest score of a cell",
         value=lambda row, called: row.worst.worst_cell[1],
         interval=True,
+        spare=3,
     )
     yield Column(
         name="worst_cell",
@@ -144,7 +145,7 @@ def _scores(track: Track) -> Iterator[Column]:
         meaning="the cell with the lowest score",
         value=lambda row, called: " × ".join(map(written, row.worst.worst_cell[0].values())),
         kind="text",
-        spare=2,
+        spare=5,
     )
     yield Column(
         name="clean",
@@ -154,7 +155,7 @@ def _scores(track: Track) -> Iterator[Column]:
         value=lambda row, called: row.worst.clean,
         by_cell=lambda worst: worst.clean_by_cell,
         interval=True,
-        spare=3,
+        spare=4,
     )
     yield Column(
         name="certified",
@@ -163,6 +164,7 @@ def _scores(track: Track) -> Iterator[Column]:
         meaning="lower bound of the score under every attack of the threat model",
         value=lambda row, called: row.worst.certified,
         optional=True,
+        spare=3,
     )
     if contrast and contrast.side == "victim":
         yield Column(
@@ -174,6 +176,7 @@ def _scores(track: Track) -> Iterator[Column]:
             kind="difference",
             by_cell=lambda worst: (worst.scores - worst.rival).mean((0, 2)),
             interval=True,
+            spare=2,
         )
 
 
@@ -185,6 +188,17 @@ def _rest(track: Track) -> Iterator[Column]:
         meaning="the single attack that is the strongest in most cells",
         value=lambda row, called: called(row.attacks[0], "attack"),
         kind="text",
+        spare=1,
+    )
+    yield Column(
+        name="attacks",
+        title="Attacks",
+        short="\nattacks",
+        meaning="number of attacks that count: a score is only as good as these",
+        value=lambda row, called: len(row.attacks),
+        kind="count",
+        digits=0,
+        spare=6,
     )
     yield Column(
         name="strongest_attack_params",
@@ -197,7 +211,7 @@ def _rest(track: Track) -> Iterator[Column]:
     yield Column(
         name="flags",
         title="Flags",
-        short="flags",
+        short="\n⚑",
         meaning="the flags that have fired, which cast doubt on the score",
         value=lambda row, called: " ".join(flag.name for flag in row.flags if flag.fired),
         kind="text",

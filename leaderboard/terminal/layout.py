@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, product
 from typing import Generic, Literal, TypeVar
@@ -57,7 +57,7 @@ def fitted(
         columns: from left to right.
         sections: from top to bottom.
         console: where the table is printed.
-        apart: whether there is an empty line between the sections.
+        apart: whether there is an empty line between the sections; otherwise there is room for few lines.
     """
     room = console.width - 2
     rows = [
@@ -65,32 +65,55 @@ def fitted(
     ]
     titles = [section.title for section in sections]
     limits = range(max(column.spare for column in columns), -1, -1)
-    for names, limit, gap in product((None, console.width // 3), limits, (1, 0)):
+    # Fewer columns rather than a name in two lines; then two lines rather than no space between columns, unless lines are few. No
+    # word is broken, unless a terminal has no room for it.
+    close, folded_names = list(product((False, True), (0,), (0,))), list(product((True,), limits, (1,)))
+    tries = [*product((False,), limits, (1,)), *(folded_names + close if apart else close + folded_names)]
+    for folded, limit, gap in tries:
         kept = [place for place, column in enumerate(columns) if column.spare <= limit]
         texts = [[[row[place] for place in kept] for row in section] for section in rows]
-        made = _table([columns[place] for place in kept], list(zip(titles, texts, strict=True)), gap, names, apart)
-        if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= room:
+        own = [columns[place] for place in kept]
+        widths = _least(own, texts) if folded else {}
+        made = _table(own, list(zip(titles, texts, strict=True)), gap, widths, apart)
+        left = room - Measurement.get(console, console.options.update(max_width=10_000), made).maximum
+        if left >= 0:
             break
-    return made
+    # Folded names get the room that is left.
+    for place, least in widths.items():
+        widths[place] = min(_longest(texts, place), least + max(left, 0))
+        left -= widths[place] - least
+    return _table(own, list(zip(titles, texts, strict=True)), gap, widths, apart) if widths else made
+
+
+def _least(columns: Sequence[Column[Subject]], texts: Sequence[Sequence[Sequence[Text]]]) -> dict[int, int]:
+    """How wide each column of names is at least: as its longest word."""
+    return {
+        place: max((len(word) for section in texts for row in section for word in row[place].plain.split()), default=1)
+        for place, column in enumerate(columns)
+        if column.folds
+    }
+
+
+def _longest(texts: Sequence[Sequence[Sequence[Text]]], place: int) -> int:
+    return max((len(row[place].plain) for section in texts for row in section), default=1)
 
 
 def _table(
     columns: Sequence[Column[Subject]],
     sections: Sequence[tuple[Text | None, Sequence[Sequence[Text]]]],
     gap: int,
-    names: int | None,
+    widths: Mapping[int, int],
     apart: bool,
 ) -> Table:
-    """With `gap` characters between the columns; names that fold are at most `names` wide."""
+    """With `gap` characters between the columns; the names in some have a width, and go on in the next line."""
     made = Table(box=box.SIMPLE_HEAD, header_style="dim", padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
-    for column in columns:
-        whole = not column.folds or names is None
+    for place, column in enumerate(columns):
         made.add_column(
             column.heading,
             justify=column.justify,
-            no_wrap=whole,
-            overflow="ellipsis" if whole else "fold",
-            max_width=None if whole else names,
+            no_wrap=place not in widths,
+            overflow="fold" if place in widths else "ellipsis",
+            width=widths.get(place),
             vertical="bottom",
         )
     for title, rows in sections:

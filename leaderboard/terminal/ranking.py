@@ -1,4 +1,4 @@
-"""The ranking of every threat model on the terminal, with the flags that have fired."""
+"""The ranking of every threat model on the terminal, of defended victims and of attacks; and why rows are flagged."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from cavbench.leaderboard.ranking.boards import Board, Row, read_boards
 from cavbench.leaderboard.ranking.columns import Called, columns
 from cavbench.leaderboard.ranking.columns import Column as Ranked
 from cavbench.leaderboard.ranking.flags import FLAGS
+from cavbench.leaderboard.terminal.attackers import print_attackers
 from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, fitted
 from cavbench.leaderboard.terminal.text import (
     ATTACKED,
@@ -36,7 +37,7 @@ ADDED = 0.01
 
 
 def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> None:
-    """Print the ranking of every threat model, with the flags that have fired.
+    """Print the ranking of defended victims in every threat model, and that of the attacks on them.
 
     Args:
         records: by track (`cavbench.records.schema`); where there are none, the published records count.
@@ -45,53 +46,86 @@ def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> Non
     print_boards(read_boards(records or every_track())[0], console)
 
 
-def print_boards(boards: Sequence[Board], console: Console) -> None:
-    """Print the leaderboard of each threat model."""
-    for board in boards:
-        norm, budget, access, queries, frames = board.threat
-        allowed = f"{board.grid}, {norm} {budget:g}, access {access}, {queries} queries{of_frames(frames)}"
-        title = Text.assemble((board.track.name, "bold"), f" in {board.world[0]}, {allowed}")
-        console.print(Padding(title, (1, 1)))
-        console.print(Padding(fitted(_columns(board), _sections(board), console), (0, 1)))
-        flagged = BELOW if any(row.flagged for row in board.rows) else ""
-        console.print(Padding(Text(flagged + SHARED, style="dim"), (0, 1)))
-        for name, drive in board.baselines.items():
-            score = estimate(share_interval(drive.column(board.track.metric)), style=BASELINE)
-            console.print(Padding(Text.assemble(f"{name}: ", score), (0, 3)))
+def beside_report(records: Mapping[str, pa.Table], console: Console) -> None:
+    """Print the same ranking with the published rows beside those of the records, which are marked.
+
+    Args:
+        records: as of `leaderboard_report`; there must be some.
+        console: likewise.
+
+    Raises:
+        UserError: if nothing was attacked.
+    """
+    print_boards(read_boards(records, every_track())[0], console)
+
+
+def flags_report(records: Mapping[str, pa.Table], console: Console) -> None:
+    """Print why each row of the ranking is flagged, what each attack adds, and what else a reader must know of it.
+
+    Args:
+        records: as of `leaderboard_report`.
+        console: likewise.
+    """
+    for board in read_boards(records or every_track())[0]:
+        console.print(Padding(_title(board), (1, 1, 0, 1)))
         for row in board.rows:
-            if len(row.attacks) > 1:
-                console.print(
-                    Padding(Text.assemble(("added ", "dim"), f"{_name(row, board)}: ", (_added(row), "dim")), (0, 1))
-                )
-            if row.flagged:
-                titles = "; ".join(FLAGS[flag.name][0] for flag in row.flags if flag.fired)
-                said = Text.assemble(("flagged ", "yellow"), f"{_name(row, board)}: ", (titles, "dim"))
-                console.print(Padding(said, (0, 1)))
-        for line in _notes(board):
-            console.print(Padding(line, (0, 1)))
+            console.print(Padding(Text(_name(row, board), style="bold"), (1, 1, 0, 1)))
+            for line in _said(row):
+                console.print(Padding(line, (0, 3)))
     console.print()
 
 
-FLAGGED = "⚑"
-BELOW = f"{FLAGGED} flagged: ranks below all rows without a flag, whatever its score; why is said below. "
+def _said(row: Row) -> Iterator[Text]:
+    """What there is to say of a row, a line each."""
+    for flag in row.flags:
+        if flag.fired:
+            yield Text.assemble((f"{FLAGGED} {FLAGS[flag.name][0]}: ", "yellow"), flag.reason)
+    if len(row.attacks) > 1:
+        yield Text.assemble(("added: ", "dim"), _added(row))
+    for remark in row.remarks:
+        yield Text.assemble(("note: ", "dim"), remark.text)
+
+
+def print_boards(boards: Sequence[Board], console: Console) -> None:
+    """Print the leaderboard of each threat model."""
+    for board in boards:
+        console.print(Padding(_title(board), (1, 1)))
+        console.print(Padding(fitted(_columns(board), _sections(board), console), (0, 1)))
+        mine = _of_mine(board)
+        flagged = BELOW if any(row.flagged for row in board.rows) else ""
+        console.print(Padding(Text(mine + flagged + SHARED, style="dim"), (0, 1)))
+        for name, drive in board.baselines.items():
+            score = estimate(share_interval(drive.column(board.track.metric)), style=BASELINE)
+            console.print(Padding(Text.assemble(f"{name}: ", score), (0, 3)))
+        console.print()
+        print_attackers(board, console)
+    console.print()
+
+
+def _title(board: Board) -> Text:
+    norm, budget, access, queries, frames = board.threat
+    allowed = f"{board.grid}, {norm} {budget:g}, access {access}, {queries} queries{of_frames(frames)}"
+    return Text.assemble((board.track.name, "bold"), f" in {board.world[0]}, {allowed}")
+
+
+FLAGGED, MINE = "⚑", "▸"
+BELOW = f"{FLAGGED} number of flags: a flagged row ranks below all rows without one; `bench report flags` says why. "
 SHARED = "Rows of one rank are not told apart from its first."
 """What stands under a ranking, so that its order is understood."""
+
+
+def _of_mine(board: Board) -> str:
+    """What a mark means, and that there is nothing to compare with."""
+    if not any(row.mine for row in board.rows):
+        return ""
+    alone = "no published row was driven in this threat model and world. " * all(row.mine for row in board.rows)
+    return f"{MINE} your rows; {alone}" if alone else f"{MINE} your rows. "
 
 
 def _sections(board: Board) -> list[Section[Row]]:
     """The rows without a flag, then the others."""
     parts = ([row for row in board.rows if row.flagged is flagged] for flagged in (False, True))
     return [Section(part) for part in parts if part]
-
-
-def _notes(board: Board) -> Iterator[Text]:
-    """What a reader must know of the scores besides the flags; of several rows in one line."""
-    about: dict[str, list[str]] = {}
-    for row in board.rows:
-        for remark in row.remarks:
-            about.setdefault(remark.text, []).append(_name(row, board))
-    for text, names in about.items():
-        yield Text.assemble(("note ", "yellow"), f"{'; '.join(names)}: ", (text, "dim"))
 
 
 def _name(row: Row, board: Board) -> str:
@@ -138,7 +172,7 @@ def _column(one: Ranked, called: Called) -> Column[Row]:
     def shown(row: Row) -> Text | str:
         found = one.value(row, called)
         if one.name == "rank":
-            return f"{FLAGGED} {found}" if row.flagged else str(found)
+            return f"{MINE * row.mine}{FLAGGED * row.flagged} {found}".lstrip()
         if one.name == "flags":
             return _fired(row)
         if one.name in STYLES:

@@ -1,0 +1,71 @@
+"""The ranking on the terminal: names are whole, and sentences are told on request."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import pyarrow as pa
+import pytest
+from rich.console import Console
+
+from cavbench.leaderboard.published import every_track
+from cavbench.leaderboard.ranking.boards import read_boards
+from cavbench.leaderboard.terminal.ranking import flags_report, leaderboard_report
+from tests.leaderboard.synthetic import CLEAR, drive
+
+LONG = {"behind": "tracker+shield"}
+
+
+@pytest.fixture(scope="module")
+def published() -> dict[str, pa.Table]:
+    return every_track()
+
+
+def printed(report: object, records: dict[str, pa.Table], width: int) -> str:
+    console = Console(file=io.StringIO(), width=width)
+    report(records, console)  # type: ignore[operator]
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("width", [80, 100, 140])
+def test_no_name_of_the_published_rows_is_broken(published: dict[str, pa.Table], width: int) -> None:
+    text = printed(leaderboard_report, published, width)
+    assert max(map(len, text.splitlines())) <= width
+    words = set(text.split())
+    for board in read_boards(published)[0]:
+        for row in board.rows:
+            for kind in ("defense", "victim", "attack"):
+                assert str(row.identity[kind]) in words
+    assert "behind=tracker+shield" in words
+
+
+def test_a_ranking_of_seventeen_rows_has_no_sentences_about_each_row(published: dict[str, pa.Table]) -> None:
+    text = printed(leaderboard_report, {"driving": published["driving"]}, 100)
+    assert "too few seeds" not in text
+    assert len(text.splitlines()) < 60
+    assert "`bench report flags`" in text
+
+
+def test_why_rows_are_flagged_is_told_on_request() -> None:
+    common = {"cells": CLEAR[:3], "episodes": 6, "runs": (0,)}
+    records = [
+        drive(skill=0.8, **common),  # type: ignore[arg-type]
+        drive(attack="zo", skill=0.3, queries=5.0, **common),  # type: ignore[arg-type]
+        drive(attack="noise", skill=0.5, **common),  # type: ignore[arg-type]
+    ]
+    text = " ".join(printed(flags_report, {"driving": pa.concat_tables(records)}, 80).split())
+    assert "⚑ too few seeds, scenarios or cells: It was driven with 1 seed" in text
+    assert re.search(r"added: zo −0\.\d\d", text)
+
+
+def test_a_long_name_goes_on_in_the_next_line_at_a_space() -> None:
+    names = [drive(victim_params=params, skill=0.8, cells=CLEAR[:3]) for params in ({}, LONG)]
+    attacked = [
+        drive(attack="zo", victim_params=params, defense="a_defence_with_a_long_name", skill=0.3, cells=CLEAR[:3])
+        for params in ({"behind": ""}, LONG)
+    ]
+    text = printed(leaderboard_report, {"driving": pa.concat_tables([*names, *attacked])}, 80)
+    assert "a_defence_with_a_long_name" in text
+    assert "behind=tracker+shield" in text
+    assert max(map(len, text.splitlines())) <= 80
