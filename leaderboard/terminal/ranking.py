@@ -21,6 +21,7 @@ from cavbench.leaderboard.terminal.text import (
     ATTACKED,
     BASELINE,
     CLEAN,
+    MISSING,
     estimate,
     number,
     of_frames,
@@ -138,7 +139,8 @@ def _column(one: Ranked, called: Called) -> Column[Row]:
     def shown(row: Row) -> Text | str:
         found = one.value(row, called)
         if one.name == "rank":
-            return f"{FLAGGED} {found}" if row.flagged else str(found)
+            place = MISSING if found is None else str(found)
+            return f"{FLAGGED} {place}" if row.flagged else place
         if one.name == "flags":
             return _fired(row)
         if one.name in STYLES:
