@@ -165,7 +165,7 @@ def _within(one: Comparison, key: Key) -> bool:
 
 
 def ranked(rows: Iterable[Row]) -> Iterator[Row]:
-    """Best first, flagged ones last, in groups whose rows are not significantly below the first; at the end those without rank."""
+    """Best first, flagged ones last, in groups whose rows are not significantly below the first; then those without a rank."""
     found = list(rows)
     hopeless = [row for row in found if row.hopeless]
     ordered = sorted(
