@@ -50,8 +50,8 @@ class Graph(nn.Module):
             if node.operation == CONSTANT:
                 if node.name not in file.weights:
                     raise RefusedError(f"its constant {node.name[:60]!r} is not among its weights")
-                self.places[node.name] = f"weight_{len(self.places)}"
-                self.register_buffer(self.places[node.name], file.weights[node.name])
+                self.places[node.name] = place = f"weight_{len(self.places)}"
+                self._keep(place, file.weights[node.name])
             elif node.operation not in GIVEN:
                 operation(node)
         self.last = {name: number for number, node in enumerate(self.steps) for name, _ in node.inputs}
@@ -60,6 +60,13 @@ class Graph(nn.Module):
             sample = torch.zeros([side or 1 for side in self.shape])
             with torch.no_grad():
                 self._run(sample, self.ratios)
+
+    def _keep(self, place: str, weight: Tensor) -> None:
+        """Numbers can be trained further; sizes and places can not."""
+        if weight.is_floating_point() and weight.ndim:
+            self.register_parameter(place, nn.Parameter(weight, requires_grad=False))
+        else:
+            self.register_buffer(place, weight)
 
     def forward(self, given: Tensor) -> tuple[Tensor, ...]:
         """The outputs.
@@ -79,7 +86,7 @@ class Graph(nn.Module):
                 if node.name == self.given:
                     found: Sequence[Tensor] = (given,)
                 elif node.name in self.places:
-                    found = (self.get_buffer(self.places[node.name]),)
+                    found = (getattr(self, self.places[node.name]),)
                 else:
                     found = self._result(node, [_taken(values, one) for one in node.inputs], ratios)
                 for place, one in enumerate(found):

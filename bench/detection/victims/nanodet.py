@@ -41,6 +41,7 @@ class NanoDetNetwork(Detector):
 
     def __init__(self, graph: Graph) -> None:
         super().__init__()
+        self.shape: dict[str, object] = {}
         self.graph = graph
         self.mean: Tensor
         self.deviation: Tensor
