@@ -21,7 +21,8 @@ const fs = require("fs"), path = require("path"), tf = require("@tensorflow/tfjs
 (async () => {
   await tf.setBackend("cpu");
   const { file, shape, outputs } = JSON.parse(process.argv[1]), described = JSON.parse(fs.readFileSync(file));
-  const parts = described.weightsManifest.flatMap((group) => group.paths.map((one) => fs.readFileSync(path.join(path.dirname(file), one))));
+  const beside = (one) => fs.readFileSync(path.join(path.dirname(file), one));
+  const parts = described.weightsManifest.flatMap((group) => group.paths.map(beside));
   const weights = Buffer.concat(parts), given = fs.readFileSync(0);
   const model = await tf.loadGraphModel({ load: async () => ({
     modelTopology: described.modelTopology, format: described.format, signature: described.signature,

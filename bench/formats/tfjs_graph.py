@@ -45,7 +45,7 @@ class Graph(nn.Module):
             raise RefusedError(f"it takes {len(inputs)} inputs, it must take one")
         self.given = inputs[0].name
         self.shape = _shape(inputs[0])
-        self.places = {}
+        self.places: dict[str, str] = {}
         for node in self.steps:
             if node.operation == CONSTANT:
                 if node.name not in file.weights:

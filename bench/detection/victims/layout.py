@@ -108,13 +108,13 @@ def split(
         (rows,) = outputs
         rows = rows.transpose(1, 2) if layout == "columns" else rows
         boxes, scores = rows[..., :4], rows[..., 4:]
-    sure = scores[..., 0] if layout == "objectness" else None
+    objectness = scores[..., 0] if layout == "objectness" else None
     scores = scores[..., 1:] if layout == "objectness" else scores
     if activation == "sigmoid":
-        sure, scores = None if sure is None else sure.sigmoid(), scores.sigmoid()
+        objectness, scores = None if objectness is None else objectness.sigmoid(), scores.sigmoid()
     elif activation == "softmax":
         scores = scores.softmax(-1)
-    return boxes, torch.ones_like(scores[..., 0]) if sure is None else sure, scores
+    return boxes, torch.ones_like(scores[..., 0]) if objectness is None else objectness, scores
 
 
 def _best(outputs: Sequence[Tensor], layout: Layout) -> tuple[Tensor, Tensor, Tensor]:
