@@ -90,10 +90,13 @@ def _instead(path: str) -> str:
     name = Path(path).name
     if path.endswith(PICKLES):
         stem = short(name.rpartition(".")[0])
+        five = (
+            f"; a file of release 6.0 or later is victim=yolov5 victim.path={short(name)}" if "yolov5" in name else ""
+        )
         return (
             f": it holds a pickle, which is a program and is never opened. With Ultralytics' own command, `yolo export "
             f"model={short(name)} format=onnx imgsz=384,1248` writes {stem}.onnx; of your own module, torch.export.save writes a "
-            f"{TORCH}; a yolov5*.pt of release 6.0 or later is victim=yolov5 victim.path={short(name)}"
+            f"{TORCH}{five}"
         )
     if path.endswith(".json"):
         return ": a TensorFlow.js graph is victim=tfjs"
