@@ -10,13 +10,16 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from cavbench.core.pair import choose
 from cavbench.detection.boxes import confidence
+from cavbench.detection.trial import try_detector
 from cavbench.detection.victims import coco
 from cavbench.detection.victims.in_process import detector as detector_of
 from cavbench.detection.victims.layout import layout_of, named, split
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.errors import UserError
 from tests.detection.victims.test_from_file import NAMES, RedCells, load, torch_file
+from tests.plugins.toy_camera import RedStreet
 
 SIDE, SIGN = 32, 1
 SIZES = torch.tensor([float(SIDE)] * 4)
@@ -235,6 +238,20 @@ def test_labels_are_told_from_scores_by_type_then_by_whole_numbers() -> None:
         )
     with pytest.raises(UserError, match="neither of the two outputs"):
         split([boxes, sure, sure + 0.1], "apart", 2)
+
+
+def test_a_run_says_which_numbering_is_meant_before_it_begins(tmp_path: Path) -> None:
+    """The labels are COCO's categories, and were read as its 80 classes."""
+
+    def wrap(boxes: Tensor, scores: Tensor) -> tuple[Tensor, ...]:
+        found, sure, labels = best(boxes, scores)
+        return found, sure, torch.where(labels == SIGN, 13, 3)
+
+    victim = choose("victim", "detector", path=torch_file(tmp_path / "net.pt2", Wrapped(wrap)), frame=SIDE).component
+    (said,) = try_detector(victim.load(0, RedStreet().facts), victim, RedStreet(), alone=True)
+    assert said.startswith(
+        "sees no stop sign in 4 clear, near frames without a patch; with victim.names=coco91 it has "
+    )
 
 
 def test_numberings_of_coco_follow_from_the_number_of_classes() -> None:
