@@ -16,6 +16,8 @@ from cavbench.core.pair import Chosen, Pair, choose
 from cavbench.core.registry import GROUPS, Kind
 from cavbench.core.suites import Suite, combined
 from cavbench.core.track import track
+from cavbench.detection import CameraWorld, Detector
+from cavbench.detection.victims.in_process import DetectorObject, detector
 from cavbench.driving import DrivingWorld
 from cavbench.driving.victims.in_process import InProcess, code_of_policies, in_process
 from cavbench.driving.victims.sb3_environment import training_of
@@ -79,7 +81,7 @@ def world_of(given: World | str | None, victim: object) -> Chosen[Any]:
     if given is not None:
         return chosen("world", given)
     own = choose("victim", victim).component if isinstance(victim, str) else victim
-    name = own.tracks()[0] if isinstance(own, Victim) else "driving"
+    name = own.tracks()[0] if isinstance(own, Victim) else "detection" if isinstance(own, Detector) else "driving"
     return choose("world", track(name).world)
 
 
@@ -97,6 +99,8 @@ def victim_of(
     Raises:
         UserError: if an object is no policy of the world.
     """
+    if isinstance(given, DetectorObject):
+        return _as_chosen(given, name)
     if isinstance(given, str | Victim):
         if name is not None or actions is not None:
             raise UserError("name= and actions= are for a victim that is an object, such as a torch.nn.Module")
@@ -106,6 +110,10 @@ def victim_of(
                 'cavbench.component("victim", "sb3", path=…, trained_in=…)'
             )
         return chosen("victim", given)
+    if isinstance(world.component, CameraWorld):
+        if actions is not None or trained_in is not None:
+            raise UserError("actions= and trained_in= are for drivers; the victim of a camera world is a detector")
+        return _detector(given, name)
     if not isinstance(world.component, DrivingWorld):
         raise UserError(
             f"victims of the {world.component.tracks()[0]} track are given by name, got {type(given).__name__}"
@@ -124,6 +132,25 @@ def victim_of(
     code = code_of_policies(victim)
     label = name or f"{type(objects[0]).__name__}-{victim.policies[0].weights_sha256[:HASH_DIGITS]}"
     return Chosen(kind="victim", name=label, component=victim, code=code)
+
+
+def _detector(given: Any, name: str | None) -> Chosen[Any]:
+    """A detector that was given as an object, alone or as the only one of a list.
+
+    Raises:
+        UserError: if it is none, or there are several.
+    """
+    objects = several(given)
+    if len(objects) != 1:
+        raise UserError(
+            f"the victim of a camera world is one detector, got {len(objects)}; seeds= are those of patches"
+        )
+    return _as_chosen(detector(objects[0]), name)
+
+
+def _as_chosen(victim: DetectorObject, name: str | None) -> Chosen[Any]:
+    label = name or f"{victim.source.rpartition('.')[2]}-{victim.network_given.weights_sha256[:HASH_DIGITS]}"
+    return Chosen(kind="victim", name=label, component=victim, code=victim.code)
 
 
 def _trained_in(objects: Sequence[object], world: Chosen[Any], grid: Grid, stated: str | None) -> str:

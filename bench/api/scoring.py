@@ -62,7 +62,8 @@ def score(
         victim: a name, as on the command line; or an object: a `cavbench.driving.Policy`, a `torch.nn.Module` that maps
             observations [N, V, F] or [N, V * F] to values [N, A] of the discrete actions or to actions [N, 2] in [-1, 1], an
             actor of TorchRL, or a model of Stable-Baselines3. A list of objects holds the trainings of one policy, one for each
-            training seed.
+            training seed. In a camera world: a `cavbench.detection.Detector`, or a `torch.nn.Module` that maps images to boxes
+            and scores (`cavbench.detector` takes it with parameters).
         attack: an attack or a suite, or a list of them: names, or objects such as `component("attack", "pgd", steps=50)`.
         defense: a defence, or a list of them; a name or an object each.
         world: name or object; by default that of the victim's track.

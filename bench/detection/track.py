@@ -195,6 +195,7 @@ class DetectionTrack(Track):
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")
     metric: ClassVar[str] = "stop_score"
     metric_title: ClassVar[str] = "stop score"
+    blind_at_zero: ClassVar[tuple[str, str]] = ("detection_rate", "it sees no stop sign in any frame")
     failure: ClassVar[str] = "ran"
     measures: ClassVar[tuple[Measure, ...]] = (
         Measure(column="average_precision", heading="AP of\nstop", digits=2, spare=1, ranked=True),

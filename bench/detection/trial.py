@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import itemgetter
 
 import torch
 from torch import Tensor
@@ -165,10 +166,10 @@ def _sight(
     if own >= SURE:
         return ""
     other, named = max(best_other(predictions, label, windows.boxes))
-    if own < SEES and other >= max(SEES, own + SURER):
+    misnamed = own < SEES and other >= max(SEES, own + SURER)
+    hint = _hint(victim, facts, windows, own, ("victim.names=",) if misnamed else ("",)) if alone else ""
+    if misnamed and not hint:
         hint = f"it sees {detector.names[named]!r} there: are its class names in its own order?"
-    else:
-        hint = _hint(victim, facts, windows, label, own) if alone else ""
     if own >= BLIND and not hint:
         return ""
     seen = "no stop sign" if own < BLIND else f"a stop sign with a mean confidence of {own:.2f}"
@@ -176,18 +177,20 @@ def _sight(
     return f"{line}; {hint}" if hint else f"{line}, so its score says nothing"
 
 
-def _hint(victim: DetectorVictim, facts: Facts, windows: Windows, label: int, own: float) -> str:
-    """The fewest other parameters with which it is far surer of the sign; empty if there are none."""
-    others = victim.alternatives()
+def _hint(victim: DetectorVictim, facts: Facts, windows: Windows, own: float, begins: tuple[str, ...]) -> str:
+    """The fewest other parameters, whose words begin so, with which it is far surer of the sign; empty if there are none."""
+    others = {words: other for words, other in victim.alternatives().items() if words.startswith(begins)}
     for count in sorted({len(words.split()) for words in others}):
         found = []
         for words in (words for words in others if len(words.split()) == count):
             try:
-                predictions = _predicted(others[words].load(0, facts), windows.pictures)
+                network = others[words].load(0, facts)
+                predictions = _predicted(network, windows.pictures)
             except UserError:
                 continue
-            found.append((float(confidence(predictions, label, windows.boxes).mean()), words))
-        best, words = max(found, default=(0.0, ""))
+            sure = confidence(predictions, network.index(STOP_SIGN), windows.boxes)
+            found.append((float(sure.mean()), words))
+        best, words = max(found, key=itemgetter(0), default=(0.0, ""))
         if best >= max(SEES, own + SURER):
             return f"with {words} it has {best:.2f}"
     return ""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType as Fixed
 from typing import Any
 
 import torch
@@ -19,11 +20,13 @@ from cavbench.formats.trial import OperationError
 LIBRARY = "onnxruntime"
 TYPES = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16}
 """The allowed types of the input."""
+BYTES = {"tensor(uint8)": torch.uint8}
+"""Those of a network that takes images, besides."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A model with one input.
+    """A model with one input, and perhaps others that say something about it.
 
     Args:
         session: of ONNX Runtime.
@@ -32,6 +35,7 @@ class Model:
         dtype: type of its input.
         outputs: names of its outputs.
         sha256: hash of the file, and of the bytes that are run (`cavbench.formats.onnx_file.whole`).
+        others: names of its other inputs.
     """
 
     session: Any
@@ -40,16 +44,28 @@ class Model:
     dtype: torch.dtype
     outputs: tuple[str, ...]
     sha256: str
+    others: tuple[str, ...] = ()
 
-    def run(self, given: Tensor, outputs: Sequence[str]) -> tuple[Tensor, ...]:
+    @property
+    def whole(self) -> tuple[bool, ...]:
+        """Whether each output is of whole numbers."""
+        return tuple("int" in one.type for one in self.session.get_outputs())
+
+    def run(self, given: Tensor, outputs: Sequence[str], **others: Tensor) -> tuple[Tensor, ...]:
         """Some of its outputs for an input, on the device of the input, as float32.
+
+        Args:
+            given: the input.
+            outputs: the names of the outputs.
+            others: the other inputs, by their names.
 
         Raises:
             OperationError: if it fails.
         """
-        array = given.detach().cpu().to(self.dtype).contiguous().numpy()
+        arrays = {name: tensor.numpy() for name, tensor in others.items()}
+        arrays[self.given] = given.detach().cpu().to(self.dtype).contiguous().numpy()
         try:
-            answers = self.session.run(list(outputs), {self.given: array})
+            answers = self.session.run(list(outputs), arrays)
         # ONNX Runtime has many exceptions; their text names the operation.
         except Exception as error:
             node = re.search(r"running (\w+) node", str(error))
@@ -57,13 +73,17 @@ class Model:
         return tuple(torch.from_numpy(answer).float().to(given.device) for answer in answers)
 
 
-def read(path: Path, name: str, sha256: str) -> Model:
+def read(
+    path: Path, name: str, sha256: str, types: Mapping[str, torch.dtype] = TYPES, others: Mapping[str, str] = Fixed({})
+) -> Model:
     """Read a model.
 
     Args:
         path: the file.
         name: its name in errors.
         sha256: hash of the file.
+        types: allowed types of the input.
+        others: types of other inputs that it may have, by their names.
 
     Raises:
         UserError: if ONNX Runtime or the onnx package is missing, the file is refused, or has other inputs or outputs than
@@ -91,13 +111,14 @@ def read(path: Path, name: str, sha256: str) -> Model:
             ) from error
         raise
     inputs, outputs = session.get_inputs(), session.get_outputs()
-    if len(inputs) != 1 or inputs[0].type not in TYPES:
+    main = [one for one in inputs if others.get(one.name) != one.type]
+    if len(main) != 1 or main[0].type not in types:
         raise UserError(f"{name} takes {_listed(inputs)}; it must take one tensor(float)")
     if any(not one.type.startswith("tensor(") for one in outputs):
         raise UserError(f"{name} returns {_listed(outputs)}; it must return tensors")
-    shape = tuple(side if isinstance(side, int) else None for side in inputs[0].shape)
-    names = tuple(one.name for one in outputs)
-    return Model(session, inputs[0].name, shape, TYPES[inputs[0].type], names, sha256)
+    shape = tuple(side if isinstance(side, int) else None for side in main[0].shape)
+    names, also = tuple(one.name for one in outputs), tuple(one.name for one in inputs if one is not main[0])
+    return Model(session, main[0].name, shape, types[main[0].type], names, sha256, also)
 
 
 def _listed(values: Sequence[Any]) -> str:

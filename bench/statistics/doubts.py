@@ -33,7 +33,7 @@ TITLES = {
     "one_draw": "random, but attacked with one draw",
 }
 """What each measurement says where it fires."""
-OF_VICTIM = ("provenance", "trained_elsewhere", "hopeless")
+OF_VICTIM = ("provenance", "trained_elsewhere", "hopeless", "always_fails")
 """Remarks that are about the victim under every attack, and without one."""
 
 
@@ -168,12 +168,16 @@ def of_victim(records: pa.Table, clean: pa.Table | None, track: Track, about: st
         yield Remark("trained_elsewhere", about, f"trained in {trained_in}, scored in {world}")
     if clean is None or not clean.num_rows:
         return
-    if not np.nan_to_num(clean[track.metric].to_numpy(zero_copy_only=False).astype(float)).any():
-        what = f"its {track.metric_title} is 0 in every {track.episode[0]} without an attack"
-        yield Remark("hopeless", about, f"{what}: are the settings of {victim} right?")
+    column, what = track.blind_at_zero
+    if column not in clean.column_names:
+        column, what = track.metric, f"its {track.metric_title} is 0 in every {track.episode[0]}"
+    if not np.nan_to_num(clean[column].to_numpy(zero_copy_only=False).astype(float)).any():
+        yield Remark(
+            "hopeless", about, f"{what} without an attack, so it has no rank: are the settings of {victim} right?"
+        )
     elif track.failure and clean[track.failure].to_numpy(zero_copy_only=False).astype(float).all():
         yield Remark(
-            "hopeless",
+            "always_fails",
             about,
             f"it fails in every {track.episode[0]} without an attack: are the settings of {victim} right?",
         )

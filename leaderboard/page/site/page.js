@@ -48,7 +48,8 @@ function mean(one, name, whole) {
   return left.length === one.cells.length ? whole : average(left.map((cell) => cell[name]));
 }
 function ranked(rows) {
-  return [...rows].sort((a, b) => a.row.flagged - b.row.flagged || b.score.estimate - a.score.estimate);
+  const unranked = (one) => one.row.values.rank == null;
+  return [...rows].sort((a, b) => unranked(a) - unranked(b) || a.row.flagged - b.row.flagged || b.score.estimate - a.score.estimate);
 }
 
 /* ---- tables: columns say what a row shows, sorts by and copies ---- */

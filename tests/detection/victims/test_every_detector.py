@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from tests.checks.rules import broken, built_in, each
 
-OWN_TESTS = {"detector"}
-"""It needs a file of the user: test_from_file.py writes some."""
+OWN_TESTS = {"detector", "tfjs"}
+"""They need a file of the user: test_from_file.py and test_tfjs.py write some."""
 DETECTORS = built_in("victim", "cavbench.detection").keys() - OWN_TESTS
 
 

@@ -393,7 +393,11 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
     "COCO": ({}, {"names": ""}, "with 80 classes (victim.names) it must return boxes [N, K, 4] and scores [N, K, 80]"),
     "four outputs": ({"outputs": ("boxes", "scores", "rows", "sure")}, {}, "returns [1, 3, 4] and [1, 3, 2] and"),
     "boxes alone": ({"outputs": ("boxes",)}, {}, "returns [1, 3, 4] for 1 image"),
-    "logits": ({"scores": 9 * SCORES}, {}, "they must be in [0, 1]: export it with its sigmoid or softmax"),
+    "logits": (
+        {"scores": 9 * SCORES},
+        {},
+        "they must be in [0, 1]: if they are logits, set victim.activation=sigmoid or victim.activation=softmax",
+    ),
     "NaN": ({"scores": np.full_like(SCORES, np.nan)}, {}, "returns boxes or scores that are NaN or infinite"),
     "infinite boxes": ({"boxes": BOXES + np.inf}, {}, "returns boxes or scores that are NaN or infinite"),
     "the batch": ({"shared": True}, {}, "returns other scores for an image if other images are in its batch"),
@@ -402,17 +406,21 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
     "centres": (
         {"boxes": BOXES[..., [2, 3, 0, 1]]},
         {},
-        "x2 < x1 or y2 < y1; if they are [x, y, width, height], set victim.boxes=centre",
+        "x2 < x1 or y2 < y1: if they are [x, y, width, height], set victim.boxes=centre",
     ),
     "two inputs": (
         {"inputs": ("pictures", "size")},
         {},
         "takes pictures tensor(float), size tensor(float); it must take one",
     ),
-    "bytes": ({"dtype": 2}, {}, "takes pictures tensor(uint8); it must take one tensor(float)"),
+    "signed bytes": ({"dtype": 3}, {}, "takes pictures tensor(int8); it must take one tensor(float)"),
     "double": ({"dtype": 11}, {}, "takes pictures tensor(double)"),
     "text": ({"dtype": 8}, {}, "takes pictures tensor(string)"),
-    "channels last": ({"shape": (1, 32, 32, 3)}, {}, "takes [1, 32, 32, 3]; a detector takes images [N, 3, H, W]"),
+    "channels between": (
+        {"shape": (1, 32, 3, 32)},
+        {},
+        "takes [1, 32, 3, 32]; a detector takes images [N, 3, H, W] or",
+    ),
     "half dynamic": ({"shape": ("n", 3, 32, "w")}, {}, "takes [any, 3, 32, any]; a detector takes images"),
     "a street": ({"shape": ("n", 3, 10**6, 10**6)}, {}, "with H and W both fixed, up to 4096, or both dynamic"),
     "a crowd": ({"shape": (10**9, 3, 32, 32)}, {}, "N up to 64 or dynamic"),
@@ -483,7 +491,16 @@ def test_a_truncated_file_is_refused(program: str, black_box: str, tmp_path: Pat
     (tmp_path / "text.onnx").write_text("nothing of the kind")
     assert "cannot be read" in refusal(str(tmp_path / "text.onnx"))
     assert "there is no file" in refusal(str(tmp_path / "nothing.pt2"))
-    assert "path must end with .onnx or .pt2, got 'yolov5n.pt'" in refusal("yolov5n.pt")
+    assert "path must end with .onnx or .pt2, got 'net.engine': export the detector to .onnx" in refusal("net.engine")
+    assert "a TensorFlow.js graph is victim=tfjs" in refusal("model.json")
+
+
+def test_a_pickle_of_ultralytics_is_told_what_to_type_and_never_opened(tmp_path: Path) -> None:
+    path = tmp_path / "best.pt"
+    path.symlink_to("/dev/zero")
+    line = refusal(str(path))
+    assert "it holds a pickle, which is a program and is never opened" in line
+    assert "`yolo export model=best.pt format=onnx imgsz=384,1248` writes best.onnx" in line
 
 
 def test_an_operation_outside_of_the_list_is_refused(program: str, tmp_path: Path) -> None:

@@ -7,10 +7,12 @@ from pathlib import Path
 import pyarrow.compute as pc
 import pytest
 
+import cavbench
 from cavbench.records import reading
 from cavbench.run.replay import replay
 from tests.detection.test_detection import Bench
-from tests.detection.victims.test_from_file import NAMES, onnx_file, torch_file
+from tests.detection.victims.test_from_file import NAMES, RedCells, onnx_file, torch_file
+from tests.detection.victims.test_wrappings import Anywhere
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 WORDS = (
@@ -53,3 +55,23 @@ def test_an_onnx_detector_is_a_black_box_on_the_command_line(tmp_path: Path, ben
     assert hardened.code != 0
     assert "a detector in a file cannot be trained" in hardened.err
     assert "Error:" not in hardened.err
+
+
+def test_a_module_of_the_session_has_the_score_of_its_file(tmp_path: Path) -> None:
+    where = {"world": "red_street", "lanes": 3, "density": 1, "weather": "clear", "seeds": [0], "baselines": False}
+    eot = cavbench.component("attack", "eot", steps=10, batch=4, texels=16, learning_rate=0.3)
+    path = torch_file(tmp_path / "red.pt2")
+    file = cavbench.component("victim", "detector", path=path, names=NAMES, frame=32)
+    given = cavbench.detector(Anywhere(RedCells()), names=NAMES)
+    found = [
+        cavbench.score(victim, eot, threat={"budget": 1.0}, out=tmp_path / "out", **where) for victim in (file, given)
+    ]
+    for column in ("stop_score", "queries"):
+        assert list(found[0][column].fillna(0)) == pytest.approx(list(found[1][column].fillna(0)), abs=1e-5)
+    assert found[1].victim[0].startswith("Anywhere-")
+    attacked, clean = found[1].stop_score
+    assert attacked < clean
+    with pytest.raises(cavbench.UserError, match="a detector that is an object cannot be trained"):
+        cavbench.score(given, eot, "advtrain", out=tmp_path / "out", **where)
+    with pytest.raises(cavbench.UserError, match="the victim of a camera world is one detector, got 2"):
+        cavbench.score([RedCells(), RedCells()], eot, **where)

@@ -11,7 +11,9 @@ from rich.console import Console
 
 from cavbench.core.track import track
 from cavbench.leaderboard.comparisons.reading import distinct, read_comparisons
+from cavbench.leaderboard.ranking.boards import boards
 from cavbench.leaderboard.ranking.remarks import run_remarks
+from cavbench.leaderboard.terminal.ranking import leaderboard_report
 from cavbench.leaderboard.terminal.run import cells_report, run_report
 from cavbench.statistics import doubts
 from tests.leaderboard.synthetic import CLEAR, drive, probed
@@ -80,6 +82,17 @@ def test_a_control_that_does_nothing_and_baselines_that_all_fail_are_said() -> N
     failing = idm.set_column(idm.schema.get_field_index("crashed"), idm.schema.field("crashed"), crashed)
     assert {one.name for one in doubts.of_baselines([failing], DRIVING)} == {"baselines_fail"}
     assert not list(doubts.of_baselines([failing, idm], DRIVING))
+
+
+def test_a_victim_that_does_nothing_without_an_attack_has_no_rank() -> None:
+    blind = [probed(one, safe_progress=0.0) for one in pair({"hidden": 64})]
+    with_rank, without = boards(read_comparisons(pa.concat_tables([*pair(), *blind]), DRIVING))[0].rows
+    assert (with_rank.group, with_rank.hopeless) == (1, False)
+    assert (without.group, without.hopeless) == (0, True)
+    console = Console(width=120, record=True, file=StringIO())
+    leaderboard_report({"driving": pa.concat_tables([*pair(), *blind])}, console)
+    said = " ".join(console.export_text().split())
+    assert "its safe progress is 0 in every scenario without an attack, so it has no rank" in said
 
 
 def test_a_score_above_its_members_is_explained() -> None:
