@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy
 from cavbench.driving.victims.from_file import FilePolicy, Typed, check_trained_in
 from cavbench.driving.victims.remembering import RememberingPolicy
-from cavbench.driving.victims.sb3_model import LIBRARY, critic_of, is_model, is_sampling_part, network_of
+from cavbench.driving.victims.sb3_fitting import network_of
+from cavbench.driving.victims.sb3_model import LIBRARY, critic_of, is_model, is_sampling_part
 from cavbench.driving.victims.spaces import CONTROLS, UNKNOWN
 from cavbench.driving.victims.torchrl_actor import ActorNetwork, is_actor
 from cavbench.errors import UserError, reason
@@ -152,16 +153,17 @@ def _check_scores(name: str, policy: Policy, scores: object, observation: Tensor
 
 
 def _of_model(model: object, facts: DrivingFacts, observation: Tensor) -> Policy:
-    network, native = network_of(model, facts, observation)
-    return FilePolicy(
-        network,
-        network.shape,
-        network.action_type,
-        network.width,
-        state_digest(network),
-        critic_of(network),
-        native,
-    )
+    network, own, shape, native = network_of(model, facts, observation)
+    options: dict[str, Any] = {
+        "shape": shape,
+        "action_type": own.action_type,
+        "width": own.width,
+        "sha256": state_digest(network),
+        "native": native,
+    }
+    if network.memory:
+        return RememberingPolicy(network, network.memory, **options)
+    return FilePolicy(network, critic=critic_of(own), **options)
 
 
 def _of_module(module: nn.Module, facts: DrivingFacts, observation: Tensor, actions: str | None) -> Policy:

@@ -12,6 +12,8 @@ from torch import Tensor
 from cavbench.driving import State
 from cavbench.driving.victims.from_file import FilePolicy
 
+BEGUN = "begun"
+"""The entry of a memory that is true after the first decision."""
 Memory = Mapping[str, tuple[tuple[int, ...], torch.dtype]]
 """The shape and the type of each entry that is remembered of an episode. Before the first decision all entries are 0."""
 

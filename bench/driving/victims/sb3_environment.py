@@ -15,7 +15,10 @@ from cavbench.scenarios import Grid
 
 RESHAPING = ("FlattenObservation", "DtypeObservation")
 """Wrappers that change no number of an observation."""
+STACKING = ("VecFrameStack", "FrameStackObservation")
+"""Wrappers of `LIBRARIES` that stack frames; a model's stack is rebuilt (`cavbench.driving.victims.sb3_model`)."""
 HARMLESS = (
+    *STACKING,
     *("OrderEnforcing", "PassiveEnvChecker", "TimeLimit", "Autoreset", "RecordEpisodeStatistics", "RecordVideo"),
     *("HumanRendering", "RenderCollection", "AddWhiteNoise", "ObstructView", "NormalizeReward", "Monitor"),
     *("VecMonitor", "VecCheckNan", "VecVideoRecorder"),
@@ -123,7 +126,7 @@ def chain(env: Any) -> Training:
         changes = isinstance(env, gymnasium.ObservationWrapper | gymnasium.ActionWrapper) or hasattr(env, "obs_rms")
         harmless = isinstance(env, gymnasium.RewardWrapper) or type(env).__name__ in (*HARMLESS, *RESHAPING)
         ours = _package(env) in LIBRARIES
-        if (changes and type(env).__name__ not in RESHAPING) or (ours and not harmless):
+        if (changes and type(env).__name__ not in (*RESHAPING, *STACKING)) or (ours and not harmless):
             changing.append(env)
         known = known and (changes or ours)
         env = env.env

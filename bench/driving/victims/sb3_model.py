@@ -7,20 +7,24 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from cavbench.driving import ActionType, DrivingFacts
-from cavbench.driving.victims.sb3_traces import check_traces
-from cavbench.driving.victims.spaces import Bounds, Expected, check_actions, check_range
+from cavbench.driving import ActionType
+from cavbench.driving.victims.remembering import BEGUN, Memory, empty
+from cavbench.driving.victims.sb3_seen import Normaliser
+from cavbench.driving.victims.spaces import Bounds
 from cavbench.errors import UserError, short
 
 VALUES, DISTRIBUTION, ACTOR = ("DQN",), ("PPO", "A2C"), ("SAC", "TD3", "DDPG")
+RECURRENT = "RecurrentPPO"
+"""The algorithm of sb3-contrib that is read, too."""
 LIBRARY = "stable-baselines3"
+LIBRARIES = ("stable_baselines3", "sb3_contrib")
 INSTEAD = "Give the torch.nn.Module from observation to values or actions instead"
 CLOSE = 1e-4
 """Largest difference between actions and those of the model's own `predict`."""
@@ -36,7 +40,7 @@ def is_sampling_part(given: object) -> bool:
     """Whether an object is a policy or an actor of a model that samples its actions unless it is asked not to."""
     packages = {base.__module__.partition(".")[0] for base in type(given).__mro__}
     parameters = inspect.signature(type(given).forward).parameters if isinstance(given, nn.Module) else {}
-    return "stable_baselines3" in packages and "deterministic" in parameters
+    return bool(packages & {*LIBRARIES}) and "deterministic" in parameters
 
 
 class ModelNetwork(nn.Module):
@@ -45,7 +49,7 @@ class ModelNetwork(nn.Module):
     Differentiable in the observation, and any batch size. Observations are normalised as by the model's VecNormalize, if any.
 
     Args:
-        model: a DQN, PPO, A2C, SAC, TD3 or DDPG.
+        model: a DQN, PPO, A2C, SAC, TD3 or DDPG, or sb3-contrib's RecurrentPPO.
 
     Raises:
         UserError: if it is another algorithm, or its spaces are not supported.
@@ -53,19 +57,17 @@ class ModelNetwork(nn.Module):
 
     low: Tensor
     high: Tensor
-    mean: Tensor
-    deviation: Tensor
 
     def __init__(self, model: Any) -> None:
         super().__init__()
         self.algorithm = next((base.__name__ for base in type(model).__mro__ if base.__name__ in _KNOWN), "")
         contrib = type(model).__module__.startswith("sb3_contrib")
-        if not self.algorithm or contrib:
+        if not self.algorithm or contrib != (self.algorithm == RECURRENT):
             raise UserError(
                 f"models of {type(model).__module__.partition('.')[0]}'s {type(model).__name__} are not supported; "
-                f"supported: {', '.join(_KNOWN)} of Stable-Baselines3. {INSTEAD}"
+                f"supported: {', '.join(_KNOWN[:-1])} of Stable-Baselines3, and {RECURRENT} of sb3-contrib. {INSTEAD}"
             )
-        own = "predict" in vars(model) or type(model).predict.__module__.partition(".")[0] != "stable_baselines3"
+        own = "predict" in vars(model) or type(model).predict.__module__.partition(".")[0] not in LIBRARIES
         if own:
             raise UserError(
                 f"{type(model).__name__} has a predict() of its own, by which it would not be driven. {INSTEAD}"
@@ -92,18 +94,36 @@ class ModelNetwork(nn.Module):
         self._set_normalisation(model.get_vec_normalize_env())
 
     def _set_normalisation(self, env: Any) -> None:
-        self.clip = 0.0
+        """The statistics of its VecNormalize: of what it is shown, or of a frame of that."""
+        self.normaliser: Normaliser | None = None
+        self.of_frame: Normaliser | None = None
         if env is None or not env.norm_obs:
             return
-        self.clip = float(env.clip_obs)
-        # In float64, as there: a feature that hardly varies is divided by almost nothing.
-        self.register_buffer("mean", torch.as_tensor(env.obs_rms.mean, dtype=torch.float64))
-        spread = torch.as_tensor(env.obs_rms.var, dtype=torch.float64) + env.epsilon
-        self.register_buffer("deviation", spread.sqrt())
+        found = Normaliser(env.obs_rms.mean, env.obs_rms.var, env.epsilon, float(env.clip_obs))
+        if found.shape == self.shape:
+            self.normaliser = found
+        else:
+            self.of_frame = found
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """Q-values or logits [N, A], or actions [N, 2] in [-1, 1], of observations [N, *shape]."""
+    @property
+    def memory(self) -> Memory:
+        """What a recurrent model remembers; empty for another one."""
+        if self.algorithm != RECURRENT:
+            return {}
+        layers, _, size = self.policy.lstm_hidden_state_shape
+        return {BEGUN: ((), torch.bool), **dict.fromkeys(("h", "c"), ((layers, size), torch.float32))}
+
+    def forward(
+        self, observation: Tensor, memory: TensorDictBase | None = None
+    ) -> Tensor | tuple[Tensor, TensorDictBase]:
+        """Q-values or logits [N, A], or actions [N, 2] in [-1, 1], of observations [N, *shape].
+
+        With a memory: a pair of these and the memory after them.
+        """
         observation = self.normalised(observation)
+        if self.algorithm == RECURRENT:
+            assert memory is not None
+            return self._recurrent(observation, memory)
         if self.algorithm in VALUES:
             return self.policy.q_net(observation)
         # Actors answer in [-1, 1]; `predict` scales that to the range of the actions.
@@ -112,26 +132,36 @@ class ModelNetwork(nn.Module):
             return mean.tanh()
         if self.algorithm in ACTOR:
             return self.policy.actor(observation)
-        found = self._distribution(observation)
-        if self.action_type == "discrete":
-            return found.distribution.logits
-        return found.mode() if self.policy.squash_output else self._scaled(found.mode())
+        return self._chosen(self._distribution(observation))
 
-    def _distribution(self, observation: Tensor) -> Any:
+    def _recurrent(self, observation: Tensor, memory: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        # The batch is the second axis of the library's states. A first decision starts from 0, as its `predict` does.
+        states = tuple(memory[name].transpose(0, 1).contiguous() for name in ("h", "c"))
+        found, after = self._distribution(observation, states, torch.zeros(len(observation), device=observation.device))
+        entries = {name: state.transpose(0, 1) for name, state in zip(("h", "c"), after, strict=True)}
+        entries[BEGUN] = torch.ones_like(memory[BEGUN])
+        return self._chosen(found), TensorDict(entries, batch_size=observation.shape[:1])
+
+    def _chosen(self, distribution: Any) -> Tensor:
+        """The logits of a distribution of actions, or its most probable action on the [-1, 1] scale."""
+        if self.action_type == "discrete":
+            logits: Tensor = distribution.distribution.logits
+            return logits
+        mode: Tensor = distribution.mode()
+        return mode if self.policy.squash_output else self._scaled(mode)
+
+    def _distribution(self, *given: Any) -> Any:
         """The distribution of the actions, of which the policy keeps nothing: its graph could be neither copied nor pickled."""
         kept = self.policy.action_dist
         self.policy.action_dist = copy.copy(kept)
         try:
-            return self.policy.get_distribution(observation)
+            return self.policy.get_distribution(*given)
         finally:
             self.policy.action_dist = kept
 
     def normalised(self, observation: Tensor) -> Tensor:
         """The observation as the model's networks receive it."""
-        if not self.clip:
-            return observation
-        shown = (observation.double() - self.mean) / self.deviation
-        return shown.clamp(-self.clip, self.clip).to(observation.dtype)
+        return observation if self.normaliser is None else self.normaliser(observation)
 
     def _scaled(self, action: Tensor) -> Tensor:
         """An action of the space's range on the [-1, 1] scale."""
@@ -147,7 +177,10 @@ class ModelNetwork(nn.Module):
         Raises:
             UserError: if they differ: then its policy has code of its own, which computes otherwise.
         """
-        answer = self(observation)
+        if self.memory:
+            answer, _ = self(observation, empty(self.memory, torch.arange(len(observation))))
+        else:
+            answer = self(observation)
         wanted, _ = copy.deepcopy(self.policy).predict(self.normalised(observation).numpy(), deterministic=True)
         if self.range is None:
             same = bool((answer.argmax(-1).numpy() == wanted).all())
@@ -162,46 +195,6 @@ class ModelNetwork(nn.Module):
             raise UserError(
                 f"{type(self.policy).__name__} of the model acts otherwise than its predict(deterministic=True). {INSTEAD}"
             )
-
-
-def network_of(
-    model: Any, facts: DrivingFacts, observation: Tensor
-) -> tuple[ModelNetwork, Callable[[Tensor], Tensor] | None]:
-    """The network of a model that fits a world, and what converts the world's observations for it (`Expected.fit`).
-
-    Args:
-        model: the model.
-        facts: facts of the world.
-        observation: observations of the world [B, V, F].
-
-    Raises:
-        UserError: if its spaces are not the world's, its environment has changed the observations in a way that is not known,
-            or it acts otherwise than `predict(deterministic=True)`.
-    """
-    network = ModelNetwork(model)
-    name = f"the {network.algorithm} model"
-    check_actions(name, network.action_type, network.width, facts)
-    if network.range is not None:
-        check_range(name, network.range, facts)
-    expected = Expected(facts=facts, rows=observation.shape[-2])
-    native = expected.fit(name, network.shape, network.bounds)
-    if not network.clip:
-        last, raw = (_kept(model, key, network.bounds) for key in ("_last_obs", "_last_original_obs"))
-        # A model that still has both is as it was trained; `load(env=...)` and `set_env` drop the last observation.
-        live = model.get_env() is not None and last is not None
-        normaliser = model.get_vec_normalize_env()
-        behind = normaliser is None and not live and getattr(model, "_last_original_obs", None) is not None
-        check_traces(name, expected, last, raw, behind, native=native is not None, algorithm=network.algorithm)
-    shown = observation if native is None else native(observation)
-    network.check(shown.reshape(-1, *network.shape))
-    return network, native
-
-
-def _kept(model: Any, name: str, bounds: Bounds) -> Any:
-    """The last observations of a model's training [n, V * F]; None if it keeps none."""
-    kept = getattr(model, name, None)
-    size = int(np.prod(bounds.shape))
-    return kept.reshape(-1, size) if isinstance(kept, np.ndarray) and kept.size and kept.size % size == 0 else None
 
 
 def _copied(policy: Any) -> Any:
@@ -246,4 +239,4 @@ def critic_of(network: ModelNetwork) -> ModelCritic | None:
     return ModelCritic(network) if network.algorithm in ACTOR else None
 
 
-_KNOWN = (*VALUES, *DISTRIBUTION, *ACTOR)
+_KNOWN = (*VALUES, *DISTRIBUTION, *ACTOR, RECURRENT)

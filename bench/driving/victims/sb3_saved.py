@@ -22,15 +22,16 @@ from cavbench.archive import Archive
 from cavbench.driving import ActionType
 from cavbench.driving.victims.spaces import Bounds
 from cavbench.errors import UserError, short
-from cavbench.formats.pickled_array import floats
+from cavbench.formats.pickled import floats
 from cavbench.formats.trial import hashed
 
-Algorithm = Literal["dqn", "ppo", "a2c", "sac", "td3", "ddpg"]
+Algorithm = Literal["dqn", "ppo", "a2c", "sac", "td3", "ddpg", "recurrent_ppo"]
 POLICIES: dict[str, tuple[Algorithm, ...]] = {
     "stable_baselines3.dqn.policies": ("dqn",),
     "stable_baselines3.common.policies": ("ppo", "a2c"),
     "stable_baselines3.sac.policies": ("sac",),
     "stable_baselines3.td3.policies": ("td3", "ddpg"),
+    "sb3_contrib.common.recurrent.policies": ("recurrent_ppo",),
 }
 """The algorithms whose MlpPolicy is in a module."""
 FORMAT = "a model of Stable-Baselines3"
@@ -74,7 +75,7 @@ class Saved:
         """
         named = self.options.get("activation_fn")
         if named is None:
-            return nn.Tanh if self.algorithm in ("ppo", "a2c") else nn.ReLU
+            return nn.Tanh if self.algorithm in ("ppo", "a2c", "recurrent_ppo") else nn.ReLU
         match = re.fullmatch(r"<class 'torch\.nn\.modules\.activation\.(\w+)'>", str(named))
         activation = getattr(nn, match[1], None) if match else None
         if not (isinstance(activation, type) and issubclass(activation, nn.Module)):
@@ -107,9 +108,13 @@ def _saved(given: str, sha256: str) -> Saved:
 def _read(name: str, data: Mapping[str, Any]) -> Saved:
     algorithm = _algorithm(name, data)
     options = data.get("policy_kwargs") or {}
+    if strange := set(options.get("lstm_kwargs") or {}) - {"dropout"}:
+        raise UserError(f"{name} has an LSTM with {', '.join(sorted(map(str, strange)))}; {ONLY}")
     extractor = str(options.get("features_extractor_class", "FlattenExtractor'>"))
     if not extractor.endswith("FlattenExtractor'>"):
-        raise UserError(f"{name} has the features extractor {short(extractor)}; {ONLY}")
+        raise UserError(
+            f"{name} has the features extractor {short(extractor)}, whose code is not in it: give cavbench.score the model itself"
+        )
     observation = data["observation_space"]
     if not _is(observation, "Box"):
         raise UserError(f"{name} was trained on observations of {_type(observation)}; the type must be Box")
@@ -143,7 +148,10 @@ def _read(name: str, data: Mapping[str, Any]) -> Saved:
     )
 
 
-ONLY = "victim 'sb3' reads the MlpPolicy of Stable-Baselines3's DQN, PPO, A2C, SAC, TD3 and DDPG only"
+ONLY = (
+    "victim 'sb3' reads the MlpPolicy of Stable-Baselines3's DQN, PPO, A2C, SAC, TD3 and DDPG, and the MlpLstmPolicy of "
+    "sb3-contrib's RecurrentPPO"
+)
 
 
 def _algorithm(name: str, data: Mapping[str, Any]) -> Algorithm:

@@ -56,8 +56,9 @@ def check_traces(
         normalised = kept and bool(what or (native and _beyond(last, raw, expected)))
     if normalised:
         raise UserError(
-            f"{name} was trained behind VecNormalize, whose statistics are not in it: give cavbench.score the model with its "
-            f"environment, as in cavbench.score({whole}), or train it without norm_obs"
+            f"{name} was trained behind VecNormalize, whose statistics are not in it: add the file of VecNormalize.save, "
+            f"victim.normalize=statistics.pkl, or give the model with its environment, cavbench.score({whole}), or train it "
+            "without norm_obs"
         )
     if what:
         raise UserError(

@@ -134,6 +134,13 @@ class Expected:
         lows, highs = zip(*own, strict=True)
         return str(Bounds(shape=self.native, low=_short(lows), high=_short(highs)))
 
+    def _frames(self, shape: tuple[int, ...]) -> int:
+        """How many observations of the world a shape may hold; 0 if it is no whole number of at least 2."""
+        own = self.native if self.facts.flat else self.shape
+        count = math.prod(side or 0 for side in own)
+        whole = count and math.prod(shape) % count == 0 and shape[-1] % (own[-1] or 1) == 0
+        return math.prod(shape) // count if whole and math.prod(shape) > count else 0
+
     def _complaint(self, name: str, shape: tuple[int, ...], bounds: Bounds | None) -> str:
         facts, (rows, features) = self.facts, self.shape
         if facts.flat:
@@ -152,6 +159,8 @@ class Expected:
         why = ""
         if bounds is not None and bounds.unbounded and not facts.flat:
             why = "; highway-env's own tasks (Box(-inf, inf, …)) have other ranges, rows, order and decision rate"
+        elif frames := self._frames(shape):
+            why = f"; if these are {frames} frames, add victim.frames={frames} to victim=sb3"
         elif rows and shape not in self._both((rows, features)) and math.prod(shape) == rows * features:
             why = "; these are as many numbers in another arrangement"
         elif not facts.flat and len(shape) == 2 and shape[1] == features and (bounds is None or not bounds.unbounded):

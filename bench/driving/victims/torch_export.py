@@ -14,13 +14,10 @@ from torch import Tensor, nn
 
 from cavbench.driving import DrivingFacts
 from cavbench.driving.victims.from_file import FileDriver, FilePolicy, Typed
-from cavbench.driving.victims.remembering import Memory, RememberingPolicy
+from cavbench.driving.victims.remembering import BEGUN, Memory, RememberingPolicy
 from cavbench.errors import UserError
 from cavbench.formats.torch_graph import Graph, Single
 from cavbench.formats.torch_program import Program, Value, read
-
-BEGUN = "begun"
-"""The entry of a memory that is true after the first decision."""
 
 
 @dataclass(frozen=True, kw_only=True)

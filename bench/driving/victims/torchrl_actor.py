@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import GRUModule, LSTMModule, set_recurrent_mode
 
-from cavbench.driving.victims.remembering import Memory, empty
+from cavbench.driving.victims.remembering import BEGUN, Memory, empty
 from cavbench.driving.victims.spaces import UNBOUNDED
 from cavbench.errors import UserError
 
@@ -23,8 +23,6 @@ VALUES = ("action_value", "logits", "probs")
 ACTION = "action"
 FIRST = "is_init"
 """The entry that says whether an episode begins."""
-BEGUN = "begun"
-"""The entry of a memory that is true after the first decision."""
 LEARNING = ("VecNorm", "VecNormV2")
 """Transforms whose statistics change when they are called. A lock of theirs also stays locked after a failed call."""
 Carried = dict[Any, tuple[Any, tuple[int, ...]]]

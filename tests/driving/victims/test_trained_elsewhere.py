@@ -189,13 +189,16 @@ def test_a_file_of_a_model_that_divides_pictures_by_255_is_refused(tmp_path: Pat
     refused(tmp_path / "model.zip", "was trained on pictures of uint8, which Stable-Baselines3 divides by 255")
 
 
-def test_a_stack_of_frames_is_refused(tmp_path: Path) -> None:
+def test_a_file_of_a_model_on_a_stack_of_frames_is_refused_unless_it_is_said(tmp_path: Path) -> None:
     from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
     model = trained("ppo", VecFrameStack(DummyVecEnv([make]), 2))
     model.save(tmp_path / "model.zip")
-    for given in (model, tmp_path / "model.zip"):
-        refused(given, r"was trained on Box\(-1, 1, \(10, 10\)\), this world shows Box\(-1, 1, \(10, 5\)\)")
+    refused(
+        tmp_path / "model.zip",
+        r"was trained on Box\(-1, 1, \(10, 10\)\), this world shows Box\(-1, 1, \(10, 5\)\).*if these are 2 frames",
+    )
+    refused(sb3.PPO.load(tmp_path / "model.zip"), r"if these are 2 frames, add victim.frames=2")
 
 
 @pytest.mark.parametrize("shape", [(2, 5, 5), (5, 10), (1, 50), (25, 2), (5, 5), (15, 5)])

@@ -38,7 +38,7 @@ from cavbench.envs.camera.world import StopSignApproach
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
 from cavbench.formats.onnx_file import whole
-from cavbench.formats.pickled_array import floats
+from cavbench.formats.pickled import floats
 from cavbench.records import reading
 from cavbench.records.store import FOLDER
 from cavbench.records.table import plain
