@@ -88,8 +88,8 @@ class RoadsConfig:
     target_speeds: tuple[float, ...] = DEFAULT_SPEEDS
     reward_speed_range: tuple[float, float] = (20.0, 30.0)
     features: tuple[str, ...] = ("presence", "x", "y", "vx", "vy")
-    low: tuple[float, float, float, float] | None = None
-    high: tuple[float, float, float, float] | None = None
+    low: tuple[float, ...] | None = None
+    high: tuple[float, ...] | None = None
     clipped: bool = True
     relative: bool = True
     obstacles: bool = True

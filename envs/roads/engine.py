@@ -41,6 +41,7 @@ from cavbench.envs.roads.state import (
     BODY,
     EPISODE,
     Bodies,
+    Body,
     Episode,
     Floats,
     Integers,
@@ -117,7 +118,7 @@ def time_to_collision(road: Road, bodies: Bodies, episode: Episode) -> float:
 
 
 @inner
-def apply_action(road: Road, ego: Bodies, action: int, control: Floats, first: bool, parameters: Parameters) -> None:
+def apply_action(road: Road, ego: Body, action: int, control: Floats, first: bool, parameters: Parameters) -> None:
     """Apply the action to the ego; if an action is held, a lane change is applied only the `first` time."""
     if parameters.ego == DISCRETE:
         held = first or action in (FASTER, SLOWER)

@@ -6,7 +6,7 @@ The cars of an episode are in highway-env's order, because several of its rules 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Protocol
+from typing import Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +105,10 @@ class Bodies(Protocol):
 
     size: int
 
+    @overload
     def __getitem__(self, number: int) -> Body: ...
+    @overload
+    def __getitem__(self, number: slice) -> Bodies: ...
 
 
 class Lanes(Protocol):

@@ -101,8 +101,8 @@ class RoadsWorld(DrivingWorld):
         scenes = []
         for cell in cells:
             weather = WEATHERS[cell.weather]
-            sensor = {"sensor_range": sensor_range_m(weather), "noise_sigma": noise_sigma(weather)}
-            scenes.append(replace(self.scene(cell), **sensor))
+            reach, sigma = sensor_range_m(weather), noise_sigma(weather)
+            scenes.append(replace(self.scene(cell), sensor_range=reach, noise_sigma=sigma))
         return self._configured(tuple(scenes), control or Control())
 
     def _configured(self, scenes: tuple[Scene, ...], control: Control) -> RoadsConfig:
