@@ -60,6 +60,7 @@ FIGURES = {
     "victim_rcnn.png": "detectors:rcnn",
     "victim_detector.svg": "detector_files:detector_file",
     "world_highway.svg": "highway:world",
+    "world_merge.svg": "roads:merge",
     "world_camera.png": "camera:world",
     "world_crossing.png": "crossing:world",
     "world_places.png": "camera:places",

@@ -1,0 +1,75 @@
+"""A planner with perfect information on road networks: it tries plans in copies of the engine, hidden state included."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavbench.compiled import entry_point
+from cavbench.envs.highway.clairvoyant import FAILURE, ClairvoyantPlanner
+from cavbench.envs.roads.engine import PARTS, RoadsEngine, drive
+from cavbench.envs.roads.state import Integers
+
+
+@entry_point
+def roll_batch(
+    roads: NDArray[np.void],
+    bodies: NDArray[np.void],
+    episodes: NDArray[np.void],
+    generators: NDArray[np.uint64],
+    actions: Integers,
+    parameters: NDArray[np.void],
+    failed: Integers,
+    progress: NDArray[np.float32],
+) -> None:
+    """Simulate plans [R, P, T] from the states of R episodes: decisions before a failure, and the progress made [R, P]."""
+    given = parameters[0]
+    copy, episode = np.empty_like(bodies[0]), np.empty_like(episodes[:1])
+    generator, corners = np.empty_like(generators[0]), np.empty((2, 5, 2))
+    control, parts = np.zeros(2), np.zeros(PARTS)
+    for row in range(actions.shape[0]):
+        road = roads[episodes[row].network]
+        for plan in range(actions.shape[1]):
+            copy[:] = bodies[row]
+            generator[:] = generators[row]
+            episode[:] = episodes[row : row + 1]
+            now, total, step = episode[0], 0.0, 0
+            while step < actions.shape[2]:
+                drive(road, copy, now, actions[row, plan, step], control, given, corners, parts)
+                if now.crashed or now.offroad:
+                    break
+                total += now.progress
+                step += 1
+            failed[row, plan] = step
+            progress[row, plan] = total
+
+
+class RoadsPlanner(ClairvoyantPlanner):
+    """`ClairvoyantPlanner` on the engine of road networks.
+
+    Args:
+        engine: the engine, with discrete actions.
+    """
+
+    def __init__(self, engine: RoadsEngine) -> None:
+        super().__init__(engine)  # type: ignore[arg-type]
+        self.roads = engine
+        # Within a plan every decision counts, and only a crash or the roadside ends it.
+        self.parameters = engine.parameters.copy()
+        self.parameters["action_repeat"], self.parameters["max_steps"] = 1, 10**9
+
+    def worth(self, rows: NDArray[np.int64], tried: NDArray[np.int64]) -> NDArray[np.floating]:
+        """See `ClairvoyantPlanner.worth`."""
+        engine = self.roads
+        failed, progress = np.zeros(tried.shape[:2], np.int64), np.zeros(tried.shape[:2], np.float32)
+        roll_batch(
+            engine.roads,
+            np.ascontiguousarray(engine.bodies[rows]),
+            np.ascontiguousarray(engine.episodes[rows]),
+            np.ascontiguousarray(engine.generators[rows]),
+            tried,
+            self.parameters,
+            failed,
+            progress,
+        )
+        return progress - np.where(failed < self.length, FAILURE - failed, 0.0)

@@ -1,0 +1,325 @@
+"""The engine of road networks: B episodes at once, with the results of highway-env at every step.
+
+Episodes are independent. A finished episode does not change, and costs no time, until it is reset.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavbench.compiled import entry_point, inner
+from cavbench.envs.highway.dynamics import clip, linear_map
+from cavbench.envs.highway.ego import FASTER, IDLE, PROGRESS_LANE, PROGRESS_SPEED, SLOWER
+from cavbench.envs.highway.engine import (
+    CRASHED,
+    DONE,
+    OFFROAD,
+    PROGRESS,
+    REWARD,
+    SPEED,
+    TERMINATED,
+    TRUNCATED,
+    TTC,
+    Flag,
+    Number,
+    X,
+    check_seeds,
+    physical_controls,
+)
+from cavbench.envs.roads import merge_rules as merge
+from cavbench.envs.roads import roundabout_rules as roundabout
+from cavbench.envs.roads.bodies import settle_ego
+from cavbench.envs.roads.collision import find_collisions
+from cavbench.envs.roads.config import RoadsConfig, Scene, TaskKind, parameters
+from cavbench.envs.roads.generator import WORDS, Generator, seed_generator
+from cavbench.envs.roads.lanes import is_on
+from cavbench.envs.roads.motion import apply_meta_action, move
+from cavbench.envs.roads.network import WIDTH
+from cavbench.envs.roads.rows import observe
+from cavbench.envs.roads.state import (
+    BODY,
+    EPISODE,
+    Bodies,
+    Body,
+    Episode,
+    Floats,
+    Integers,
+    Kind,
+    Parameters,
+    Road,
+)
+from cavbench.envs.roads.traffic import act, lane_distance, neighbours
+
+ACTIONS = 5
+PARTS = 5
+"""Largest number of parts of a task's reward."""
+MERGE_CLASSIC, MERGE_GENERIC = int(TaskKind.MERGE_CLASSIC), int(TaskKind.MERGE_GENERIC)
+ROUNDABOUT = int(TaskKind.ROUNDABOUT)
+DISCRETE, CONTINUOUS = int(Kind.DISCRETE), int(Kind.CONTINUOUS)
+
+
+@inner
+def spawn(road: Road, bodies: Bodies, episode: Episode, generator: Generator, parameters: Parameters) -> None:
+    """The start of an episode, from its random numbers."""
+    if parameters.task == MERGE_CLASSIC:
+        merge.spawn_classic(road, bodies, episode, generator, parameters)
+    elif parameters.task == MERGE_GENERIC:
+        merge.spawn_generic(road, bodies, episode, generator, parameters)
+    elif parameters.task == ROUNDABOUT:
+        roundabout.spawn(road, bodies, episode, generator, parameters)
+    ego = bodies[episode.ego]
+    settle_ego(ego, parameters)
+    episode.range_y = WIDTH * road.edges[road.lanes[ego.lane].edge].lanes
+
+
+@inner
+def progress(road: Road, bodies: Bodies, episode: Episode, parameters: Parameters) -> float:
+    """Thesis Eq. 4.1 without its offset, in [0, 1]: the lane to the right, and the forward speed from 20 to 30 m/s."""
+    ego = bodies[episode.ego]
+    lane = road.lanes[ego.lane if ego.kind == CONTINUOUS else ego.target_lane]
+    last = road.edges[0].lanes - 1
+    right = min(lane.number, last) / max(last, 1)
+    low, high = parameters.reward_speed_low, parameters.reward_speed_high
+    speed = clip(linear_map(ego.speed * ego.cos_heading, low, high, 0.0, 1.0), 0.0, 1.0)
+    return (PROGRESS_LANE * right + PROGRESS_SPEED * speed) / (PROGRESS_LANE + PROGRESS_SPEED)
+
+
+@inner
+def score(road: Road, bodies: Bodies, episode: Episode, action: int, parameters: Parameters, parts: Floats) -> None:
+    """Update the episode's record after one decision; reward and progress are sums over a held action."""
+    ego = bodies[episode.ego]
+    on_road = is_on(road.lanes[ego.lane], ego.along, ego.across, 0.0)
+    if parameters.task == ROUNDABOUT:
+        episode.reward += roundabout.reward(bodies, episode, action, on_road, parameters, parts)
+    else:
+        episode.reward += merge.reward(road, bodies, episode, action, parameters, parts)
+    episode.crashed = ego.crashed
+    episode.offroad = not on_road
+    if on_road and not ego.crashed:
+        episode.progress += progress(road, bodies, episode, parameters)
+    arrived = ego.x > road.end
+    episode.terminated = ego.crashed or arrived or (parameters.offroad_terminal and not on_road)
+    episode.truncated = episode.steps >= parameters.max_steps or episode.time >= parameters.duration
+
+
+@inner
+def time_to_collision(road: Road, bodies: Bodies, episode: Episode) -> float:
+    """Seconds until the ego hits the body ahead in its lane at their current speeds; inf if never."""
+    ego = bodies[episode.ego]
+    leader, _ = neighbours(road, bodies, episode.ego, ego.lane)
+    if leader < 0:
+        return np.inf
+    other = bodies[leader]
+    closing = ego.speed - other.speed * (other.cos_heading * ego.cos_heading + other.sin_heading * ego.sin_heading)
+    if closing <= 0:
+        return np.inf
+    return max(lane_distance(road, ego, other) - (ego.length + other.length) / 2, 0.0) / closing
+
+
+@inner
+def apply_action(road: Road, ego: Body, action: int, control: Floats, first: bool, parameters: Parameters) -> None:
+    """Apply the action to the ego; if an action is held, a lane change is applied only the `first` time."""
+    if parameters.ego == DISCRETE:
+        held = first or action in (FASTER, SLOWER)
+        apply_meta_action(road, ego, action if held else IDLE, parameters)
+    elif parameters.ego == CONTINUOUS:
+        ego.acceleration, ego.steering = control[0], control[1]
+
+
+@inner
+def advance(road: Road, bodies: Bodies, cars: int, parameters: Parameters, corners: Floats) -> None:
+    """AbstractEnv._simulate: the physics frames of one decision."""
+    for _ in range(parameters.substeps):
+        act(road, bodies, cars, parameters)
+        for number in range(cars):
+            move(road, bodies[number], parameters.dt)
+        find_collisions(bodies, cars, parameters.dt, corners)
+
+
+@inner
+def drive(
+    road: Road,
+    bodies: Bodies,
+    episode: Episode,
+    action: int,
+    control: Floats,
+    parameters: Parameters,
+    corners: Floats,
+    parts: Floats,
+) -> None:
+    """One action of one episode: up to `action_repeat` decisions, fewer if the episode ends."""
+    episode.reward = episode.progress = 0.0
+    for held in range(parameters.action_repeat):
+        apply_action(road, bodies[episode.ego], action, control, held == 0, parameters)
+        episode.time += parameters.period
+        advance(road, bodies[: episode.bodies], episode.cars, parameters, corners)
+        episode.steps += 1
+        score(road, bodies, episode, action, parameters, parts)
+        if episode.terminated or episode.truncated:
+            break
+
+
+@inner
+def report(
+    road: Road, bodies: Bodies, episode: Episode, numbers: NDArray[np.float32], flags: NDArray[np.bool_], number: int
+) -> None:
+    """Copy an episode's record into column `number` of the outputs."""
+    ego = bodies[episode.ego]
+    episode.ttc = time_to_collision(road, bodies[: episode.bodies], episode)
+    numbers[REWARD, number] = episode.reward
+    numbers[PROGRESS, number] = episode.progress
+    numbers[SPEED, number] = ego.speed
+    numbers[X, number] = ego.x
+    numbers[TTC, number] = episode.ttc
+    flags[DONE, number] = episode.terminated or episode.truncated
+    flags[TERMINATED, number] = episode.terminated
+    flags[TRUNCATED, number] = episode.truncated
+    flags[CRASHED, number] = episode.crashed
+    flags[OFFROAD, number] = episode.offroad
+
+
+@entry_point
+def step_batch(
+    roads: NDArray[np.void],
+    bodies: NDArray[np.void],
+    episodes: NDArray[np.void],
+    actions: Integers,
+    controls: Floats,
+    paused: NDArray[np.bool_],
+    parameters: NDArray[np.void],
+    observation: NDArray[np.float32],
+    numbers: NDArray[np.float32],
+    flags: NDArray[np.bool_],
+    parts: Floats,
+) -> None:
+    """One action of every unfinished episode. See `RoadsEngine.step`."""
+    corners, given = np.empty((2, 5, 2)), parameters[0]
+    rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
+    for number in range(episodes.size):
+        episode, cars = episodes[number], bodies[number]
+        if paused[number] or episode.terminated or episode.truncated:
+            numbers[REWARD, number] = 0.0
+            numbers[PROGRESS, number] = 0.0
+            continue
+        road = roads[episode.network]
+        drive(road, cars, episode, actions[number], controls[number], given, corners, parts[number])
+        observe(road, cars, episode, given, rows, work, observation[number])
+        report(road, cars, episode, numbers, flags, number)
+
+
+@entry_point
+def start_batch(
+    roads: NDArray[np.void],
+    bodies: NDArray[np.void],
+    episodes: NDArray[np.void],
+    chosen: Integers,
+    seeds: Integers,
+    generators: NDArray[np.uint64],
+    parameters: NDArray[np.void],
+    observation: NDArray[np.float32],
+    numbers: NDArray[np.float32],
+    flags: NDArray[np.bool_],
+) -> None:
+    """Start the episodes `chosen` [R] from `seeds` [R]. See `RoadsEngine.reset`."""
+    rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
+    given = parameters[0]
+    for row in range(chosen.size):
+        number = chosen[row]
+        episode, cars = episodes[number], bodies[number]
+        road = roads[episode.network]
+        episode.seed, episode.steps, episode.time = seeds[row], 0, 0.0
+        episode.reward = episode.progress = 0.0
+        episode.crashed = episode.offroad = episode.terminated = episode.truncated = False
+        seed_generator(generators[number], seeds[row])
+        spawn(road, cars, episode, generators[number], given)
+        observe(road, cars, episode, given, rows, work, observation[number])
+        report(road, cars, episode, numbers, flags, number)
+
+
+class RoadsEngine:
+    """B episodes of `config`, in numpy. The engine owns the outputs and overwrites them in the next call.
+
+    Attributes:
+        observation: float32 [B, V, F].
+        numbers: float32 [5, B]; rows as in `cavbench.envs.highway.engine.Number`.
+        flags: bool [5, B]; rows as in `cavbench.envs.highway.engine.Flag`.
+        parts: [B, 5] the parts of the last reward, in the order of highway-env's `_rewards`.
+        bodies: [B, N] records `BODY`.
+        episodes: [B] records `EPISODE`.
+    """
+
+    def __init__(self, config: RoadsConfig) -> None:
+        batch = config.batch
+        self.config = config
+        different: dict[int, Scene] = {id(scene.road): scene for scene in config.scenes}
+        scenes, places = list(different.values()), {key: place for place, key in enumerate(different)}
+        self.roads = np.concatenate([scene.road for scene in scenes])
+        self.parameters = parameters(config)
+        self.bodies = np.zeros((batch, max(scene.capacity for scene in config.scenes)), dtype=BODY)
+        self.episodes = np.zeros(batch, dtype=EPISODE)
+        self.generators = np.zeros((batch, WORDS), dtype=np.uint64)
+        self.observation = np.zeros((batch, config.observed_vehicles, len(config.features)), dtype=np.float32)
+        self.numbers = np.zeros((len(Number), batch), dtype=np.float32)
+        self.flags = np.zeros((len(Flag), batch), dtype=np.bool_)
+        self.parts = np.zeros((batch, PARTS))
+        self.episodes["network"] = [places[id(scene.road)] for scene in config.scenes]
+        for name in ("traffic", "sensor_range", "noise_sigma"):
+            self.episodes[name] = [getattr(scene, name) for scene in config.scenes]
+        # No episode runs before its reset.
+        self.episodes["truncated"] = True
+        self._no_actions = np.full(batch, IDLE, dtype=np.int64)
+        self._no_controls = np.zeros((batch, 2))
+        self._no_pause = np.zeros(batch, dtype=np.bool_)
+
+    def reset(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
+        """Start the episodes `chosen` [R] (row numbers) from the scenario seeds [R].
+
+        Raises:
+            ValueError: if a seed is negative.
+        """
+        check_seeds(seeds)
+        start_batch(
+            self.roads,
+            self.bodies,
+            self.episodes,
+            chosen,
+            seeds,
+            self.generators,
+            self.parameters,
+            self.observation,
+            self.numbers,
+            self.flags,
+        )
+
+    def step(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None = None) -> None:
+        """Execute one action in each episode; finished and paused episodes do not change and have reward 0.
+
+        Args:
+            action: int64 [B] numbers of actions, or float32 [B, 2] acceleration and steering in [-1, 1] (clipped).
+            paused: bool [B], episodes that do not step, besides the finished ones.
+
+        Raises:
+            ValueError: if a discrete action is not one of the five.
+        """
+        actions, controls = self._no_actions, self._no_controls
+        if self.config.ego == Kind.DISCRETE:
+            # Always one memory layout: numba would compile again for another one.
+            actions = np.ascontiguousarray(action, dtype=np.int64)
+            if actions.min() < 0 or actions.max() >= ACTIONS:
+                raise ValueError(f"actions must be between 0 and {ACTIONS - 1}, got {actions.tolist()}")
+        elif self.config.ego == Kind.CONTINUOUS:
+            controls = physical_controls(np.asarray(action))
+        step_batch(
+            self.roads,
+            self.bodies,
+            self.episodes,
+            actions,
+            controls,
+            self._no_pause if paused is None else paused,
+            self.parameters,
+            self.observation,
+            self.numbers,
+            self.flags,
+            self.parts,
+        )

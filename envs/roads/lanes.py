@@ -1,0 +1,145 @@
+"""Geometry of lanes in compiled code: highway-env's road/lane.py, with floating-point operations in its order."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cavbench.compiled import inner
+from cavbench.envs.roads.network import LaneKind, LaneRecord
+from cavbench.envs.roads.state import Body, Road
+
+STRAIGHT, SINE, CIRCULAR = int(LaneKind.STRAIGHT), int(LaneKind.SINE), int(LaneKind.CIRCULAR)
+CAR_LENGTH = 5.0
+"""AbstractLane.VEHICLE_LENGTH in m."""
+TWO_PI = 2 * np.pi
+SURELY = 1e-6
+"""Margin in m, larger than any rounding error."""
+
+
+@inner
+def wrap_to_pi(angle: float) -> float:
+    """highway_env.utils.wrap_to_pi: `angle` in [-pi, pi); the cases give the bits of the remainder without a division."""
+    shifted = angle + np.pi
+    if 0.0 <= shifted < TWO_PI:
+        return shifted - np.pi
+    if TWO_PI <= shifted < 2 * TWO_PI:
+        return (shifted - TWO_PI) - np.pi
+    if -TWO_PI < shifted < 0.0:
+        return (shifted + TWO_PI) - np.pi
+    return shifted % TWO_PI - np.pi
+
+
+@inner
+def local_coordinates(lane: LaneRecord, x: float, y: float) -> tuple[float, float]:
+    """AbstractLane.local_coordinates: m along the lane, and m to the right of its centre."""
+    if lane.kind == CIRCULAR:
+        off_x, off_y = x - lane.center_x, y - lane.center_y
+        angle = lane.start_phase + wrap_to_pi(math.atan2(off_y, off_x) - lane.start_phase)
+        distance = math.sqrt(off_x * off_x + off_y * off_y)
+        return lane.turn * (angle - lane.start_phase) * lane.radius, lane.turn * (lane.radius - distance)
+    off_x, off_y = x - lane.start_x, y - lane.start_y
+    along = off_x * lane.direction_x + off_y * lane.direction_y
+    across = off_x * -lane.direction_y + off_y * lane.direction_x
+    if lane.kind == SINE:
+        across -= lane.amplitude * math.sin(lane.pulsation * along + lane.phase)
+    return along, across
+
+
+@inner
+def position(lane: LaneRecord, along: float, across: float) -> tuple[float, float]:
+    """AbstractLane.position: the point x, y."""
+    if lane.kind == CIRCULAR:
+        angle = lane.turn * along / lane.radius + lane.start_phase
+        distance = lane.radius - across * lane.turn
+        return lane.center_x + distance * math.cos(angle), lane.center_y + distance * math.sin(angle)
+    if lane.kind == SINE:
+        across += lane.amplitude * math.sin(lane.pulsation * along + lane.phase)
+    x = lane.start_x + along * lane.direction_x + across * -lane.direction_y
+    return x, lane.start_y + along * lane.direction_y + across * lane.direction_x
+
+
+@inner
+def heading_at(lane: LaneRecord, along: float) -> float:
+    """AbstractLane.heading_at in rad."""
+    if lane.kind == CIRCULAR:
+        return lane.turn * along / lane.radius + lane.start_phase + np.pi / 2 * lane.turn
+    if lane.kind == SINE:
+        swing = lane.amplitude * lane.pulsation * math.cos(lane.pulsation * along + lane.phase)
+        return lane.heading + math.atan(swing)
+    return lane.heading
+
+
+@inner
+def is_on(lane: LaneRecord, along: float, across: float, margin: float) -> bool:
+    """AbstractLane.on_lane: whether local coordinates are on the lane, widened by `margin` m on both sides."""
+    near = abs(across) <= lane.width / 2 + margin
+    return near and -CAR_LENGTH <= along < lane.length + CAR_LENGTH
+
+
+@inner
+def is_reachable(lane: LaneRecord, x: float, y: float) -> bool:
+    """AbstractLane.is_reachable_from: whether a lane change to the lane may start at a point."""
+    if lane.forbidden:
+        return False
+    along, across = local_coordinates(lane, x, y)
+    return abs(across) <= 2 * lane.width and 0 <= along < lane.length + CAR_LENGTH
+
+
+@inner
+def distance_to(lane: LaneRecord, x: float, y: float) -> float:
+    """AbstractLane.distance: L1 distance in m of a point."""
+    along, across = local_coordinates(lane, x, y)
+    return abs(across) + max(along - lane.length, 0.0) + max(0.0 - along, 0.0)
+
+
+@inner
+def heading_distance(lane: LaneRecord, x: float, y: float, heading: float, least: float) -> tuple[float, float, float]:
+    """AbstractLane.distance_with_heading: distance in m plus angle in rad, then the local coordinates.
+
+    The distance is inf if it is surely larger than `least`; that is found without trigonometry.
+    """
+    if lane.kind == CIRCULAR:
+        off_x, off_y = x - lane.center_x, y - lane.center_y
+        across = lane.turn * (lane.radius - math.sqrt(off_x * off_x + off_y * off_y))
+        if abs(across) > least + SURELY:
+            return np.inf, 0.0, 0.0
+        angle = lane.start_phase + wrap_to_pi(math.atan2(off_y, off_x) - lane.start_phase)
+        along = lane.turn * (angle - lane.start_phase) * lane.radius
+    else:
+        off_x, off_y = x - lane.start_x, y - lane.start_y
+        along = off_x * lane.direction_x + off_y * lane.direction_y
+        across = off_x * -lane.direction_y + off_y * lane.direction_x
+        if abs(across) - abs(lane.amplitude) + max(along - lane.length, 0.0) + max(-along, 0.0) > least + SURELY:
+            return np.inf, 0.0, 0.0
+        if lane.kind == SINE:
+            across -= lane.amplitude * math.sin(lane.pulsation * along + lane.phase)
+    apart = abs(across) + max(along - lane.length, 0.0) + max(0.0 - along, 0.0)
+    if apart > least + SURELY:
+        return np.inf, 0.0, 0.0
+    return apart + abs(wrap_to_pi(heading - heading_at(lane, along))), along, across
+
+
+@inner
+def update_lane(body: Body, road: Road) -> None:
+    """RoadNetwork.get_closest_lane_index: set the lane of a body and its place on it; the first lane wins a tie.
+
+    The lane of the frame before is tried first, because most others are then ruled out at once.
+    """
+    best = body.lane
+    least, along, across = heading_distance(road.lanes[best], body.x, body.y, body.heading, np.inf)
+    before = best
+    for number in range(road.lane_count):
+        if number != before:
+            apart, s, r = heading_distance(road.lanes[number], body.x, body.y, body.heading, least)
+            if apart < least or (apart == least and number < best):
+                best, least, along, across = number, apart, s, r
+    body.lane, body.along, body.across = best, along, across
+
+
+@inner
+def is_after_end(lane: LaneRecord, x: float, y: float) -> bool:
+    """AbstractLane.after_end: whether a point is on the last half car length of the lane, or beyond."""
+    along, _ = local_coordinates(lane, x, y)
+    return along > lane.length - CAR_LENGTH / 2

@@ -1,0 +1,293 @@
+"""Networks of lanes: highway-env's road/lane.py and the graph of road/road.py, laid out as a record for compiled code.
+
+A network is built in Python, lane by lane, in highway-env's order: the order decides ties between lanes. `record` lays it out, so
+that each episode of a batch may be on another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavbench.envs.highway.state import record_type
+
+Point = Sequence[float] | NDArray[np.float64]
+
+WIDTH = 4.0
+"""AbstractLane.DEFAULT_WIDTH in m."""
+
+
+class LaneKind(IntEnum):
+    """The shapes of highway-env's lanes."""
+
+    STRAIGHT = 0
+    SINE = 1
+    CIRCULAR = 2
+
+
+class Line(IntEnum):
+    """highway-env's LineType: how a side of a lane is painted."""
+
+    NONE = 0
+    STRIPED = 1
+    CONTINUOUS = 2
+    CONTINUOUS_LINE = 3
+
+
+@dataclass(kw_only=True)
+class Lane:
+    """A lane; `straight`, `sine` and `circular` make one.
+
+    A straight lane runs from `start` along `direction` (a unit vector) at `heading`. A sine lane swings around it by `amplitude`
+    sin(`pulsation` s + `phase`). A circular one turns around `center` from `start_phase`, to the right if `turn` is 1, to the
+    left if it is -1 (y points to the right). Lengths in m, angles in rad, `speed_limit` in m/s.
+    """
+
+    kind: LaneKind
+    length: float
+    width: float = WIDTH
+    start: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    direction: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    heading: float = 0.0
+    amplitude: float = 0.0
+    pulsation: float = 0.0
+    phase: float = 0.0
+    center: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    radius: float = 0.0
+    start_phase: float = 0.0
+    turn: float = 0.0
+    forbidden: bool = False
+    speed_limit: float = 20.0
+    priority: int = 0
+    lines: tuple[int, int] = (Line.STRIPED, Line.STRIPED)
+
+    def position(self, along: float, across: float) -> NDArray[np.float64]:
+        """The point [2] at `along` m on the lane and `across` m to its right."""
+        if self.kind == LaneKind.CIRCULAR:
+            angle = self.turn * along / self.radius + self.start_phase
+            return self.center + (self.radius - across * self.turn) * np.array([np.cos(angle), np.sin(angle)])
+        if self.kind == LaneKind.SINE:
+            across = across + self.amplitude * np.sin(self.pulsation * along + self.phase)
+        return self.start + along * self.direction + across * np.array([-self.direction[1], self.direction[0]])
+
+
+def straight(start: Point, end: Point, **options: object) -> Lane:
+    """highway-env's StraightLane from `start` to `end`; `options` are the other fields of `Lane`."""
+    first, last = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
+    length = float(np.linalg.norm(last - first))
+    heading = float(np.arctan2(last[1] - first[1], last[0] - first[0]))
+    line = {"start": first, "direction": (last - first) / length, "heading": heading, "length": length}
+    return Lane(kind=LaneKind.STRAIGHT, **line, **options)  # type: ignore[arg-type]
+
+
+def sine(start: Point, end: Point, amplitude: float, pulsation: float, phase: float, **options: object) -> Lane:
+    """highway-env's SineLane around the line from `start` to `end`."""
+    lane = straight(start, end, **options)
+    lane.kind, lane.amplitude, lane.pulsation, lane.phase = LaneKind.SINE, amplitude, pulsation, phase
+    return lane
+
+
+def circular(
+    center: Point, radius: float, start_phase: float, end_phase: float, *, clockwise: bool = True, **options: object
+) -> Lane:
+    """highway-env's CircularLane."""
+    turn = 1.0 if clockwise else -1.0
+    length = radius * (end_phase - start_phase) * turn
+    arc = {"center": np.array(center, dtype=np.float64), "radius": radius, "start_phase": start_phase, "turn": turn}
+    return Lane(kind=LaneKind.CIRCULAR, length=length, **arc, **options)  # type: ignore[arg-type]
+
+
+class LaneRecord:
+    """One lane in compiled code; see `Lane`."""
+
+    kind: int
+    forbidden: bool
+    edge: int  # the road that it belongs to
+    number: int  # its number on that road, 0 the leftmost
+    priority: int
+    length: float
+    width: float
+    speed_limit: float  # m/s
+    start_x: float
+    start_y: float
+    direction_x: float
+    direction_y: float
+    heading: float
+    amplitude: float
+    pulsation: float
+    phase: float
+    center_x: float
+    center_y: float
+    radius: float
+    start_phase: float
+    turn: float
+    linked: int  # how many lanes are searched for its neighbours, itself included
+
+
+class EdgeRecord:
+    """One road in compiled code: the lanes from one node to another."""
+
+    first: int  # number of its first lane
+    lanes: int
+    start: int  # node
+    end: int  # node
+
+
+LANE = record_type(LaneRecord)
+EDGE = record_type(EdgeRecord)
+
+MOST_LANES, MOST_EDGES, MOST_LINKED, MOST_SPOTS = 64, 48, 8, 8
+MOST_ROUTES, LONGEST_ROUTE = 256, 16
+"""Sizes of the tables. They are fixed, so that one compiled engine serves all networks."""
+
+ROAD = np.dtype(
+    [
+        ("lane_count", np.int64),
+        ("edge_count", np.int64),
+        ("end", np.float64),  # m along x, where the task is done
+        ("spots", np.int64, (MOST_SPOTS,)),  # lanes that the task names
+        ("lanes", LANE, (MOST_LANES,)),
+        ("edges", EDGE, (MOST_EDGES,)),  # roads, in highway-env's order
+        ("linked", np.int64, (MOST_LANES, MOST_LINKED)),  # lanes that are searched for neighbours
+        ("offsets", np.float64, (MOST_LANES, MOST_LINKED)),  # m, where they begin on the lane
+        ("routes", np.int16, (MOST_ROUTES, LONGEST_ROUTE)),  # roads from a lane to a destination, -1 after the end
+        ("route_lanes", np.int16, (MOST_ROUTES, LONGEST_ROUTE)),  # the lane on each of them, -1 for any
+    ],
+    align=True,
+)
+"""A network in compiled code. One record is one argument of a function, where a tuple of arrays would be fifty."""
+
+
+@dataclass
+class Network:
+    """A graph of roads: `graph[from][to]` is the list of lanes from one node to another, from left to right.
+
+    Args:
+        connected: whether cars look for neighbours on the lanes before and after their own, too: the tasks with v1 (v2 for
+            the intersection) of highway-env 1.12.
+    """
+
+    connected: bool = False
+    graph: dict[str, dict[str, list[Lane]]] = field(default_factory=dict)
+
+    def add(self, start: str, end: str, lane: Lane) -> None:
+        """RoadNetwork.add_lane."""
+        self.graph.setdefault(start, {}).setdefault(end, []).append(lane)
+
+    def add_straight(self, start: str, end: str, lanes: int, origin: float, length: float, speed_limit: float) -> None:
+        """RoadNetwork.straight_road_network: parallel lanes along x from `origin` m."""
+        for lane in range(lanes):
+            sides = (
+                Line.CONTINUOUS_LINE if lane == 0 else Line.STRIPED,
+                Line.CONTINUOUS_LINE if lane == lanes - 1 else Line.NONE,
+            )
+            y = lane * WIDTH
+            self.add(start, end, straight([origin, y], [origin + length, y], lines=sides, speed_limit=speed_limit))
+
+    def roads(self) -> Iterator[tuple[str, str, list[Lane]]]:
+        """Every road with its nodes, in highway-env's order."""
+        for start, ends in self.graph.items():
+            for end, lanes in ends.items():
+                yield start, end, lanes
+
+    def lanes(self) -> list[Lane]:
+        """Every lane, by its number."""
+        return [lane for _, _, lanes in self.roads() for lane in lanes]
+
+    def number(self, start: str, end: str, lane: int) -> int:
+        """The number of a lane of the road from `start` to `end`."""
+        before = 0
+        for first, last, lanes in self.roads():
+            if (first, last) == (start, end):
+                return before + lane
+            before += len(lanes)
+        raise KeyError(f"no road from {start} to {end}")
+
+    def linked(self, start: str, end: str, lane: int) -> list[tuple[int, float]]:
+        """Road.neighbour_vehicles: the lanes that are searched for a car's neighbours, and where they begin, in m."""
+        own = self.graph[start][end][lane]
+        found = [(self.number(start, end, lane), 0.0)]
+        if self.connected:
+            for after, lanes in self.graph.get(end, {}).items():
+                found.append((self.number(end, after, lane if lane < len(lanes) else 0), own.length))
+            for before, ends in self.graph.items():
+                if start in ends:
+                    place = lane if lane < len(ends[start]) else 0
+                    found.append((self.number(before, start, place), -ends[start][place].length))
+        return found
+
+    def path(self, start: str, goal: str) -> list[str]:
+        """RoadNetwork.shortest_path: the nodes from `start` to `goal`, breadth first; empty if there is no way."""
+        queue = [[start]]
+        while queue:
+            path = queue.pop(0)
+            for after in sorted(node for node in self.graph.get(path[-1], {}) if node not in path):
+                if after == goal:
+                    return [*path, after]
+                if after in self.graph:
+                    queue.append([*path, after])
+        return []
+
+    def route(self, start: str, end: str, lane: int, goal: str) -> list[tuple[int, int]]:
+        """ControlledVehicle.plan_route_to: the roads from a lane to a node, and the lane on each, -1 for any."""
+        edges = {(first, last): number for number, (first, last, _) in enumerate(self.roads())}
+        path = self.path(end, goal)
+        return [(edges[start, end], lane), *((edges[pair], -1) for pair in pairwise(path))]
+
+
+def _fill(place: np.void, lane: Lane) -> None:
+    for name in ("kind", "forbidden", "priority", "length", "width", "speed_limit", "heading", "amplitude"):
+        place[name] = getattr(lane, name)
+    for name in ("pulsation", "phase", "radius", "start_phase", "turn"):
+        place[name] = getattr(lane, name)
+    place["start_x"], place["start_y"] = lane.start
+    place["direction_x"], place["direction_y"] = lane.direction
+    place["center_x"], place["center_y"] = lane.center
+
+
+def record(
+    network: Network, *, spots: Sequence[int] = (), destinations: Sequence[str] = (), end: float = np.inf
+) -> NDArray[np.void]:
+    """A network as an array of one record `ROAD`.
+
+    Args:
+        network: the network.
+        spots: numbers of the lanes that the task names.
+        destinations: nodes to which routes are planned; the route from lane l to destination d is row l * D + d.
+        end: place in m along x at which the task is done.
+
+    Raises:
+        ValueError: if the network is larger than the tables.
+    """
+    roads = list(network.roads())
+    nodes = {name: number for number, name in enumerate(dict.fromkeys(n for s, e, _ in roads for n in (s, e)))}
+    lanes = sum(len(members) for _, _, members in roads)
+    if lanes > MOST_LANES or len(roads) > MOST_EDGES or lanes * len(destinations) > MOST_ROUTES:
+        raise ValueError(f"a network has at most {MOST_LANES} lanes and {MOST_EDGES} roads, got {lanes}, {len(roads)}")
+    table = np.zeros(1, dtype=ROAD)
+    road = table[0]
+    road["lane_count"], road["edge_count"], road["end"] = lanes, len(roads), end
+    road["spots"][: len(spots)] = spots
+    road["routes"] = road["route_lanes"] = -1
+    number = 0
+    for edge, (start, last, members) in enumerate(roads):
+        road["edges"][edge] = (number, len(members), nodes[start], nodes[last])
+        for own, lane in enumerate(members):
+            place = road["lanes"][number]
+            _fill(place, lane)
+            linked = network.linked(start, last, own)
+            place["edge"], place["number"], place["linked"] = edge, own, len(linked)
+            for link, (other, offset) in enumerate(linked):
+                road["linked"][number, link], road["offsets"][number, link] = other, offset
+            for goal, name in enumerate(destinations):
+                route = network.route(start, last, own, name)
+                row = number * len(destinations) + goal
+                road["routes"][row, : len(route)] = [towards for towards, _ in route]
+                road["route_lanes"][row, : len(route)] = [wanted for _, wanted in route]
+            number += 1
+    return table

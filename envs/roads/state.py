@@ -1,0 +1,183 @@
+"""The state of the engine: one record for a body on the road, one for an episode, and the parameters of all episodes.
+
+The cars of an episode are in highway-env's order, because several of its rules depend on the order; obstacles come after them.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Protocol, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavbench.envs.highway.state import record_type
+from cavbench.envs.roads.network import EdgeRecord, LaneRecord
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+class Kind(IntEnum):
+    """What a body on the road is: highway-env's MDPVehicle, Vehicle, IDMVehicle or Obstacle."""
+
+    DISCRETE = 0
+    CONTINUOUS = 1
+    IDM = 2
+    OBSTACLE = 3
+
+
+class Feature(IntEnum):
+    """Features of a row; the first four are noisy and relative to the ego."""
+
+    X = 0
+    Y = 1
+    VX = 2
+    VY = 3
+    PRESENCE = 4
+    COS_H = 5
+    SIN_H = 6
+    LONG_OFF = 7
+    LAT_OFF = 8
+    ANG_OFF = 9
+
+
+class Body:
+    """One car or obstacle."""
+
+    x: float  # m
+    y: float  # m
+    along: float  # m on its lane
+    across: float  # m to the right of its lane's centre
+    lane: int  # the closest one
+    speed: float  # m/s, signed
+    cos_heading: float
+    sin_heading: float
+    heading: float  # rad
+    kind: int
+    target_lane: int
+    target_speed: float  # m/s
+    steering: float  # rad
+    acceleration: float  # m/s2
+    timer: float  # s since a lane change was last considered
+    delta: float  # exponent of the IDM
+    route: int  # row of the table of routes, -1 without one
+    route_place: int  # the next road of the route
+    speed_index: int  # of the target speed in the table, of a discrete ego
+    length: float  # m
+    width: float  # m
+    impact_x: float  # m, the push of a collision, applied in the next frame
+    impact_y: float  # m
+    impact: bool  # whether one is pending
+    crashed: bool
+    changes_lanes: bool  # whether MOBIL is on
+
+
+class Episode:
+    """One episode."""
+
+    network: int
+    cars: int  # number of cars
+    bodies: int  # number of cars and obstacles
+    ego: int  # number of the ego
+    traffic: int  # number of cars that the cell asks for
+    seed: int  # scenario seed
+    steps: int  # decisions so far
+    time: float  # s, as highway-env adds it up
+    sensor_range: float  # m
+    noise_sigma: float  # m and m/s
+    range_y: float  # m, the default range of y in observations, fixed at the reset
+    reward: float  # of the last action
+    progress: float  # of the last action, in [0, 1] per decision
+    ttc: float  # s, time to collision
+    crashed: bool
+    offroad: bool
+    terminated: bool
+    truncated: bool
+
+
+BODY = record_type(Body)
+EPISODE = record_type(Episode)
+
+
+class Bodies(Protocol):
+    """The bodies [N] of an episode in compiled code: a numpy array of `BODY`."""
+
+    size: int
+
+    @overload
+    def __getitem__(self, number: int) -> Body: ...
+    @overload
+    def __getitem__(self, number: slice) -> Bodies: ...
+
+
+class Lanes(Protocol):
+    """Lanes in compiled code: an array of `LANE`."""
+
+    def __getitem__(self, number: int) -> LaneRecord: ...
+
+
+class Edges(Protocol):
+    """Roads in compiled code: an array of `EDGE`."""
+
+    def __getitem__(self, number: int) -> EdgeRecord: ...
+
+
+class Road(Protocol):
+    """The network of an episode in compiled code: a record `ROAD`."""
+
+    lane_count: int
+    edge_count: int
+    end: float
+    spots: Integers
+    lanes: Lanes
+    edges: Edges
+    linked: Integers
+    offsets: Floats
+    routes: Integers
+    route_lanes: Integers
+
+
+class Parameters(Protocol):
+    """The parameters of all episodes of a batch in compiled code: a record `PARAMETERS`; documented in `RoadsConfig`."""
+
+    task: int
+    ego: int
+    substeps: int
+    dt: float
+    period: float
+    duration: float
+    max_steps: int
+    action_repeat: int
+    speeds: int  # number of target speeds
+    target_speeds: Floats
+    default_speeds: Floats  # highway-env's
+    idm_acceleration: float
+    idm_braking: float
+    gap_scale: float  # 2 sqrt(a b)
+    jam_distance: float
+    reward_speed_low: float
+    reward_speed_high: float
+    offroad_terminal: bool
+    columns: int  # of an observation
+    features: Integers  # numbers of `Feature`
+    low: Floats  # of x, y, vx, vy
+    high: Floats
+    default_range: bool
+    clipped: bool
+    relative: bool
+    obstacles: bool
+
+
+MOST_SPEEDS, MOST_COLUMNS = 32, 16
+_SHAPES = {
+    "target_speeds": (MOST_SPEEDS,),
+    "default_speeds": (3,),
+    "features": (MOST_COLUMNS,),
+    "low": (4,),
+    "high": (4,),
+}
+_KINDS = {"float": np.float64, "int": np.int64, "bool": np.bool_, "Floats": np.float64, "Integers": np.int64}
+PARAMETERS = np.dtype(
+    [(name, _KINDS[kind], _SHAPES.get(name, ())) for name, kind in Parameters.__annotations__.items()], align=True
+)

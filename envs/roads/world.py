@@ -1,0 +1,130 @@
+"""What the worlds of road networks have in common."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from cavbench.core.parameters import differing
+from cavbench.driving import Control, Driver, DrivingFacts, DrivingWorld, Features, Kinematics
+from cavbench.envs.highway.config import ACTIONS, KINEMATICS, STANDARD_FEATURES, STANDARD_TARGET_SPEEDS
+from cavbench.envs.roads.config import RoadsConfig, Scene
+from cavbench.envs.weather import WEATHERS
+from cavbench.scenarios import Cell
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoadsWorld(DrivingWorld):
+    """A world on the engine of road networks, with the cars, features and decisions of `highway`.
+
+    Args:
+        connected: whether cars look for their neighbours on the lanes before and after their own, too: highway-env's v1 of the
+            task; without it, v0.
+        observed_vehicles: number of rows in an observation, including the ego.
+        target_speeds: speeds in m/s for FASTER and SLOWER.
+        simulation_frequency, policy_frequency: physics frames and decisions per second.
+        max_steps: number of decisions until an episode is truncated.
+        offroad_terminal: whether leaving the road ends the episode.
+
+    Raises:
+        ValueError: if a value is not allowed; the message is one line.
+    """
+
+    features: ClassVar[Features] = STANDARD_FEATURES
+    actions: ClassVar[tuple[str, ...]] = ACTIONS
+    drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm", "clairvoyant")
+    gym_name: ClassVar[str]
+    """The name of the world in `cavbench.gym.make`."""
+    start_speed: ClassVar[float]
+    """The ego's speed at the start in m/s."""
+
+    connected: bool = True
+    observed_vehicles: int = 10
+    target_speeds: tuple[float, ...] = STANDARD_TARGET_SPEEDS
+    simulation_frequency: int = 15
+    policy_frequency: int = 15
+    max_steps: int = 300
+    offroad_terminal: bool = True
+
+    def __post_init__(self) -> None:
+        # A list from a configuration file would make the world unhashable.
+        object.__setattr__(self, "target_speeds", tuple(float(speed) for speed in self.target_speeds))
+        if not 1 <= self.policy_frequency <= self.simulation_frequency or (
+            self.simulation_frequency % self.policy_frequency
+        ):
+            raise ValueError(
+                f"policy_frequency must divide simulation_frequency ({self.simulation_frequency}), got {self.policy_frequency}"
+            )
+        self._configured((self.scene(self._some_cell()),), Control())
+
+    @abstractmethod
+    def _some_cell(self) -> Cell:
+        """A cell of this world, for checks that do not depend on it."""
+
+    @abstractmethod
+    def scene(self, cell: Cell) -> Scene:
+        """The road of a cell; equal roads must be the same object."""
+
+    @abstractmethod
+    def task(self) -> dict[str, Any]:
+        """The arguments of `RoadsConfig` that name the task."""
+
+    @property
+    def decision_hz(self) -> float:
+        return self.policy_frequency
+
+    @property
+    def kinematics(self) -> Kinematics:
+        frames = self.simulation_frequency // self.policy_frequency
+        constants = {**KINEMATICS, "start_speed": self.start_speed}
+        return Kinematics(frames=frames, target_speeds=self.target_speeds, **constants)
+
+    @property
+    def observed_rows(self) -> int:
+        return self.observed_vehicles
+
+    @property
+    def facts(self) -> DrivingFacts:
+        options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
+        return replace(super().facts, environment=f'cavbench.gym.make("{self.gym_name}"{options})')
+
+    def config(self, cells: Sequence[Cell], control: Control | None = None) -> RoadsConfig:
+        """The environment's full configuration; arguments as in `DrivingWorld.build`."""
+        # Imported here because it loads numba, which `bench list` must not load.
+        from cavbench.envs.highway.sensor import noise_sigma, sensor_range_m
+
+        scenes = []
+        for cell in cells:
+            weather = WEATHERS[cell.weather]
+            reach, sigma = sensor_range_m(weather), noise_sigma(weather)
+            scenes.append(replace(self.scene(cell), sensor_range=reach, noise_sigma=sigma))
+        return self._configured(tuple(scenes), control or Control())
+
+    def _configured(self, scenes: tuple[Scene, ...], control: Control) -> RoadsConfig:
+        return RoadsConfig(
+            **self.task(),
+            scenes=scenes,
+            simulation_frequency=self.simulation_frequency,
+            policy_frequency=self.policy_frequency,
+            max_steps=self.max_steps,
+            action_type=control.action_type,
+            driver=control.driver,
+            action_repeat=control.action_repeat,
+            target_speeds=self.target_speeds,
+            low=self.features.low,
+            high=self.features.high,
+            observed_vehicles=self.observed_vehicles,
+            offroad_terminal=self.offroad_terminal,
+        )
+
+    def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
+        """See `cavbench.driving.DrivingWorld.build`."""
+        # Imported here because it loads torchrl and numba, which `bench list` must not load.
+        from cavbench.envs.roads.environment import RoadsEnv
+
+        return RoadsEnv(self.config(cells, control))
