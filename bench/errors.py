@@ -44,6 +44,8 @@ class UnfinishedError(UserError):
     def __init__(self, lines: Sequence[str], finished: Sequence[str], missing: int) -> None:
         self.lines, self.finished = tuple(lines), finished
         kept = f"{missing} of {len(finished) + missing} units are not finished, the others are kept"
+        if not missing:
+            kept = f"the {len(finished)} units of the others are finished"
         if finished:
             self.lines = (f"{lines[0]} ({kept})",) if len(lines) == 1 else (*lines, kept)
         super().__init__("; ".join(self.lines))

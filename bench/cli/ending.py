@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import atexit
-import faulthandler
 import os
 import sys
 import threading
-import time
+from _thread import start_new_thread
 from collections.abc import Callable
 from contextlib import suppress
+
+# By name, before any plug-in is imported: one could replace or delete what a module has.
+from faulthandler import dump_traceback_later
+from os import _exit as end_now
+from os import open as open_descriptor
+from os import write
+from time import sleep
 
 from cavbench.errors import bounded
 
@@ -53,24 +59,26 @@ def _flush() -> None:
 def _end(code: int) -> None:
     """Wait for threads and hooks as Python does, but not for ever."""
     phase = ["threads"]
-    threading.Thread(target=_watch, args=(code, phase), daemon=True).start()
-    with open(os.devnull, "w") as silence, suppress(BaseException):
-        faulthandler.dump_traceback_later(END_S + BACKSTOP_S, exit=True, file=silence)
+    with suppress(BaseException):
+        dump_traceback_later(END_S + BACKSTOP_S, exit=True, file=open_descriptor(os.devnull, os.O_WRONLY))
+    with suppress(BaseException):
+        # `threading.Thread.start` would wait for ever where a plug-in took away what a new thread calls first.
+        start_new_thread(_watch, (code, phase))
         threading._shutdown()  # type: ignore[attr-defined]
         phase[0] = "hooks"
         atexit._run_exitfuncs()
         _flush()
-    os._exit(code)
+    end_now(code)
 
 
 def _watch(code: int, phase: list[str]) -> None:
-    time.sleep(END_S)
+    sleep(END_S)
     line = "the command is ended, although something that a plug-in left does not end"
     with suppress(BaseException):
         line = f"the command is ended, although {_held(phase[0])}"
     with suppress(BaseException):
-        os.write(2, f"warning: {bounded(line)}\n".encode())
-    os._exit(code)
+        write(2, f"warning: {bounded(line)}\n".encode())
+    end_now(code)
 
 
 def _held(phase: str) -> str:

@@ -83,7 +83,7 @@ def located(run: str, out: Path) -> tuple[Path, str]:
 def records_of(folder: Path, pair: str = "") -> list[tuple[Track, pa.Table]]:
     """The records of each track in a folder; only those of the pair's track if a pair's name begins with `pair`."""
     every = [(track(name), records) for name, records in reading.read_all(folder).items()]
-    with_pair = [one for one in every if pc.any(pc.starts_with(one[1]["pair"], pair)).as_py()]
+    with_pair = [one for one in every if any(name.startswith(pair) for name in pc.unique(one[1]["pair"]).to_pylist())]
     return with_pair[:1] if pair and with_pair else every
 
 

@@ -28,8 +28,16 @@ LIBRARIES = {
     "hashlib": ("",),
     "json": ("",),
     "pickle": ("",),
+    "os": ("",),
+    "io": ("",),
+    "threading": ("", "Thread"),
+    "signal": ("",),
+    "atexit": ("",),
+    "contextlib": ("",),
+    "functools": ("",),
+    "pathlib": ("", "Path"),
 }
-"""Modules of libraries that scores are computed with; the names are their classes, "" is the module itself."""
+"""Modules of libraries that scores are computed with, and processes end with; the names are their classes, "" is the module."""
 SETTINGS = ("manual_seed", "seed", "set_", "load", "save", "compile")
 """Beginnings of the names of library functions that no score depends on, and that other libraries wrap."""
 BUILTINS = (

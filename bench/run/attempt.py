@@ -39,7 +39,8 @@ def attempt(task: Task, tell: Tell, framework: Snapshot) -> Outcome:
     outcome = _together(task, tell) if task.others else _kept(task, tell)
     if changed := framework.changed():
         framework.restore()
-        return Outcome(why=f"is refused: {changed} was replaced{blamed(task.pair)}", tampered=True)
+        were = "were" if ", " in changed else "was"
+        return Outcome(why=f"is refused: {changed} {were} replaced{blamed(task.pair)}", tampered=True)
     return outcome
 
 

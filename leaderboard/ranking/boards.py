@@ -184,7 +184,7 @@ def ranked(rows: Iterable[Row]) -> Iterator[Row]:
         if leader is None or row.flagged != leader.flagged or _below(row.worst, leader.worst):
             group, leader = group + 1, row
         yield replace(row, group=group)
-    yield from sorted(hopeless, key=lambda row: row.attacks[0].defended)
+    yield from sorted(hopeless, key=lambda row: row.attacks[0].ranked_as)
 
 
 def _below(row: Worst, leader: Worst) -> bool:

@@ -55,11 +55,17 @@ LATE = {
         "a hook for the end of the process of cavbench-late 2.0 does not end",
     ),
     "an object that waits when it is deleted": ("def main(): global kept; kept = Kept()", ""),
+    "no function that a new thread calls first": (
+        "def main(): del threading.get_native_id; del time.sleep; atexit.register(spin)",
+        "a hook for the end of the process of cavbench-late 2.0 does not end",
+    ),
     "nothing": ("def main(): atexit.register(print, 'and the hooks are heard')", ""),
 }
 HEAD = """
 import atexit, threading, time
 def wait(): time.sleep(99)
+def spin():
+    while True: pass
 def stubborn():
     while True:
         try: wait()

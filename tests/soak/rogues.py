@@ -7,6 +7,7 @@ leave the records of the honest ones as they are without them.
 from __future__ import annotations
 
 import random
+import re
 import time
 from pathlib import Path
 
@@ -75,6 +76,7 @@ LEFT = (
 PLUGIN = """
 import atexit, ctypes, gc, importlib, inspect, os, pathlib, random, resource, signal, subprocess, sys, threading, time, warnings
 from dataclasses import dataclass
+from typing import ClassVar
 import numpy as np
 import torch
 from cavbench.driving import DrivingAttack
@@ -90,6 +92,8 @@ def deed():
 @dataclass(frozen=True, kw_only=True)
 class Attack(DrivingAttack):
     \"\"\"Moves nothing, after its deed.\"\"\"
+
+    access: ClassVar[str] = "oblivious"
 
     def perturb(self, observation, oracle):
         {at_attack}
@@ -138,10 +142,10 @@ def sweep(place: Path, count: int, seed: int) -> str:
         f"{name} said nothing: {deeds[name].partition('def deed():')[2].strip().splitlines()[0]}" for name in silent
     ]
     wrong += [] if same else ["the records of the honest attacks differ"]
-    wrong += ["a traceback"] if "Traceback" in said.err else []
+    wrong += ["a traceback"] if re.search("^Traceback", said.err, re.MULTILINE) else []
     wrong += [] if alone.code == 0 else [alone.err]
     return (
-        f"{count} plug-ins in {seconds:.0f} s: {len(finished - set(HONEST))} driven, {len(named)} named; "
+        f"{count} plug-ins in {seconds:.0f} s: {len(finished & set(names))} driven, {len(named)} named; "
         f"{'nothing wrong' if not wrong else '; '.join(wrong)}"
     )
 
