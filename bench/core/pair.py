@@ -68,7 +68,7 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
     try:
         with contained(), nullcontext() if component.__module__.partition(".")[0] == OWN else unchanged():
             return Chosen(kind=kind, name=name, component=component(**params))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, UserError) as error:
         raise UserError(f"{kind} {name!r}: {message(error) or type(error).__name__}") from error
     # The checks of a plug-in may raise anything else.
     except Exception as error:
@@ -114,6 +114,9 @@ class Pair:
             raise UserError(f"{type(self.threat).__name__} is not a threat model of the {self.track} track")
         if not self.is_clean and (why := attack.misfit(victim) or ("" if victim.sees else "which ignores its input")):
             raise UserError(f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}, {why}")
+        for part in (self.defense,) if self.is_clean else (self.attack, self.defense):
+            if missing := part.component.lacks(self.world.component):
+                raise UserError(f"{part.kind} {part.name!r} does not fit world {self.world.name!r}: {missing}")
         # The dynamics are the world's: of the victim such an attack asks what a white-box attack asks.
         asked: Access = "gradients" if attack.access == "dynamics" else attack.access
         if not permits(victim.answers, asked):

@@ -9,7 +9,7 @@ import json
 import os
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -36,14 +36,27 @@ STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)
 
 
 def canonical(value: Any) -> str:
-    """The canonical JSON of a value: sorted keys, no spaces; dataclasses and mappings as objects, anything else by str()."""
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
+    """The canonical JSON of a value: sorted keys, no spaces; dataclasses and mappings as objects, anything else by str().
+
+    What was made from a parameter (`as_given`) is written as the parameter.
+    """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), default=_plain)
 
 
 def _plain(value: Any) -> Any:
+    if (given := as_given(value)) is not value:
+        return given
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
     return dict(value) if isinstance(value, Mapping) else str(value)
+
+
+def as_given(value: Any) -> Any:
+    """The parameter that a value was made from, if it says so (`given_parameter`); otherwise the value itself.
+
+    A component may turn a parameter into an object that it computes with, such as axes from a mapping of values.
+    """
+    return value.given_parameter if hasattr(type(value), "given_parameter") else value
 
 
 def digest(value: Any) -> str:

@@ -130,7 +130,8 @@ def _grid(units: Sequence[pa.Table], records: pa.Table, pair: Pair) -> Grid:
         cells = [world.axes.cell(**json.loads(text)) for text in pc.unique(records["cell"]).to_pylist()]
         values = {axis: tuple(dict.fromkeys(cell[axis] for cell in cells)) for axis in world.axes}
         blocks = sorted({_block(unit) for unit in units}, key=lambda block: (block.start, block.stop))
-        starts = {grid.first_seed for grid in registry.grids(pair.world.name)}
+        own = world.own_grid()
+        starts = {grid.first_seed for grid in (registry.grids(pair.world.name) if own is None else [own])}
         if blocks[0].start not in starts:
             known = " or ".join(map(str, sorted(starts)))
             raise UserError(

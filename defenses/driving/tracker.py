@@ -33,6 +33,8 @@ class Tracker(DrivingDefense):
         assumed_noise: by how much the sensor may be wrong about other cars along the road besides, in m and m/s.
     """
 
+    reckons: ClassVar[bool] = True
+
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"
     assumed_noise: NotNegative = 0.1

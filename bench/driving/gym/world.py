@@ -40,6 +40,8 @@ class GymWorld(Declaration):
             flat=True,
             shape=native_shape(self),
             limits=native_limits(self),
+            # An environment takes one kind of actions.
+            controls=() if self.actions else self.controls,
         )
 
     def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
