@@ -62,7 +62,8 @@ def check(world: Declaration, env: gymnasium.Env[Any, Any], action_type: ActionT
         )
     action = env.action_space
     if action_type == "discrete" and not (isinstance(action, spaces.Discrete) and action.n == len(world.actions)):
-        raise UserError(f"{name} names {len(world.actions)} discrete actions, its environment takes {action}")
+        hint = ": continuous policies fit it (victim.actions or action_type=continuous)" if isinstance(action, spaces.Box) else ""
+        raise UserError(f"{name} names {len(world.actions)} discrete actions, its environment takes {action}{hint}")
     if action_type == "continuous":
         _check_controls(world, name, action)
 

@@ -111,6 +111,8 @@ def make(world: str | DrivingWorld = "highway", *, action_type: ActionType = "di
 def world_and_cells(world: str | DrivingWorld, options: Mapping[str, Any]) -> tuple[DrivingWorld, tuple[Cell, ...]]:
     """The world, and its cells with these values on its axes; the other options are parameters of the world."""
     known = registry.load("world", world).axes if isinstance(world, str) else world.axes
+    # The axes of the world `gym` are one of its parameters.
+    known = known or {}
     made: Any = world
     parameters = {name: value for name, value in options.items() if name not in known}
     if isinstance(world, str):
@@ -125,7 +127,7 @@ def world_and_cells(world: str | DrivingWorld, options: Mapping[str, Any]) -> tu
 def _cells(world: DrivingWorld, given: Mapping[str, Any]) -> tuple[Cell, ...]:
     values = {name: tuple(value) if isinstance(value, list | tuple) else (value,) for name, value in given.items()}
     try:
-        if set(values) == set(world.axes):
+        if set(values) == set(world.axes) and values:
             grid = Grid(name="custom", world="", axes=world.axes, values=values, episodes=1)
         else:
             grid = registry.grid_of(world)
