@@ -81,7 +81,9 @@ BRAKE, BRAKING = "SLOWER", 4
 """Name and, on the highway, number of the action that brakes."""
 
 
-def without_brake(objective: str, braking_action: int, world: DrivingWorld, anywhere: Sequence[str] = ("margin",)) -> str:
+def without_brake(
+    objective: str, braking_action: int, world: DrivingWorld, anywhere: Sequence[str] = ("margin",)
+) -> str:
     """What an attack misses whose objective spares braking, or aims at an acceleration; empty for nothing.
 
     Args:

@@ -83,7 +83,11 @@ def _text(value: object) -> str | None:
             return None if None in texts else f"[{','.join(filter(None, texts))}]"
         case Mapping():
             texts = [_text(item) for item in value.values()]
-            return None if None in texts else "{" + ",".join(f"{name}:{text}" for name, text in zip(value, texts, strict=True)) + "}"
+            return (
+                None
+                if None in texts
+                else "{" + ",".join(f"{name}:{text}" for name, text in zip(value, texts, strict=True)) + "}"
+            )
         case str():
             quoted = value.replace("\\", "\\\\").replace('"', '\\"')
             return f'"{quoted}"'

@@ -128,6 +128,14 @@ class World(Component):
         """The default grid of a world whose axes follow from its parameters; None for that of the name `grid`."""
         return None
 
+    @classmethod
+    def imports(cls, params: Mapping[str, Any]) -> str:
+        """The module that these parameters make it import, which no plug-in of cavbench is; empty for none.
+
+        A submission with one is refused: its sender would choose what runs.
+        """
+        return ""
+
     def doubts(self, cells: Sequence[Any]) -> Sequence[str]:
         """What makes scores in these cells doubtful, one line each; a run says it before it drives. It may take seconds.
 

@@ -11,8 +11,9 @@ from typing import Any, Generic, TypeVar
 
 from cavbench.core import registry, sources
 from cavbench.core.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
-from cavbench.core.parameters import differing
+from cavbench.core.parameters import differing, parameters
 from cavbench.core.registry import Kind
+from cavbench.core.settings import frozen
 from cavbench.errors import PluginError, UserError, message, reason
 from cavbench.identity.fingerprint import canonical, digest, state_digest
 from cavbench.isolation.foreign import contained, unchanged
@@ -75,6 +76,22 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
         raise PluginError(
             f"{kind} {name!r} cannot be created: {reason(error)} (--debug shows the traceback)"
         ) from error
+
+
+def label(kind: Kind, name: str, params: Mapping[str, Any]) -> str:
+    """What tables call a component with the parameters of a record, as `str(Chosen)`.
+
+    It is not created, for anyone may write records.
+
+    Raises:
+        UserError: if there is no such component.
+    """
+    owned = parameters(registry.load(kind, name))
+    given = {key: frozen(params[key]) for key in owned if key in params}
+    changed = [
+        f"{key}={value}" for key, value in given.items() if owned[key].required or value != frozen(owned[key].default)
+    ]
+    return f"{name}({', '.join(changed)})" if changed else name
 
 
 def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:

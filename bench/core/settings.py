@@ -17,9 +17,11 @@ class Settings(Mapping[str, Any]):
     """
 
     __slots__ = ("_values",)
+    ordered = True
+    """Records keep the order, which may say what is first."""
     _values: dict[str, Any]
 
-    def __init__(self, values: Mapping[str, Any] = {}) -> None:  # noqa: B006 - it is copied
+    def __init__(self, values: Mapping[str, Any] = {}) -> None:
         object.__setattr__(self, "_values", {_key(name): frozen(value) for name, value in values.items()})
 
     def __getitem__(self, name: str) -> Any:

@@ -29,7 +29,8 @@ class DrivingWorld(World):
     without it, seeds are drawn from `set_seed`). They write under `("next", ...)`:
     `observation` float32 [B, V, F]; `reward` float32 [B, 1]; `done`, `terminated`, `truncated` bool [B, 1]; and `info`, the
     ground truth for scoring, which policies and attacks may not read: `progress` (thesis Eq. 4.1 without its offset, divided by
-    0.5, in [0, 1]; in the step that ends an episode by arriving, that of the steps that are left, too), `speed` in m/s, `x` in m, `ttc` in s (time to collision with the car ahead in the ego's lane, inf if there
+    0.5, in [0, 1]; in the step that ends an episode by arriving, that of the steps that are left, too), `speed` in m/s, `x` in
+    m, `ttc` in s (time to collision with the car ahead in the ego's lane, inf if there
     is none), each float32 [B, 1]; `crashed` and `offroad`, bool [B, 1].
     """
 

@@ -18,7 +18,6 @@ from cavbench.core.pair import Pair
 from cavbench.driving.features import DrivingFacts, Features
 from cavbench.errors import UserError
 
-
 SHOWN = 6
 """So many features are named in a sentence."""
 

@@ -76,7 +76,9 @@ class Features:
         if self.present and (
             len(self.present) != len(self.names) or not all(-1 <= place < len(self.names) for place in self.present)
         ):
-            raise ValueError("features.present is empty, or the number of a feature (-1 for none) for each of features.names")
+            raise ValueError(
+                "features.present is empty, or the number of a feature (-1 for none) for each of features.names"
+            )
         if isinstance(self.fixed, str):
             raise ValueError(f"features.fixed is a tuple of names: write ({self.fixed!r},)")
         if strange := [name for name in self.fixed if name not in self.names]:

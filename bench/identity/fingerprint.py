@@ -38,17 +38,25 @@ STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)
 def canonical(value: Any) -> str:
     """The canonical JSON of a value: sorted keys, no spaces; dataclasses and mappings as objects, anything else by str().
 
-    What was made from a parameter (`as_given`) is written as the parameter.
+    What was made from a parameter (`as_given`) is written as the parameter. A mapping whose class is `ordered` keeps its order.
     """
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), default=_plain)
+    return json.dumps(_plain(value), separators=(",", ":"), default=str)
 
 
 def _plain(value: Any) -> Any:
+    """The same of dicts with sorted keys, lists, and what `json` writes as it is."""
+    if value is None or isinstance(value, str | int | float):
+        return value
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
     if (given := as_given(value)) is not value:
-        return given
+        return _plain(given)
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: getattr(value, field.name) for field in fields(value)}
-    return dict(value) if isinstance(value, Mapping) else str(value)
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        items = value.items() if getattr(type(value), "ordered", False) else sorted(value.items())
+        return {name: _plain(each) for name, each in items}
+    return str(value)
 
 
 def as_given(value: Any) -> Any:

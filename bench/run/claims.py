@@ -74,6 +74,7 @@ def of(units: Sequence[pa.Table]) -> Claim:
             )
     first = records.slice(0, 1).to_pylist()[0]
     _check_loadable(first)
+    _check_imports(first)
     try:
         pair = pair_of(first)
     except (UserError, ValueError, TypeError) as error:
@@ -118,6 +119,20 @@ def _names_a_file(params: Any) -> bool:
     """Whether parameters, also those of the links of a chain, name a file."""
     inner = params.values() if isinstance(params, dict) else params if isinstance(params, list) else ()
     return bool(isinstance(params, dict) and params.get("path")) or any(map(_names_a_file, inner))
+
+
+def _check_imports(record: Mapping[str, Any]) -> None:
+    """Refuse a world that would import a module which the sender names.
+
+    Raises:
+        UserError: names the module.
+    """
+    params = json.loads(record["world_params"])
+    if isinstance(params, dict) and (module := registry.load("world", record["world"]).imports(params)):
+        raise UserError(
+            f"the records are of a world that imports the module {short(module)}, which no plug-in of cavbench is: nobody can "
+            "verify them without running it; register the environment as a world of a package (GymWorld)"
+        )
 
 
 def _grid(units: Sequence[pa.Table], records: pa.Table, pair: Pair) -> Grid:

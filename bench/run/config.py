@@ -157,7 +157,9 @@ def grid_of(chosen: Chosen[Any], name: str | None) -> Grid:
     world, own = chosen.name, chosen.component.own_grid()
     if own is not None:
         if name not in (None, own.name):
-            raise UserError(f"grid {name!r} is none of the world {world!r}, whose cells are given by world.axes: leave out grid")
+            raise UserError(
+                f"grid {name!r} is none of the world {world!r}, whose cells are given by world.axes: leave out grid"
+            )
         return own
     name = name or chosen.component.grid
     known = [grid.name for grid in registry.grids(world)]

@@ -81,7 +81,8 @@ class PolicySuite(Suite):
             require(allowed, f"decide returns actions outside 0 to {scores.shape[-1] - 1}")
         else:
             require(
-                action.shape == (*observation.shape[:-2], scores.shape[-1]), f"decide returns shape {list(action.shape)}, not [B, {scores.shape[-1]}]"
+                action.shape == (*observation.shape[:-2], scores.shape[-1]),
+                f"decide returns shape {list(action.shape)}, not [B, {scores.shape[-1]}]",
             )
             require(bool((action.abs() <= 1).all()), "decide returns actions outside [-1, 1]")
         not_noisy(policy)

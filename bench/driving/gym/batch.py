@@ -14,8 +14,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from cavbench.driving import ActionType
-from cavbench.driving.gym.declaration import Declaration
-from cavbench.driving.gym.declaration import REWARD
+from cavbench.driving.gym.declaration import REWARD, Declaration
 from cavbench.driving.gym.declared import check
 from cavbench.driving.gym.environment import drawn_seeds
 from cavbench.errors import UserError

@@ -62,7 +62,11 @@ def check(world: Declaration, env: gymnasium.Env[Any, Any], action_type: ActionT
         )
     action = env.action_space
     if action_type == "discrete" and not (isinstance(action, spaces.Discrete) and action.n == len(world.actions)):
-        hint = ": continuous policies fit it (victim.actions or action_type=continuous)" if isinstance(action, spaces.Box) else ""
+        hint = (
+            ": continuous policies fit it (victim.actions or action_type=continuous)"
+            if isinstance(action, spaces.Box)
+            else ""
+        )
         raise UserError(f"{name} names {len(world.actions)} discrete actions, its environment takes {action}{hint}")
     if action_type == "continuous":
         _check_controls(world, name, action)
@@ -71,7 +75,9 @@ def check(world: Declaration, env: gymnasium.Env[Any, Any], action_type: ActionT
 def _check_controls(world: Declaration, name: str, action: spaces.Space[Any]) -> None:
     listed = ", ".join(world.controls)
     if not isinstance(action, spaces.Box):
-        raise UserError(f"the environment of {name} takes {short(str(action))}, a continuous policy has {len(world.controls)} controls")
+        raise UserError(
+            f"the environment of {name} takes {short(str(action))}, a continuous policy has {len(world.controls)} controls"
+        )
     if prod(action.shape) != len(world.controls):
         found = tuple(f"control{place}" for place in range(prod(action.shape)))
         raise UserError(
@@ -80,7 +86,7 @@ def _check_controls(world: Declaration, name: str, action: spaces.Space[Any]) ->
         )
     if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
         raise UserError(
-            f"the environment of {name} takes {action}, without a lowest and a highest value: wrap it in RescaleAction or ClipAction"
+            f"the environment of {name} takes {action}, without a lowest and a highest value: wrap it in RescaleAction"
         )
 
 

@@ -72,14 +72,21 @@ def of_space(space: spaces.Space[Any], name: str = "o", part: str = "") -> list[
         parts = enumerate(space.spaces)
         return [one for at, inner in parts for one in of_space(inner, f"{name}{at}", part or f"{name}{at}")]
     if not space.is_np_flattenable:
-        raise UserError(f"its environment observes {type(space).__name__}, which has no fixed number of entries: wrap it")
+        raise UserError(
+            f"its environment observes {type(space).__name__}, which has no fixed number of entries: wrap it"
+        )
     if (count := int(spaces.flatdim(space))) > MOST:
-        raise UserError(f"its observation has {count} entries, at most {MOST} are possible: wrap it, for instance in ResizeObservation")
+        raise UserError(
+            f"its observation has {count} entries, at most {MOST} are possible: wrap it, for instance in ResizeObservation"
+        )
     if not isinstance(space, spaces.Box):
-        return [Entry(name=f"{name}_{at}", low=0.0, high=1.0, fixed=True, column=name, part=part) for at in range(count)]
+        return [
+            Entry(name=f"{name}_{at}", low=0.0, high=1.0, fixed=True, column=name, part=part) for at in range(count)
+        ]
     low, high = (np.asarray(side, np.float64).reshape(-1).tolist() for side in (space.low, space.high))
     return [
-        Entry(name=one, low=a, high=b, part=part) for one, a, b in zip(_names(name, space.shape), low, high, strict=True)
+        Entry(name=one, low=a, high=b, part=part)
+        for one, a, b in zip(_names(name, space.shape), low, high, strict=True)
     ]
 
 
@@ -96,8 +103,8 @@ def ranged(entries: Sequence[Entry], given: Mapping[str, Any], columns: int) -> 
 
     Args:
         entries: the entries.
-        given: [low, high] by name: of entries that have these names; or of all entries, in order; or, of an array, of the columns
-            of its last axis, which every row has.
+        given: [low, high] by name: of entries that have these names; or of all entries, or all that are not fixed, in order; or,
+            of an array, of the columns of its last axis, which every row has.
         columns: size of that axis; 0 if there is none.
 
     Raises:
@@ -105,13 +112,15 @@ def ranged(entries: Sequence[Entry], given: Mapping[str, Any], columns: int) -> 
     """
     ranges = {name: _range(name, value) for name, value in given.items()}
     if all(any(entry.called(name) for entry in entries) for name in ranges):
-        return [_with(entry, next((ends for name, ends in ranges.items() if entry.called(name)), None)) for entry in entries]
-    listed = list(ranges.items())
-    if len(listed) == len(entries):
         return [
-            replace(entry, name=name, column="", low=ends[0], high=ends[1])
-            for entry, (name, ends) in zip(entries, listed, strict=True)
+            _with(entry, next((ends for name, ends in ranges.items() if entry.called(name)), None)) for entry in entries
         ]
+    listed = list(ranges.items())
+    free = [entry for entry in entries if not entry.fixed]
+    if len(listed) in (len(entries), len(free)):
+        renamed = iter(listed)
+        every = len(listed) == len(entries)
+        return [_renamed(entry, *next(renamed)) if every or not entry.fixed else entry for entry in entries]
     if columns and len(listed) == columns:
         found = []
         for place, entry in enumerate(entries):
@@ -126,6 +135,10 @@ def ranged(entries: Sequence[Entry], given: Mapping[str, Any], columns: int) -> 
     )
 
 
+def _renamed(entry: Entry, name: str, ends: tuple[float, float]) -> Entry:
+    return replace(entry, name=name, column="", low=ends[0], high=ends[1])
+
+
 def _with(entry: Entry, ends: tuple[float, float] | None) -> Entry:
     return entry if ends is None else replace(entry, low=ends[0], high=ends[1])
 
@@ -134,7 +147,9 @@ def _range(name: str, value: Any) -> tuple[float, float]:
     ends = frozen(value)
     fits = isinstance(ends, tuple) and len(ends) == 2 and all(_is_number(end) for end in ends)
     if not (fits and ends[0] < ends[1]):
-        raise UserError(f"world.features: the range of {name} is [low, high], for instance {{{name}: [-1, 1]}}, got {written(value)}")
+        raise UserError(
+            f"world.features: the range of {name} is [low, high], for instance {{{name}: [-1, 1]}}, got {written(value)}"
+        )
     return float(ends[0]), float(ends[1])
 
 
@@ -150,11 +165,15 @@ def told(entries: Sequence[Entry], option: str, given: Mapping[str, Any], attrib
     """
     for name, value in given.items():
         if not any(entry.called(name) for entry in entries):
-            raise UserError(f"world.{option} names {name!r}, which the observation does not have: it has {some(entries)}")
+            raise UserError(
+                f"world.{option} names {name!r}, which the observation does not have: it has {some(entries)}"
+            )
         if attribute == "floor" and not (_is_number(value) and value >= 0):
             raise UserError(f"world.{option}: the floor of {name} is a number of at least 0, got {written(value)}")
     return [
-        replace(entry, **{attribute: next((given[name] for name in given if entry.called(name)), getattr(entry, attribute))})
+        replace(
+            entry, **{attribute: next((given[name] for name in given if entry.called(name)), getattr(entry, attribute))}
+        )
         for entry in entries
     ]
 
@@ -169,14 +188,17 @@ def features_of(entries: Sequence[Entry]) -> Features:
     if unknown := [entry for entry in entries if not entry.known]:
         # Of a kind of entries one range is enough.
         names = list(dict.fromkeys(entry.column or entry.name for entry in unknown))
-        shown = ", ".join(f"{name}: [-1, 1]" for name in names[:2])
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        shown = ", ".join([f"{name}: [-1, 1]" for name in names[:2]] + ["…"] * (len(names) > 2))
         raise UserError(
-            f"the range of {', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''} is not known: attacks are "
-            f"limited by it, and values outside are clipped. Write world.features={{{shown}{', …' if len(names) > 2 else ''}}} with the range of each sensor"
+            f"the range of {', '.join(names[:3])}{more} is not known: attacks are limited by it, and values outside are clipped. "
+            f"Write world.features={{{shown}}} with the range of each sensor"
         )
     names = [entry.name for entry in entries]
     if twice := [name for name in names if names.count(name) > 1][:1] if len(set(names)) < len(names) else []:
-        raise UserError(f"two entries of the observation have the name {twice[0]!r}: give other names in world.features")
+        raise UserError(
+            f"two entries of the observation have the name {twice[0]!r}: give other names in world.features"
+        )
     present = tuple(entry.present for entry in entries)
     return Features(
         names=tuple(names),

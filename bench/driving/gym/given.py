@@ -52,7 +52,9 @@ class GivenWorld(RegisteredWorld):
         except Exception as error:
             raise UserError(f"the environment of world={self.id} cannot be made: {reason(error)}") from error
         if not isinstance(env, gymnasium.Env):
-            raise UserError(f"world= takes a function that returns a gymnasium environment, {self.id} returned a {type(env).__name__}")
+            raise UserError(
+                f"world= takes a function that returns a gymnasium environment, {self.id} returned a {type(env).__name__}"
+            )
         return env
 
     @property
@@ -120,12 +122,18 @@ def world(given: Any, **parameters: Any) -> RegisteredWorld:
         return _of_id(given, parameters)
     if isinstance(given, gymnasium.Env):
         if isinstance(given.unwrapped, DrivingEnv):
-            raise UserError("this environment is a world of cavbench already: give that world, world=env.unwrapped.world")
+            raise UserError(
+                "this environment is a world of cavbench already: give that world, world=env.unwrapped.world"
+            )
         return _made(_copies(given), _name(given), type(given.unwrapped), _of_object(given), parameters)
     if hasattr(given, "venv") or hasattr(given, "num_envs") or hasattr(given, "envs"):
-        raise UserError(f"a {type(given).__name__} holds several environments: give one of them, or a function that makes one")
+        raise UserError(
+            f"a {type(given).__name__} holds several environments: give one of them, or a function that makes one"
+        )
     if callable(given):
-        return _made(given, getattr(given, "__name__", type(given).__name__).strip("<>"), given, _of_function(given), parameters)
+        return _made(
+            given, getattr(given, "__name__", type(given).__name__).strip("<>"), given, _of_function(given), parameters
+        )
     raise UserError(
         f"world takes a name, a World, the id of a gymnasium environment, such an environment, or a function that makes one, got "
         f"{short(type(given).__name__)}"
@@ -141,7 +149,9 @@ def _of_id(name: str, parameters: Mapping[str, Any]) -> RegisteredWorld:
             raise UserError(str(error)) from error
     # It is registered in this process only, so no other can make it by its name.
     maker = functools.partial(gymnasium.make, spec, disable_env_checker=True)
-    return _made(maker, spec.id, spec.entry_point, digest([str(spec.kwargs), code_of(_class(spec.entry_point))]), parameters)
+    return _made(
+        maker, spec.id, spec.entry_point, digest([str(spec.kwargs), code_of(_class(spec.entry_point))]), parameters
+    )
 
 
 def _class(entry: Any) -> Any:

@@ -48,10 +48,11 @@ def _named(*rows: tuple[str, str, float], fixed: Sequence[str] = ()) -> Callable
         # A wrapper may have changed the observation.
         if len(entries) != len(rows):
             return list(entries)
-        return [
-            replace(one, name=name, unit=unit, fixed=name in fixed, **({} if one.known else {"low": -end, "high": end}))
-            for one, (name, unit, end) in zip(entries, rows, strict=True)
-        ]
+        found = []
+        for one, (name, unit, end) in zip(entries, rows, strict=True):
+            low, high = (one.low, one.high) if one.known else (-end, end)
+            found.append(replace(one, name=name, unit=unit, fixed=name in fixed, low=low, high=high))
+        return found
 
     return of
 
@@ -59,7 +60,14 @@ def _named(*rows: tuple[str, str, float], fixed: Sequence[str] = ()) -> Callable
 CART = (("x", "m", 4.8), ("vx", "m/s", 4.0), ("angle", "rad", 0.42), ("spin", "rad/s", 4.0))
 CAR = (("x", "", 1.0), ("v", "", 1.0))
 PENDULUM = (("cos", "", 1.0), ("sin", "", 1.0), ("spin", "rad/s", 8.0))
-ACROBOT = (("cos1", "", 1.0), ("sin1", "", 1.0), ("cos2", "", 1.0), ("sin2", "", 1.0), ("spin1", "rad/s", 12.6), ("spin2", "rad/s", 28.3))
+ACROBOT = (
+    ("cos1", "", 1.0),
+    ("sin1", "", 1.0),
+    ("cos2", "", 1.0),
+    ("sin2", "", 1.0),
+    ("spin1", "rad/s", 12.6),
+    ("spin2", "rad/s", 28.3),
+)
 LANDER = tuple((name, "", 1.0) for name in ("x", "y", "vx", "vy", "angle", "spin", "left_leg", "right_leg"))
 GYMNASIUM: dict[str, Known] = {
     "CartPole": Known(entries=_named(*CART), terminated="failure", actions=("LEFT", "RIGHT")),

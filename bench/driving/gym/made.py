@@ -52,7 +52,11 @@ def _imported(module: str) -> None:
         there = False
     if not there:
         raise UserError(f"there is no module {short(module)!r}, which world.id names: install it, or correct the id")
-    if top not in TRUSTED and module not in sys.modules and (why := harm(partial(importlib.import_module, module), stays=True)):
+    if (
+        top not in TRUSTED
+        and module not in sys.modules
+        and (why := harm(partial(importlib.import_module, module), stays=True))
+    ):
         raise UserError(f"the module {module!r}, which world.id names, cannot be imported: its import {why}")
     try:
         with contained(), warnings.catch_warnings():
@@ -61,6 +65,12 @@ def _imported(module: str) -> None:
     # A user's module may raise anything.
     except Exception as error:
         raise UserError(f"the module {module!r}, which world.id names, cannot be imported: {reason(error)}") from error
+
+
+def stranger(name: str) -> str:
+    """The module that an id makes us import, if it is none of `TRUSTED`; otherwise empty."""
+    module, _, _ = name.rpartition(":")
+    return "" if not module or module.partition(".")[0] in TRUSTED else module
 
 
 def home(spec: EnvSpec) -> str:
@@ -96,7 +106,11 @@ def made(spec: EnvSpec, given: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
     try:
         with contained(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            kind = gymnasium.envs.registration.load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+            kind = (
+                gymnasium.envs.registration.load_env_creator(spec.entry_point)
+                if isinstance(spec.entry_point, str)
+                else spec.entry_point
+            )
             highway_tasks.restore_traffic()
             return gymnasium.make(spec, disable_env_checker=True, **_arguments(spec, kind, given))
     except UserError:
@@ -115,7 +129,9 @@ def _arguments(spec: EnvSpec, kind: Any, given: Mapping[str, Any]) -> dict[str, 
     if hasattr(kind, "default_config"):
         default = highway_tasks.merged(kind.default_config(), spec.kwargs.get("config") or {})
         if strange := [name for name in given if name not in default]:
-            raise UserError(registry.unknown(f"key {strange[0]!r} of the configuration of {spec.id}", strange[0], sorted(default)))
+            raise UserError(
+                registry.unknown(f"key {strange[0]!r} of the configuration of {spec.id}", strange[0], sorted(default))
+            )
         return {"config": highway_tasks.merged(default, given)} if given else {}
     parameters = inspect.signature(kind).parameters
     if not any(one.kind is one.VAR_KEYWORD for one in parameters.values()):

@@ -87,7 +87,8 @@ def _axis(name: str, values: Any) -> Axis:
     kind = "float" if found == {"int", "float"} else next(iter(found)) if len(found) == 1 else ""
     if not listed or not kind or not name.isidentifier():
         raise ValueError(
-            f"axes takes numbers or texts by the name of a setting, for instance {{lanes_count: [3, 4]}}, got {name}: {written(values)}"
+            f"axes takes numbers or texts by the name of a setting, for instance {{lanes_count: [3, 4]}}, got {name}: "
+            f"{written(values)}"
         )
     chosen: tuple[Value, ...] = tuple(float(value) for value in listed) if kind == "float" else tuple(listed)
     if len(set(chosen)) < len(chosen):
@@ -98,7 +99,12 @@ def _axis(name: str, values: Any) -> Axis:
 def grid_of(axes: GivenAxes, world: str, name: str) -> Grid:
     """All combinations of the values on the axes."""
     return Grid(
-        name=name, world=world, axes=axes, values={key: axis.choices for key, axis in axes.items()}, episodes=EPISODES, training_seeds=1
+        name=name,
+        world=world,
+        axes=axes,
+        values={key: axis.choices for key, axis in axes.items()},
+        episodes=EPISODES,
+        training_seeds=1,
     )
 
 

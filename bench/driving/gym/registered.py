@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -63,7 +64,11 @@ class RegisteredWorld(GymWorld):
     terminated: Ending = "unknown"  # type: ignore[misc]
     reward: tuple[float, ...] = ()
     max_steps: Count | None = None  # type: ignore[assignment]
-    hz: Positive | None = None  # type: ignore[misc]
+    hz: Positive | None = None  # type: ignore[misc, assignment]
+
+    @classmethod
+    def imports(cls, params: Mapping[str, Any]) -> str:
+        return made.stranger(str(params.get("id", "")))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -71,6 +76,7 @@ class RegisteredWorld(GymWorld):
             value = getattr(self, name)
             value = value.given_parameter if hasattr(type(value), "given_parameter") else value
             self._set(name, mapping(name, value))
+        self._set("fixed", tuple(self.fixed))
         self._set("reward", tuple(float(number) for number in self.reward))
         if self.reward and not (len(self.reward) == 2 and self.reward[0] < self.reward[1]):
             raise ValueError(f"reward is [worst, best] of a step, for instance [-1, 0], got {list(self.reward)}")
@@ -83,6 +89,12 @@ class RegisteredWorld(GymWorld):
             self._ask(env)
         finally:
             env.close()
+
+    @property
+    def known(self) -> Known:
+        """What is known of the environment."""
+        found: Known = vars(self)["_known"]
+        return found
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -97,7 +109,7 @@ class RegisteredWorld(GymWorld):
         known = known_of(env)
         self._set("ranges_known", known.entries is not list and not self.features)
         # What it was asked for is in the features.
-        self._set("known", replace(known, entries=list))
+        self._set("_known", replace(known, entries=list))
         self._set("actions", _actions(env.action_space, known))
         self._set("controls", _controls(env.action_space, known))
         self._set("features", GivenFeatures.of(self._described(env, known), self.features))
@@ -112,20 +124,16 @@ class RegisteredWorld(GymWorld):
         space = env.observation_space
         found = known.entries(entries.of_space(space))
         found = self._measured(space, found, self.part or known.part)
-        attacked = [entry for entry in found if not entry.fixed]
         if self.features:
             columns = space.shape[-1] if isinstance(space, spaces.Box) and len(space.shape) > 1 else 0
-            if len(self.features) == len(found):
-                found = entries.ranged(found, self.features, columns)
-            else:
-                renamed = iter(entries.ranged(attacked or found, self.features, columns))
-                found = [next(renamed) if entry in attacked or not attacked else entry for entry in found]
+            found = entries.ranged(found, self.features, columns)
         found = entries.told(found, "floors", self.floors or {}, "floor")
         found = entries.told(found, "units", self.units or {}, "unit")
         found = entries.told(found, "fixed", dict.fromkeys(self.fixed, True), "fixed")
         if all(entry.fixed for entry in found):
             raise UserError(
-                f"{self.id} observes {short(str(space))}, in which an attacker can change nothing: only numbers of a Box are measured"
+                f"{self.id} observes {short(str(space))}, in which an attacker can change nothing: only numbers of a Box are "
+                "measured"
             )
         return without_units(entries.features_of(found))
 
@@ -206,8 +214,8 @@ def _actions(space: Any, known: Known) -> tuple[str, ...]:
         return ()
     if not isinstance(space, spaces.Discrete):
         raise UserError(
-            f"its environment takes actions of {short(str(space))}: it must be Discrete or Box (several cars or several choices at "
-            "once need a wrapper)"
+            f"its environment takes actions of {short(str(space))}: it must be Discrete or Box (several cars, or several choices "
+            "at once, need a wrapper)"
         )
     count = int(space.n)
     return known.actions if len(known.actions) == count else tuple(f"action{place}" for place in range(count))

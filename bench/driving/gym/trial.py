@@ -99,7 +99,13 @@ def doubts(world: Declaration, cells: Sequence[Cell]) -> list[str]:
         limits = [found for env in batch.envs if (found := time_limit(env)) is not None]
         early = _drive(batch, seen)
     limits += early if len(early) > 1 and len(set(early)) == 1 else []
-    declared = [*_of_ranges(world, seen), *_of_rewards(world, seen), *_of_length(world, limits), *_of_ends(seen), *_of_meaning(world, seen)]
+    declared = [
+        *_of_ranges(world, seen),
+        *_of_rewards(world, seen),
+        *_of_length(world, limits),
+        *_of_ends(seen),
+        *_of_meaning(world, seen),
+    ]
     return [*repeats(world, cells), *declared]
 
 
@@ -184,8 +190,9 @@ def _of_ends(seen: Seen) -> Iterator[str]:
 def _of_meaning(world: Declaration, seen: Seen) -> Iterator[str]:
     if type(world).failed is Declaration.failed and world.ending == "unknown" and not seen.tells:
         yield (
-            f"the environment of {world.label} does not tell in info whether an episode that terminates has failed or arrived (crashed, is_success): "
-            f"each counts as failed; write {world.writes('terminated', 'failure')} or {world.writes('terminated', 'success')}"
+            f"the environment of {world.label} does not tell in info whether an episode that terminates has failed or arrived "
+            f"(crashed, is_success): each counts as failed; write {world.writes('terminated', 'failure')} or "
+            f"{world.writes('terminated', 'success')}"
         )
 
 
@@ -201,9 +208,9 @@ def time_limit(env: gymnasium.Env[Any, Any]) -> int | None:
             found.append(int(wrapped._max_episode_steps))
         wrapped = wrapped.env
     config = getattr(wrapped, "config", None)
-    if isinstance(config, dict) and {"duration", "policy_frequency"} <= set(config):
-        if config["duration"] * config["policy_frequency"] <= LONGEST:
-            found.append(_decisions(config["duration"], config["policy_frequency"]))
+    config = config if isinstance(config, dict) else {}
+    if {"duration", "policy_frequency"} <= set(config) and config["duration"] * config["policy_frequency"] <= LONGEST:
+        found.append(_decisions(config["duration"], config["policy_frequency"]))
     return min(found, default=None)
 
 
