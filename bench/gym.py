@@ -3,6 +3,6 @@
 Importing this module registers an environment `cavbench/WORLD-v0` for each installed driving world.
 """
 
-from cavbench.driving.gym import DrivingEnv, DrivingVectorEnv, GymWorld, make, make_vec
+from cavbench.driving.gym import DrivingEnv, DrivingVectorEnv, GymWorld, RegisteredWorld, make, make_vec, world
 
-__all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "make", "make_vec"]
+__all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "RegisteredWorld", "make", "make_vec", "world"]

@@ -38,6 +38,7 @@ class Directed(DrivingAttack):
     """
 
     access: ClassVar[Access] = "gradients"
+    needs: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy")
     learns: ClassVar[bool] = True
     at_run_time: ClassVar[tuple[str, ...]] = ("steps", "restarts", "step_size")
 

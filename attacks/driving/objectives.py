@@ -8,10 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 from torch import Tensor
+
+from cavbench.driving.features import CONTROLS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from cavbench.driving import DrivingWorld
 
 Objective = Literal["collision", "expected", "margin", "target"]
 
@@ -68,6 +75,39 @@ def distance(action: Tensor, reference: Tensor) -> Tensor:
 def distortion(perturbed: Tensor, observation: Tensor) -> Tensor:
     """Eq. 4.9 of the thesis: the L2 norm of the squared perturbation, [..., B]."""
     return (perturbed - observation).square().flatten(-2).norm(dim=-1)
+
+
+BRAKE, BRAKING = "SLOWER", 4
+"""Name and, on the highway, number of the action that brakes."""
+
+
+def without_brake(
+    objective: str, braking_action: int, world: DrivingWorld, anywhere: Sequence[str] = ("margin",)
+) -> str:
+    """What an attack misses whose objective spares braking, or aims at an acceleration; empty for nothing.
+
+    Args:
+        objective: its objective.
+        braking_action: the number of the action that `collision` spares.
+        world: the world.
+        anywhere: the objectives that need no particular controls of a continuous victim.
+    """
+    actions, controls = world.actions, world.facts.controls
+    if not actions and objective not in anywhere and controls != CONTROLS:
+        return (
+            f"its objective {objective} needs acceleration and steering, the controls here are {', '.join(controls)}: write "
+            "attack.objective=margin"
+        )
+    if objective != "collision" or not actions or actions[braking_action : braking_action + 1] == (BRAKE,):
+        return ""
+    if braking_action < len(actions) and braking_action != BRAKING:
+        # Its user says that this action brakes.
+        return ""
+    there = f", or attack.braking_action={actions.index(BRAKE)}" if BRAKE in actions else ""
+    return (
+        f"its objective collision spares the action that brakes, number {braking_action} on the highway, which here is "
+        f"{actions[braking_action] if braking_action < len(actions) else 'none'}: write attack.objective=margin{there}"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

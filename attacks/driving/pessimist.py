@@ -31,6 +31,7 @@ class Pessimist(DrivingAttack):
     """
 
     access: ClassVar[Access] = "oblivious"
+    needs: ClassVar[tuple[str, ...]] = ("x", "vx")
 
     outlook: Outlook = "pessimist"
 

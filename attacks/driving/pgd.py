@@ -12,14 +12,14 @@ from torch import Tensor
 
 from cavbench.attacks.driving.candidates import best_of, better, random_starts
 from cavbench.attacks.driving.critic import CriticLoss
-from cavbench.attacks.driving.objectives import ContinuousLoss, DiscreteLoss, Objective
+from cavbench.attacks.driving.objectives import ContinuousLoss, DiscreteLoss, Objective, without_brake
 from cavbench.attacks.driving.timing import gap_misfit, timed
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Count, Natural, Positive, Share
 from cavbench.driving import DrivingAttack
 
 if TYPE_CHECKING:
-    from cavbench.driving import DrivingVictim, Oracle
+    from cavbench.driving import DrivingVictim, DrivingWorld, Oracle
 
 Loss = Callable[[Tensor], Tensor]
 Key = Callable[[Tensor, Tensor], Tensor]
@@ -88,6 +88,9 @@ class PGD(DrivingAttack):
 
     def misfit(self, victim: DrivingVictim) -> str:
         return gap_misfit(self.gap, victim) or super().misfit(victim)
+
+    def lacks(self, world: DrivingWorld) -> str:
+        return without_brake(self.objective, self.braking_action, world, ("margin", "expected")) or super().lacks(world)
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if not len(observation) or int(oracle.remaining.min()) < 1:

@@ -52,6 +52,7 @@ class Rehearse(DrivingAttack):
     """
 
     access: ClassVar[Access] = "dynamics"
+    needs: ClassVar[tuple[str, ...]] = NEEDED
     joint: ClassVar[bool] = True
 
     horizon: Positive = 4.0

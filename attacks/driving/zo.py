@@ -11,13 +11,13 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from cavbench.attacks.driving.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion
+from cavbench.attacks.driving.objectives import ContinuousLoss, DiscreteLoss, Loss, distortion, without_brake
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Count, Natural, NotNegative, Positive
 from cavbench.driving import DrivingAttack, Part, parts_of
 
 if TYPE_CHECKING:
-    from cavbench.driving import Oracle
+    from cavbench.driving import DrivingWorld, Oracle
 
 ZOObjective = Literal["collision", "expected", "margin", "target", "thesis"]
 
@@ -84,6 +84,9 @@ class ZOSignSGD(DrivingAttack):
     enough: Annotated[float, Interval(gt=0, le=1)] = 1.0
     random_start: bool = False
     draw: Natural = 0
+
+    def lacks(self, world: DrivingWorld) -> str:
+        return without_brake(self.objective, self.braking_action, world) or super().lacks(world)
 
     def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
         if not len(observation) or (left := int(oracle.remaining.min())) < 1:

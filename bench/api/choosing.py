@@ -73,16 +73,36 @@ def chosen(kind: Kind, given: object, track_name: str = "") -> Chosen[Any]:
             return Chosen(kind=kind, name=name, component=given)
     if missing := given.missing():
         raise UserError(f"{kind} {type(given).__name__} does not implement {', '.join(missing)}")
-    return Chosen(kind=kind, name=type(given).__name__, component=given, code=content_of(given))
+    # A world from gymnasium knows its content: looking through an environment, whose parts hold each other, would take hours.
+    own = getattr(given, "content", "")
+    name = given.id if own else type(given).__name__  # type: ignore[attr-defined]
+    return Chosen(kind=kind, name=name, component=given, code=own or content_of(given))
 
 
-def world_of(given: World | str | None, victim: object) -> Chosen[Any]:
-    """The world: the given one, or the default of the victim's track."""
+def world_of(given: Any, victim: object) -> Chosen[Any]:
+    """The world: the given one, one of a gymnasium environment that was given, or the default of the victim's track.
+
+    Raises:
+        UserError: if it is none of these.
+    """
     if given is not None:
-        return chosen("world", given)
+        return chosen("world", given if isinstance(given, World) or _is_name(given) else _of_gymnasium(given))
     own = choose("victim", victim).component if isinstance(victim, str) else victim
     name = own.tracks()[0] if isinstance(own, Victim) else "detection" if isinstance(own, Detector) else "driving"
     return choose("world", track(name).world)
+
+
+def _is_name(given: object) -> bool:
+    """Whether it is the name of a world, and not the id of a gymnasium environment."""
+    return isinstance(given, str) and (given in registry.names("world") or not registry.is_environment(given))
+
+
+def _of_gymnasium(given: Any) -> World:
+    try:
+        from cavbench.driving.gym import world
+    except ImportError as error:
+        raise UserError(str(error)) from error
+    return world(given)
 
 
 def victim_of(
@@ -244,7 +264,7 @@ def grid_with(world: Chosen[Any], given: Grid | str | None, episodes: int | None
     Raises:
         UserError: if the grid or an axis is unknown, or a value is not allowed.
     """
-    grid = given if isinstance(given, Grid) else grid_of(world.name, given or world.component.grid)
+    grid = given if isinstance(given, Grid) else grid_of(world, given)
     if strange := [name for name in cells if name not in grid.axes]:
         raise UserError(registry.unknown(f"argument or axis {strange[0]!r}", strange[0], grid.axes))
     try:

@@ -10,7 +10,7 @@ from cavbench.core import registry
 from cavbench.core.options import configured
 from cavbench.core.parameters import description, parameters
 from cavbench.errors import UserError
-from cavbench.identity.fingerprint import canonical
+from cavbench.identity.fingerprint import as_given, canonical
 
 
 class ComponentSuite(Suite):
@@ -34,14 +34,15 @@ class ComponentSuite(Suite):
     def set_by_words(self) -> str:
         """Every parameter can be written on the command line, and is parsed to the same value."""
         owned = parameters(type(self.component))
-        written = {name: text for name in owned if (text := _text(getattr(self.component, name))) is not None}
+        given = {name: as_given(getattr(self.component, name)) for name in owned}
+        written = {name: text for name, value in given.items() if (text := _text(value)) is not None}
         try:
             made = configured(self.subject.kind, self.subject.name, written).component
         except UserError as error:
             hint = "types may be bool, int, float, str, Literal, None and tuples of them"
             raise BrokenRuleError(f"{one_line(error)} ({hint})") from None
         for name, text in written.items():
-            value, wanted = getattr(made, name), getattr(self.component, name)
+            value, wanted = as_given(getattr(made, name)), given[name]
             require(
                 type(value) is type(wanted) and value == wanted,
                 f"{self.subject.kind}.{name}={text} is parsed as {value!r}: its annotation does not fit its value {wanted!r}",
@@ -80,6 +81,13 @@ def _text(value: object) -> str | None:
         case tuple() | list():
             texts = [_text(item) for item in value]
             return None if None in texts else f"[{','.join(filter(None, texts))}]"
+        case Mapping():
+            texts = [_text(item) for item in value.values()]
+            return (
+                None
+                if None in texts
+                else "{" + ",".join(f"{name}:{text}" for name, text in zip(value, texts, strict=True)) + "}"
+            )
         case str():
             quoted = value.replace("\\", "\\\\").replace('"', '\\"')
             return f'"{quoted}"'

@@ -40,6 +40,9 @@ class ScenarioSuite(Suite):
     def has_a_grid(self) -> str:
         """The default grid is installed, and every grid of the world has the world's axes."""
         name = self.subject.name
+        if (own := self.component.own_grid()) is not None:
+            self._check_values(own)
+            return f"from its parameters: {len(own.cells())} cell{'s' if len(own.cells()) > 1 else ''}"
         wanted = getattr(self.component, "grid", None)
         require(isinstance(wanted, str) and wanted, 'name the default grid of a run: grid: ClassVar[str] = "…"')
         try:
@@ -114,4 +117,4 @@ def first_cell(world: World) -> Cell:
     Raises:
         UserError: if the grid is not installed.
     """
-    return registry.grid(world.grid).cells()[0]
+    return registry.grid_of(world).cells()[0]

@@ -43,6 +43,9 @@ class Chain(Defense):
             return first, next(iter(others), None)
         return first, (MARK.join(name for name, _ in others), _linked(*others))
 
+    def lacks(self, world: Any) -> str:
+        return next(filter(None, (link.lacks(world) for link in self.links)), "")
+
     @property
     def seeded(self) -> bool:
         return any(link.seeded for link in self.links)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 from cavbench.core import ranges
 from cavbench.errors import UserError
-from cavbench.scenarios import Axes
+from cavbench.scenarios import Axes, Grid
 
 if TYPE_CHECKING:
     # Reports read records and need no torch, which takes seconds to import.
@@ -124,6 +124,18 @@ class World(Component):
         """What victims, defences and reports may know of this world."""
         return Facts(axes=self.axes)
 
+    def own_grid(self) -> Grid | None:
+        """The default grid of a world whose axes follow from its parameters; None for that of the name `grid`."""
+        return None
+
+    @classmethod
+    def imports(cls, params: Mapping[str, Any]) -> str:
+        """The module that these parameters make it import, which no plug-in of cavbench is; empty for none.
+
+        A submission with one is refused: its sender would choose what runs.
+        """
+        return ""
+
     def doubts(self, cells: Sequence[Any]) -> Sequence[str]:
         """What makes scores in these cells doubtful, one line each; a run says it before it drives. It may take seconds.
 
@@ -225,6 +237,10 @@ class Attack(Component):
         """Why it cannot attack a victim of its track, as the end of a sentence; empty if it can attack it."""
         return ""
 
+    def lacks(self, world: Any) -> str:
+        """What it misses in a world of its track, as a sentence; empty if it can be used there."""
+        return ""
+
 
 class Defense(Component):
     """Protects a victim: at training time, at run time, or both."""
@@ -232,6 +248,10 @@ class Defense(Component):
     def train(self, victim: Any, world: Any, *, seed: int, progress: Progress) -> Trained[Any] | None:
         """Train the defended network of training seed `seed`; None if there is nothing to train."""
         return None
+
+    def lacks(self, world: Any) -> str:
+        """What it misses in a world of its track, as a sentence; empty if it can be used there."""
+        return ""
 
     @property
     def seeded(self) -> bool:

@@ -11,8 +11,9 @@ from typing import Any, Generic, TypeVar
 
 from cavbench.core import registry, sources
 from cavbench.core.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
-from cavbench.core.parameters import differing
+from cavbench.core.parameters import differing, parameters
 from cavbench.core.registry import Kind
+from cavbench.core.settings import frozen
 from cavbench.errors import PluginError, UserError, message, reason
 from cavbench.identity.fingerprint import canonical, digest, state_digest
 from cavbench.isolation.foreign import contained, unchanged
@@ -68,13 +69,29 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
     try:
         with contained(), nullcontext() if component.__module__.partition(".")[0] == OWN else unchanged():
             return Chosen(kind=kind, name=name, component=component(**params))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, UserError) as error:
         raise UserError(f"{kind} {name!r}: {message(error) or type(error).__name__}") from error
     # The checks of a plug-in may raise anything else.
     except Exception as error:
         raise PluginError(
             f"{kind} {name!r} cannot be created: {reason(error)} (--debug shows the traceback)"
         ) from error
+
+
+def label(kind: Kind, name: str, params: Mapping[str, Any]) -> str:
+    """What tables call a component with the parameters of a record, as `str(Chosen)`.
+
+    It is not created, for anyone may write records.
+
+    Raises:
+        UserError: if there is no such component.
+    """
+    owned = parameters(registry.load(kind, name))
+    given = {key: frozen(params[key]) for key in owned if key in params}
+    changed = [
+        f"{key}={value}" for key, value in given.items() if owned[key].required or value != frozen(owned[key].default)
+    ]
+    return f"{name}({', '.join(changed)})" if changed else name
 
 
 def check_track(victim: Chosen[Any], *parts: Chosen[Any]) -> None:
@@ -114,6 +131,9 @@ class Pair:
             raise UserError(f"{type(self.threat).__name__} is not a threat model of the {self.track} track")
         if not self.is_clean and (why := attack.misfit(victim) or ("" if victim.sees else "which ignores its input")):
             raise UserError(f"attack {self.attack.name!r} does not fit victim {self.victim.name!r}, {why}")
+        for part in (self.defense,) if self.is_clean else (self.attack, self.defense):
+            if missing := part.component.lacks(self.world.component):
+                raise UserError(f"{part.kind} {part.name!r} does not fit world {self.world.name!r}: {missing}")
         # The dynamics are the world's: of the victim such an attack asks what a white-box attack asks.
         asked: Access = "gradients" if attack.access == "dynamics" else attack.access
         if not permits(victim.answers, asked):

@@ -13,6 +13,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 from cavbench.core import ranges
 from cavbench.core.contracts import Component
 from cavbench.errors import PluginError
+from cavbench.identity.fingerprint import as_given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +106,7 @@ def differing(component: Any) -> dict[str, Any]:
     """The parameters of a component that differ from their defaults; those of the links of a chain as `LINK.NAME`."""
     found: dict[str, Any] = {}
     for name, parameter in parameters(type(component)).items():
-        value = getattr(component, name)
+        value = as_given(getattr(component, name))
         if isinstance(value, Component):
             found |= {f"{name}.{inner}": each for inner, each in differing(value).items()}
         elif parameter.required or value != parameter.default:

@@ -9,6 +9,7 @@ import contextlib
 import difflib
 import importlib
 import inspect
+import re
 import sys
 from collections import UserDict
 from collections.abc import Iterable
@@ -137,11 +138,22 @@ def find(group: str, name: str, noun: str) -> Entry:
         return _joined([find(group, link, noun) for link in split(name)])
     own = plain(name)
     if own not in known:
-        hint = (_of_file(name) if noun == "victim" else "") or checkout.waiting(group, own)
+        hint = _of_file(name) if noun == "victim" else _of_environment(name) if noun == "world" else ""
+        hint = hint or checkout.waiting(group, own)
         raise UserError(f"unknown {noun} {name!r}; {hint}" if hint else unknown(f"{noun} {own!r}", own, known))
     if complaint := problem(known[own]):
         raise UserError(f"{noun} {own!r} is {complaint}")
     return known[own][0]
+
+
+def is_environment(name: str) -> bool:
+    """Whether a name is written like the id of a gymnasium environment: NAME-v0, or MODULE:NAME."""
+    return bool(re.fullmatch(r"[\w./-]+:[\w./-]+|[\w./-]+-v\d+", name))
+
+
+def _of_environment(name: str) -> str:
+    """How the environment of an id is given as a world; empty if the name is not that of one."""
+    return f"a gymnasium environment is given as world=gym world.id={name}" if is_environment(name) else ""
 
 
 def _of_file(name: str) -> str:
@@ -261,6 +273,18 @@ def all_grids() -> list[Grid]:
         with contextlib.suppress(UserError):
             found.append(grid(name))
     return found
+
+
+def grid_of(world: Any) -> Grid:
+    """The default grid of a world.
+
+    Args:
+        world: a `cavbench.core.contracts.World`.
+
+    Raises:
+        UserError: if it is not installed.
+    """
+    return world.own_grid() or grid(world.grid)
 
 
 def grids(world: str) -> list[Grid]:

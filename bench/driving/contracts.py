@@ -29,7 +29,8 @@ class DrivingWorld(World):
     without it, seeds are drawn from `set_seed`). They write under `("next", ...)`:
     `observation` float32 [B, V, F]; `reward` float32 [B, 1]; `done`, `terminated`, `truncated` bool [B, 1]; and `info`, the
     ground truth for scoring, which policies and attacks may not read: `progress` (thesis Eq. 4.1 without its offset, divided by
-    0.5, in [0, 1]), `speed` in m/s, `x` in m, `ttc` in s (time to collision with the car ahead in the ego's lane, inf if there
+    0.5, in [0, 1]; in the step that ends an episode by arriving, that of the steps that are left, too), `speed` in m/s, `x` in
+    m, `ttc` in s (time to collision with the car ahead in the ego's lane, inf if there
     is none), each float32 [B, 1]; `crashed` and `offroad`, bool [B, 1].
     """
 
@@ -211,6 +212,13 @@ class DrivingAttack(Attack):
     """Whether one call may attack the episodes of several units. Such an attack draws the random numbers of each unit from the
     unit's own generator (`Oracle.parts`), and nothing else that it does for a unit depends on the others. A subclass says it
     for itself."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Names of the features without which it can do nothing."""
+
+    def lacks(self, world: DrivingWorld) -> str:
+        if self.access == "dynamics" and type(world).dynamics is DrivingWorld.dynamics:
+            return "it needs the dynamics of the world (how its cars move), which this world does not offer"
+        return missing_features(self.needs, world)
 
     @classmethod
     def missing(cls) -> list[str]:
@@ -257,6 +265,15 @@ class DrivingDefense(Defense):
     track: ClassVar[str] = "driving"
     brakes_to: ClassVar[float | None] = None
     """As `DrivingVictim.brakes_to`."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Names of the features without which it can do nothing."""
+    reckons: ClassVar[bool] = False
+    """Whether it needs to know how the world's cars move (`DrivingFacts.kinematics`)."""
+
+    def lacks(self, world: DrivingWorld) -> str:
+        if self.reckons and world.kinematics is None:
+            return "it needs to know how the world's cars move (kinematics), which this world does not say"
+        return missing_features(self.needs, world)
 
     @abstractmethod
     def load(self, victim: DrivingVictim, seed: int, facts: DrivingFacts) -> Policy:
@@ -267,3 +284,16 @@ class DrivingDefense(Defense):
             seed: training seed.
             facts: facts of the world: features with units, ranges and resolutions, decision period, meaning of actions.
         """
+
+
+NAMED = 6
+"""So many features are named in a message."""
+
+
+def missing_features(needed: Sequence[str], world: DrivingWorld) -> str:
+    """That a world does not measure what is needed, as a sentence; empty if it does."""
+    names = world.features.names
+    if set(needed) <= set(names):
+        return ""
+    listed = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+    return f"it needs the features {', '.join(needed)} of each car in a row of its own, this world measures {listed}"

@@ -18,6 +18,9 @@ from cavbench.core.pair import Pair
 from cavbench.driving.features import DrivingFacts, Features
 from cavbench.errors import UserError
 
+SHOWN = 6
+"""So many features are named in a sentence."""
+
 
 def doubts(pair: Pair, default_world: str) -> Iterator[str]:
     """The doubts about a pair, one line each.
@@ -31,6 +34,20 @@ def doubts(pair: Pair, default_world: str) -> Iterator[str]:
         yield from _too_fast(name, part, pair, facts)
         if _in_zoo(part, pair):
             yield from _trained_elsewhere(name, part, facts, default_world)
+
+
+def other_features(pair: Pair, default_world: str) -> str:
+    """The end of a sentence on a network of the zoo that has learned other features than those of the world; empty for none."""
+    here: Any = pair.world.component.facts
+    for name, part in _named(pair):
+        home = _home(part, default_world) if _in_zoo(part, pair) else None
+        if home is not None and len(home.features.names) != len(here.features.names):
+            listed = ", ".join(here.features.names[:SHOWN]) + (", …" if len(here.features.names) > SHOWN else "")
+            return (
+                f"was trained on {', '.join(home.features.names)}, this world measures {listed}: give a "
+                f"policy that was trained here, victim=sb3 (or torch, onnx) with victim.path=…, in place of {name}"
+            )
+    return ""
 
 
 def hopeless(baselines: pa.Table) -> str:
@@ -79,17 +96,21 @@ def _in_zoo(part: Any, pair: Pair) -> bool:
 
 def _trained_elsewhere(name: str, part: Any, facts: DrivingFacts, default_world: str) -> Iterator[str]:
     """A network of the zoo is at home in the world that its recipe names."""
+    home = _home(part, default_world)
+    if home is not None and (differs := _difference(home, facts)):
+        yield f"{name} was trained in another world: {differs}; train it in this one (bench train), or choose its own"
+
+
+def _home(part: Any, default_world: str) -> DrivingFacts | None:
+    """The facts of the world that a network was trained in; None if it can no longer be made, which does not matter here."""
     first, *others = [*shlex.split(part.trained_in), ""]
     values = [word for word in (first, *others) if "=" in word]
     world = first if first and "=" not in first else default_world
     try:
-        made = configured("world", world, dict(word.split("=", 1) for word in values))
-        home: Any = made.component.facts
-    # Whether its world can still be made does not matter here.
+        facts = configured("world", world, dict(word.split("=", 1) for word in values)).component.facts
     except UserError:
-        return
-    if isinstance(home, DrivingFacts) and (differs := _difference(home, facts)):
-        yield f"{name} was trained in another world: {differs}; train it in this one (bench train), or choose its own"
+        return None
+    return facts if isinstance(facts, DrivingFacts) else None
 
 
 def _difference(home: DrivingFacts, here: DrivingFacts) -> str:

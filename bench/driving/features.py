@@ -34,6 +34,10 @@ class Control:
 
 CONSTANT_CONTROLS = {"throttle": (1.0, 0.0), "coast": (0.0, 0.0), "brake": (-1.0, 0.0)}
 """[acceleration, steering] in [-1, 1] of the constant policies, by name."""
+CONTROLS = ("acceleration", "steering")
+"""Names of the controls of a continuous action, unless a world has others."""
+CONSTANT_SHARES = {"all_low": -1.0, "all_middle": 0.0, "all_high": 1.0}
+"""Every control of the constant policies, by name, in a world with other controls."""
 RIGHT_THEN_SLOWER = "right_then_slower"
 """The policy that changes to the rightmost lane and then brakes."""
 
@@ -53,9 +57,11 @@ class Features:
         floors: resolution of the sensor, in `units`: the smallest radius of the `relative` set at a budget of 0.1; empty for
             none.
         fixed: names of the features that no attack can change, like `presence`: flags, one-hot codes, the clock.
+        present: of each feature, the number of the feature without which there is nothing to measure, and no attack can change
+            it: the presence of a car in a flat observation; -1 for none. Empty if all are always there.
 
     Raises:
-        ValueError: if `fixed` names a feature that there is not.
+        ValueError: if `fixed` names a feature that there is not, or `present` is not a number for each feature.
     """
 
     names: tuple[str, ...]
@@ -64,8 +70,15 @@ class Features:
     units: tuple[str, ...]
     floors: tuple[float, ...] = ()
     fixed: tuple[str, ...] = ()
+    present: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.present and (
+            len(self.present) != len(self.names) or not all(-1 <= place < len(self.names) for place in self.present)
+        ):
+            raise ValueError(
+                "features.present is empty, or the number of a feature (-1 for none) for each of features.names"
+            )
         if isinstance(self.fixed, str):
             raise ValueError(f"features.fixed is a tuple of names: write ({self.fixed!r},)")
         if strange := [name for name in self.fixed if name not in self.names]:
@@ -75,9 +88,14 @@ class Features:
         """[F - 1] 1 for the features that an attack may change, 0 for those that are `fixed`."""
         return torch.tensor([float(name not in self.fixed) for name in self.names])
 
+    def there(self, observation: Tensor) -> Tensor:
+        """[..., F - 1] whether there is something to measure, of an observation [..., F] (`present`)."""
+        places = torch.tensor(self.present)
+        return (observation[..., 1:][..., places] > 0) | (places < 0)
+
     def written(self) -> dict[str, Any]:
-        """As plain JSON values for records; without `fixed` if there is none, as in records from before it."""
-        return {name: value for name, value in asdict(self).items() if name != "fixed" or value}
+        """As plain JSON values for records; without `fixed` and `present` if there are none, as in records from before them."""
+        return {name: value for name, value in asdict(self).items() if name not in ("fixed", "present") or value}
 
     def half_range(self) -> Tensor:
         """[F - 1] size of one normalised unit, in physical units."""
@@ -102,6 +120,7 @@ class DrivingFacts(Facts):
         shape: shape of that array; empty for [F - 1].
         limits: the lowest and the highest value of each of its entries, in that environment; empty if nobody asked.
         rows: V, the number of rows in its observations; None if the world does not say.
+        controls: names of the controls of a continuous action, each in [-1, 1]; empty if it takes none.
         environment: the call that makes the world's gymnasium environment, for messages; empty if the world does not say.
     """
 
@@ -112,6 +131,7 @@ class DrivingFacts(Facts):
     shape: tuple[int, ...] = ()
     limits: tuple[tuple[float, float], ...] = ()
     rows: int | None = None
+    controls: tuple[str, ...] = CONTROLS
     environment: str = ""
 
     def native(self, observation: Tensor) -> Tensor:
@@ -127,10 +147,25 @@ class DrivingFacts(Facts):
     def blind_policies(self, action_type: ActionType) -> list[str]:
         """Names of this world's input-independent policies: each constant action, and `right_then_slower` if possible."""
         if action_type == "continuous":
-            return list(CONSTANT_CONTROLS)
+            return list(self.constant_controls())
         constant = [name.lower() for name in self.actions]
         sequence = {"lane_right", "slower"} <= set(constant)
         return [*constant, RIGHT_THEN_SLOWER] if sequence else constant
+
+    def takes(self) -> str:
+        """The actions of the world, in a message."""
+        kinds = []
+        if self.actions:
+            kinds.append(f"{len(self.actions)} discrete ones ({', '.join(self.actions)})")
+        if self.controls:
+            kinds.append(f"{len(self.controls)} continuous ones ({' and '.join(self.controls)}, in [-1, 1])")
+        return " or ".join(kinds)
+
+    def constant_controls(self) -> dict[str, tuple[float, ...]]:
+        """The controls of the constant policies, by name."""
+        if self.controls == CONTROLS:
+            return dict(CONSTANT_CONTROLS)
+        return {name: (share,) * len(self.controls) for name, share in CONSTANT_SHARES.items()}
 
     def written(self) -> dict[str, Any]:
         values = super().written() | {
@@ -140,4 +175,7 @@ class DrivingFacts(Facts):
         # No report reads them.
         for name in ("kinematics", "shape", "limits", "rows", "environment"):
             del values[name]
+        # As in records from before it.
+        if self.controls in (CONTROLS, ()):
+            del values["controls"]
         return values

@@ -71,6 +71,8 @@ class ObservationThreat(ThreatModel):
         bound = bound * (observation[..., :1] > 0)
         if features.fixed:
             bound = bound * features.forgeable().to(bound)
+        if features.present:
+            bound = bound * features.there(observation)
         return torch.cat((torch.zeros_like(observation[..., :1]), bound), -1)
 
     def reach(self, rows: int, features: Features, steps: int) -> float:

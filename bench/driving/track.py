@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Baseline, Contrast, Driven, Job, Measure, Track
+from cavbench.errors import UserError
 from cavbench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, field
 from cavbench.scenarios import Cell
 
@@ -206,11 +207,14 @@ class DrivingTrack(Track):
         return {"action_type": _parts(pair)[0].action_type}
 
     def try_network(self, network: Any, pair: Pair, cells: Sequence[Cell]) -> list[str]:
+        from cavbench.driving.doubts import other_features
         from cavbench.driving.trial import try_policy
 
         victim, world = _parts(pair)
         if not victim.sees:
             return []
+        if why := other_features(pair, self.world):
+            raise UserError(why)
         gradients = victim.answers == "gradients"
         return try_policy(
             network, world, cells, gradients=gradients, random=victim.draws or pair.defense.name != "none"

@@ -17,8 +17,6 @@ from cavbench.isolation.memory import changed, kept
 from cavbench.isolation.streams import Stream
 from cavbench.scenarios import Cell, SeedBlock
 
-CONTROLS = 2
-"""Size of a continuous action: acceleration and steering."""
 EPISODES, STEPS = 8, 30
 """The observations are of so many episodes, and of so many decisions with random actions."""
 COPIES = 3
@@ -106,7 +104,7 @@ def _observed(world: DrivingWorld, cells: Sequence[Cell], action_type: str) -> t
             action = (
                 torch.randint(len(world.actions), (EPISODES,), generator=generator)
                 if action_type == "discrete"
-                else torch.rand(EPISODES, CONTROLS, generator=generator) * 0.2 - 0.1
+                else torch.rand(EPISODES, len(world.facts.controls), generator=generator) * 0.2 - 0.1
             )
             td = env.step(td.set("action", action))["next"]
     finally:
@@ -140,7 +138,7 @@ def _try_answer(policy: Policy, world: DrivingWorld, moment: Moment) -> None:
     """Raise UserError if an answer is no tensor of finite numbers, one for each action."""
     scores = _answer(policy, moment)
     actions = world.facts.actions
-    width = len(actions) if policy.action_type == "discrete" else CONTROLS
+    width = len(actions) if policy.action_type == "discrete" else len(world.facts.controls)
     if type(scores) is not Tensor or not scores.is_floating_point():
         raise UserError(
             f"answers {getattr(scores, 'dtype', type(scores).__name__)}; scores are a tensor of real numbers"

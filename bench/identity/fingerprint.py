@@ -9,7 +9,7 @@ import json
 import os
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -36,14 +36,35 @@ STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)
 
 
 def canonical(value: Any) -> str:
-    """The canonical JSON of a value: sorted keys, no spaces; dataclasses and mappings as objects, anything else by str()."""
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), default=_plain)
+    """The canonical JSON of a value: sorted keys, no spaces; dataclasses and mappings as objects, anything else by str().
+
+    What was made from a parameter (`as_given`) is written as the parameter. A mapping whose class is `ordered` keeps its order.
+    """
+    return json.dumps(_plain(value), separators=(",", ":"), default=str)
 
 
 def _plain(value: Any) -> Any:
-    return dict(value) if isinstance(value, Mapping) else str(value)
+    """The same of dicts with sorted keys, lists, and what `json` writes as it is."""
+    if value is None or isinstance(value, str | int | float):
+        return value
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if (given := as_given(value)) is not value:
+        return _plain(given)
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        items = value.items() if getattr(type(value), "ordered", False) else sorted(value.items())
+        return {name: _plain(each) for name, each in items}
+    return str(value)
+
+
+def as_given(value: Any) -> Any:
+    """The parameter that a value was made from, if it says so (`given_parameter`); otherwise the value itself.
+
+    A component may turn a parameter into an object that it computes with, such as axes from a mapping of values.
+    """
+    return value.given_parameter if hasattr(type(value), "given_parameter") else value
 
 
 def digest(value: Any) -> str:

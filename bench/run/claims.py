@@ -74,6 +74,7 @@ def of(units: Sequence[pa.Table]) -> Claim:
             )
     first = records.slice(0, 1).to_pylist()[0]
     _check_loadable(first)
+    _check_imports(first)
     try:
         pair = pair_of(first)
     except (UserError, ValueError, TypeError) as error:
@@ -120,6 +121,20 @@ def _names_a_file(params: Any) -> bool:
     return bool(isinstance(params, dict) and params.get("path")) or any(map(_names_a_file, inner))
 
 
+def _check_imports(record: Mapping[str, Any]) -> None:
+    """Refuse a world that would import a module which the sender names.
+
+    Raises:
+        UserError: names the module.
+    """
+    params = json.loads(record["world_params"])
+    if isinstance(params, dict) and (module := registry.load("world", record["world"]).imports(params)):
+        raise UserError(
+            f"the records are of a world that imports the module {short(module)}, which no plug-in of cavbench is: nobody can "
+            "verify them without running it; register the environment as a world of a package (GymWorld)"
+        )
+
+
 def _grid(units: Sequence[pa.Table], records: pa.Table, pair: Pair) -> Grid:
     """The grid that records are of: the values on its axes, and its blocks of seeds."""
     world = pair.world.component
@@ -130,7 +145,8 @@ def _grid(units: Sequence[pa.Table], records: pa.Table, pair: Pair) -> Grid:
         cells = [world.axes.cell(**json.loads(text)) for text in pc.unique(records["cell"]).to_pylist()]
         values = {axis: tuple(dict.fromkeys(cell[axis] for cell in cells)) for axis in world.axes}
         blocks = sorted({_block(unit) for unit in units}, key=lambda block: (block.start, block.stop))
-        starts = {grid.first_seed for grid in registry.grids(pair.world.name)}
+        own = world.own_grid()
+        starts = {grid.first_seed for grid in (registry.grids(pair.world.name) if own is None else [own])}
         if blocks[0].start not in starts:
             known = " or ".join(map(str, sorted(starts)))
             raise UserError(

@@ -139,19 +139,29 @@ def _grid(given: Options, name: str | None) -> Grid:
     Raises:
         UserError: if there is no such grid, or several worlds are chosen.
     """
-    worlds = {world.name: world.component for world in given.chosen("world")}
-    if len(worlds) > 1:
-        raise UserError(f"a run uses one world, got {' and '.join(worlds)}: start one run for each")
-    ((world_name, world),) = worlds.items()
-    return grid_of(world_name, name or world.grid)
+    worlds = given.chosen("world")
+    first = worlds[0]
+    own = first.component.own_grid()
+    # Those of one name may have other axes, or other values on them.
+    if any((world.name, world.component.own_grid()) != (first.name, own) for world in worlds):
+        raise UserError(f"a run uses one world, got {' and '.join(map(str, worlds))}: start one run for each")
+    return grid_of(first, name)
 
 
-def grid_of(world: str, name: str) -> Grid:
-    """The grid of this name of a world.
+def grid_of(chosen: Chosen[Any], name: str | None) -> Grid:
+    """The grid of this name of a world, or its default one.
 
     Raises:
         UserError: if there is no such grid.
     """
+    world, own = chosen.name, chosen.component.own_grid()
+    if own is not None:
+        if name not in (None, own.name):
+            raise UserError(
+                f"grid {name!r} is none of the world {world!r}, whose cells are given by world.axes: leave out grid"
+            )
+        return own
+    name = name or chosen.component.grid
     known = [grid.name for grid in registry.grids(world)]
     if name not in known:
         if name in registry.entries(registry.GRIDS):

@@ -260,7 +260,7 @@ def _chosen(kind: registry.Kind, record: Mapping[str, Any]) -> Chosen[Any]:
     links = {
         name: choose(kind, name, **_values(value)).component
         for name, value in params.items()
-        if isinstance(value, dict)
+        if isinstance(value, dict) and kind == "defense"
     }
     return choose(kind, record[kind], **{**_values(params), **links})
 

@@ -181,7 +181,8 @@ class Unit:
             return SEQUENTIAL
         if self.seeds.start >= SeedBlock.AUDIT:
             return AUDIT
-        grids = registry.grids(self.pair.world.name)
+        own = self.pair.world.component.own_grid()
+        grids = registry.grids(self.pair.world.name) if own is None else [own]
         return next(
             (grid.name for grid in grids if self.cell in grid.cells() and self.seeds in grid.blocks()), "custom"
         )

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cavbench.core.pair import choose
+from cavbench.core.pair import label
 from cavbench.core.track import Track
 from cavbench.errors import UserError
 
@@ -218,6 +218,6 @@ def _world(records: pa.Table) -> str:
     """The world as tables name it, with the parameters that are not its defaults."""
     name = records["world"][0].as_py()
     try:
-        return str(choose("world", name, **json.loads(records["world_params"][0].as_py() or "{}")))
+        return label("world", name, json.loads(records["world_params"][0].as_py() or "{}"))
     except (UserError, ValueError):
         return str(name)

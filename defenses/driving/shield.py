@@ -46,6 +46,7 @@ class Shield(DrivingDefense):
     """
 
     brakes_to: ClassVar[float | None] = 10.0
+    reckons: ClassVar[bool] = True
 
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"

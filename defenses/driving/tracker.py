@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from annotated_types import Interval
@@ -32,6 +32,8 @@ class Tracker(DrivingDefense):
         assumed_norm: kind of this set.
         assumed_noise: by how much the sensor may be wrong about other cars along the road besides, in m and m/s.
     """
+
+    reckons: ClassVar[bool] = True
 
     assumed_budget: Annotated[float, Interval(ge=0, le=0.9)] = 0.1
     assumed_norm: Norm = "relative"

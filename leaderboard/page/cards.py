@@ -103,6 +103,8 @@ def _word(value: object) -> str:
         return str(value).lower()
     if isinstance(value, list):
         return "[" + ",".join(_word(each) for each in value) + "]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{name}:{_word(each)}" for name, each in value.items()) + "}"
     if isinstance(value, float):
         return f"{value:g}"
     text = str(value)

@@ -202,7 +202,7 @@ def allowing(attack: DrivingAttack, **values: Any) -> ObservationThreat:
 
 def dynamics(attack: DrivingAttack, world: DrivingWorld, action_type: ActionType, episodes: int) -> Dynamics | None:
     """The dynamics of some episodes in the world's first cell, if the attack has access to them."""
-    cells = [registry.grid(world.grid).cells()[0]] * max(1, episodes)
+    cells = [registry.grid_of(world).cells()[0]] * max(1, episodes)
     return world.dynamics(cells, action_type) if attack.access == "dynamics" else None
 
 

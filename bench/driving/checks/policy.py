@@ -54,7 +54,8 @@ class PolicySuite(Suite):
     def shapes(self) -> None:
         """Scores have the right shape for a batch and, without a memory, for any leading dimensions, which attacks use."""
         policy, state, observation = *self._ready(), self._observations()
-        width, why = 2, "but continuous actions have 2"
+        width = len(self.world.facts.controls)
+        why = f"but continuous actions have {width}"
         if policy.action_type == "discrete":
             width = len(self.world.facts.actions)
             why = f"but the world has {width} actions: use facts.actions"
@@ -80,7 +81,8 @@ class PolicySuite(Suite):
             require(allowed, f"decide returns actions outside 0 to {scores.shape[-1] - 1}")
         else:
             require(
-                action.shape == (*observation.shape[:-2], 2), f"decide returns shape {list(action.shape)}, not [B, 2]"
+                action.shape == (*observation.shape[:-2], scores.shape[-1]),
+                f"decide returns shape {list(action.shape)}, not [B, {scores.shape[-1]}]",
             )
             require(bool((action.abs() <= 1).all()), "decide returns actions outside [-1, 1]")
         not_noisy(policy)

@@ -86,7 +86,7 @@ class WorldSuite(Suite):
 
     def starts_every_cell(self) -> str:
         """All cells of the default grid can be started in one batch."""
-        grid = registry.grid(self.component.grid)
+        grid = registry.grid_of(self.component)
         cells = grid.cells()[:CELLS]
         env = self._env(cells, self._action_types()[0])
         try:
@@ -139,7 +139,9 @@ class WorldSuite(Suite):
             require(bool((observation[presence == 0] == 0).all()), "rows with presence 0 must be all zero")
             if ("info", "progress") in step.keys(include_nested=True):
                 progress = step["info", "progress"]
-                require(bool(((progress >= 0) & (progress <= 1)).all()), "info.progress is outside [0, 1]")
+                # Who arrives has the progress of the steps that are left, too.
+                most = torch.where(step["terminated"], float(self.component.facts.max_steps), 1.0)
+                require(bool(((progress >= 0) & (progress <= most)).all()), "info.progress is outside [0, 1]")
 
     def same_seed_same_traffic(self) -> None:
         """The scenario seed determines the scenario."""
@@ -180,7 +182,7 @@ class WorldSuite(Suite):
 
     def is_as_declared(self) -> None:
         """A short drive finds nothing that makes scores in the default grid doubtful."""
-        if doubts := self.component.doubts(registry.grid(self.component.grid).cells()):
+        if doubts := self.component.doubts(registry.grid_of(self.component).cells()):
             raise DoubtError(*doubts)
 
     def _action_types(self) -> tuple[ActionType, ...]:
@@ -204,7 +206,8 @@ class WorldSuite(Suite):
         try:
             td = _reset(env, seeds)
             steps = [td.clone()]
-            steering = torch.tensor([0.2, 0.0]).expand(len(seeds), 2)
+            steering = torch.zeros(len(seeds), len(self.component.facts.controls))
+            steering[:, :1] = 0.2
             for step in range(min(STEPS, self.component.facts.max_steps)):
                 number = step % len(self.component.facts.actions) if every and action_type == "discrete" else 0
                 action = torch.full((len(seeds),), number) if action_type == "discrete" else steering

@@ -7,12 +7,16 @@ except ImportError as error:
 
 from cavbench.core import sources
 from cavbench.driving.gym.environment import DrivingEnv, make
+from cavbench.driving.gym.given import world
+from cavbench.driving.gym.registered import RegisteredWorld
 from cavbench.driving.gym.vector import DrivingVectorEnv, make_vec
 from cavbench.driving.gym.world import GymWorld
 
-__all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "make", "make_vec"]
+__all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "RegisteredWorld", "make", "make_vec", "world"]
 
 for _name in sources.names("world", "driving"):
+    if _name == "gym":
+        continue  # An environment of gymnasium already.
     gymnasium.register(
         id=f"cavbench/{_name}-v0",
         entry_point="cavbench.driving.gym.environment:make",

@@ -14,8 +14,8 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from cavbench.driving import ActionType
-from cavbench.driving.gym.declaration import Declaration
-from cavbench.driving.gym.declared import CONTROLS, check
+from cavbench.driving.gym.declaration import REWARD, Declaration
+from cavbench.driving.gym.declared import check
 from cavbench.driving.gym.environment import drawn_seeds
 from cavbench.errors import UserError
 from cavbench.scenarios import Cell
@@ -31,8 +31,8 @@ class Witness(Protocol):
     def saw(self, observation: NDArray[np.float64]) -> None:
         """An observation [n] of one environment, in its own units."""
 
-    def earned(self, reward: float) -> None:
-        """The reward of one step of one environment."""
+    def earned(self, reward: float, info: Mapping[str, Any]) -> None:
+        """The reward of one step of one environment, and what it told."""
 
 
 class Batch(EnvBase):
@@ -59,7 +59,7 @@ class Batch(EnvBase):
         self.envs = [world.environment(cell) for cell in cells]
         if len({id(env.unwrapped) for env in self.envs}) < size:
             raise UserError(
-                f"{type(world).__name__}.environment returned the same environment for two episodes, which are driven in turn: "
+                f"{world.source} returned the same environment for two episodes, which are driven in turn: "
                 "make a new one in each call"
             )
         for env in self.envs:
@@ -82,7 +82,8 @@ class Batch(EnvBase):
             observation=Bounded(-1, 1, self.seen.shape), info=Composite(info, shape=(size,)), shape=(size,)
         )
         actions = len(self.world.actions)
-        self.action_spec = Categorical(actions, (size,)) if self.discrete else Bounded(-1, 1, (size, CONTROLS))
+        controls = len(self.world.controls)
+        self.action_spec = Categorical(actions, (size,)) if self.discrete else Bounded(-1, 1, (size, controls))
         self.reward_spec = number
         self.done_spec = Composite(done=flag, terminated=flag, truncated=flag, shape=(size,))
 
@@ -117,11 +118,14 @@ class Batch(EnvBase):
         world, env = self.world, self.envs[place]
         observation, reward, terminated, truncated, info = env.step(self._own(env.action_space, action))
         if self.witness is not None:
-            self.witness.earned(float(reward))
+            self.witness.earned(float(reward), info)
         self.time[place] += 1
         self.numbers["reward"][place] = reward
-        self.numbers["progress"][place] = _share(world, world.progress(float(reward), info))
-        self.flags["crashed"][place] = world.failed(bool(terminated), info)
+        failed = bool(world.failed(bool(terminated), {REWARD: float(reward), **info}))
+        # Who arrives earlier is no worse than who arrives later.
+        left = world.max_steps - self.time[place] if terminated and not failed else 0
+        self.numbers["progress"][place] = _share(world, world.progress(float(reward), info)) + left
+        self.flags["crashed"][place] = failed
         over = bool(truncated) or self.time[place] >= world.max_steps
         ends = {"terminated": bool(terminated), "truncated": over and not terminated, "done": over or bool(terminated)}
         for name, value in ends.items():
@@ -134,11 +138,11 @@ class Batch(EnvBase):
             assert isinstance(space, spaces.Discrete)
             return int(space.start) + int(action)
         assert isinstance(space, spaces.Box)
-        share = (np.clip(np.asarray(action, np.float64), -1, 1) + 1) / 2
+        share = (np.clip(np.asarray(action, np.float64).reshape(space.shape), -1, 1) + 1) / 2
         return (space.low + share * (space.high - space.low)).astype(space.dtype)
 
     def _set(self, place: int, observation: Any, info: Mapping[str, Any]) -> None:
-        raw = np.asarray(observation, np.float64).reshape(-1)
+        raw = np.asarray(spaces.flatten(self.envs[place].observation_space, observation), np.float64)
         if self.witness is not None:
             self.witness.saw(raw)
         self.seen[place, 0, 1:] = np.clip((raw - self.centre) / self.half, -1, 1)
@@ -166,5 +170,5 @@ def _share(world: Declaration, progress: float) -> float:
         UserError: if it is not in [0, 1].
     """
     if not -ROUNDING <= progress <= 1 + ROUNDING:
-        raise UserError(f"{type(world).__name__}.progress returned {progress:g}: return a share in [0, 1]")
+        raise UserError(f"{world.label}.progress returned {progress:g}: return a share in [0, 1]")
     return min(max(progress, 0.0), 1.0)

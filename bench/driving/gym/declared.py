@@ -7,17 +7,17 @@ from math import prod
 from typing import Any
 
 import gymnasium
+import numpy as np
 from gymnasium import spaces
 
 from cavbench.core import registry
 from cavbench.driving import ActionType
 from cavbench.driving.gym.declaration import Declaration
-from cavbench.errors import UserError
+from cavbench.errors import UserError, short
 from cavbench.identity.fingerprint import canonical
 from cavbench.isolation.foreign import contained
 from cavbench.scenarios import Axes, Cell, Value
 
-CONTROLS = 2
 # Not among the data that no unit may change (`cavbench.isolation.framework.Snapshot`): a world is asked when it is needed.
 _asked: UserDict[tuple[type, str], spaces.Box | None] = UserDict()
 """What environments that were asked observe, by class and parameters of the world."""
@@ -52,19 +52,42 @@ def check(world: Declaration, env: gymnasium.Env[Any, Any], action_type: ActionT
     Raises:
         UserError: says what differs.
     """
-    name, count, space = type(world).__name__, len(world.features.names), env.observation_space
-    if not isinstance(space, spaces.Box) or prod(space.shape) != count:
-        raise UserError(f"{name} declares {count} features, its environment observes {space}")
-    if space.shape != (shape := native_shape(world)):
+    name, count, space = world.label, len(world.features.names), env.observation_space
+    if not space.is_np_flattenable or spaces.flatdim(space) != count:
+        raise UserError(f"{name} declares {count} features, its environment observes {short(str(space))}")
+    if isinstance(space, spaces.Box) and space.shape != (shape := native_shape(world)):
         raise UserError(
             f"the environment of {name} observes arrays {list(space.shape)}, not {list(shape)}: "
             f"write shape: ClassVar[tuple[int, ...]] = {space.shape} in the class"
         )
     action = env.action_space
     if action_type == "discrete" and not (isinstance(action, spaces.Discrete) and action.n == len(world.actions)):
-        raise UserError(f"{name} names {len(world.actions)} discrete actions, its environment takes {action}")
-    if action_type == "continuous" and not (isinstance(action, spaces.Box) and action.shape == (CONTROLS,)):
-        raise UserError(f"continuous policies have {CONTROLS} controls, the environment of {name} takes {action}")
+        hint = (
+            ": continuous policies fit it (victim.actions or action_type=continuous)"
+            if isinstance(action, spaces.Box)
+            else ""
+        )
+        raise UserError(f"{name} names {len(world.actions)} discrete actions, its environment takes {action}{hint}")
+    if action_type == "continuous":
+        _check_controls(world, name, action)
+
+
+def _check_controls(world: Declaration, name: str, action: spaces.Space[Any]) -> None:
+    listed = ", ".join(world.controls)
+    if not isinstance(action, spaces.Box):
+        raise UserError(
+            f"the environment of {name} takes {short(str(action))}, a continuous policy has {len(world.controls)} controls"
+        )
+    if prod(action.shape) != len(world.controls):
+        found = tuple(f"control{place}" for place in range(prod(action.shape)))
+        raise UserError(
+            f"{name} has {len(world.controls)} controls ({listed}), its environment takes {action}; for its {len(found)} numbers "
+            f"write controls: ClassVar[tuple[str, ...]] = {found} in the class"
+        )
+    if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
+        raise UserError(
+            f"the environment of {name} takes {action}, without a lowest and a highest value: wrap it in RescaleAction"
+        )
 
 
 def _space(world: Declaration) -> spaces.Box | None:
@@ -89,8 +112,8 @@ def _ask(world: Declaration) -> spaces.Box | None:
 
 def _any_cell(world: Declaration) -> Cell:
     """The first cell of the world's grid or, if that is not installed, one of values that the axes allow."""
-    if world.grid in registry.entries(registry.GRIDS):
-        return registry.grid(world.grid).cells()[0]
+    if world.own_grid() is not None or world.grid in registry.entries(registry.GRIDS):
+        return registry.grid_of(world).cells()[0]
     return _allowed(world.axes)
 
 

@@ -21,8 +21,6 @@ from cavbench.errors import UserError
 from cavbench.scenarios import Cell, Grid, SeedBlock
 
 LAST_SEED = 2**31
-CONTROLS = 2
-"""Size of a continuous action: acceleration and steering."""
 Observation = NDArray[np.float32]
 
 
@@ -73,7 +71,8 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         Raises:
             UserError: if it is not in the action space.
         """
-        batch = torch.as_tensor(checked_actions(action, self.action_type, ())).unsqueeze(0)
+        controls = len(self.world.facts.controls)
+        batch = torch.as_tensor(checked_actions(action, self.action_type, (), controls)).unsqueeze(0)
         self._td = self._env.step(self._td.set("action", batch))["next"]
         reward, terminated, truncated = (self._td[name].item() for name in ("reward", "terminated", "truncated"))
         return self._td["observation"][0].numpy(), reward, terminated, truncated and not terminated, self._info()
@@ -112,6 +111,8 @@ def make(world: str | DrivingWorld = "highway", *, action_type: ActionType = "di
 def world_and_cells(world: str | DrivingWorld, options: Mapping[str, Any]) -> tuple[DrivingWorld, tuple[Cell, ...]]:
     """The world, and its cells with these values on its axes; the other options are parameters of the world."""
     known = registry.load("world", world).axes if isinstance(world, str) else world.axes
+    # The axes of the world `gym` are one of its parameters.
+    known = known or {}
     made: Any = world
     parameters = {name: value for name, value in options.items() if name not in known}
     if isinstance(world, str):
@@ -126,10 +127,10 @@ def world_and_cells(world: str | DrivingWorld, options: Mapping[str, Any]) -> tu
 def _cells(world: DrivingWorld, given: Mapping[str, Any]) -> tuple[Cell, ...]:
     values = {name: tuple(value) if isinstance(value, list | tuple) else (value,) for name, value in given.items()}
     try:
-        if set(values) == set(world.axes):
+        if set(values) == set(world.axes) and values:
             grid = Grid(name="custom", world="", axes=world.axes, values=values, episodes=1)
         else:
-            grid = registry.grid(world.grid)
+            grid = registry.grid_of(world)
             grid = replace(grid, values={**grid.values, **values})
         return grid.cells()
     except ValueError as error:
@@ -143,7 +144,7 @@ def spaces_of(
     shown = spaces.Box(-1.0, 1.0, tuple(observation.shape[1:]), np.float32)
     if action_type == "discrete":
         return shown, spaces.Discrete(len(world.actions))
-    return shown, spaces.Box(-1.0, 1.0, (CONTROLS,), np.float32)
+    return shown, spaces.Box(-1.0, 1.0, (len(world.facts.controls),), np.float32)
 
 
 def checked_seed(seed: Any) -> int | None:
@@ -159,14 +160,14 @@ def checked_seed(seed: Any) -> int | None:
     return int(seed)
 
 
-def checked_actions(actions: Any, action_type: ActionType, leading: tuple[int, ...]) -> NDArray[Any]:
-    """The actions as the engine takes them: int64 [*leading], or float32 [*leading, 2].
+def checked_actions(actions: Any, action_type: ActionType, leading: tuple[int, ...], controls: int) -> NDArray[Any]:
+    """The actions as the engine takes them: int64 [*leading], or float32 [*leading, controls].
 
     Raises:
         UserError: if they have another shape or type. Their range is checked by the world.
     """
     found = np.asarray(actions)
-    shape = leading if action_type == "discrete" else (*leading, CONTROLS)
+    shape = leading if action_type == "discrete" else (*leading, controls)
     kinds = "iu" if action_type == "discrete" else "iuf"
     if found.shape != shape or found.dtype.kind not in kinds:
         what = "whole numbers" if action_type == "discrete" else "numbers"

@@ -14,7 +14,6 @@ from tensordict import TensorDict
 from cavbench.driving import ActionType
 from cavbench.driving.gym.batch import Batch
 from cavbench.driving.gym.declaration import Declaration
-from cavbench.driving.gym.declared import CONTROLS
 from cavbench.scenarios import Cell, SeedBlock
 
 STEPS, CPU_S = 30, 1.0
@@ -43,7 +42,7 @@ def repeats(world: Declaration, cells: Sequence[Cell]) -> list[str]:
     pair = [cells[0], cells[-1]]
     alone = _driven(world, pair[:1], SEEDS[:1], STEPS)[0]
     steps = len(alone) - 1
-    name = type(world).__name__
+    name = world.label
     if _differ(alone, _driven(world, pair[:1], SEEDS[:1], steps)[0]):
         return [
             f"an environment of {name} that is reset with the same seed goes on otherwise, so {UNPAIRED}: pass the seed of reset "
@@ -91,7 +90,7 @@ def _episode(batch: Batch, seeds: Sequence[int], steps: int) -> list[Track]:
             actions = torch.tensor([int(one.integers(len(batch.world.actions))) for one in generators])
         else:
             actions = torch.from_numpy(
-                np.stack([one.uniform(-1, 1, CONTROLS) for one in generators]).astype(np.float32)
+                np.stack([one.uniform(-1, 1, len(batch.world.controls)) for one in generators]).astype(np.float32)
             )
         td = batch.step(td.set("action", actions))["next"]
         for place, track in enumerate(tracks):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -15,8 +15,7 @@ from tensordict import TensorDict
 
 from cavbench.driving import ActionType, Features
 from cavbench.driving.gym.batch import Batch
-from cavbench.driving.gym.declaration import Declaration
-from cavbench.driving.gym.declared import CONTROLS
+from cavbench.driving.gym.declaration import SUCCESS, Declaration
 from cavbench.driving.gym.repeats import repeats
 from cavbench.scenarios import Cell, SeedBlock
 
@@ -26,6 +25,8 @@ CPU_S, WALL_S = 5.0, 15.0
 """A slow environment is driven for so many seconds at most."""
 USED, LEFT = 0.05, 0.01
 """A range is doubtful if less than this share of it is used, or if more than this share of the values leaves it."""
+LONGEST = 100_000
+"""A limit of time of more decisions is none."""
 NAMED = 2
 """So many features are named in a line."""
 SHARE_OF_RANGE = 1e-6
@@ -51,6 +52,8 @@ class Seen:
         self.outside = np.zeros(len(self.low))
         self.observations = 0
         self.rewards: list[float] = []
+        self.tells = False
+        """Whether `info` says what an episode is that terminates."""
         self.late = {"crashed": 0, "truncated": 0}
         """How many episodes that reached `max_steps` count as failed, and how many were truncated."""
 
@@ -61,8 +64,9 @@ class Seen:
         # NaN is outside, too.
         self.outside += ~((observation >= self._low) & (observation <= self._high))
 
-    def earned(self, reward: float) -> None:
+    def earned(self, reward: float, info: Mapping[str, Any]) -> None:
         self.rewards.append(reward)
+        self.tells = self.tells or any(name in info for name in ("crashed", *SUCCESS))
 
     def unused(self) -> NDArray[np.bool_]:
         """[n] the features that use less than 5 % of their range.
@@ -95,7 +99,13 @@ def doubts(world: Declaration, cells: Sequence[Cell]) -> list[str]:
         limits = [found for env in batch.envs if (found := time_limit(env)) is not None]
         early = _drive(batch, seen)
     limits += early if len(early) > 1 and len(set(early)) == 1 else []
-    declared = [*_of_ranges(world, seen), *_of_rewards(world, seen), *_of_length(world, limits), *_of_ends(seen)]
+    declared = [
+        *_of_ranges(world, seen),
+        *_of_rewards(world, seen),
+        *_of_length(world, limits),
+        *_of_ends(seen),
+        *_of_meaning(world, seen),
+    ]
     return [*repeats(world, cells), *declared]
 
 
@@ -110,7 +120,7 @@ def _drive(batch: Batch, seen: Seen) -> list[int]:
         if batch.discrete:
             action = torch.from_numpy(generator.integers(len(batch.world.actions), size=size))
         else:
-            action = torch.from_numpy(generator.uniform(-1, 1, (size, CONTROLS)).astype(np.float32))
+            action = torch.from_numpy(generator.uniform(-1, 1, (size, len(batch.world.controls))).astype(np.float32))
         td = batch.step(td.set("action", action))["next"]
         early += batch.time[(td["truncated"][:, 0].numpy()) & (batch.time < batch.world.max_steps)].tolist()
         last = batch.time >= batch.world.max_steps
@@ -128,13 +138,13 @@ def _of_ranges(world: Declaration, seen: Seen) -> Iterator[str]:
     forged = np.array([name not in features.fixed for name in features.names])
     steps = len(seen.rewards)
     named: list[tuple[NDArray[np.bool_], str]] = [(seen.left(), f"is left by more than {100 * LEFT:g} % of the values")]
-    if steps >= ENOUGH:
+    if steps >= ENOUGH and not world.ranges_known:
         named.insert(0, (seen.unused() & forged, f"is used by less than {100 * USED:g} %"))
     for which, what in named:
         if which.any():
             yield (
                 f"the declared range of {_listed(features, seen, which)} {what} in {steps} random steps; values outside are "
-                "clipped and budgets follow the range: write features.low and high in the units of the environment"
+                f"clipped and budgets follow the range: {world.writes_ranges()}"
             )
 
 
@@ -149,14 +159,14 @@ def _listed(features: Features, seen: Seen, which: NDArray[np.bool_]) -> str:
 
 
 def _of_rewards(world: Declaration, seen: Seen) -> Iterator[str]:
-    if type(world).progress is not Declaration.progress:
+    if not world.clips_rewards:
         return
     rewards = np.array(seen.rewards)
     outside = ~((rewards >= -SHARE_OF_RANGE) & (rewards <= 1 + SHARE_OF_RANGE))
     if outside.mean() > LEFT:
         yield (
             f"{100 * outside.mean():.0f} % of the rewards are outside [0, 1] ({rewards.min():.3g} to {rewards.max():.3g} in "
-            f"{len(rewards)} random steps), and safe_progress clips them: override progress() of {type(world).__name__}"
+            f"{len(rewards)} random steps), and safe_progress clips them: {world.writes_progress()}"
         )
 
 
@@ -165,7 +175,7 @@ def _of_length(world: Declaration, lengths: Sequence[int]) -> Iterator[str]:
     if shortest < world.max_steps:
         yield (
             f"the environment ends every episode after {shortest} steps, but max_steps is {world.max_steps}: no safe_progress "
-            f"can be above {shortest / world.max_steps:.2g}; write max_steps={shortest}"
+            f"can be above {shortest / world.max_steps:.2g}; write {world.writes('max_steps', shortest)}"
         )
 
 
@@ -174,6 +184,15 @@ def _of_ends(seen: Seen) -> Iterator[str]:
         yield (
             f"all {seen.late['crashed']} episodes that reached max_steps count as failed, as the environment terminates them: at "
             "a limit of time return truncated=True and terminated=False, or override failed()"
+        )
+
+
+def _of_meaning(world: Declaration, seen: Seen) -> Iterator[str]:
+    if type(world).failed is Declaration.failed and world.ending == "unknown" and not seen.tells:
+        yield (
+            f"the environment of {world.label} does not tell in info whether an episode that terminates has failed or arrived "
+            f"(crashed, is_success): each counts as failed; write {world.writes('terminated', 'failure')} or "
+            f"{world.writes('terminated', 'success')}"
         )
 
 
@@ -189,9 +208,15 @@ def time_limit(env: gymnasium.Env[Any, Any]) -> int | None:
             found.append(int(wrapped._max_episode_steps))
         wrapped = wrapped.env
     config = getattr(wrapped, "config", None)
-    if isinstance(config, dict) and {"duration", "policy_frequency"} <= set(config):
-        decisions = config["duration"] * config["policy_frequency"]
-        if np.isfinite(decisions):
-            # Its clock adds fractions of a second, so an episode may be one decision longer.
-            found.append(int(np.ceil(decisions)) + (config["policy_frequency"] > 1))
+    config = config if isinstance(config, dict) else {}
+    if {"duration", "policy_frequency"} <= set(config) and config["duration"] * config["policy_frequency"] <= LONGEST:
+        found.append(_decisions(config["duration"], config["policy_frequency"]))
     return min(found, default=None)
+
+
+def _decisions(duration: float, rate: float) -> int:
+    """The decisions of an episode of highway-env, whose clock adds fractions of a second: 30 s at 15 Hz are 451."""
+    count, clock = 0, 0.0
+    while count == 0 or clock < duration:
+        count, clock = count + 1, clock + 1 / rate
+    return count

@@ -55,7 +55,7 @@ class DrivingVectorEnv(VectorEnv[Observation, Any, NDArray[Any]]):
         if num_envs < 1:
             raise UserError(f"num_envs must be at least 1, got {num_envs}")
         self.num_envs, self.cells = num_envs, tuple(cells[number % len(cells)] for number in range(num_envs))
-        self.action_type = action_type
+        self.action_type, self._controls = action_type, len(world.facts.controls)
         self._env = world.make(self.cells, action_type=action_type)
         self._td: TensorDictBase = TensorDict({}, batch_size=[num_envs])
         shape = self._env.observation_spec["observation"]
@@ -111,7 +111,7 @@ class DrivingVectorEnv(VectorEnv[Observation, Any, NDArray[Any]]):
         Raises:
             UserError: if the actions are not in the action space.
         """
-        given = checked_actions(actions, self.action_type, (self.num_envs,))
+        given = checked_actions(actions, self.action_type, (self.num_envs,), self._controls)
         self._td = self._env.step(self._td.set("action", torch.from_numpy(given)))["next"]
         reward, terminated, truncated = (
             self._td[name].squeeze(-1).numpy().copy() for name in ("reward", "terminated", "truncated")

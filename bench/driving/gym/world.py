@@ -40,6 +40,8 @@ class GymWorld(Declaration):
             flat=True,
             shape=native_shape(self),
             limits=native_limits(self),
+            # An environment takes one kind of actions.
+            controls=() if self.actions else self.controls,
         )
 
     def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
@@ -53,5 +55,8 @@ class GymWorld(Declaration):
             UserError: if the spaces of an environment are not those that the world declares.
         """
         if control.driver != "agent" or control.action_repeat != 1:
-            raise UserError(f"{type(self).__name__} has no driver of its own and repeats no actions")
+            raise UserError(
+                f"{self.label} has no driver of its own and repeats no actions, as bench train needs: train with any library in "
+                "cavbench.gym.make(world), or in the environment itself"
+            )
         return Batch(self, cells, control.action_type)

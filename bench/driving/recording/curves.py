@@ -7,7 +7,7 @@ from itertools import cycle
 
 import numpy as np
 
-from cavbench.driving.recording.episode import CONTROLS, Episode
+from cavbench.driving.recording.episode import Episode
 from cavbench.driving.recording.scene import CRASHED
 from cavbench.recording.colours import EGO, GREY, MEASURED, SHOWN, Colour
 from cavbench.recording.columns import Columns
@@ -55,7 +55,7 @@ def _decisions(episode: Episode, columns: Columns) -> None:
 
 
 def _scores(episode: Episode, columns: Columns) -> None:
-    names = episode.facts.actions if episode.discrete else CONTROLS
+    names = episode.facts.actions if episode.discrete else episode.facts.controls
     colours = ACTION_COLOURS if episode.discrete else (EGO, MEASURED)
     for place, (name, colour) in enumerate(zip(names, cycle(colours), strict=False)):
         columns.curve(f"scores/shown/{name}", episode.steps["scores"][:, place], name, colour)

@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 from cavbench.driving import DrivingFacts, Features, ObservationThreat
 from cavbench.driving.rollout import Trace
 
-CONTROLS = ("acceleration", "steering")
-"""The components of a continuous action, each in [-1, 1]."""
-
 Array = NDArray[np.float64]
 
 

@@ -8,7 +8,7 @@ from itertools import cycle, islice
 import numpy as np
 from numpy.typing import NDArray
 
-from cavbench.driving.recording.episode import CONTROLS, Array, Episode
+from cavbench.driving.recording.episode import Array, Episode
 from cavbench.driving.recording.scene import CAR_LENGTH, CAR_WIDTH, DASH, DASH_EVERY, LANE_WIDTH, edges
 from cavbench.recording import about
 from cavbench.recording.film.drawing import (
@@ -177,7 +177,7 @@ class EpisodeFilm(Film):
             write(picture, f"{moved[step]:.1f} of {budget[step]:.1f} {unit}", 12, top + 36, size=16, colour=BLACK)
         if not episode.discrete:
             _, taken = episode.choices
-            words = [f"{name} {value:+.2f}" for name, value in zip(CONTROLS, taken[step], strict=True)]
+            words = [f"{name} {value:+.2f}" for name, value in zip(episode.facts.controls, taken[step], strict=True)]
             write(picture, "     ".join(words), 12, self.bands_top + 2, size=14, colour=GREY)
 
     def _road(self, picture: Picture, step: int) -> None:

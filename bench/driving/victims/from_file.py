@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from cavbench.core.ranges import Count
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from cavbench.driving.victims.spaces import CONTROLS, UNKNOWN, Bounds, Expected
+from cavbench.driving.victims.spaces import UNKNOWN, Bounds, Expected
 from cavbench.errors import UserError, short
 from cavbench.formats.trial import RefusedError, failure, hashed, refuse_harm
 
@@ -194,7 +194,7 @@ class FileDriver(DrivingVictim):
 
     def width(self, facts: DrivingFacts) -> int:
         """The required size of the output for one observation."""
-        return len(facts.actions) if self.action_type == "discrete" else CONTROLS
+        return len(facts.actions) if self.action_type == "discrete" else len(facts.controls)
 
     def fitted(
         self, facts: DrivingFacts, shape: Sequence[int | None], bounds: Bounds | None = None
@@ -234,7 +234,7 @@ class FileDriver(DrivingVictim):
                 )
 
     def _hint(self, policy: FilePolicy, scores: Tensor) -> str:
-        two = scores.shape[-1:] == (CONTROLS,) and policy.action_type == "discrete"
+        two = scores.shape[-1:] == (2,) and policy.action_type == "discrete"
         return "; if these are acceleration and steering, set victim.actions=continuous" if two else ""
 
 

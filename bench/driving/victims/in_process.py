@@ -15,7 +15,7 @@ from cavbench.driving.victims.from_file import FilePolicy, Typed, check_trained_
 from cavbench.driving.victims.remembering import RememberingPolicy
 from cavbench.driving.victims.sb3_fitting import network_of
 from cavbench.driving.victims.sb3_model import LIBRARY, critic_of, is_model, is_sampling_part
-from cavbench.driving.victims.spaces import CONTROLS, UNKNOWN
+from cavbench.driving.victims.spaces import UNKNOWN
 from cavbench.driving.victims.torchrl_actor import ActorNetwork, is_actor
 from cavbench.errors import UserError, reason
 from cavbench.identity.bytecode import code_of
@@ -143,7 +143,7 @@ def _policy(given: object, facts: DrivingFacts, observation: Tensor, actions: st
 
 def _check_scores(name: str, policy: Policy, scores: object, observation: Tensor, facts: DrivingFacts) -> None:
     """Refuse a policy whose scores are not those of the world's actions."""
-    size = len(facts.actions) if policy.action_type == "discrete" else CONTROLS
+    size = len(facts.actions) if policy.action_type == "discrete" else len(facts.controls)
     wanted = [len(observation), size]
     found = list(scores.shape) if isinstance(scores, Tensor) else type(scores).__name__
     if found != wanted:
@@ -234,10 +234,10 @@ def _answer(network: nn.Module, observation: Tensor) -> Tensor | str:
 
 
 def _action_type(name: str, width: int, facts: DrivingFacts, actions: str | None) -> ActionType:
-    fitting: dict[str, int] = {"discrete": len(facts.actions), "continuous": CONTROLS}
+    fitting: dict[str, int] = {"discrete": len(facts.actions), "continuous": len(facts.controls)}
     kinds = [kind for kind, size in fitting.items() if size == width and actions in (None, kind)]
     if len(kinds) != 1:
-        needs = f"{len(facts.actions)} values of discrete actions ({', '.join(facts.actions)}) or {CONTROLS} controls"
+        needs = facts.takes()
         asks = "say which: actions='discrete' or actions='continuous'" if kinds else f"the world needs {needs}"
         raise UserError(f"{name} returns {width} numbers for an observation; {asks}")
     return "discrete" if kinds[0] == "discrete" else "continuous"

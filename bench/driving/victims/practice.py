@@ -20,7 +20,7 @@ def roads(world: DrivingWorld, copies: int) -> list[Cell]:
 
     Perceptual axes have their first value: training is in clear weather.
     """
-    cells = dict.fromkeys(world.axes.unperceived(cell) for cell in registry.grid(world.grid).cells())
+    cells = dict.fromkeys(world.axes.unperceived(cell) for cell in registry.grid_of(world).cells())
     return [cell for cell in cells for _ in range(copies)]
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cavbench.core.registry import unknown
 from cavbench.driving import ActionType, Driver, DrivingFacts, DrivingVictim, Policy, State
-from cavbench.driving.features import CONSTANT_CONTROLS, RIGHT_THEN_SLOWER
+from cavbench.driving.features import CONSTANT_CONTROLS, CONSTANT_SHARES, RIGHT_THEN_SLOWER
 from cavbench.errors import UserError
 
 RIGHT_S = 4.0
@@ -59,8 +59,9 @@ class Blind(DrivingVictim):
     The best of these policies in a cell is the baseline under attack: a victim with a lower score would do better without input.
 
     Args:
-        policy: `throttle`, `coast` and `brake` are continuous. Other values are names of the world's discrete actions, in lower
-            case; `right_then_slower` changes to the rightmost lane, then slows down.
+        policy: `throttle`, `coast` and `brake` are continuous (`all_low`, `all_middle` and `all_high` in a world with other
+            controls). Other values are names of the world's discrete actions, in lower case; `right_then_slower` changes to the
+            rightmost lane, then slows down.
     """
 
     sees: ClassVar[bool] = False
@@ -68,14 +69,15 @@ class Blind(DrivingVictim):
 
     @property
     def action_type(self) -> ActionType:
-        return "continuous" if self.policy in CONSTANT_CONTROLS else "discrete"
+        return "continuous" if self.policy in {*CONSTANT_CONTROLS, *CONSTANT_SHARES} else "discrete"
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         known = facts.blind_policies(self.action_type)
         if self.policy not in known:
-            raise UserError(unknown(f"victim.policy {self.policy!r}", self.policy, [*known, *CONSTANT_CONTROLS]))
+            every = dict.fromkeys([*known, *facts.constant_controls()])
+            raise UserError(unknown(f"victim.policy {self.policy!r}", self.policy, every))
         if self.action_type == "continuous":
-            return _Constant(torch.tensor(CONSTANT_CONTROLS[self.policy]), "continuous").eval()
+            return _Constant(torch.tensor(facts.constant_controls()[self.policy]), "continuous").eval()
         actions = torch.eye(len(facts.actions))
         place = [name.lower() for name in facts.actions].index
         if self.policy == RIGHT_THEN_SLOWER:
@@ -87,9 +89,9 @@ class Blind(DrivingVictim):
 class _RandomPolicy(Policy):
     """Random actions from one generator per episode, so that they do not depend on the rest of the batch."""
 
-    def __init__(self, action_type: ActionType, actions: int) -> None:
+    def __init__(self, action_type: ActionType, actions: int, controls: int) -> None:
         super().__init__()
-        self.action_type, self.actions = action_type, actions
+        self.action_type, self.actions, self.controls = action_type, max(actions, controls), controls
 
     def initial(self, episodes: Tensor) -> State:
         generators = [torch.Generator().manual_seed(int(episode)) for episode in episodes]
@@ -102,7 +104,7 @@ class _RandomPolicy(Policy):
         assert state is not None
         step = (state["step"] % DRAWS).view(-1, 1, 1).expand(-1, 1, self.actions)
         draw = state["draws"].gather(1, step).squeeze(1)
-        return draw if self.action_type == "discrete" else 2 * draw[:, :2] - 1
+        return draw if self.action_type == "discrete" else 2 * draw[:, : self.controls] - 1
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None
@@ -125,7 +127,7 @@ class RandomDriver(DrivingVictim):
         return self.actions
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
-        return _RandomPolicy(self.actions, max(len(facts.actions), 2)).eval()
+        return _RandomPolicy(self.actions, len(facts.actions), len(facts.controls)).eval()
 
 
 @dataclass(frozen=True, kw_only=True)

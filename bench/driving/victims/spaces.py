@@ -15,8 +15,6 @@ from cavbench.errors import UserError
 
 UNKNOWN = "unknown"
 """The value of `trained_in` for a policy that does not say in which world it was trained."""
-CONTROLS = 2
-"""Size of a continuous action: acceleration and steering."""
 UNBOUNDED = 1e30
 """Bounds beyond this are none: some environments write the largest float32 instead of infinity."""
 SPARE = 0.01
@@ -177,14 +175,10 @@ def check_actions(name: str, found: ActionType, width: int, facts: DrivingFacts)
     Raises:
         UserError: says what differs.
     """
-    wanted = len(facts.actions) if found == "discrete" else CONTROLS
+    wanted = len(facts.actions) if found == "discrete" else len(facts.controls)
     if width == wanted and wanted:
         return
-    listed = f" ({', '.join(facts.actions)})" if facts.actions else ""
-    raise UserError(
-        f"{name} was trained for {width} {found} actions, this world takes {len(facts.actions)} discrete ones{listed} or "
-        f"{CONTROLS} continuous ones (acceleration and steering, in [-1, 1])"
-    )
+    raise UserError(f"{name} was trained for {width} {found} actions, this world takes {facts.takes()}")
 
 
 def check_range(name: str, bounds: Bounds, facts: DrivingFacts) -> None:

@@ -253,6 +253,7 @@ class RoadWorld(GymWorld):
     )  # fmt: skip
     actions: ClassVar[tuple[str, ...]] = ("A", "B")
     hz: ClassVar[float] = 1.0
+    terminated: ClassVar[Any] = "failure"
     tells: ClassVar[Callable[[int, int], dict[str, Any]]] = staticmethod(lambda time, action: {})
 
     max_steps: int = 10
