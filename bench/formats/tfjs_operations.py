@@ -204,7 +204,7 @@ def _range(node: Node, start: Tensor, stop: Tensor, step: Tensor) -> Tensor:
     if not float(step) or not math.isfinite(float(step)):
         raise RefusedError(f"its node {node.name!r} counts by {float(step)}")
     room((max(0, math.ceil((float(stop) - float(start)) / float(step))),))
-    return torch.arange(start.item(), stop.item(), step.item())
+    return torch.arange(start.item(), stop.item(), step.item(), device=start.device)
 
 
 def _dense(node: Node, places: Tensor, shape: Tensor, values: Tensor, rest: Tensor) -> Tensor:
@@ -249,7 +249,7 @@ def _unpacked(node: Node, x: Tensor) -> tuple[Tensor, ...]:
 
 
 def _shape(node: Node, x: Tensor) -> Tensor:
-    return torch.tensor(x.shape)
+    return torch.tensor(x.shape, device=x.device)
 
 
 def _same(node: Node, x: Tensor, *others: Tensor) -> Tensor:

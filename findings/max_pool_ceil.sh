@@ -1,0 +1,65 @@
+#!/bin/sh
+# Guess: a MaxPool with ceil_mode has one size, in every library and in ONNX's own shape inference.
+# What happens: with 7 pixels, windows of 2, steps of 2 and a border of 1, ONNX Runtime returns 4 x 4 (as torch does:
+# no window begins in the border), OpenVINO returns 5 x 5, and ONNX's shape inference says 5 x 5. What is flattened
+# after that has another number of predictions.
+# Versions: onnx 1.23.2, onnxruntime 1.32.0, openvino 2026.4.1 (CPU). Source: the ONNX operator MaxPool, the formula
+# of its output.
+set -eu
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+python3 -m venv "$folder/env"
+"$folder/env/bin/pip" install --quiet --disable-pip-version-check numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1
+cd "$folder"
+env/bin/python - <<'END'
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+
+def model(operation, inputs, outputs, constants, opset, types=(), **attributes):
+    """A model of one operation; shapes of its inputs by name."""
+    kinds = dict(types)
+    values = [
+        [helper.make_tensor_value_info(name, kinds.get(name, TensorProto.FLOAT), shape) for name, shape in part]
+        for part in (inputs, outputs)
+    ]
+    names = attributes.pop("names")
+    nodes = [helper.make_node(operation, names, [name for name, _ in outputs], **attributes)]
+    kept = [numpy_helper.from_array(value, name) for name, value in constants.items()]
+    graph = helper.make_graph(nodes, "one", *values, kept)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
+
+
+def onnx_runtime(made, **given):
+    import onnxruntime
+
+    onnxruntime.set_default_logger_severity(3)
+    session = onnxruntime.InferenceSession(made.SerializeToString(), providers=["CPUExecutionProvider"])
+    return session.run(None, given)
+
+
+def openvino(made, **given):
+    import openvino
+
+    onnx.save(made, "one.onnx")
+    core = openvino.Core()
+    compiled = core.compile_model(core.read_model("one.onnx"), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    found = compiled(given)
+    return [found[one] for one in compiled.outputs]
+
+
+made = model(
+    "MaxPool", [("x", [1, 1, 7, 7])], [("y", None)], {}, 17, names=["x"], kernel_shape=[2, 2], strides=[2, 2], pads=[1] * 4,
+    ceil_mode=1,
+)
+x = np.random.default_rng(0).random((1, 1, 7, 7), dtype=np.float32)
+stated = onnx.shape_inference.infer_shapes(made).graph.output[0].type.tensor_type.shape.dim
+sizes = {
+    "shape inference": [one.dim_value for one in stated],
+    "onnxruntime": list(onnx_runtime(made, x=x)[0].shape),
+    "openvino": list(openvino(made, x=x)[0].shape),
+}
+print(sizes)
+assert sizes == {"shape inference": [1, 1, 5, 5], "onnxruntime": [1, 1, 4, 4], "openvino": [1, 1, 5, 5]}
+END
