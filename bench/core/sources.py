@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import importlib.util
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -35,6 +36,14 @@ def tracks_of(target: str) -> list[str]:
 def access_of(target: str) -> str:
     """The access that the attack `module:Class` declares, or the nearest of its bases; empty if the source does not tell."""
     return next((one.access for one in _ancestry(target) if one.access), "")
+
+
+def defaults_of(target: str) -> dict[str, object]:
+    """The defaults of the parameters of the class `module:Class`, its own or its bases', as far as the source writes them out."""
+    found: dict[str, object] = {}
+    for one in reversed(list(_ancestry(target))):
+        found |= one.defaults
+    return found
 
 
 def _ancestry(target: str) -> Iterator[_Class]:
@@ -72,30 +81,35 @@ def summary(target: str) -> str:
 
 @dataclass(frozen=True)
 class _Class:
-    """What is read of a class: its docstring, tracks, the access that it declares ("" for none), and its bases as (module or
-    alias, name); "" is the class's own module."""
+    """What is read of a class: its docstring, tracks, the access that it declares ("" for none), the defaults of its fields, and
+    its bases as (module or alias, name); "" is the class's own module."""
 
     docstring: str
     tracks: frozenset[str]
     access: str
+    defaults: Mapping[str, object]
     bases: tuple[tuple[str, str], ...]
 
     @classmethod
     def read(cls, node: ast.ClassDef) -> _Class:
-        tracks, access, bases = set(), "", []
+        tracks, access, bases, defaults = set(), "", [], {}
         for line in node.body:
             match line:
                 case ast.AnnAssign(target=ast.Name(id="track"), value=ast.Constant(value=str(track))):
                     tracks.add(track)
                 case ast.AnnAssign(target=ast.Name(id="access"), value=ast.Constant(value=str(declared))):
                     access = declared
+                case ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value):
+                    # Anything but a constant, a number with a sign, or a tuple of these is computed, and not read here.
+                    with contextlib.suppress(ValueError):
+                        defaults[name] = ast.literal_eval(value)
         for base in node.bases:
             match base.value if isinstance(base, ast.Subscript) else base:
                 case ast.Name(id=name):
                     bases.append(("", name))
                 case ast.Attribute(value=ast.Name(id=parent), attr=name):
                     bases.append((parent, name))
-        return cls(ast.get_docstring(node) or "", frozenset(tracks), access, tuple(bases))
+        return cls(ast.get_docstring(node) or "", frozenset(tracks), access, defaults, tuple(bases))
 
 
 @cache

@@ -168,7 +168,8 @@ def _copy_leaderboard(app: Sphinx, failure: Exception | None) -> None:
         # If a file is missing, Sphinx warns on the pages that link it.
         if source.exists():
             target.parent.mkdir(exist_ok=True)
-            shutil.copyfile(source, target)
+            # The page links the pages beside it, wherever the site lies.
+            target.write_text(source.read_text(encoding="utf-8").replace('"docs":""', '"docs":"../"'), encoding="utf-8")
     films = app.srcdir.parent / "leaderboard" / "clips"
     if failure is None and films.is_dir():
         shutil.copytree(films, Path(app.outdir) / "leaderboard" / "clips", dirs_exist_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -15,10 +15,12 @@ import pyarrow.compute as pc
 
 from cavbench.core import registry
 from cavbench.core.registry import KINDS, Kind
-from cavbench.core.sources import summary
+from cavbench.core.sources import defaults_of, summary
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison, parameters
 from cavbench.records.table import group_codes
 
+DEFAULTS = {("attack", "none"), ("defense", "none"), ("victim", "dqn"), ("world", "highway")}
+"""What a command line has where nothing is typed."""
 PLAIN = re.compile(r"[\w./+-]+")
 
 
@@ -73,19 +75,52 @@ def run_command(one: Comparison) -> str:
     identity = one.identity
     words = []
     for kind in KINDS:
-        words.append(f"{kind}={identity[kind]}")
-        words += [f"{kind}.{name}={_word(value)}" for name, value in parameters(identity[f"{kind}_params"]).items()]
+        words += [f"{kind}={identity[kind]}"] if (kind, identity[kind]) not in DEFAULTS else []
+        given = _given(kind, str(identity[kind]), parameters(identity[f"{kind}_params"]))
+        words += [f"{kind}.{name}={_word(value)}" for name, value in given.items()]
     if one.is_attacked:
         # Every frame is the default, and tracks without frames do not know the option.
         given = [name for name in THREAT if (name, identity[name]) != ("threat_share", 1)]
         words += [f"threat.{name.removeprefix('threat_')}={_word(identity[name])}" for name in given]
     named = {grid.name for grid in registry.grids(str(identity["world"]))}
     words += [f"grid={name}" for name in _values(one.own.table, "grid") if name in named]
+    return shlex.join(["bench", "run", *words, *_part(one)])
+
+
+def _given(kind: Kind, name: str, params: Mapping[str, object]) -> dict[str, object]:
+    """The parameters without those that the source says are the defaults, which nobody types.
+
+    An empty one is typed where it is not the default. Those of a link of a chain are `LINK.NAME`.
+    """
+    found = {}
+    for key, value in params.items():
+        link, _, own = key.rpartition(".")
+        claims = registry.entries(registry.GROUPS[kind]).get(link or name.partition(":")[0], ())
+        defaults = defaults_of(claims[0].target) if len(claims) == 1 else {}
+        if own not in defaults or repr(_plain(defaults[own])) != repr(value):
+            found[key] = value
+    return found
+
+
+def _plain(value: object) -> object:
+    """A default as the JSON of a record has it."""
+    return list(map(_plain, value)) if isinstance(value, tuple) else value
+
+
+def _part(one: Comparison) -> list[str]:
+    """The part of the grid, as far as it is not the whole of it."""
+    grids = {grid.name: grid for grid in registry.grids(str(one.identity["world"]))}
+    whole = grids.get(str(one.identity["grid"]))
+    words = []
     for axis in one.axes:
-        values = dict.fromkeys(cell[axis] for cell in one.cells)
-        words.append(f"{axis}={','.join(_word(value) for value in values)}")
-    words += [f"episodes={len(one.own.seeds)}", f"seeds={','.join(map(str, one.own.runs))}"]
-    return shlex.join(["bench", "run", *words])
+        values = list(dict.fromkeys(cell[axis] for cell in one.cells))
+        if whole is None or values != list(dict.fromkeys(cell[axis] for cell in whole.cells())):
+            words.append(f"{axis}={','.join(_word(value) for value in values)}")
+    if whole is None or len(one.own.seeds) != whole.episodes:
+        words.append(f"episodes={len(one.own.seeds)}")
+    if whole is None or list(one.own.runs) != list(range(whole.training_seeds)):
+        words.append(f"seeds={','.join(map(str, one.own.runs))}")
+    return words
 
 
 def replay_command(one: Comparison, pair: str, folder: Path | None) -> str:

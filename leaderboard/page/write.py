@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from importlib import metadata
 from importlib.resources import files
 from multiprocessing import get_context
 from pathlib import Path
@@ -128,9 +129,9 @@ def html(made: Mapping[str, Any], episodes: int, thesis: Sequence[chapters.Chapt
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string((site / "page.html").read_text(encoding="utf-8"))
     # "<" would end the element that the data stand in.
-    data = json.dumps({**made, "recordings": recordings}, separators=(",", ":"), allow_nan=False).replace(
-        "<", "\\u003c"
-    )
+    data = json.dumps(
+        {**made, "recordings": recordings, **addresses()}, separators=(",", ":"), allow_nan=False
+    ).replace("<", "\\u003c")
     ranked = list(dict.fromkeys(board["track"] for board in made["boards"]))
     css, js = ((site / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     return template.render(
@@ -148,6 +149,16 @@ def html(made: Mapping[str, Any], episodes: int, thesis: Sequence[chapters.Chapt
         flags=[{"title": title, "meaning": find.__doc__} for title, find in FLAGS.values()],
         thesis=thesis,
     )
+
+
+def addresses() -> dict[str, str]:
+    """Where the documentation and the repository are, from the metadata of the package; empty where they have no address yet.
+
+    The site's copy of the page gets the way to the site's other pages instead (docs/_ext/cavbench_site.py).
+    """
+    urls = dict(line.split(", ", 1) for line in metadata.metadata("cavbench").get_all("Project-URL") or ())
+    docs = urls.get("Documentation", "")
+    return {"docs": docs if not docs or docs.endswith("/") else f"{docs}/", "repository": urls.get("Repository", "")}
 
 
 def policy(css: str, js: str) -> str:

@@ -16,6 +16,8 @@ function el(tag, attributes = {}, ...children) {
   made.append(...children.filter((child) => child != null));
   return made;
 }
+/* Text with `names` in it: these are set apart. */
+const marked = (text) => text.split("`").map((part, i) => (i % 2 ? el("samp", {}, part) : part));
 const fixed = (value, digits = 2) => (value == null ? "—" : (Math.abs(value) < 0.5 * 10 ** -digits ? 0 : value).toFixed(digits).replace("-", "−"));
 const short = (value) => fixed(value).replace(/^(−?)0\./, "$1.");
 const bounds = (found) => (found && found.low != null ? `${short(found.low)}–${short(found.high)}` : "");
@@ -80,7 +82,7 @@ function draw(id, columns, rows, classes) {
     });
   }
   const focused = document.activeElement?.dataset?.column;
-  const shown = columns;
+  const shown = columns.filter((column) => !column.hidden);
   const head = el("tr", {}, ...shown.map((column) => {
     const own = sort?.name === column.name ? (sort.down ? "descending" : "ascending") : "none";
     const cell = el("th", { scope: "col", class: column.number ? "number" : null });
@@ -164,6 +166,7 @@ const threatName = (t) => threatText({ ...t, allowed: "" });
 const threatShort = (t) => (t.budget ? `${t.norm} ${t.budget}, ${t.access}` : "none");
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 const place = (cell) => JSON.stringify(Object.entries(cell).sort());
+const plural = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`;
 const joined = (values) => values.join(" × ");
 
 function options(select, values, chosen) {
@@ -184,7 +187,7 @@ function boardNames() {
     return name;
   });
 }
-const rowName = (row) => `${row.defense.label}+${row.victim.label}`.replaceAll(" ", ",");
+const rowName = (row) => `${row.mine ? "yours:" : ""}${row.defense.label}+${row.victim.label}`.replaceAll(" ", ",");
 const rowOf = (pair) => current().rows.find((row) => sameDefended(row, pair)) ?? null;
 const sorted = (id) => (id === "ranks" ? "sort" : `sort-${id}`);
 function address({ row = state.row, pair = state.pair } = {}) {
@@ -243,7 +246,7 @@ function setBoard(place, given, row, pair) {
     state[kind] = names.includes(given.get(kind)) ? given.get(kind) : "";
     options(at(kind), [["", "all"], ...[...new Set(names)].sort().map((name) => [name, name])], state[kind]);
   }
-  for (const id of ["ranks", "pairs"]) {
+  for (const id of ["ranks", "attackers", "pairs"]) {
     const sort = given.get(sorted(id))?.replaceAll(",", " ");
     if (sort) state.sort[id] = { name: sort.replace(/^-/, ""), down: sort.startsWith("-") };
   }
@@ -280,12 +283,16 @@ function render() {
   const columns = board.columns.filter(({ shown }) => shown).flatMap((column) => {
     const made = rankColumn(column);
     if (column.name === "score") return [made, { name: "0 – 1", class: "drawn", show: (one) => strip(one.score, baselineOf(one)) }];
+    // The cell is named where its score is, and in what is copied.
+    if (column.name === "worst_cell") return [{ ...made, hidden: true }];
     if (column.name === "flags" && board.rows.some((row) => row.clip)) return [FILM, made];
     return [made];
   });
   draw("ranks", columns, [...rows, ...baselines], (one, before, unsorted) =>
-    [one.baseline ? "baseline" : "", one.row?.flagged ? "flagged" : "", rankOf(one) === 1 ? "best" : "", unsorted && before && rankOf(one) !== rankOf(before) ? "group" : "", unsorted && before?.row && one.row && one.row.flagged !== before.row.flagged ? "divided" : ""].filter(Boolean).join(" "));
+    [one.baseline ? "baseline" : "", one.row?.mine ? "mine" : "", one.row?.flagged ? "flagged" : "", rankOf(one) === 1 ? "best" : "", unsorted && before && rankOf(one) !== rankOf(before) ? "group" : "", unsorted && before?.row && one.row && one.row.flagged !== before.row.flagged ? "divided" : ""].filter(Boolean).join(" "));
 
+  drawAttackers(board);
+  drawWorlds(board);
   drawPairs(board, metric);
   drawMatrix(board);
   drawCurves(board);
@@ -294,10 +301,12 @@ function render() {
 }
 /* ---- the ranking: which columns there are, the document says (leaderboard/ranking/columns.py) ---- */
 const rankOf = (one) => one.row?.values.rank;
-const FILM = { name: "Film", show: ({ row }) => (row?.clip ? el("a", { href: address({ row, pair: null }), "aria-label": `Film of ${row.defense.label} · ${row.victim.label}` }, "▶ film") : "") };
+const FILM = { name: "Film", show: ({ row }) => (row?.clip ? el("a", { href: address({ row, pair: null }), "aria-label": `Film of ${row.defense.label} · ${row.victim.label}` }, "▶") : "") };
 const LOOKS = {
-  defense: (row, text) => el("a", { href: address({ row, pair: null }) }, text),
-  strongest_attack: (row, text) => cardLink(pairs.get(row.strongest), text),
+  defense: (row, text) => [el("a", { href: address({ row, pair: null }) }, text), row.mine ? el("small", { class: "yours" }, " ▸ yours") : ""],
+  worst_cell_score: (row, found) => (found == null ? "—" : el("span", { title: `in ${valueOf({ name: "worst_cell" }, row)}` }, fixed(found.estimate))),
+  lead: (row, found) => (found == null ? "—" : el("span", { title: `${fixed(found.estimate)} [${bounds(found)}]` }, el("b", {}, signed(found)))),
+  strongest_attack: (row, text) => { const one = pairs.get(row.strongest), link = cardLink(one, one.attack.name); link.title = text; return link; },
   flags: (row) => doubts(row),
 };
 function rankColumn(column) {
@@ -334,7 +343,7 @@ function shown({ kind, digits, interval }, found, bounded) {
   return bounded && interval ? [el("b", {}, written), " ", el("small", {}, bounds(found))] : written;
 }
 function sameDefended(a, b) {
-  return ["defense", "victim"].every((kind) => JSON.stringify([a[kind].name, a[kind].params]) === JSON.stringify([b[kind].name, b[kind].params]));
+  return a.mine === b.mine && ["defense", "victim"].every((kind) => JSON.stringify([a[kind].name, a[kind].params]) === JSON.stringify([b[kind].name, b[kind].params]));
 }
 function controlOf(row) {
   const strongest = pairs.get(row.strongest);
@@ -347,17 +356,33 @@ function baselineOf(one) {
   const cells = one.row ? besideBaseline(one.row) : [];
   return cells.length ? average(cells.map((cell) => cell.baseline)) : null;
 }
+/* What is said of each flag that was measured or not, and the remarks. */
+function reasons(row) {
+  const fired = [...row.flags].sort((a, b) => (b.fired === true) - (a.fired === true));
+  return el("ul", {}, ...fired.map((flag) =>
+    el("li", {}, el("b", {}, `${flag.fired ? "⚑ " : ""}${flag.name.replaceAll("_", " ")}: `), ...marked(flag.reason))), ...remarksOf(row));
+}
+/* A mark with a tip: the titles when the pointer is over it, the measurements when it is pressed. */
 function doubts(row) {
-  const fired = row.flags.filter((flag) => flag.fired);
-  const unmeasured = row.flags.filter((flag) => flag.fired === null).length;
-  const notes = row.remarks.length ? ` ⚠ ${row.remarks.map(remarkName).join(", ")}` : "";
-  const summary = (fired.length ? `⚑ ${fired.map((flag) => flag.title).join("; ")}` : `none of ${row.flags.length - unmeasured}`) + notes;
-  return el("details", {}, el("summary", { class: fired.length ? null : "quiet" }, summary), el("ul", {}, ...row.flags.map((flag) =>
-    el("li", {}, el("b", {}, `${flag.fired ? "⚑ " : ""}${flag.name.replaceAll("_", " ")}: `), flag.reason)), ...remarksOf(row)));
+  const fired = row.flags.filter((flag) => flag.fired).map((flag) => flag.title);
+  const notes = row.remarks.map(remarkName);
+  const said = [...fired, ...notes.map((name) => `note: ${name}`)].join("; ") || `none of ${row.flags.filter((flag) => flag.fired != null).length} flags`;
+  const mark = [fired.length ? `⚑ ${fired.length}` : "", notes.length ? `⚠ ${notes.length}` : ""].filter(Boolean).join(" ") || "–";
+  return tip(mark, `${plural(fired.length, "flag")}, ${plural(notes.length, "note")}: ${said}`, said, reasons(row), fired.length ? "" : "quiet");
+}
+function tip(mark, label, title, content, classes) {
+  const panel = el("div", { popover: "auto", class: "tip", role: "dialog", tabindex: "0", "aria-label": label }, content);
+  const button = el("button", { type: "button", class: `mark ${classes}`.trim(), title, "aria-label": label, "aria-haspopup": "dialog", onclick: () => {
+    panel.togglePopover();
+    const at = button.getBoundingClientRect(), own = panel.getBoundingClientRect();
+    panel.style.left = `${Math.max(8, Math.min(at.right - own.width, innerWidth - own.width - 8))}px`;
+    panel.style.top = `${Math.max(8, Math.min(at.bottom + 4, innerHeight - own.height - 8))}px`;
+  } }, mark);
+  return el("span", {}, button, panel);
 }
 /* What a reader must know before trusting a number. */
 const remarkName = (remark) => remark.name.replaceAll("_", " ");
-const remarksOf = (one) => one.remarks.map((remark) => el("li", {}, el("b", {}, `⚠ ${remarkName(remark)}: `), remark.text));
+const remarksOf = (one) => one.remarks.map((remark) => el("li", {}, el("b", {}, `⚠ ${remarkName(remark)}: `), ...marked(remark.text)));
 /* By how much an attack lowers the score of its row further than all the others do. */
 function added(pair, row) {
   const place = row ? row.pairs.indexOf(pair.key) : -1;
@@ -366,6 +391,37 @@ function added(pair, row) {
 function adds(pair, row) {
   const found = added(pair, row);
   return found ? [fixed(found.estimate), " ", el("small", {}, found.low == null ? "" : `${fixed(found.low)} … ${fixed(found.high)}`)] : "";
+}
+/* The attacks of the board, by what they add (leaderboard/ranking/attackers.py); they refer to all cells, as ranks do. */
+function drawAttackers(board) {
+  const one = (name, key, show) => ({ name, number: true, value: (row) => row[key], show: (row) => show(row[key]) });
+  const whole = (value) => fixed(value, 0);
+  draw("attackers", [
+    { name: "Rank", show: (row) => String(row.rank), value: (row) => row.rank },
+    { name: "Attack", show: (row) => [row.name, row.variants > 1 ? el("small", {}, ` ${plural(row.variants, "variant")}`) : ""], value: (row) => row.name },
+    one("Adds", "added", (value) => el("b", {}, fixed(value))),
+    one("Alone takes", "alone", fixed),
+    one("Strongest in cells", "strongest", percent),
+    one(`Rows of ${board.rows.length}`, "rows", whole),
+    one(capital(said().queries_title), "queries", whole),
+    one("CPU s / episode", "seconds", (value) => fixed(value, value < 10 ? 2 : 0)),
+  ], board.attackers);
+}
+/* The same defended victims in other worlds and grids, under the same norm and budget. */
+function drawWorlds(board) {
+  const alike = data.boards.filter((one) => one.track === board.track && ["norm", "budget", "share"].every((name) => one.threat[name] === board.threat[name]));
+  const places = [...new Map(alike.map((one) => [`${one.world.name}, ${one.grid}`, one])).entries()];
+  const rows = board.rows.filter(chosen).map((row) => ({ row, found: places.map(([, one]) => one.rows.find((other) => sameDefended(other, row))) }))
+    .filter(({ found }) => found.filter(Boolean).length > 1);
+  at("worlds-section").hidden = places.length < 2 || !rows.length;
+  const score = (other) => el("td", { class: "value", style: tint(other.values.score.estimate) }, fixed(other.values.score.estimate), el("small", {}, bounds(other.values.score)));
+  at("worlds").replaceChildren(
+    el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Defence · victim"), ...places.map(([name]) => el("th", { scope: "col" }, name)))),
+    el("tbody", {}, ...rows.map(({ row, found }) => el("tr", {}, el("th", { scope: "row" }, `${row.defense.label} · ${row.victim.label}`), ...found.map((other) => (other ? score(other) : el("td", { class: "value" }, "")))))));
+  at("worlds").copied = () => ({
+    heads: [{ name: "defence" }, { name: "victim" }, ...places.map(([name]) => ({ name, interval: true }))],
+    rows: rows.map(({ row, found }) => [row.defense.label, row.victim.label, ...found.map((other) => other?.values.score ?? { estimate: null })]),
+  });
 }
 function drawPairs(board, metric) {
   const rows = within(board).filter(chosen).filter((pair) => !state.attack || pair.attack.name === state.attack)
@@ -383,7 +439,7 @@ function drawPairs(board, metric) {
     { name: "Asks", show: ({ pair }) => pair.asks, value: ({ pair }) => pair.asks },
     { name: "Queries", show: (one) => fixed(queries(one), 0), value: queries, number: true },
     { name: "Adds", show: ({ pair }) => adds(pair, rowOf(pair)), value: ({ pair }) => added(pair, rowOf(pair))?.estimate ?? null, interval: ({ pair }) => added(pair, rowOf(pair)), number: true },
-    ...(rows.some(({ pair }) => pair.remarks.length) ? [{ name: "Doubts", class: "doubts", show: ({ pair }) => (pair.remarks.length ? el("details", {}, el("summary", {}, `⚠ ${pair.remarks.map(remarkName).join(", ")}`), el("ul", {}, ...remarksOf(pair))) : ""), value: ({ pair }) => pair.remarks.map(remarkName).join(" ") }] : []),
+    ...(rows.some(({ pair }) => pair.remarks.length) ? [{ name: "Doubts", class: "doubts", show: ({ pair }) => (pair.remarks.length ? tip(`⚠ ${pair.remarks.length}`, `${plural(pair.remarks.length, "note")}: ${pair.remarks.map(remarkName).join("; ")}`, pair.remarks.map(remarkName).join("; "), el("ul", {}, ...remarksOf(pair)), "") : ""), value: ({ pair }) => pair.remarks.map(remarkName).join(" ") }] : []),
     { name: "Recording", show: ({ pair }) => (pair.card.recording ? el("a", { href: data.recordings + pair.card.recording }, "rrd") : "") },
   ], rows);
 }
@@ -531,10 +587,23 @@ function bibtex(title, key) {
     `  note = {cavbench ${data.cavbench}, records of ${data.made.slice(0, 10)}},`, `  howpublished = {${here()}}`, "}"].join("\n");
 }
 /* What the components are, with the papers that their authors name. */
+const FOLDERS = { attack: "attacks", defense: "defenses", victim: "victims", world: "worlds" };
+function page(card, kind) {
+  const name = card.components[kind].name;
+  const own = card.about[kind].includes("Code: cavbench.") && !/[+:]/.test(name);
+  return data.docs && own ? el("a", { href: `${data.docs}${FOLDERS[kind]}/${name}.html` }, "documentation") : null;
+}
+/* A search for the paper that the code names, by its title or by authors, year and what it does: addresses of papers move. */
+function paper(text) {
+  const title = text.match(/"([^"]{12,})"/)?.[0], authors = text.match(/\(([^()"]*\b(?:19|20)\d\d[^()"]*)/)?.[1];
+  const wanted = title ?? (authors ? `${authors} ${text.split("(")[0]}` : null);
+  return wanted ? el("a", { href: `https://scholar.google.com/scholar?q=${encodeURIComponent(wanted)}`, rel: "noreferrer" }, "find the paper") : null;
+}
 function works(card, kinds) {
   return kinds.flatMap((kind) => fact(kind === "defense" ? "defence" : kind,
     el("b", {}, [card.components[kind].name, ...Object.entries(card.components[kind].params).map(([k, v]) => `${k}=${JSON.stringify(v)}`)].join(" ")),
-    card.about[kind] ? el("div", {}, card.about[kind]) : null, el("small", { class: "quiet" }, listed(card.shipped_by[kind]))));
+    card.about[kind] ? el("div", {}, ...marked(card.about[kind])) : null,
+    el("small", { class: "quiet links" }, page(card, kind), paper(card.about[kind]), listed(card.shipped_by[kind]))));
 }
 function provenance(pair) {
   const card = pair.card;
@@ -558,7 +627,7 @@ function rowCard(row) {
     ...current().columns.filter((column) => column.shown && !["defense", "victim", "strongest_attack", "flags"].includes(column.name))
       .flatMap((column) => (row.values[column.name] == null ? [] : fact(column.title, ...[shown(column, row.values[column.name], true)].flat()))),
     ...fact("attacks", ...row.pairs.map((key) => el("div", {}, cardLink(pairs.get(key), attackName(pairs.get(key))), " ", ...estimate(pairs.get(key).score), " ", el("small", { class: "quiet" }, part(pairs.get(key), row))))),
-    ...fact("flags", doubts(row)),
+    ...fact("flags", reasons(row)),
     ...works(strongest.card, ["defense", "victim", "world"]),
     ...fact("strongest attack", pairs.get(row.strongest).attack.label),
     ...provenance(strongest),
@@ -590,11 +659,13 @@ function showCard() {
 at("card").addEventListener("close", () => { state.row = state.pair = null; history.replaceState(null, "", address()); });
 at("card").addEventListener("click", (event) => { if (event.target === at("card")) at("card").close(); });
 addEventListener("hashchange", go);
+at("links").append(...[[data.docs && `${data.docs}index.html`, "Documentation"], [data.docs && `${data.docs}leaderboard.html`, "How rows are ranked"],
+  [data.docs && `${data.docs}submit.html`, "Hand in a row"], [data.repository, "Repository"]].filter(([href]) => href).map(([href, text]) => el("a", { href }, text)));
 
 for (const button of document.querySelectorAll("[data-track]")) button.addEventListener("click", (event) => { event.preventDefault(); visit(`#/${button.dataset.track}`); });
 at("threat").addEventListener("change", (event) => visit(`#/${written(state.track)}/${written(boardNames()[+event.target.value])}`));
 for (const kind of ["defense", "victim", "attack"]) at(kind).addEventListener("change", (event) => { state[kind] = event.target.value; render(); });
-for (const id of ["ranks", "pairs"]) at(`sort-${id}`).addEventListener("change", ({ target }) => {
+for (const id of ["ranks", "attackers", "pairs"]) at(`sort-${id}`).addEventListener("change", ({ target }) => {
   if (target.value) state.sort[id] = { name: target.value.replace(/^-/, ""), down: target.value.startsWith("-") };
   else delete state.sort[id];
   render();

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
+from cavbench.leaderboard.page.write import write
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.records import reading
 from cavbench.statistics.estimates import share_interval
@@ -70,9 +72,17 @@ def test_rows_are_in_rank_groups_with_their_flags_and_the_baselines_below(opened
     ranks = [int(text) for text in column(page, "ranks", 1) if text]
     assert ranks == sorted(ranks)
     row = page.locator("#ranks tr:has(a:text-is('masked'))")
-    row.locator("summary").click()
-    assert "an attack without gradients beats those with them" in row.inner_text()
-    assert "(with gradients)" in row.locator("li", has_text="masked gradients").inner_text()
+    mark = row.locator(".mark")
+    assert "an attack without gradients beats those with them" in mark.get_attribute("title")
+    assert not page.locator(".tip:popover-open").count()
+    mark.click()
+    tip = page.locator(".tip:popover-open")
+    assert "(with gradients)" in tip.locator("li", has_text="masked gradients").inner_text()
+    box = tip.bounding_box()
+    assert box["x"] >= 0
+    assert box["x"] + box["width"] <= 1280
+    page.keyboard.press("Escape")
+    assert not page.locator(".tip:popover-open").count()
 
 
 def test_measures_of_decoys_stand_beside_the_scores_of_detectors_only(opened: Open) -> None:
@@ -197,7 +207,7 @@ def test_a_row_opens_its_card_and_its_recording_is_there(opened: Open, site: Pat
     for words in (
         "zo-none-dqn",
         "ab" * 32,
-        "bench run attack=zo attack.steps=4",
+        "bench run attack=zo threat.norm=relative",
         "bench view zo-none-dqn",
         "training seeds",
     ):
@@ -253,7 +263,7 @@ def test_the_card_of_a_row_shows_its_film(browser: Any, site: Path, tmp_path: Pa
     (folder / "leaderboard.html").write_text(text.replace('"clip":null', '"clip":"film.webp"'))
     page = browser.new_page()
     page.goto((folder / "leaderboard.html").as_uri())
-    page.locator("#ranks a", has_text="film").first.click()
+    page.locator("#ranks a[aria-label^=Film]").first.click()
     page.wait_for_function("document.querySelector('#card img')?.naturalWidth > 100")
     page.close()
 
@@ -307,7 +317,7 @@ def test_one_plot_has_a_line_for_each_defended_victim(opened: Open) -> None:
 
 
 @pytest.mark.parametrize("track", ["driving", "detection", "thesis", "method"])
-@pytest.mark.parametrize("width", [360, 820, 1280])
+@pytest.mark.parametrize("width", [360, 390, 768, 1280, 1920])
 def test_nothing_is_wider_than_the_screen(opened: Open, track: str, width: int) -> None:
     page = opened(at=f"#/{track}", viewport={"width": width, "height": 740})
     assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -319,6 +329,81 @@ def test_nothing_is_wider_than_the_screen(opened: Open, track: str, width: int) 
         box = page.locator("#card").bounding_box()
         assert box["x"] >= 0
         assert box["x"] + box["width"] <= 360
+
+
+def test_a_ranking_of_twenty_rows_is_on_one_screen_of_a_laptop(browser: Any, published_site: Path) -> None:
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((published_site / "index.html").as_uri())
+    for track in ("Driving", "Detection"):
+        page.get_by_role("button", name=track).click()
+        rows = page.locator("#ranks tbody tr:not(.baseline)")
+        assert rows.count() >= 17
+        last = rows.last.bounding_box()
+        assert last["y"] + last["height"] <= 900
+        assert page.evaluate("(e => e.scrollWidth <= e.clientWidth)(document.querySelector('.scroll:has(#ranks)'))")
+    page.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 768, 1280, 1920])
+def test_axe_finds_nothing(browser: Any, site: Path, width: int, scheme: str) -> None:
+    axe = pytest.importorskip(
+        "axe_playwright_python.sync_playwright", reason="axe is not installed: pip install -e '.[dev]'"
+    )
+    # The page's own policy would refuse the script of the test.
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, bypass_csp=True)
+    page = context.new_page()
+    for track in ("driving", "detection", "thesis", "method"):
+        page.goto(f"{(site / 'leaderboard.html').as_uri()}#/{track}")
+        page.reload()
+        assert axe.Axe().run(page).violations_count == 0, axe.Axe().run(page).generate_report()
+    page.goto(f"{(site / 'leaderboard.html').as_uri()}#/driving")
+    page.reload()
+    page.locator("#ranks .mark").first.click()
+    assert axe.Axe().run(page).violations_count == 0
+    page.keyboard.press("Escape")
+    page.locator("#ranks a").first.click()
+    page.locator("#card").wait_for()
+    assert axe.Axe().run(page).violations_count == 0
+    context.close()
+
+
+def test_attacks_are_ranked_below_the_victims(opened: Open, site: Path) -> None:
+    page = opened()
+    made = json.loads((site / "leaderboard.json").read_text())["boards"][0]["attackers"]
+    assert [text.split()[0] for text in column(page, "attackers", 2)] == [one["name"] for one in made]
+    assert [float(text) for text in column(page, "attackers", 3)] == pytest.approx(
+        [one["added"] for one in made], abs=0.0051
+    )
+
+
+def test_ones_own_rows_are_marked(browser: Any, site: Path, tmp_path: Path) -> None:
+    records = reading.read_all(site / "results")
+    write(site / "results", tmp_path / "beside.html", Console(quiet=True), published=records)
+    page = browser.new_page()
+    page.goto((tmp_path / "beside.html").as_uri())
+    mine, all_rows = page.locator("#ranks tr.mine"), page.locator("#ranks tbody tr:not(.baseline)")
+    assert 0 < mine.count() == all_rows.count() / 2
+    assert all("yours" in text for text in mine.all_inner_texts())
+    mine.first.locator("a").first.click()
+    assert page.evaluate("decodeURIComponent(location.hash)").startswith("#/driving/relative-0.1/yours:")
+    page.close()
+
+
+def test_links_lead_to_the_documentation_where_it_has_an_address(browser: Any, site: Path, tmp_path: Path) -> None:
+    text = (site / "leaderboard.html").read_text()
+    assert '"docs":""' in text, "there is no public address yet"
+    (tmp_path / "page.html").write_text(text.replace('"docs":""', '"docs":"../"'))
+    page = browser.new_page()
+    page.goto((tmp_path / "page.html").as_uri())
+    assert page.locator("#links a").all_inner_texts() == ["Documentation", "How rows are ranked", "Hand in a row"]
+    page.locator("#ranks a", has_text="advtrain").first.click()
+    page.locator("#card").wait_for()
+    links = [one.get_attribute("href") for one in page.locator("#card .links a").all()]
+    assert "../defenses/advtrain.html" in links
+    assert any("Mnih%20et%20al.%202015" in link for link in links)
+    assert "`" not in page.locator("#card").inner_text()
+    page.close()
 
 
 def test_the_keyboard_reaches_everything_and_shows_where_it_is(opened: Open) -> None:
