@@ -24,6 +24,7 @@ from cavbench.files import scratch
 from cavbench.leaderboard.published import BASELINES, HOME
 from cavbench.records import reading
 from cavbench.records.columns import track_of
+from cavbench.records.table import together
 
 PUBLISHED = "published"
 DATA = PurePosixPath("leaderboard", "data")
@@ -160,7 +161,7 @@ def _together(paths: Iterator[Path] | list[Path], text: str) -> Records:
             raise UserError(
                 f"the records of {text} were written by another version, which cannot be read here"
             ) from error
-    return {name: pa.concat_tables(tables) for name, tables in found.items()}
+    return {name: together(tables) for name, tables in found.items()}
 
 
 def _is_of(stem: str, row: str) -> bool:

@@ -80,8 +80,8 @@ def run_command(one: Comparison) -> str:
         words += [f"{kind}.{name}={_word(value)}" for name, value in given.items()]
     if one.is_attacked:
         # Every frame is the default, and tracks without frames do not know the option.
-        given = [name for name in THREAT if (name, identity[name]) != ("threat_share", 1)]
-        words += [f"threat.{name.removeprefix('threat_')}={_word(identity[name])}" for name in given]
+        limits = [name for name in THREAT if (name, identity[name]) != ("threat_share", 1)]
+        words += [f"threat.{name.removeprefix('threat_')}={_word(identity[name])}" for name in limits]
     named = {grid.name for grid in registry.grids(str(identity["world"]))}
     words += [f"grid={name}" for name in _values(one.own.table, "grid") if name in named]
     return shlex.join(["bench", "run", *words, *_part(one)])
