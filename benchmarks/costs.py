@@ -2,7 +2,7 @@
 
     python benchmarks/costs.py                   # from the published records
     python benchmarks/costs.py RESULTS           # renews what a results folder has measured
-    python benchmarks/costs.py --overheads       # measures what a batch costs beside its episodes, too: 3 CPU minutes
+    python benchmarks/costs.py --overheads       # measures what a batch costs beside its episodes, too: a CPU minute
 
 Every record has the wall time of its unit, a share of that of its batch, in a worker with one thread. The table is
 `bench/run/costs.json` (`cavbench.run.cost`): for each attack on each defended victim the median seconds an episode, for the
@@ -36,9 +36,10 @@ from cavbench.run.task import Task
 
 TABLE = Path(__file__).parents[1] / "bench" / "run" / "costs.json"
 CELL = ("lanes=4", "density=1", "weather=clear", "seeds=0", "reference=false")
-SMALL, LARGE = 2, 8
+SMALL, LARGE = 4, 30
 """Episodes of the two batches whose difference is the cost of an episode."""
-SIDES = {"plain": (), "filtered": ("defense=tracker+shield",)}
+SIDES = {"plain": ("defense=advtrain",), "filtered": ("defense=tracker+shield",)}
+"""Defended victims that do not crash, so that all episodes of a batch are equally long."""
 
 
 def measured(records: pa.Table) -> dict[str, dict[str, dict[str, float]]]:
@@ -74,7 +75,10 @@ def _effort(attack: str, params: str) -> float | None:
 
 def overhead(words: tuple[str, ...], framework: Snapshot) -> float:
     """What a batch costs beside its episodes, in episodes: CPU time of pgd, in this process."""
-    small, large = (_driven((*words, *CELL, "attack=pgd", f"episodes={count}"), framework) for count in (SMALL, LARGE))
+    small, large = (
+        _driven((*words, *CELL, "attack=pgd", "attack.steps=2", f"episodes={count}"), framework)
+        for count in (SMALL, LARGE)
+    )
     episode = (large - small) / (LARGE - SMALL)
     return float(f"{max(small / episode - SMALL, 0):.2g}")
 

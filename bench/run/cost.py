@@ -8,7 +8,7 @@ What the units of a run really take corrects the estimate while it goes on (`cav
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
@@ -210,9 +210,15 @@ def effort(attack: Any) -> float:
     return found
 
 
-def shares(units: Sequence[Unit], workers: int) -> list[float]:
-    """The CPU seconds of each unit; of several in one batch each has its share of that."""
-    alike = batches([Task(unit=unit) for unit in units], (), workers)
+def shares(units: Sequence[Unit], workers: int, recorded: Collection[str] = ()) -> list[float]:
+    """The CPU seconds of each unit; of several in one batch each has its share of that.
+
+    Args:
+        units: the units.
+        workers: number of worker processes.
+        recorded: fingerprints of the units that are recorded, which are driven alone; none if they are not known yet.
+    """
+    alike = batches([Task(unit=unit) for unit in units], recorded, workers)
     found: dict[int, float] = {}
     known: dict[str, Rates] = {}
     for batch in alike:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Collection, Hashable, Sequence
 from dataclasses import dataclass
 
 from cavbench.core.pair import Pair
@@ -52,12 +52,19 @@ class Forecast:
         tasks: what is to be done: a task for each unit, and for what is prepared.
         workers: number of tasks that are carried out at once.
         now: a clock in seconds.
+        recorded: fingerprints of the units that are recorded.
     """
 
-    def __init__(self, tasks: Sequence[Task], workers: int, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        tasks: Sequence[Task],
+        workers: int,
+        now: Callable[[], float] = time.monotonic,
+        recorded: Collection[str] = (),
+    ) -> None:
         self.workers, self.now = workers, now
         units = [task.unit for task in tasks if task.step == "drive"]
-        costs = iter(shares(units, workers))
+        costs = iter(shares(units, workers, recorded))
         self.parts: dict[str, Part] = {}
         for task in tasks:
             pair, group = task.pair, (task.step, task.pair.id, task.unit.training_seed)

@@ -123,7 +123,9 @@ class _Driving:
         """What the units that are not finished take, with what is prepared for them."""
         waiting = [unit for unit in units if unit.fingerprint not in self.finished]
         absent = {unit.artefact: Task(unit=unit, step="prepare") for unit in waiting if self.results.lacks(unit)}
-        return Forecast([*absent.values(), *(Task(unit=unit) for unit in waiting)], self.back_end.size)
+        return Forecast(
+            [*absent.values(), *(Task(unit=unit) for unit in waiting)], self.back_end.size, recorded=self.recorded
+        )
 
     def carry_out(self, units: Sequence[Unit]) -> set[str]:
         """Prepare what is missing, drive the units that are not finished, and return the fingerprints of those that are now."""
