@@ -36,7 +36,7 @@ from cavbench.run.task import Task
 
 TABLE = Path(__file__).parents[1] / "bench" / "run" / "costs.json"
 CELL = ("lanes=4", "density=1", "weather=clear", "seeds=0", "reference=false")
-SMALL, LARGE = 4, 30
+SMALL, LARGE = 2, 10
 """Episodes of the two batches whose difference is the cost of an episode."""
 SIDES = {"plain": ("defense=advtrain",), "filtered": ("defense=tracker+shield",)}
 """Defended victims that do not crash, so that all episodes of a batch are equally long."""
@@ -76,10 +76,11 @@ def _effort(attack: str, params: str) -> float | None:
 def overhead(words: tuple[str, ...], framework: Snapshot) -> float:
     """What a batch costs beside its episodes, in episodes: CPU time of pgd, in this process."""
     small, large = (
-        _driven((*words, *CELL, "attack=pgd", "attack.steps=2", f"episodes={count}"), framework)
+        _driven((*words, *CELL, "attack=pgd", "attack.steps=1", f"episodes={count}"), framework)
         for count in (SMALL, LARGE)
     )
     episode = (large - small) / (LARGE - SMALL)
+    print(f"{' '.join(words)}: {SMALL} episodes {small:.1f} s, {LARGE} episodes {large:.1f} s")
     return float(f"{max(small / episode - SMALL, 0):.2g}")
 
 
@@ -109,7 +110,6 @@ def main() -> None:
         settle()
         registry.load("attack", "pgd")
         framework = Snapshot()
-        _driven((*CELL, "attack=pgd", "episodes=1"), framework)
         table["driving"]["overhead"] = {name: overhead(side, framework) for name, side in SIDES.items()}
     with whole(TABLE) as file:
         file.write((json.dumps(table, indent=1, sort_keys=True) + "\n").encode())

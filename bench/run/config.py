@@ -70,6 +70,7 @@ def plan_of(words: Sequence[str], start: Callable[[str], None] = lambda executor
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     given = Options(words, kinds=KINDS, settings=RunOptions, axes=list(axes))
     given.check_names()
+    given.check_outlines()
     settings = given.settings()
     start(settings["executor"])
     if settings["executor"] != "ray" and any(key.startswith("ray.") for key in given.values):
@@ -178,6 +179,7 @@ def training_of(words: Sequence[str], start: Callable[[str], None] = lambda exec
     """
     given = Options(words, kinds=KINDS, settings=TrainOptions)
     given.check_names()
+    given.check_outlines()
     start("")
     settings = given.settings()
     one: dict[Kind, Chosen[Any]] = {}
