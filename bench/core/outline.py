@@ -11,7 +11,7 @@ import ast
 import builtins
 import importlib
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import new_class
@@ -137,7 +137,7 @@ def _class(node: ast.ClassDef, module: str) -> type[Any]:
         match line:
             case ast.AnnAssign(target=ast.Name(id=name), annotation=hint, value=value) if _is_of_class(hint):
                 if value is not None:
-                    body |= _if_clear(name, lambda value=value: _value(value, module))
+                    body |= _if_clear(name, value, module)
             case ast.AnnAssign(target=ast.Name(id=name), annotation=hint, value=value):
                 body["__annotations__"][name] = _value(hint, module)
                 if value is not None:
@@ -165,9 +165,10 @@ def _is_of_class(hint: ast.expr) -> bool:
     return ast.unparse(hint).startswith(("ClassVar", "typing.ClassVar"))
 
 
-def _if_clear(name: str, value: Callable[[], Any]) -> dict[str, Any]:
+def _if_clear(name: str, node: ast.expr, module: str) -> dict[str, Any]:
     """A declaration, if it can be told; one that needs torch is left out."""
     try:
-        return {name: value()}
+        return {name: _value(node, module)}
+    # An expression may raise anything.
     except Exception:
         return {}
