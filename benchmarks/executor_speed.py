@@ -46,7 +46,7 @@ QUIET = ("record=0", "reference=false")
 class Silent:
     """A watcher that says nothing."""
 
-    def begin(self, *, episodes: int, finished: int) -> None:
+    def begin(self, *, episodes: int, finished: int, forecast: object) -> None:
         pass
 
     def __getattr__(self, name: str) -> object:

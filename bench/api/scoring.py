@@ -136,7 +136,7 @@ def _driven(plan: Plan, progress: bool | None) -> Any:
 class _Silent:
     """Watches a run (`cavbench.run.runner.RunWatcher`) and shows its warnings only."""
 
-    def begin(self, *, episodes: int, finished: int) -> None:
+    def begin(self, *, episodes: int, finished: int, forecast: object) -> None:
         pass
 
     def working(self, tasks: object) -> None:

@@ -64,7 +64,10 @@ def audit(both: Audit, console: Console, *, as_json: bool = False) -> int:
     again = f"salt={both.salt} repeats or continues this audit"
     console.print(Text(f"Drawn scenarios: {again}."), soft_wrap=True)
     units: list[str] = []
-    with RunProgress(Console(stderr=True)) as progress:
+    aside = Console(stderr=True)
+    for name, part in (("public", both.public), ("drawn", both.drawn)):
+        aside.print(Text(f"{name}: {part.cost}"), soft_wrap=True)
+    with RunProgress(aside) as progress:
         for part in (both.public, both.drawn):
             try:
                 units += runner.run(part, progress)

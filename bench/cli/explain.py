@@ -9,7 +9,8 @@ from pathlib import Path
 from rich.text import Text
 
 from cavbench.core import registry, suites
-from cavbench.core.registry import GROUPS, KINDS
+from cavbench.core.parameters import Parameter
+from cavbench.core.registry import GROUPS, KINDS, Kind
 from cavbench.core.track import Measure, tracks
 from cavbench.errors import UserError
 from cavbench.records.schema import IDENTITY, PROVENANCE
@@ -105,16 +106,24 @@ def _spellings(heading: str) -> set[str]:
     return {_plain(heading), _plain(heading.partition(" /")[0]), _plain(re.sub(r" (m|s)$", "", heading))}
 
 
-def _of_a_parameter(term: str) -> list[Text]:
-    """`threat.budget` or `attack.steps`: a parameter of the threat models, or of all components of a kind that have it."""
+def _parameters(kind: Kind, owner: str) -> dict[str, Parameter]:
+    """The parameters of a component; none of an adapter with choices."""
+    from cavbench.core.outline import outline
     from cavbench.core.parameters import parameters
 
+    if (known := outline(kind, owner)) is not None:
+        return parameters(known)
+    return {} if registry.offers(kind, owner) else parameters(registry.load(kind, owner))
+
+
+def _of_a_parameter(term: str) -> list[Text]:
+    """`threat.budget` or `attack.steps`: a parameter of the threat models, or of all components of a kind that have it."""
     kind, _, name = term.partition(".")
     found = []
     if kind in KINDS and name:
         for owner in registry.names(kind):
             try:
-                known = {} if registry.offers(kind, owner) else parameters(registry.load(kind, owner))
+                known = _parameters(kind, owner)
             except UserError:
                 continue
             if name in known:

@@ -14,6 +14,7 @@ from rich.text import Text
 from cavbench import documents
 from cavbench.core import registry, suites
 from cavbench.core.contracts import ANY_TRACK
+from cavbench.core.outline import outline
 from cavbench.core.registry import GROUPS, KINDS, Kind
 from cavbench.core.sources import summary, tracks_of
 from cavbench.core.suites import Suite
@@ -132,7 +133,7 @@ def _parameters(kind: Kind, name: str) -> list[dict[str, str | None]]:
             "allowed": one.allowed,
             "meaning": one.meaning,
         }
-        for own, one in flattened(registry.load(kind, name)).items()
+        for own, one in flattened(outline(kind, name) or registry.load(kind, name)).items()
     ]
 
 
@@ -160,8 +161,9 @@ def heading(kind: Kind, name: str) -> Text:
 def _print_page(kind: Kind, name: str, console: Console) -> None:
     from cavbench.core.parameters import description, flattened
 
-    offered = registry.offers(kind, name)
-    component = registry.declared(kind, name) if offered else registry.load(kind, name)
+    known = outline(kind, name)
+    offered = {} if known else registry.offers(kind, name)
+    component = known or (registry.declared(kind, name) if offered else registry.load(kind, name))
     console.print(heading(kind, name))
     console.print()
     for paragraph in _paragraphs(description(component)):
@@ -172,8 +174,8 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
         return
     console.print(fits(kind, component), highlight=False)
     console.print()
-    known = flattened(component)
-    if not known:
+    owned = flattened(component)
+    if not owned:
         console.print("It has no parameters.")
         return
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
@@ -181,7 +183,7 @@ def _print_page(kind: Kind, name: str, console: Console) -> None:
     table.add_column("type", no_wrap=True)
     table.add_column("default", max_width=18)
     table.add_column("meaning", ratio=1)
-    for name, parameter in known.items():
+    for name, parameter in owned.items():
         meaning = Text("\n").join(filter(None, [_with_code(parameter.meaning), Text(parameter.allowed, style="dim")]))
         written = Text(f"{kind}.{name}", style="bold")
         table.add_row(written, parameter.type_name, parameter.default_text, meaning)

@@ -153,7 +153,15 @@ Cells = Annotated[bool, typer.Option("--cells", help="Show every cell, parameter
 
 
 @app.command(cls=RunHelp)
-def run(words: Words = None, cells: Cells = False, as_json: AsJson = False) -> None:
+def run(
+    words: Words = None,
+    cells: Cells = False,
+    as_json: AsJson = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be driven and what it costs, and end.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a run of more than an hour.")] = False,
+) -> None:
     """Score attacks on defended victims over a grid of scenarios. Run the same command again to continue an interrupted run.
 
     For instance: bench run attack=zo defense=advtrain
@@ -163,7 +171,10 @@ def run(words: Words = None, cells: Cells = False, as_json: AsJson = False) -> N
     plan = plan_of(words or [], start)
     from cavbench.cli import run as cli_run
 
-    raise typer.Exit(cli_run.run(plan, Console(), partial(_print_report, cells=cells), as_json=as_json))
+    if dry_run:
+        cli_run.show_plan(plan, Console())
+        return
+    raise typer.Exit(cli_run.run(plan, Console(), partial(_print_report, cells=cells), as_json=as_json, yes=yes))
 
 
 @app.command(cls=RunHelp)

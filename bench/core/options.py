@@ -26,12 +26,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cavbench.core import budgets, registry, suites
 from cavbench.core.contracts import Access, Defense, ThreatModel
+from cavbench.core.outline import outline
 from cavbench.core.pair import Chosen, choose
 from cavbench.core.parameters import Parameter, flattened, parameters
 from cavbench.core.registry import Kind
 from cavbench.core.suites import Suite
 from cavbench.core.track import track
-from cavbench.errors import PluginError, UserError, short
+from cavbench.errors import PluginError, UserError, message, short
 from cavbench.scenarios import Axes, Axis, Value
 
 LONGEST_VALUE, MOST_VALUES = 5_000, 1_000
@@ -166,14 +167,7 @@ class Options:
         if swept and not names:
             fixed = " and ".join(suite.name for suite in self.suites)
             raise UserError(f"the attacks of the suite {fixed} have fixed parameters, got {kind}.{next(iter(swept))}")
-        for key in swept:
-            if not any(key.partition(".")[0] in owned for owned in known.values()):
-                if lost := [why for name, why in self.broken.items() if name in names]:
-                    raise PluginError(lost[0])
-                what = f"parameter {kind}.{key} of {', '.join(names)}"
-                raise UserError(
-                    registry.unknown(what, key, dict.fromkeys(p for owned in known.values() for p in owned))
-                )
+        self._refuse_unknown(kind, names, known)
         found: dict[str, Chosen[Any]] = {}
         for name, owned in known.items():
             _check_lists(kind, owned, swept)
@@ -185,6 +179,52 @@ class Options:
         if names and not found:
             raise PluginError(self.broken[names[0]])
         return list(found.values())
+
+    def _refuse_unknown(self, kind: Kind, names: Sequence[str], known: Mapping[str, Mapping[str, Parameter]]) -> None:
+        """Refuse a parameter that no chosen component has."""
+        for key in (key.partition(".")[2] for key in self.values if key.startswith(f"{kind}.")):
+            if not any(key.partition(".")[0] in owned for owned in known.values()):
+                if lost := [why for name, why in self.broken.items() if name in names]:
+                    raise PluginError(lost[0])
+                what = f"parameter {kind}.{key} of {', '.join(names)}"
+                every = dict.fromkeys(name for owned in known.values() for name in owned)
+                raise UserError(registry.unknown(what, key, every))
+
+    def check_outlines(self) -> None:
+        """Refuse what built-in components do not allow, as far as their sources say it. It is quick: torch is not imported.
+
+        Raises:
+            UserError: if a parameter is unknown, or a value is not allowed.
+        """
+        victims = [outline("victim", name) for name in self.values.get("victim", (DEFAULTS["victim"],))]
+        on = {victim.tracks()[0] for victim in victims if victim is not None}
+        if len(on) != 1 or None in victims:
+            return
+        for kind in self.kinds:
+            names = [name for name in self.values.get(kind, ()) if kind != "attack" or name not in suites.names()]
+            names = names or ([DEFAULTS[kind]] if kind in DEFAULTS and kind not in self.values else [])
+            if kind == "world" and not names:
+                names = [track(next(iter(on))).world]
+            names = names if kind == "victim" else [registry.on_track(kind, name, next(iter(on))) for name in names]
+            found = {name: outline(kind, name) for name in names}
+            if found and None not in found.values():
+                self._check_outlines(kind, {name: one for name, one in found.items() if one is not None})
+        if self.axes and victims[0] is not None and isinstance(victims[0].threat, type):
+            self._threats(victims[0].threat, next(iter(on)))
+
+    def _check_outlines(self, kind: Kind, found: Mapping[str, type[Any]]) -> None:
+        known = {name: parameters(one) for name, one in found.items()}
+        self._refuse_unknown(kind, list(found), known)
+        swept = {key.partition(".")[2]: values for key, values in self.values.items() if key.startswith(f"{kind}.")}
+        for name, owned in known.items():
+            _check_lists(kind, owned, swept)
+            keys = [key for key in swept if key.partition(".")[0] in owned]
+            for values in itertools.product(*(swept[key] for key in keys)):
+                arguments = _arguments(kind, name, owned, dict(zip(keys, values, strict=True)))
+                try:
+                    found[name](**arguments)
+                except ValueError as error:
+                    raise UserError(f"{kind} {name!r}: {message(error)}") from error
 
     def _parameters(self, kind: Kind, names: Sequence[str]) -> dict[str, dict[str, Parameter]]:
         """The parameters of the components that can be loaded."""
@@ -222,14 +262,17 @@ class Options:
     def threats(self) -> list[ThreatModel]:
         """The threat models: every combination of the given values. A suite needs the access of its members by default."""
         model = self.chosen("victim")[0].component.threat
-        owned = parameters(model)
         if self.suites and "threat.access" not in self.values:
             self.values["threat.access"] = (max((suite.access for suite in self.suites), key=get_args(Access).index),)
+        return self._threats(model, self.track)
+
+    def _threats(self, model: type[ThreatModel], track_name: str) -> list[ThreatModel]:
+        owned = parameters(model)
         keys = [key for key in self.values if key.startswith("threat.")]
         names = [key.removeprefix("threat.") for key in keys]
         if strange := [key for key, name in zip(keys, names, strict=True) if name not in owned]:
             known = [f"threat.{name}" for name in owned]
-            raise UserError(registry.unknown(f"key {strange[0]!r} of the {self.track} track", strange[0], known))
+            raise UserError(registry.unknown(f"key {strange[0]!r} of the {track_name} track", strange[0], known))
         found = []
         for values in itertools.product(*(self.values[key] for key in keys)):
             given = dict(zip(names, values, strict=True))

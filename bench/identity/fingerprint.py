@@ -8,7 +8,7 @@ import importlib.util
 import json
 import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import metadata
@@ -78,14 +78,37 @@ def code_digest(modules: tuple[str, ...]) -> str:
     return digest({name: _code(path) for name, path in sources(modules).items()})
 
 
-@cache
 def _code(path: Path) -> str:
     """sha256 of the syntax tree of a file, without docstrings."""
+    return _parsed(path)[0]
+
+
+Import = ast.Import | ast.ImportFrom
+
+
+@cache
+def _parsed(path: Path) -> tuple[str, tuple[Import, ...]]:
+    """sha256 of the syntax tree of a file, without docstrings; and its imports. Parsing a file takes as long as importing it."""
     tree = ast.parse(path.read_bytes())
+    imports = tuple(_imports_of(tree, path))
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             node.body = [kept for kept in node.body if not _is_text(kept)] or [ast.Pass()]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), imports
+
+
+def _imports_of(tree: ast.AST, path: Path) -> Iterator[Import]:
+    """The import statements of a file, but for those of types alone."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        # What types alone need is never executed; a package may import it when it is first used (`cavbench.exports`).
+        for_types = isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        skipped = for_types and path.name != "__init__.py"
+        inside = node.orelse if skipped and isinstance(node, ast.If) else ast.iter_child_nodes(node)
+        waiting += [child for child in inside if isinstance(child, STATEMENTS)]
+        if isinstance(node, Import):
+            yield node
 
 
 def _is_text(node: ast.stmt) -> bool:
@@ -143,17 +166,10 @@ def _imports(module: str, path: Path) -> tuple[str, ...]:
     """Every name in the import statements of a module, whether it names a module or not."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     found: list[str] = []
-    waiting: list[ast.AST] = [ast.parse(path.read_bytes())]
-    while waiting:
-        node = waiting.pop()
-        # What types alone need is never executed; a package may import it when it is first used (`cavbench.exports`).
-        for_types = isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-        skipped = for_types and path.name != "__init__.py"
-        inside = node.orelse if skipped and isinstance(node, ast.If) else ast.iter_child_nodes(node)
-        waiting += [child for child in inside if isinstance(child, STATEMENTS)]
+    for node in _parsed(path)[1]:
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
+        else:
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
             found += [base, *(f"{base}.{alias.name}" for alias in node.names)]
     return tuple(found)

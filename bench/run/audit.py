@@ -31,7 +31,7 @@ class Audit:
     salt: int
 
 
-def audit_of(words: Sequence[str], start: Callable[[], None] = lambda: None) -> Audit:
+def audit_of(words: Sequence[str], start: Callable[[str], None] = lambda executor: None) -> Audit:
     """The audit with these words: those of `bench run`, and `salt=NUMBER` to repeat or continue an audit.
 
     Args:

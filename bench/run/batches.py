@@ -22,7 +22,8 @@ def batches(tasks: Sequence[Task], recorded: Collection[str], workers: int) -> l
     """
     alike: dict[object, list[Task]] = {}
     for place, task in enumerate(tasks):
-        single = task.step != "drive" or task.unit.fingerprint in recorded
+        # A fingerprint reads the code of all components.
+        single = task.step != "drive" or bool(recorded and task.unit.fingerprint in recorded)
         key = None if single else task.unit.track.alike(task.unit.job)
         alike.setdefault(place if key is None else key, []).append(task)
     most = max(1, len(tasks) // (TASKS * workers))

@@ -56,12 +56,12 @@ class TrainConfig:
         return next((part for part in (self.attack, self.defense) if part.name != "none"), self.victim)
 
 
-def plan_of(words: Sequence[str], start: Callable[[], None] = lambda: None) -> Plan:
+def plan_of(words: Sequence[str], start: Callable[[str], None] = lambda executor: None) -> Plan:
     """The plan of `bench run` with these words.
 
     Args:
         words: options, each `key=value`.
-        start: called when all names are known, before the first component is imported, which takes seconds.
+        start: called with the executor when all names are known, before the first component is imported, which takes seconds.
 
     Raises:
         UserError: if an option cannot be parsed or is not allowed.
@@ -70,8 +70,9 @@ def plan_of(words: Sequence[str], start: Callable[[], None] = lambda: None) -> P
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     given = Options(words, kinds=KINDS, settings=RunOptions, axes=list(axes))
     given.check_names()
-    start()
+    given.check_outlines()
     settings = given.settings()
+    start(settings["executor"])
     if settings["executor"] != "ray" and any(key.startswith("ray.") for key in given.values):
         raise UserError("ray.address is of executor=ray: add executor=ray, or leave it out")
     with _one_line():
@@ -170,7 +171,7 @@ def grid_of(chosen: Chosen[Any], name: str | None) -> Grid:
     return registry.grid(name)
 
 
-def training_of(words: Sequence[str], start: Callable[[], None] = lambda: None) -> TrainConfig:
+def training_of(words: Sequence[str], start: Callable[[str], None] = lambda executor: None) -> TrainConfig:
     """What `bench train` trains with these words; arguments as in `plan_of`.
 
     Raises:
@@ -178,7 +179,8 @@ def training_of(words: Sequence[str], start: Callable[[], None] = lambda: None) 
     """
     given = Options(words, kinds=KINDS, settings=TrainOptions)
     given.check_names()
-    start()
+    given.check_outlines()
+    start("")
     settings = given.settings()
     one: dict[Kind, Chosen[Any]] = {}
     for kind in given.kinds:

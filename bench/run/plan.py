@@ -16,6 +16,7 @@ from cavbench.core.track import Track, track_of
 from cavbench.errors import short
 from cavbench.identity.fingerprint import canonical
 from cavbench.records.schema import SEQUENTIAL
+from cavbench.run.cost import Cost, cost_of
 from cavbench.run.gates import Gates
 from cavbench.run.networks import Weights, hashes
 from cavbench.run.options import EXECUTORS, half_of_memory
@@ -146,6 +147,11 @@ class Plan:
         parts = [(grid.first_seed + start, min(SCENARIOS, grid.episodes - start)) for start in first]
         grids = [replace(grid, name=SEQUENTIAL, first_seed=seed, episodes=count) for seed, count in parts]
         return tuple(replace(self, grid=part) for part in grids)
+
+    @cached_property
+    def cost(self) -> Cost:
+        """What it will cost, known before it does anything."""
+        return cost_of(self)
 
     def units(self, weights: Weights | None = None) -> list[Unit]:
         """The distinct units, or those of the shard, whose networks could be loaded.

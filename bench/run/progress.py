@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -16,16 +17,19 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.progress import Task as BarTask
 from rich.table import Column
 from rich.text import Text
 
 from cavbench.terminal import Console
 
 if TYPE_CHECKING:
+    from cavbench.run.forecast import Forecast
     from cavbench.run.task import Task
 
 PRINTED_LINES = 5
 """Lines of a unit's output that are shown."""
+MINUTE = 60.0
 
 
 class OnTerminal:
@@ -46,33 +50,65 @@ class OnTerminal:
             self.bar.stop()
 
 
+class LeftColumn(ProgressColumn):
+    """The time that is left, by a forecast."""
+
+    forecast: Forecast | None = None
+    max_refresh = 1.0
+
+    def render(self, task: BarTask) -> Text:
+        return Text("-:--:--" if self.forecast is None else clock(self.forecast.left), style="progress.remaining")
+
+
 class RunProgress(OnTerminal):
-    """Shows the progress of a run (`cavbench.run.runner.RunWatcher`): a bar on a terminal, one line per finished unit elsewhere.
+    """Shows the progress of a run (`cavbench.run.runner.RunWatcher`): a bar on a terminal, one line a minute elsewhere.
 
     Args:
         console: console to draw on; standard error, so that tables can be piped.
+        permit: is asked with the seconds that the run takes, and may raise UserError.
+        now: a clock in seconds.
     """
 
-    def __init__(self, console: Console) -> None:
-        self.console = console
-        self.bar = bar(console, MofNCompleteColumn())
+    def __init__(
+        self,
+        console: Console,
+        permit: Callable[[float], None] = lambda seconds: None,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.console, self.permit, self.now = console, permit, now
+        self.left = LeftColumn()
+        self.bar = bar(console, MofNCompleteColumn(), left=self.left)
+        self.started = self.said = now()
         self.task = self.bar.add_task("starting", total=None)
         self.total = self.done = 0
         self.working_on: dict[str, str] = {}
         self.under_way: dict[str, float] = {}
 
-    def begin(self, *, episodes: int, finished: int) -> None:
+    def begin(self, *, episodes: int, finished: int, forecast: Forecast | None = None) -> None:
         self.total, self.done = episodes, finished
+        self.left.forecast = forecast
         self.bar.reset(self.task, total=episodes, completed=finished, description="")
         if finished:
             self.console.print(f"{finished} of {episodes} episodes are already done", style="dim", highlight=False)
+        if forecast is not None:
+            # Nobody can answer while a bar is drawn.
+            if self.console.is_terminal:
+                self.bar.stop()
+            self.permit(forecast.left)
+            self.__enter__()
+        self.started = self.said = self.now()
 
     def working(self, tasks: Sequence[Task]) -> None:
+        if self.left.forecast is not None:
+            self.left.forecast.working(tasks)
         self.working_on = {str(task): self.working_on.get(str(task), "") for task in tasks}
         self.under_way = {task: done for task, done in self.under_way.items() if task in self.working_on}
         self._describe()
 
     def preparing(self, task: str, share: float, text: str, episodes: int = 0) -> None:
+        if self.left.forecast is not None:
+            self.left.forecast.reached(task, share)
+        self._say()
         if episodes:
             self.under_way[task] = share * episodes
             self._advance()
@@ -84,10 +120,21 @@ class RunProgress(OnTerminal):
         # A preparation drives no episodes.
         self.done += len(task.unit.seeds) if task.step == "drive" else 0
         self.under_way.pop(str(task), None)
+        if self.left.forecast is not None:
+            self.left.forecast.finished(task, wall_s)
         self._advance()
-        if not self.console.is_terminal:
-            line = f"{self.done}/{self.total} episodes | {task} | {wall_s:.1f} s"
-            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+        self._say(last=self.done == self.total)
+
+    def _say(self, *, last: bool = False) -> None:
+        """Print where the run is, if this is no terminal: once a minute, and at the end."""
+        if self.console.is_terminal or not (last or self.now() - self.said >= MINUTE):
+            return
+        self.said = self.now()
+        left = "" if last or self.left.forecast is None else f" | {clock(self.left.forecast.left)} left"
+        working = next(iter(self.working_on), "")
+        line = f"{self.done}/{self.total} episodes | {clock(self.now() - self.started)}{left}"
+        line += f" | {working}" if working and not last else ""
+        self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def printed(self, task: Task, lines: Sequence[str]) -> None:
         shown = [*lines[:PRINTED_LINES], *(["…"] if len(lines) > PRINTED_LINES else [])]
@@ -111,15 +158,21 @@ class RunProgress(OnTerminal):
         self.console.print(Text(f"warning: {line}", style="yellow"), soft_wrap=True)
 
 
-def bar(console: Console, *counts: ProgressColumn) -> Progress:
-    """A bar with these columns between what is done and the time."""
+def clock(seconds: float) -> str:
+    """A time as H:MM:SS."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+
+
+def bar(console: Console, *counts: ProgressColumn, left: ProgressColumn | None = None) -> Progress:
+    """A bar with these columns between what is done and the time; `left` is the time that is left."""
     return Progress(
         SpinnerColumn(),
         BarColumn(bar_width=16),
         *counts,
         TimeElapsedColumn(),
         TextColumn("ETA"),
-        TimeRemainingColumn(),
+        left or TimeRemainingColumn(),
         # Only the description gives way on a narrow terminal.
         TextColumn("{task.description}", markup=False, table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
         console=console,

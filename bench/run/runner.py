@@ -15,6 +15,7 @@ from cavbench.run.batches import batches
 from cavbench.run.executor import Executor, Finished
 from cavbench.run.executors import EXECUTORS
 from cavbench.run.failures import Failures
+from cavbench.run.forecast import Forecast
 from cavbench.run.loading import LoadWatcher, load
 from cavbench.run.plan import Plan
 from cavbench.run.results import Results
@@ -26,8 +27,12 @@ from cavbench.run.unit import Unit
 class RunWatcher(LoadWatcher, Protocol):
     """Receives the progress of a run."""
 
-    def begin(self, *, episodes: int, finished: int) -> None:
-        """The run has `episodes` in total, of which `finished` already have records."""
+    def begin(self, *, episodes: int, finished: int, forecast: Forecast) -> None:
+        """The run has `episodes` in total, of which `finished` already have records; `forecast` says what the others take.
+
+        Raises:
+            UserError: if they shall not be driven.
+        """
 
     def finished(self, task: Task, wall_s: float) -> None:
         """A task of one unit is finished and its outcome written; it took `wall_s` seconds."""
@@ -65,7 +70,8 @@ def run(plan: Plan, watcher: RunWatcher, choose: Choice | None = None) -> list[s
         driving.finished |= results.finished(units)
         episodes = {key: len(unit.seeds) for key, unit in units.items()}
         done = sum(episodes[key] for key in driving.finished)
-        watcher.begin(episodes=sum(episodes.values()), finished=done)
+        forecast = driving.forecast(list(units.values()))
+        watcher.begin(episodes=sum(episodes.values()), finished=done, forecast=forecast)
         if plan.until is None:
             driving.carry_out(list(units.values()))
             wanted = list(units)
@@ -112,6 +118,14 @@ class _Driving:
         self.watcher, self.failures = watcher, failures
         self.finished: set[str] = set()
         self._warned: set[str] = set()
+
+    def forecast(self, units: Sequence[Unit]) -> Forecast:
+        """What the units that are not finished take, with what is prepared for them."""
+        waiting = [unit for unit in units if unit.fingerprint not in self.finished]
+        absent = {unit.artefact: Task(unit=unit, step="prepare") for unit in waiting if self.results.lacks(unit)}
+        return Forecast(
+            [*absent.values(), *(Task(unit=unit) for unit in waiting)], self.back_end.size, recorded=self.recorded
+        )
 
     def carry_out(self, units: Sequence[Unit]) -> set[str]:
         """Prepare what is missing, drive the units that are not finished, and return the fingerprints of those that are now."""

@@ -15,13 +15,10 @@ import tempfile
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from functools import cache
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from cavbench import files
-from cavbench.core import registry
-from cavbench.core.track import track
 from cavbench.errors import reason
 from cavbench.isolation.foreign import contained, ended
 from cavbench.isolation.framework import Snapshot
@@ -29,12 +26,12 @@ from cavbench.isolation.settings import Settings
 from cavbench.run import tree
 from cavbench.run.attempt import attempt
 from cavbench.run.blame import blamed
-from cavbench.run.process import children, context, follow_parent, settle
+from cavbench.run.process import children, follow_parent, settle
+from cavbench.run.server import server, work_modules
 from cavbench.run.task import Limits, Outcome, Task, Tell
 
 GB = 1e9
 READY = "ready"
-RANGES = "cavbench.envs.highway.world"
 START_S = 600.0
 """Seconds that a worker may take to start: on a busy machine its imports take long."""
 KEPT_BYTES = 8192
@@ -51,7 +48,7 @@ class Worker:
     """
 
     def __init__(self, limits: Limits) -> None:
-        own = context(__name__, *work_modules())
+        own = server()
         self.limits = limits
         self.busy = self.ready = self.spent = False
         self.heard, self.printed = True, b""
@@ -244,19 +241,6 @@ def _left(before: tuple[frozenset[int], int]) -> bool:
     except OSError:
         return True
     return processes != before[0] or threads > before[1]
-
-
-@cache
-def work_modules() -> tuple[str, ...]:
-    """The modules that do the work of the built-in tracks, and those with the ranges of the driving world's features.
-
-    What is imported before any plug-in can be compared with what plug-ins leave of it.
-    """
-    names = [
-        name for name, claims in registry.entries(registry.TRACKS).items() if claims[0].distribution == registry.OWN
-    ]
-    work = [module for name in names for module in (track(name).work, track(name).preparation) if module]
-    return (*work, RANGES)
 
 
 def _carried_out(content: bytes, tell: Tell, before: Snapshot) -> Outcome:

@@ -31,7 +31,7 @@ class Warned:
         self.failures: list[str] = []
         self.said: list[str] = []
 
-    def begin(self, *, episodes: int, finished: int) -> None:
+    def begin(self, *, episodes: int, finished: int, forecast: object) -> None:
         pass
 
     def working(self, tasks: Sequence[Task]) -> None:

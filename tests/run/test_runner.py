@@ -44,7 +44,7 @@ class Silent:
         self.said: list[str] = []
         self.stop_after = stop_after
 
-    def begin(self, *, episodes: int, finished: int) -> None:
+    def begin(self, *, episodes: int, finished: int, forecast: object) -> None:
         self.episodes, self.there = episodes, finished
 
     def working(self, tasks: Sequence[Task]) -> None:
