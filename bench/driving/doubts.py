@@ -79,7 +79,7 @@ def _too_fast(name: str, part: Any, pair: Pair, facts: DrivingFacts) -> Iterator
     if (slowest := facts.kinematics.target_speeds[0]) > needed:
         yield (
             f"{name} brakes by SLOWER, which ends at {slowest:g} m/s in this world; it was made for {needed:g} m/s and crashes "
-            "into slower traffic without any attack: give world.target_speeds a lower first speed"
+            f"into slower traffic without any attack: {pair.world.component.brakes_by}"
         )
 
 
