@@ -107,7 +107,8 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
         "sb3",
         lambda path: saved(path, "ppo", spaces(continuous=False, seen=np.inf)),
         "was trained on Box(-inf, inf, (10, 5)), this world shows Box(-1, 1, (10, 5)). It is highway-env's: score it in its own "
-        "task, world=highway-fast-v0 or world=highway-v0, with 'world.config={observation: {type: Kinematics, vehicles_count: 10}}'",
+        "task, world=highway-fast-v0 or world=highway-v0, with 'world.config={observation: "
+        "{type: Kinematics, vehicles_count: 10}}'",
     ),
     "two frames": (
         "sb3",
