@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from cavbench.driving import Control, DrivingFacts, Features
 from cavbench.envs.highway.axes import AXES, FAST_V0, HIGHWAY_V0
 from cavbench.envs.highway.config import FLOORS, THESIS_TARGET_SPEEDS, UNITS, HighwayConfig
+from cavbench.envs.highway.keys import AXES as AXES_THERE
 from cavbench.envs.highway.keys import decisions, fields_of, parsed
 from cavbench.envs.highway.road import Backend, StraightRoad
 from cavbench.identity.fingerprint import canonical
@@ -42,6 +43,7 @@ class HighwayTask(StraightRoad):
     defaults: ClassVar[Mapping[str, Any]]
     """Fields of `HighwayConfig` that differ from those of all tasks; `duration` in seconds."""
     config: Mapping[str, Any] | str
+    _fields: Mapping[str, Any]
 
     def __post_init__(self) -> None:
         given = parsed(self.config)
@@ -60,8 +62,8 @@ class HighwayTask(StraightRoad):
         import highway_env
 
         gymnasium.register_envs(highway_env)
-        given = parsed(self.config) | {"lanes_count": cell.lanes, "vehicles_density": cell.density}
-        return gymnasium.make(self.name, config=given)
+        axes = {key: cell[axis] for key, axis in AXES_THERE.items() if cell[axis] != self.home[axis]}
+        return gymnasium.make(self.name, config=parsed(self.config) | axes)
 
     @property
     def observed_rows(self) -> int:

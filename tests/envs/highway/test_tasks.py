@@ -184,6 +184,20 @@ def test_a_policy_of_highway_env_is_told_where_it_is_at_home() -> None:
         Expected(facts=HighwayFastV0().facts).fit("dqn.zip", (10, 5), Bounds(shape=(10, 5), low=(-1.0,), high=(1.0,)))
 
 
+def test_a_model_that_has_its_environment_says_in_which_task_it_was_trained(tmp_path: Path) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    options = {"lanes": 3, "density": 1, "weather": "clear", "episodes": 1, "baselines": False}
+    found = []
+    for number, config in enumerate(({}, {"lanes_count": 4}, {"duration": 20})):
+        model = sb3.PPO("MlpPolicy", gymnasium.make("highway-fast-v0", config=config), n_steps=4, batch_size=4, seed=0)
+        model.learn(4)
+        cavbench.score(model, "none", world="highway-fast-v0", out=tmp_path / str(number), **options)
+        records = reading.read(tmp_path / str(number), track=track("driving"))
+        found.append(json.loads(records["victim_params"][0].as_py())["trained_in"])
+    # Another road than those of the run is told, too.
+    assert found == ["highway-fast-v0", "highway-fast-v0(lanes_count=4)", "highway-fast-v0(duration=20)"]
+
+
 def test_a_preset_of_that_name_leads_to_the_world() -> None:
     with pytest.raises(ValueError, match=r"highway-env's own tasks are worlds: world=highway-fast-v0$"):
         HighwayWorld(preset="highway-fast-v0")  # type: ignore[arg-type]
