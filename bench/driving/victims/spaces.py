@@ -171,7 +171,7 @@ class Expected:
                 whose = (
                     "; if its environment had another number of rows, write"
                     if facts.unbounded
-                    else (". It is highway-env's: score it in its own task,")
+                    else (". A policy of highway-env's own tasks is scored in its task:")
                 )
                 return f"{name} {takes}, this world shows {wanted}{whose} {home}"
             why = "; highway-env's own tasks (Box(-inf, inf, …)) have other ranges, rows, order and decision rate"
