@@ -166,14 +166,12 @@ class Expected:
             source = facts.environment or "the environment that cavbench.gym.make makes of this world"
         takes = f"was trained on {bounds}" if bounds is not None else f"takes observations {shape}"
         why = ""
-        if bounds is not None and bounds.unbounded and not facts.flat:
-            if home := _home(shape, facts):
-                whose = (
-                    "; if its environment had another number of rows, write"
-                    if facts.unbounded
-                    else (". A policy of highway-env's own tasks is scored in its task:")
-                )
-                return f"{name} {takes}, this world shows {wanted}{whose} {home}"
+        elsewhere = bounds is not None and bounds.unbounded and not facts.flat
+        if elsewhere and (home := _home(shape, facts)):
+            whose = ". A policy of highway-env's own tasks is scored in its task:"
+            whose = "; if its environment had another number of rows, write" if facts.unbounded else whose
+            return f"{name} {takes}, this world shows {wanted}{whose} {home}"
+        if elsewhere and not facts.unbounded:
             why = "; highway-env's own tasks (Box(-inf, inf, …)) have other ranges, rows, order and decision rate"
         elif frames := self._frames(shape):
             why = f"; if these are {frames} frames, add victim.frames={frames} to victim=sb3"
