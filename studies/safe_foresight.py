@@ -62,7 +62,7 @@ class Foresight:
 
 def driven(cell: Cell, episodes: int, budget: float, foresight: bool) -> tuple[float, float]:
     """Mean `safe_progress` and share of crashes of the episodes of a cell."""
-    engine = HighwayEngine(WORLD.config((cell,) * episodes))
+    engine = HighwayEngine(WORLD.configuration((cell,) * episodes))
     engine.reset(np.arange(episodes), SeedBlock.TUNE + np.arange(episodes))
     policy = Planner(assumed_budget=budget).load(0, WORLD.facts)
     assert isinstance(policy, IntervalPlanner)

@@ -136,6 +136,10 @@ class World(Component):
         """
         return ""
 
+    def facts_at(self, cell: Any) -> Facts:
+        """The facts in a cell, where they depend on it: a range may follow from the number of lanes."""
+        return self.facts
+
     def doubts(self, cells: Sequence[Any]) -> Sequence[str]:
         """What makes scores in these cells doubtful, one line each; a run says it before it drives. It may take seconds.
 

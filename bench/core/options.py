@@ -446,7 +446,9 @@ def _omegaconf_type(hint: Any) -> Any:
     if origin is Literal:
         return type(arguments[0])
     if origin in (Union, types.UnionType):
-        return Union[tuple(_omegaconf_type(argument) for argument in arguments)]  # noqa: UP007
+        # OmegaConf knows no union with a container.
+        found = tuple(_omegaconf_type(argument) for argument in arguments)
+        return Any if Any in found else Union[found]  # noqa: UP007
     if origin in (tuple, list):
         return list[_omegaconf_type(arguments[0])]  # type: ignore[misc]
     plain = isinstance(hint, type) and issubclass(hint, (bool, int, float, str, Path, Enum, types.NoneType))

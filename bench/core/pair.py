@@ -18,6 +18,7 @@ from cavbench.errors import PluginError, UserError, message, reason
 from cavbench.identity.fingerprint import canonical, digest, state_digest
 from cavbench.isolation.foreign import contained, unchanged
 from cavbench.isolation.framework import OWN
+from cavbench.scenarios import Cell
 
 IN_PROCESS = "a Python process"
 """What records say of a component that no package ships."""
@@ -184,10 +185,11 @@ class Pair:
         """The same victim and defence without the attack: the clean control."""
         return replace(self, attack=choose("attack", "none"), threat=type(self.threat).of_nobody())
 
-    def load(self, training_seed: int) -> Any:
-        """The defended network of a training seed."""
+    def load(self, training_seed: int, cell: Cell | None = None) -> Any:
+        """The defended network of a training seed, for a cell of its world if one is given."""
         # Plug-ins get copies: what they do to them reaches neither the run nor the world.
-        facts = copy.deepcopy(self.world.component.facts)
+        world = self.world.component
+        facts = copy.deepcopy(world.facts if cell is None else world.facts_at(cell))
         return self.defense.component.load(copy.copy(self.victim.component), training_seed, facts)
 
     def armed(self, training_seed: int) -> Attack:

@@ -42,6 +42,8 @@ class DrivingWorld(World):
     """Number of decisions in an episode that is not terminated early."""
     drivers: ClassVar[tuple[Driver, ...]] = ("agent",)
     """The values of `driver` that `make` supports."""
+    brakes_by: ClassVar[str] = "give world.target_speeds a lower first speed"
+    """What a user does so that SLOWER ends at a lower speed."""
 
     @property
     @abstractmethod
@@ -73,6 +75,10 @@ class DrivingWorld(World):
             kinematics=self.kinematics,
             rows=self.observed_rows,
         )
+
+    def facts_at(self, cell: Cell) -> DrivingFacts:
+        """The facts in a cell, where they depend on it. Cells with different facts are driven in different batches."""
+        return self.facts
 
     @abstractmethod
     def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:

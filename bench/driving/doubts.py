@@ -15,6 +15,7 @@ from cavbench.core.chain import Chain
 from cavbench.core.names import MARK
 from cavbench.core.options import configured
 from cavbench.core.pair import Pair
+from cavbench.driving.contracts import DrivingWorld
 from cavbench.driving.features import DrivingFacts, Features
 from cavbench.errors import UserError
 
@@ -29,11 +30,11 @@ def doubts(pair: Pair, default_world: str) -> Iterator[str]:
         pair: a pair of the driving track.
         default_world: name of the world that drivers are trained in if nothing else is said.
     """
-    facts: Any = pair.world.component.facts
+    world: Any = pair.world.component
     for name, part in _named(pair):
-        yield from _too_fast(name, part, pair, facts)
+        yield from _too_fast(name, part, pair, world)
         if _in_zoo(part, pair):
-            yield from _trained_elsewhere(name, part, facts, default_world)
+            yield from _trained_elsewhere(name, part, world.facts, default_world)
 
 
 def other_features(pair: Pair, default_world: str) -> str:
@@ -70,16 +71,17 @@ def _named(pair: Pair) -> list[tuple[str, Any]]:
     return [(pair.victim.name, pair.victim.component), *zip(pair.defense.name.split(MARK), links, strict=False)]
 
 
-def _too_fast(name: str, part: Any, pair: Pair, facts: DrivingFacts) -> Iterator[str]:
+def _too_fast(name: str, part: Any, pair: Pair, world: DrivingWorld) -> Iterator[str]:
     """Drivers and filters that brake by SLOWER need a target speed that is low enough."""
     victim: Any = pair.victim.component
+    facts = world.facts
     needed = getattr(part, "brakes_to", None)
     if needed is None or facts.kinematics is None or victim.action_type != "discrete":
         return
     if (slowest := facts.kinematics.target_speeds[0]) > needed:
         yield (
-            f"{name} brakes by SLOWER, which ends at {slowest:g} m/s in this world; it was made for {needed:g} m/s and crashes "
-            "into slower traffic without any attack: give world.target_speeds a lower first speed"
+            f"{name} brakes by SLOWER, which ends at {slowest:g} m/s in this world; it was made for {needed:g} m/s and can "
+            f"crash into slower traffic without any attack: {world.brakes_by}"
         )
 
 

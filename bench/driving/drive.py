@@ -69,11 +69,11 @@ def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
     with Stream("load", first.attack_seed).in_use():
         cells = [job.cell for job in jobs for _ in job.seeds]
         # Before any code of the attack or the defence runs, which could change what these are made from.
-        facts, threat, declared = deepcopy(world.facts), deepcopy(pair.threat), _declared(pair)
+        facts, threat, declared = deepcopy(world.facts_at(first.cell)), deepcopy(pair.threat), _declared(pair)
         env = world.make(cells, action_type=declared.action_type, driver=declared.driver)
         try:
             dynamics = world.dynamics(cells, declared.action_type)
-            policy, attack = _checked(pair.load(first.training_seed), pair), pair.armed(first.training_seed)
+            policy, attack = _checked(pair.load(first.training_seed, first.cell), pair), pair.armed(first.training_seed)
             policy = placed(policy, first.device)
             columns = rollout(
                 env,

@@ -121,6 +121,7 @@ class DrivingFacts(Facts):
         limits: the lowest and the highest value of each of its entries, in that environment; empty if nobody asked.
         rows: V, the number of rows in its observations; None if the world does not say.
         controls: names of the controls of a continuous action, each in [-1, 1]; empty if it takes none.
+        unbounded: whether the world's own environment declares Box(-inf, inf) for values in [-1, 1], as highway-env does.
         environment: the call that makes the world's gymnasium environment, for messages; empty if the world does not say.
     """
 
@@ -132,6 +133,7 @@ class DrivingFacts(Facts):
     limits: tuple[tuple[float, float], ...] = ()
     rows: int | None = None
     controls: tuple[str, ...] = CONTROLS
+    unbounded: bool = False
     environment: str = ""
 
     def native(self, observation: Tensor) -> Tensor:
@@ -173,7 +175,7 @@ class DrivingFacts(Facts):
             "drivers": list(self.drivers),
         }
         # No report reads them.
-        for name in ("kinematics", "shape", "limits", "rows", "environment"):
+        for name in ("kinematics", "shape", "limits", "rows", "unbounded", "environment"):
             del values[name]
         # As in records from before it.
         if self.controls in (CONTROLS, ()):

@@ -228,7 +228,8 @@ class DrivingTrack(Track):
     def alike(self, job: Job) -> Hashable | None:
         from cavbench.driving.drive import joint
 
-        return (job.pair.id, job.training_seed, job.seeds) if joint(job.pair) else None
+        features = _parts(job.pair)[1].facts_at(job.cell).features
+        return (job.pair.id, job.training_seed, job.seeds, features) if joint(job.pair) else None
 
     def drive_jointly(self, jobs: Sequence[Job], artefacts: Mapping[str, bytes]) -> Sequence[Driven] | None:
         from cavbench.driving.drive import drive_jointly
@@ -238,13 +239,13 @@ class DrivingTrack(Track):
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         from cavbench.driving.recording import save
 
-        save(trace, facts=_parts(job.pair)[1].facts, meta=meta, path=path)
+        save(trace, facts=_parts(job.pair)[1].facts_at(job.cell), meta=meta, path=path)
 
     def film(self, job: Job, trace: Any, meta: Mapping[str, object]) -> Film:
         from cavbench.driving.recording.episode import Episode
         from cavbench.driving.recording.film import EpisodeFilm
 
-        return EpisodeFilm(Episode.of(trace, _parts(job.pair)[1].facts, meta))
+        return EpisodeFilm(Episode.of(trace, _parts(job.pair)[1].facts_at(job.cell), meta))
 
 
 def _parts(pair: Pair) -> tuple[DrivingVictim, DrivingWorld]:

@@ -204,7 +204,7 @@ class Unit:
             **pair.threat.columns,
             "grid": self.grid,
             "cell": json.dumps(dict(self.cell), separators=(",", ":")),
-            "world_facts": json.dumps(pair.world.component.facts.written(), separators=(",", ":")),
+            "world_facts": json.dumps(pair.world.component.facts_at(self.cell).written(), separators=(",", ":")),
             **{f"{part.kind}_shipped_by": part.shipped_by for part in pair.parts},
             "weights_sha256": self.weights_sha256,
             "code_digest": self.code_digest,

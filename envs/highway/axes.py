@@ -35,3 +35,25 @@ STANDARD_V2 = Grid(
     training_seeds=10,
 )
 """The split between trainings and scenarios that makes intervals narrow at its cost (docs/statistics.md)."""
+
+HIGHWAY_V0 = Grid(
+    name="highway-env-v1",
+    world="highway-v0",
+    axes=AXES,
+    values={"lanes": (3, 4, 5), "density": (1.0, 1.5), "weather": ("clear", "rain", "fog")},
+    episodes=30,
+    block=10,
+    training_seeds=10,
+)
+"""highway-env's `highway-v0`, whose own road is lanes=4 density=1 weather=clear, and roads around it."""
+
+FAST_V0 = Grid(
+    name="highway-env-fast-v1",
+    world="highway-fast-v0",
+    axes=AXES,
+    values={"lanes": (3, 4, 5), "density": (1.0, 1.5), "weather": ("clear", "rain", "fog")},
+    episodes=30,
+    block=10,
+    training_seeds=10,
+)
+"""highway-env's `highway-fast-v0`, whose own road is lanes=3 density=1 weather=clear, and roads around it."""

@@ -141,10 +141,10 @@ def collide(
 
 
 @inner
-def find_collisions(vehicles: Vehicles, order: Integers, dt: float, corners: Floats) -> None:
+def find_collisions(vehicles: Vehicles, order: Integers, dt: float, others: bool, corners: Floats) -> None:
     """The second half of Road.step: test every pair that is close enough along the road.
 
-    `corners` [2, 5, 2] is a work array.
+    Pairs without the ego are tested if `others` collide, too (RoadObject.check_collisions). `corners` [2, 5, 2] is a work array.
     """
     fastest = 0.0
     for number in range(vehicles.size):
@@ -157,4 +157,6 @@ def find_collisions(vehicles: Vehicles, order: Integers, dt: float, corners: Flo
             other = order[ahead]
             if vehicles[other].x > limit:
                 break
+            if not others and number != 0 and other != 0:
+                continue
             collide(vehicles, min(number, other), max(number, other), dt, corners[0], corners[1])

@@ -78,10 +78,14 @@ class HighwayConfig:
         target_speeds: increasing speeds in m/s for FASTER and SLOWER; highway-env assumes that they are uniform.
         features: observed features and the fixed ranges that map to [-1, 1].
         observed_vehicles: number of rows in an observation, including the ego; at least 2.
+        lane_range: whether y ends at the width of the road, 4 m times its lanes, in place of the range in `features`: highway-env
+            without a `features_range`.
         collision_reward, right_lane_reward, high_speed_reward: weights of highway-env's reward.
         reward_speed_range: speeds in m/s at which the speed reward is 0 and 1.
         normalize_reward: map the reward to [0, 1] like highway-env.
         offroad_terminal: whether leaving the road ends the episode.
+        others_collide: whether the traffic crashes into itself; in `highway-fast-v0` only the ego collides.
+        start_lane: number of the lane in which the ego starts; None to draw it.
 
     Raises:
         ValueError: if a value is not allowed; the message is one line with the allowed values.
@@ -99,12 +103,15 @@ class HighwayConfig:
     target_speeds: tuple[float, ...] = STANDARD_TARGET_SPEEDS
     features: Features = STANDARD_FEATURES
     observed_vehicles: int = 10
+    lane_range: bool = False
     collision_reward: float = -1.0
     right_lane_reward: float = 0.1
     high_speed_reward: float = 0.4
     reward_speed_range: tuple[float, float] = (20.0, 30.0)
     normalize_reward: bool = True
     offroad_terminal: bool = True
+    others_collide: bool = True
+    start_lane: int | None = None
 
     def __post_init__(self) -> None:
         _check_counts(self)
@@ -126,6 +133,15 @@ class HighwayConfig:
     def substeps(self) -> int:
         """Physics frames per decision."""
         return self.simulation_frequency // self.policy_frequency
+
+    def features_on(self, lanes: int) -> Features:
+        """The features with their ranges on a road of so many lanes."""
+        if not self.lane_range:
+            return self.features
+        width, place = KINEMATICS["lane_width"] * lanes, self.features.names.index("y")
+        low, high = list(self.features.low), list(self.features.high)
+        low[place], high[place] = -width, width
+        return replace(self.features, low=tuple(low), high=tuple(high))
 
     @classmethod
     def thesis(cls, **changes: object) -> HighwayConfig:
@@ -165,6 +181,11 @@ def _check_counts(config: HighwayConfig) -> None:
         )
     if config.max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {config.max_steps}")
+    if config.start_lane is not None and not 0 <= config.start_lane < min(cell.lanes for cell in config.cells):
+        fewest = min(cell.lanes for cell in config.cells)
+        raise ValueError(
+            f"start_lane must be a lane of every road, from 0 to {fewest - 1} on {fewest} lanes, got {config.start_lane}"
+        )
     if config.action_repeat < 1:
         raise ValueError(f"action_repeat must be at least 1, got {config.action_repeat}")
 

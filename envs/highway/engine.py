@@ -68,7 +68,7 @@ def advance(
         for number in range(vehicles.size):
             move(vehicles[number], lanes, parameters.dt)
         sort_by_position(vehicles, order)
-        find_collisions(vehicles, order, parameters.dt, corners)
+        find_collisions(vehicles, order, parameters.dt, parameters.others_collide, corners)
 
 
 @inner
@@ -135,7 +135,7 @@ def step_batch(
             numbers[PROGRESS, number] = 0.0
             continue
         drive(cars, sequence, episode, actions[number], controls[number], parameters, places, corners)
-        observe(cars, sequence, episode, parameters.low, parameters.high, rows, measured, observation[number])
+        observe(cars, sequence, episode, parameters, rows, measured, observation[number])
         report(cars[0], episode, numbers, flags, number)
 
 
@@ -156,7 +156,7 @@ def observe_batch(
     for number in chosen:
         episode, cars, sequence = episodes[number], vehicles[number], order[number]
         episode.ttc = time_to_collision(cars, sequence)
-        observe(cars, sequence, episode, parameters.low, parameters.high, rows, measured, observation[number])
+        observe(cars, sequence, episode, parameters, rows, measured, observation[number])
         report(cars[0], episode, numbers, flags, number)
 
 

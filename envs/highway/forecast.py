@@ -74,7 +74,7 @@ def roll_batch(
                     for number in range(count):
                         move(vehicles[number], road, parameters.dt)
                     sort_by_position(vehicles, sequence)
-                    find_collisions(vehicles, sequence, parameters.dt, corners)
+                    find_collisions(vehicles, sequence, parameters.dt, parameters.others_collide, corners)
                 if ego.crashed or not is_on_lane(ego, ego.lane, 0.0):
                     break
                 share = PROGRESS_LANE * lane_share(ego, road, parameters) + PROGRESS_SPEED * speed_share(
@@ -98,9 +98,8 @@ class HighwayDynamics(Dynamics):
         self.config, self.parameters = config, parameters(config)
         self.action_type, self.period = config.action_type, 1 / config.policy_frequency
         self.actions = len(ACTIONS) if config.action_type == "discrete" else 0
-        features = config.features
-        self._half = (np.array(features.high) - np.array(features.low)) / 2
-        self._centre = (np.array(features.high) + np.array(features.low)) / 2
+        low, high = self.parameters.low, self.parameters.high
+        self._half, self._centre = (high - low) / 2, (high + low) / 2
 
     def unknown(self) -> TensorDict:
         cells = self.config.cells
@@ -117,10 +116,11 @@ class HighwayDynamics(Dynamics):
     def believe(self, observation: Tensor, before: TensorDictBase) -> TensorDict:
         cars, counts = self._records(before)
         normalised = observation.numpy().astype(np.float64)
-        rows = normalised.copy()
-        rows[..., 1:] = normalised[..., 1:] * self._half + self._centre
-        clipped = (np.abs(normalised[..., 1:]) >= 1).any(-1)
         lanes, sensor_range = before["lanes"], before["sensor_range"]
+        half, centre = (table[lanes.numpy()][:, None] for table in (self._half, self._centre))
+        rows = normalised.copy()
+        rows[..., 1:] = normalised[..., 1:] * half + centre
+        clipped = (np.abs(normalised[..., 1:]) >= 1).any(-1)
         track_batch(cars, counts, rows, clipped, lanes.numpy(), sensor_range.numpy(), self.parameters)
         fields = {name: torch.from_numpy(cars[name].astype(np.float64)) for name in FIELDS}
         road = {"lanes": lanes, "sensor_range": sensor_range}

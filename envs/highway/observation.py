@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cavbench.compiled import inner
 from cavbench.envs.highway.dynamics import VEHICLE_LENGTH, clip, linear_map
 from cavbench.envs.highway.sensor import FEATURES, add_noise
-from cavbench.envs.highway.state import Episode, Floats, Integers, Vehicle, Vehicles
+from cavbench.envs.highway.state import Episode, Floats, Integers, Parameters, Vehicle, Vehicles
 
 
 @inner
@@ -76,8 +76,7 @@ def observe(
     vehicles: Vehicles,
     order: Integers,
     episode: Episode,
-    low: Floats,
-    high: Floats,
+    parameters: Parameters,
     rows: Integers,
     measured: Floats,
     observation: NDArray[np.float32],
@@ -87,6 +86,7 @@ def observe(
     `rows` [V - 1] and `measured` [4] are work arrays.
     """
     ego = vehicles[0]
+    low, high = parameters.low[episode.lanes], parameters.high[episode.lanes]
     observation[:] = 0.0
     measure(ego, ego, False, measured)
     write_row(measured, low, high, observation[0])

@@ -31,6 +31,7 @@ LANE_CHANGES = (ACTIONS.index("LANE_LEFT"), ACTIONS.index("LANE_RIGHT"))
 def farama_config(config: HighwayConfig, cell: Cell) -> dict[str, Any]:
     """highway-env's configuration dictionary for `config` and one of its cells."""
     features = config.features
+    ranges = {name: [low, high] for name, low, high in zip(features.names, features.low, features.high, strict=True)}
     discrete: dict[str, Any] = {"type": "DiscreteMetaAction", "target_speeds": list(config.target_speeds)}
     continuous = {"type": "ContinuousAction"}
     return {
@@ -48,9 +49,7 @@ def farama_config(config: HighwayConfig, cell: Cell) -> dict[str, Any]:
             "type": "Kinematics",
             "vehicles_count": config.observed_vehicles,
             "features": ["presence", *features.names],
-            "features_range": {
-                name: [low, high] for name, low, high in zip(features.names, features.low, features.high, strict=True)
-            },
+            "features_range": None if config.lane_range else ranges,
         },
         "collision_reward": config.collision_reward,
         "right_lane_reward": config.right_lane_reward,
@@ -58,6 +57,7 @@ def farama_config(config: HighwayConfig, cell: Cell) -> dict[str, Any]:
         "reward_speed_range": list(config.reward_speed_range),
         "normalize_reward": config.normalize_reward,
         "offroad_terminal": config.offroad_terminal,
+        "initial_lane_id": config.start_lane,
     }
 
 
@@ -101,7 +101,7 @@ class SensedHighwayEnv(FaramaHighwayEnv):
         self.PERCEPTION_DISTANCE = sensor_range_m(weather)
         self.noise_sigma = noise_sigma(weather)
         self.feature_names = config.features.names[:FEATURES]
-        self.idm_ego = config.driver == "idm"
+        self.idm_ego, self.others_collide = config.driver == "idm", config.others_collide
         self.scenario_seed = 0
         self.decisions = 0
         super().__init__(config=farama_config(config, cell), render_mode=render_mode)
@@ -117,6 +117,8 @@ class SensedHighwayEnv(FaramaHighwayEnv):
             ego = IDMVehicle.create_from(self.vehicle)
             self.road.vehicles[0] = ego
             self.controlled_vehicles = [ego]
+        for other in self.road.vehicles[1:]:
+            other.check_collisions = self.others_collide
 
     def start(self, seed: int) -> NDArray[np.float32]:
         """Reset to a scenario and return its observation [V, 5]."""

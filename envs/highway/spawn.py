@@ -110,12 +110,13 @@ def spawn_episode(
     lane_factor: float,
     ego: int,
     target_speeds: Floats,
+    start_lane: int,
 ) -> None:
     """Fill `vehicles` [N], the ego first; each starts ahead of all previous ones (Vehicle.create_random)."""
     cursor = np.array([0, -1], dtype=np.int64)
     furthest = 0.0
     for number in range(vehicles.size):
-        lane = next_below(words, cursor, lanes)
+        lane = np.int64(start_lane) if number == 0 and start_lane >= 0 else next_below(words, cursor, lanes)
         speed, spacing = EGO_SPEED, ego_spacing
         if number > 0:
             speed, spacing = next_uniform(words, cursor, TRAFFIC_SPEED_LOW, TRAFFIC_SPEED_HIGH), traffic_spacing
@@ -161,6 +162,7 @@ def spawn_batch(
             lane_factors[row],
             parameters.ego,
             parameters.target_speeds,
+            parameters.start_lane,
         )
         for place in range(vehicles.shape[1]):
             order[number, place] = place

@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.config import HighwayConfig
 
 
@@ -88,7 +89,7 @@ class Parameters(NamedTuple):
     max_steps: int
     action_repeat: int
     target_speeds: NDArray[np.float64]
-    low: NDArray[np.float64]
+    low: NDArray[np.float64]  # [lanes, feature]: the ranges on a road of so many lanes
     high: NDArray[np.float64]
     collision_reward: float
     right_lane_reward: float
@@ -97,6 +98,8 @@ class Parameters(NamedTuple):
     reward_speed_high: float
     normalize_reward: bool
     offroad_terminal: bool
+    others_collide: bool
+    start_lane: int  # -1 if it is drawn
 
 
 Integers = NDArray[np.int64]
@@ -112,6 +115,7 @@ def ego_kind(config: HighwayConfig) -> EgoKind:
 
 def parameters(config: HighwayConfig) -> Parameters:
     """The configuration for the compiled engine."""
+    ranges = [config.features_on(lanes) for lanes in range(int(AXES["lanes"].high) + 1)]
     return Parameters(
         ego=int(ego_kind(config)),
         substeps=config.substeps,
@@ -119,8 +123,8 @@ def parameters(config: HighwayConfig) -> Parameters:
         max_steps=config.max_steps,
         action_repeat=config.action_repeat,
         target_speeds=np.array(config.target_speeds, dtype=np.float64),
-        low=np.array(config.features.low, dtype=np.float64),
-        high=np.array(config.features.high, dtype=np.float64),
+        low=np.array([features.low for features in ranges], dtype=np.float64),
+        high=np.array([features.high for features in ranges], dtype=np.float64),
         collision_reward=float(config.collision_reward),
         right_lane_reward=float(config.right_lane_reward),
         high_speed_reward=float(config.high_speed_reward),
@@ -128,4 +132,6 @@ def parameters(config: HighwayConfig) -> Parameters:
         reward_speed_high=float(config.reward_speed_range[1]),
         normalize_reward=bool(config.normalize_reward),
         offroad_terminal=bool(config.offroad_terminal),
+        others_collide=bool(config.others_collide),
+        start_lane=-1 if config.start_lane is None else config.start_lane,
     )

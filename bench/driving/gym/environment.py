@@ -141,7 +141,9 @@ def spaces_of(
     observation: torch.Tensor, world: DrivingWorld, action_type: ActionType
 ) -> tuple[spaces.Box, spaces.Discrete | spaces.Box]:
     """The observation space and the action space of one episode, from observations [B, V, F]."""
-    shown = spaces.Box(-1.0, 1.0, tuple(observation.shape[1:]), np.float32)
+    # As highway-env declares it, although the values are in [-1, 1]: a policy can be trained here or there.
+    end = np.inf if world.facts.unbounded else 1.0
+    shown = spaces.Box(-end, end, tuple(observation.shape[1:]), np.float32)
     if action_type == "discrete":
         return shown, spaces.Discrete(len(world.actions))
     return shown, spaces.Box(-1.0, 1.0, (len(world.facts.controls),), np.float32)

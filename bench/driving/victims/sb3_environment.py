@@ -88,14 +88,11 @@ class Training:
         return [f"{name}={short(str(found.get(name)))}" for name in names]
 
     def _of_gym(self, world: DrivingWorld, grid: Grid) -> Iterator[Training]:
-        """The environments of some cells of a world that is made of a gymnasium environment; none for another world."""
-        # A model of Stable-Baselines3 comes with gymnasium; a run without one needs none.
-        from cavbench.driving.gym.world import GymWorld
-
-        if not isinstance(world, GymWorld):
+        """The environments of some cells of a world that stands for a gymnasium environment; none for another world."""
+        if not callable(getattr(world, "environment", None)):
             return
         for cell in grid.cells()[:CELLS]:
-            env = world.environment(cell)
+            env = world.environment(cell)  # type: ignore[attr-defined]
             try:
                 yield chain(env)
             finally:

@@ -17,6 +17,10 @@ UNKNOWN = "unknown"
 """The value of `trained_in` for a policy that does not say in which world it was trained."""
 UNBOUNDED = 1e30
 """Bounds beyond this are none: some environments write the largest float32 instead of infinity."""
+TASKS = ("highway-fast-v0", "highway-v0")
+"""The worlds that are highway-env's own tasks."""
+ROWS = 5
+"""Rows of their observations, unless `vehicles_count` says otherwise."""
 SPARE = 0.01
 """A declared range may leave the bounds of a policy's space by this share of itself."""
 
@@ -105,9 +109,15 @@ class Expected:
         native = self.facts.flat and shape in self._both(self.native)
         if native and (bounds is None or not (self._beyond(bounds) or self._other_limits(bounds))):
             return self.facts.native
-        if own and (bounds is None or (set(bounds.low), set(bounds.high)) == ({-1.0}, {1.0})):
+        if own and (bounds is None or self._declares(bounds)):
             return None
         raise UserError(self._complaint(name, shape, bounds))
+
+    def _declares(self, bounds: Bounds) -> bool:
+        """Whether the world's own environment declares these bounds of an observation."""
+        if self.facts.unbounded:
+            return bounds.unbounded
+        return (set(bounds.low), set(bounds.high)) == ({-1.0}, {1.0})
 
     def _both(self, shape: tuple[int | None, ...]) -> list[tuple[int | None, ...]]:
         return [shape, (math.prod(side or 0 for side in shape),)]
@@ -149,13 +159,19 @@ class Expected:
             source = "the world's own `environment(cell)`"
         else:
             own = f"({rows if rows else 'V'}, {features})"
-            wanted = f"Box(-1, 1, {own})" if bounds is not None else f"{own}, or flattened"
+            ends = "-inf, inf" if facts.unbounded else "-1, 1"
+            wanted = f"Box({ends}, {own})" if bounds is not None else f"{own}, or flattened"
             if bounds is None and rows:
                 wanted += f" ({rows * features},)"
             source = facts.environment or "the environment that cavbench.gym.make makes of this world"
         takes = f"was trained on {bounds}" if bounds is not None else f"takes observations {shape}"
         why = ""
-        if bounds is not None and bounds.unbounded and not facts.flat:
+        elsewhere = bounds is not None and bounds.unbounded and not facts.flat
+        if elsewhere and (home := _home(shape, facts)):
+            whose = ". A policy of highway-env's own tasks is scored in its task:"
+            whose = "; if its environment had another number of rows, write" if facts.unbounded else whose
+            return f"{name} {takes}, this world shows {wanted}{whose} {home}"
+        if elsewhere and not facts.unbounded:
             why = "; highway-env's own tasks (Box(-inf, inf, …)) have other ranges, rows, order and decision rate"
         elif frames := self._frames(shape):
             why = f"; if these are {frames} frames, add victim.frames={frames} to victim=sb3"
@@ -197,6 +213,17 @@ def check_range(name: str, bounds: Bounds, facts: DrivingFacts) -> None:
             f"{name} was trained for actions in {bounds}, not in [-1, 1]. Train it in "
             f"{_continuous(facts.environment)}, where both controls are in [-1, 1]"
         )
+
+
+def _home(shape: tuple[int, ...], facts: DrivingFacts) -> str:
+    """What to type for a policy of one of highway-env's highway tasks, from the shape of its observation; empty if it is none."""
+    features = 1 + len(facts.features.names)
+    if len(shape) != 2 or shape[1] != features:
+        return ""
+    rows = f"'world.config={{observation: {{type: Kinematics, vehicles_count: {shape[0]}}}}}'"
+    if facts.unbounded:
+        return rows
+    return " or ".join(f"world={task}" for task in TASKS) + ("" if shape[0] == ROWS else f", with {rows}")
 
 
 def _continuous(call: str) -> str:

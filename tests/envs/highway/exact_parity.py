@@ -32,6 +32,15 @@ def case(
 
 
 THESIS: dict[str, Any] = {"target_speeds": THESIS_TARGET_SPEEDS}
+TASK: dict[str, Any] = THESIS | {
+    "simulation_frequency": 5,
+    "policy_frequency": 1,
+    "ego_spacing": 1.5,
+    "observed_vehicles": 5,
+    "lane_range": True,
+    "others_collide": False,
+    "offroad_terminal": False,
+}
 DRIVE: dict[str, Any] = {"action_type": "continuous"}
 FAST = {
     "discrete": case(3, 1, SOMETIMES, 1_000_000, steps=110),
@@ -41,6 +50,7 @@ FAST = {
     "continuous, off the road": case(4, 2, continuous(1.0, every=7), 14, steps=70, **DRIVE),
     "idm driver": case(3, 1, IDLE, 18, steps=60, driver="idm"),
     "1 Hz decisions": case(3, 1, ANY, 19, steps=8, policy_frequency=1),
+    "highway-fast-v0": case(4, 2, ANY, 24, steps=12, **TASK),
     "fog": case(3, 2, discrete(1, 4), 22, steps=25, weather="fog"),
     "rain": case(4, 1, ANY, 23, steps=25, weather="rain"),
 }
@@ -97,6 +107,9 @@ def random_cases(draw: st.DrawFn) -> Case:
         "action_type": draw(st.sampled_from(("discrete", "continuous"))),
         "offroad_terminal": draw(st.booleans()),
         "normalize_reward": draw(st.booleans()),
+        "lane_range": draw(st.booleans()),
+        "others_collide": draw(st.booleans()),
+        "start_lane": draw(st.sampled_from((None, None, 0, cell.lanes - 1))),
         "target_speeds": draw(
             st.sampled_from(((10.0, 15.0, 20.0, 25.0, 30.0), THESIS_TARGET_SPEEDS, (0.0, 20.0, 40.0)))
         ),

@@ -65,8 +65,8 @@ def test_the_presets_are_standard_and_thesis() -> None:
     assert standard.features == HighwayWorld.features == STANDARD_FEATURES
     assert thesis.features == THESIS_FEATURES
     cells = (AXES.cell(lanes=3, density=1.0),)
-    assert thesis.config(cells) == HighwayConfig.thesis(cells=cells)
-    assert standard.config(cells) == HighwayConfig(cells=cells)
+    assert thesis.configuration(cells) == HighwayConfig.thesis(cells=cells)
+    assert standard.configuration(cells) == HighwayConfig(cells=cells)
     assert standard.max_steps == 450
 
 
