@@ -8,7 +8,7 @@ HAS_BROWSER := (for name in chromium chromium-browser google-chrome; do command 
 RUN_STAMP := $(VENV)/installed-to-run
 DEV_STAMP := $(VENV)/installed-to-develop
 
-.PHONY: run test lint tree docs page bench soak licences wheel-check install install-dev browser debian-browser clean
+.PHONY: run test lint tree docs page bench soak findings licences wheel-check install install-dev browser debian-browser clean
 
 run: install
 	$(BIN)/bench run attack=zo defense=advtrain
@@ -45,6 +45,12 @@ wheel-check: install-dev
 # Each figure is a ratio to a peer that the same run measured. The experiments are in studies/: they take options and hours.
 bench: install-dev
 	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+# What is surprising about real libraries, each in an environment of its own: one line each, with ok or CHANGED. A quarter of an hour, 3 GB at a
+# time. Not part of `test`.
+findings:
+	@failed=0; for script in $(filter-out findings/fresh.sh,$(wildcard findings/*.sh)); do \
+		if seen=$$(bash $$script); then state=ok; else state=CHANGED; failed=1; fi; echo "$$state $$(basename $$script .sh): $$seen"; done; exit $$failed
 
 install: $(RUN_STAMP)
 

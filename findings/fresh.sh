@@ -1,0 +1,17 @@
+# Sourced by each finding: `fresh PACKAGE==VERSION ...` makes a temporary folder with an environment of its own, and removes it at the end.
+# `see NAME`, with a program on standard input, runs it there. The program prints what it saw, and exits with 1 if that changed.
+set -euo pipefail
+
+fresh() {
+    folder=$(mktemp -d)
+    trap 'rm -rf "$folder"' EXIT
+    "${PYTHON:-python3}" -m venv "$folder/venv"
+    "$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check "$@" 2>"$folder/pip.log" ||
+        { cat "$folder/pip.log" >&2; exit 2; }
+}
+
+see() {
+    cat >"$folder/seen.py"
+    (cd "$folder" && OMP_NUM_THREADS=1 venv/bin/python -W ignore seen.py 2>"$folder/errors.log") ||
+        { status=$?; tail -5 "$folder/errors.log" >&2; exit "$status"; }
+}
