@@ -1,7 +1,7 @@
 """cavbench: a benchmark for the adversarial robustness of driving policies and object detectors.
 
-`score`, `load`, `component` and `detector` are the benchmark from Python; `gym` has its gymnasium environments. They are imported
-when they are first used, because torch takes seconds.
+`score`, `attack`, `load`, `component` and `detector` are the benchmark from Python; `gym` has its gymnasium environments, and the
+`RobustEval…` classes log scores during a training. They are imported when they are first used, because torch takes seconds.
 """
 
 from __future__ import annotations
@@ -11,13 +11,31 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import cavbench.gym as gym
-    from cavbench.api import component, detector, load, score
+    from cavbench.api import attack, component, detector, load, score
+    from cavbench.api.robust_eval import RobustEvalHook
+    from cavbench.api.sb3_callback import RobustEvalCallback
     from cavbench.errors import UserError
 
 __version__ = "0.1.0"
-__all__ = ["UserError", "__version__", "component", "detector", "gym", "load", "score"]
+__all__ = [
+    "RobustEvalCallback",
+    "RobustEvalHook",
+    "UserError",
+    "__version__",
+    "attack",
+    "component",
+    "detector",
+    "gym",
+    "load",
+    "score",
+]
 
-_FROM = {**dict.fromkeys(("component", "detector", "load", "score"), "cavbench.api"), "UserError": "cavbench.errors"}
+_FROM = {
+    **dict.fromkeys(("attack", "component", "detector", "load", "score"), "cavbench.api"),
+    "RobustEvalCallback": "cavbench.api.sb3_callback",
+    "RobustEvalHook": "cavbench.api.robust_eval",
+    "UserError": "cavbench.errors",
+}
 
 
 def __getattr__(name: str) -> Any:

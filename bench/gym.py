@@ -3,6 +3,24 @@
 Importing this module registers an environment `cavbench/WORLD-v0` for each installed driving world.
 """
 
-from cavbench.driving.gym import DrivingEnv, DrivingVectorEnv, GymWorld, RegisteredWorld, make, make_vec, world
+from cavbench.driving.gym import (
+    AttackedEnv,
+    DrivingEnv,
+    DrivingVectorEnv,
+    GymWorld,
+    RegisteredWorld,
+    make,
+    make_vec,
+    world,
+)
 
-__all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "RegisteredWorld", "make", "make_vec", "world"]
+__all__ = [
+    "AttackedEnv",
+    "DrivingEnv",
+    "DrivingVectorEnv",
+    "GymWorld",
+    "RegisteredWorld",
+    "make",
+    "make_vec",
+    "world",
+]

@@ -53,7 +53,7 @@ class Chosen(Generic[C]):
 
     def __str__(self) -> str:
         """The name, with the parameters that differ from their defaults: `pgd(steps=20)`."""
-        if self.code and self.kind == "victim":
+        if self.code and (self.kind == "victim" or hasattr(self.component, "content")):
             # Its parameters only say what the object was.
             return self.name
         changed = [f"{name}={value}" for name, value in differing(self.component).items()]

@@ -59,9 +59,10 @@ def _follow(item: Any, seen: dict[str, Any]) -> None:
 
 
 @cache
-def _is_library(module: str) -> bool:
+def _is_library(module: str | None) -> bool:
     """Whether a module is no code of the user's: of Python, of the libraries that records name, or installed."""
-    top = module.partition(".")[0]
+    # What was made by `exec` may be in no module.
+    top = (module or "__main__").partition(".")[0]
     file = getattr(sys.modules.get(top), "__file__", None) or ""
     installed = bool({"site-packages", "dist-packages"} & set(Path(file).parts))
     return top in LIBRARIES or (top in sys.stdlib_module_names and top != "__main__") or installed

@@ -6,13 +6,23 @@ except ImportError as error:
     raise ImportError("cavbench.gym needs gymnasium: pip install 'cavbench[gym]'") from error
 
 from cavbench.core import sources
+from cavbench.driving.gym.attacked import AttackedEnv
 from cavbench.driving.gym.environment import DrivingEnv, make
 from cavbench.driving.gym.given import world
 from cavbench.driving.gym.registered import RegisteredWorld
 from cavbench.driving.gym.vector import DrivingVectorEnv, make_vec
 from cavbench.driving.gym.world import GymWorld
 
-__all__ = ["DrivingEnv", "DrivingVectorEnv", "GymWorld", "RegisteredWorld", "make", "make_vec", "world"]
+__all__ = [
+    "AttackedEnv",
+    "DrivingEnv",
+    "DrivingVectorEnv",
+    "GymWorld",
+    "RegisteredWorld",
+    "make",
+    "make_vec",
+    "world",
+]
 
 for _name in sources.names("world", "driving"):
     if _name == "gym":

@@ -1,0 +1,162 @@
+"""An attack on single observations, outside of a run: the same oracle, threat model and counting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cavbench.core.pair import Pair
+from cavbench.driving.attacker import Attacker, Shown
+from cavbench.driving.contracts import DrivingWorld
+from cavbench.driving.features import DrivingFacts
+from cavbench.driving.policy import Policy
+from cavbench.driving.threat import ObservationThreat
+from cavbench.driving.victim import CountedPolicy
+from cavbench.errors import UserError
+from cavbench.isolation.streams import Stream
+from cavbench.isolation.watch import Watch
+from cavbench.scenarios import Cell
+
+
+@dataclass(frozen=True)
+class Attacked:
+    """What an attack made of an observation, and what it cost; of several observations arrays [B].
+
+    Args:
+        observation: the perturbed observation, in the form of the given one, within the threat model.
+        queries: evaluations of the victim.
+        gradients: how many of these computed a gradient.
+        size: largest deviation of a value, on the [-1, 1] scale.
+        excess: how far the attack's answer was outside of the perturbation set before it was projected.
+        clean, taken: the victim's decision on the true observation and on the perturbed one.
+        milliseconds: wall time of the attack.
+    """
+
+    observation: Any
+    queries: Any
+    gradients: Any
+    size: Any
+    excess: Any
+    clean: Any
+    taken: Any
+    milliseconds: float
+
+    @property
+    def changed(self) -> Any:
+        """Whether the attack changed the decision: another discrete action, or any other control."""
+        differ = np.asarray(self.clean) != np.asarray(self.taken)
+        controls = differ.ndim - np.ndim(self.queries)
+        found = differ.any(-1) if controls else differ
+        return found if np.ndim(self.queries) else bool(found)
+
+
+class Session:
+    """An attack on a policy in one or more episodes, step by step; the attack's and the policy's states go on.
+
+    Args:
+        pair: the attack, the defended victim, the world and the threat model; it says what does not fit.
+        policy: the defended policy.
+        cells: the cell of each episode [B], for attacks with access to the dynamics of the world.
+        seed: of the attack's random numbers.
+
+    Raises:
+        UserError: if the threat model does not allow what the attack needs.
+    """
+
+    def __init__(self, pair: Pair, policy: Policy, cells: Sequence[Cell], seed: int = 0) -> None:
+        world: Any = pair.world.component
+        threat: Any = pair.threat
+        assert isinstance(world, DrivingWorld)
+        assert isinstance(threat, ObservationThreat)
+        self.facts, self.policy = world.facts, policy
+        attack: Any = None if pair.is_clean else pair.armed(0)
+        knows = attack is not None and attack.access == "dynamics"
+        dynamics = world.dynamics(cells, policy.action_type) if knows else None
+        self.watch = Watch(policy, "victim", listens=attack is not None)
+        self.subject = CountedPolicy(policy, self.watch, Stream("attack", seed))
+        frames = None if threat.share == 1 else threat.frames(self.facts.max_steps)
+        self.attacker = Attacker(
+            attack, self.subject, threat, self.facts.features, seed=seed, dynamics=dynamics, frames=frames
+        )
+        self.state = self.subject.initial(torch.arange(len(cells)))
+        self._stream = Stream("victim", seed)
+
+    def show(self, observation: Tensor) -> tuple[Shown, Tensor, Tensor]:
+        """Attack observations [B, V, F]: what the victim is shown, and its decisions on the truth and on that."""
+        running = torch.ones(len(observation), dtype=torch.bool)
+        with torch.no_grad(), self._stream.in_use(), self.watch:
+            shown = self.attacker.show(observation, running, self.state)
+            clean, taken = (self.subject.decided(one, self.state) for one in (observation, shown.observation))
+        return shown, clean, taken
+
+    def advance(self, shown: Tensor, action: Tensor) -> None:
+        """Tell a policy with a memory what it was shown and what was done."""
+        with torch.no_grad(), self._stream.in_use(), self.watch:
+            self.state = self.subject.advance(shown, action, self.state)
+
+
+class Form:
+    """The form in which observations are given: of the world [V, F], or of its own environment; one, or a batch of them.
+
+    Args:
+        facts: facts of the world.
+        given: observations: an array or a tensor.
+
+    Raises:
+        UserError: if it is neither form.
+    """
+
+    def __init__(self, facts: DrivingFacts, given: Any) -> None:
+        self.facts, self.tensor = facts, isinstance(given, Tensor)
+        with suppress(TypeError, ValueError):
+            self.values = given.detach().cpu() if self.tensor else torch.from_numpy(np.array(given, np.float32))
+        if not hasattr(self, "values"):
+            raise UserError(f"an observation is an array or a tensor of numbers, got {type(given).__name__}")
+        width = 1 + len(facts.features.names)
+        own = (1, width) if facts.flat else (facts.rows, width)
+        native = tuple(facts.native(torch.zeros(1, 1, width)).shape[1:]) if facts.flat else ()
+        shape = tuple(self.values.shape)
+        self.native = bool(native) and shape[-len(native) :] == native and len(shape) <= len(native) + 1
+        one = native if self.native else own
+        fits = all(
+            found == wanted for found, wanted in zip(shape[-len(one) :], one, strict=False) if wanted is not None
+        )
+        if not (fits and len(shape) in (len(one), len(one) + 1)):
+            listed = " or ".join(str(list(form)) for form in filter(None, (native, own)))
+            listed = listed.replace("None", "V")
+            raise UserError(
+                f"an observation of this world has the shape {listed}, or [B, …] for several, got {list(shape)}"
+            )
+        if not bool(self.values.isfinite().all()):
+            raise UserError("the observation contains NaN or infinity")
+        self.single = len(shape) == len(one)
+        self.dtype = given.dtype
+
+    def shown(self) -> Tensor:
+        """The observations as policies get them, float32 [B, V, F]."""
+        values = self.values.float().unsqueeze(0) if self.single else self.values.float()
+        if not self.native:
+            return values.contiguous()
+        features = self.facts.features
+        low, high = torch.tensor(features.low), torch.tensor(features.high)
+        measured = (2 * (values.flatten(1) - low) / (high - low) - 1).clamp(-1, 1)
+        return torch.cat((torch.ones(len(values), 1), measured), -1).unsqueeze(1)
+
+    def back(self, observation: Tensor, truth: Tensor) -> Any:
+        """Observations [B, V, F] in the form of the given ones. What was not changed is what was given, to the last bit."""
+        found = self.facts.native(observation) if self.native else observation
+        same = self.facts.native(truth) if self.native else truth
+        found = torch.where(found == same, self.values.reshape(found.shape).to(found), found)
+        found = found.reshape(self.values.shape)
+        return found.to(self.dtype) if self.tensor else found.numpy().astype(self.dtype)
+
+    def each(self, values: Tensor) -> Any:
+        """A value for each observation [B, ...]; of a single one without B."""
+        found = values.numpy()
+        return found[0] if self.single else found
