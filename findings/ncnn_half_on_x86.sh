@@ -8,10 +8,11 @@
 set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
-python3 -m venv "$folder/env"
-"$folder/env/bin/pip" install --quiet --disable-pip-version-check numpy==2.4.6 ncnn==1.0.20261020
 cd "$folder"
-env/bin/python - <<'END'
+"${PYTHON:-python3}" -m venv env
+env/bin/pip install --quiet --disable-pip-version-check \
+    numpy==2.4.6 ncnn==1.0.20261020 2>log || { cat log >&2; exit 2; }
+OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
 import ncnn
 import numpy as np
 

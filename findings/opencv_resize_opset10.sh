@@ -6,10 +6,11 @@
 set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
-python3 -m venv "$folder/env"
-"$folder/env/bin/pip" install --quiet --disable-pip-version-check numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 opencv-python-headless==5.0.0.93
 cd "$folder"
-env/bin/python - <<'END'
+"${PYTHON:-python3}" -m venv env
+env/bin/pip install --quiet --disable-pip-version-check \
+    numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 opencv-python-headless==5.0.0.93 2>log || { cat log >&2; exit 2; }
+OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper

@@ -7,7 +7,7 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
-npm install --silent --no-audit --no-fund @tensorflow/tfjs@4.22.0
+npm install --silent --no-audit --no-fund @tensorflow/tfjs@4.22.0 || exit 2
 cat > seen.js <<'END'
 const tf = require("@tensorflow/tfjs");
 // No advertisement.
@@ -17,7 +17,8 @@ const assert = require("assert");
 
 const ones = tf.ones([1, 4, 4, 1]), pool = (x) => tf.avgPool(x, 3, 2, "same");
 const forward = Array.from(pool(ones).dataSync()), gradient = tf.sum(tf.grad((x) => tf.sum(pool(x)))(ones)).dataSync()[0];
-console.log(`TensorFlow.js ${tf.version["tfjs-core"]}: ones become ${forward}; the gradient of their sum adds up to ${gradient.toFixed(3)}, not 4`);
+const said = `ones become ${forward}; the gradient of their sum adds up to ${gradient.toFixed(3)}, not 4`;
+console.log(`TensorFlow.js ${tf.version["tfjs-core"]}: ${said}`);
 assert(forward.every((value) => Math.abs(value - 1) < 1e-6));
 assert(Math.abs(gradient - 25 / 9) < 1e-3);
 END

@@ -9,7 +9,7 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
-npm install --silent --no-audit --no-fund @tensorflow/tfjs@4.22.0
+npm install --silent --no-audit --no-fund @tensorflow/tfjs@4.22.0 || exit 2
 cat > seen.js <<'END'
 const tf = require("@tensorflow/tfjs");
 // No advertisement.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from operator import itemgetter
 
 import torch
 from torch import Tensor
@@ -24,7 +23,7 @@ VISIBLE = 0.9
 SURE, SEES, BLIND = 0.8, 0.25, 0.05
 """Mean confidences in near signs: of a good detector; from which on it sees them; and below which it does not."""
 SURER = 0.2
-"""With other parameters it is far surer."""
+"""With other parameters it is far surer: by so much, or by half of what is missing."""
 TOLERANCE = 1e-3
 """Scores may depend on the batch by so much, from rounding."""
 
@@ -190,7 +189,7 @@ def _hint(victim: DetectorVictim, facts: Facts, windows: Windows, own: float, be
                 continue
             sure = confidence(predictions, network.index(STOP_SIGN), windows.boxes)
             found.append((float(sure.mean()), words))
-        best, words = max(found, key=itemgetter(0), default=(0.0, ""))
-        if best >= max(SEES, own + SURER):
+        best, words = max(found, default=(0.0, ""))
+        if best >= max(SEES, own + min(SURER, (1 - own) / 2)):
             return f"with {words} it has {best:.2f}"
     return ""

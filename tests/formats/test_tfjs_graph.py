@@ -51,6 +51,16 @@ def test_a_slice_with_steps_drops_an_axis_as_numpy_does(tmp_path: Path) -> None:
     torch.testing.assert_close(graph(torch.from_numpy(image()))[0], torch.from_numpy(image()[0:1, :5:2, 1::2, 2]))
 
 
+def test_of_equal_scores_those_with_the_lower_numbers_are_the_best(tmp_path: Path) -> None:
+    """As TensorFlow and ONNX say; OpenVINO takes others (findings/topk_of_equal_scores.sh)."""
+    path = write(tmp_path, ("TopKV2", {"sorted": True}, [None, ints(3)[0]]), (1, 100))
+    described = json.loads(path.read_text())
+    described["signature"] = {"outputs": {"places": {"name": "answer:1"}}}
+    path.write_text(json.dumps(described))
+    given = (torch.arange(100) * 37 % 11)[None] / 10
+    assert read(path, "net")[0](given)[0].tolist() == [[8, 19, 30]]
+
+
 def test_a_gradient_is_that_of_the_numbers(tmp_path: Path) -> None:
     for name in ("conv, same, stride 2", "average pool, same", "bilinear, neither, up", "fused, leaky"):
         graph, _ = read(write(tmp_path / name, CASES[name]), "net")

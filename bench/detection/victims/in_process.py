@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -41,6 +41,19 @@ class DetectorObject(Foreign):
     def said(self, name: str, value: object) -> str:
         return f"{name}={value!r}"
 
+    def alternatives(self) -> Mapping[str, Foreign]:
+        """Other readings of the same network; none of a `Detector`, which says itself how it is read."""
+        own = self.network_given
+        if not isinstance(own, FileDetector) or self.source == _class_of(own):
+            return {}
+        others = super().alternatives()
+        for victim in others.values():
+            given = replace(own.given, scaling=victim.scaling, order=victim.channels)
+            names = victim.class_names() or own.names
+            other = FileDetector(own.network, own.path, names, given, victim.output, own.weights_sha256)
+            object.__setattr__(victim, "network_given", other)
+        return others
+
     def load(self, seed: int, facts: Facts) -> Detector:
         """A copy of the detector, so that no run can change the user's object."""
         return copy.deepcopy(self.network_given)
@@ -76,7 +89,7 @@ def detector(network: nn.Module, **reading: Any) -> DetectorObject:
     if not isinstance(network, nn.Module):
         raise UserError(f"a detector is a torch.nn.Module, got {name}")
     try:
-        victim = DetectorObject(source=f"{type(network).__module__}.{type(network).__qualname__}", **reading)
+        victim = DetectorObject(source=_class_of(network), **reading)
     except (TypeError, ValueError) as error:
         raise UserError(f"how to read {name}: {error}") from None
     try:
@@ -99,6 +112,10 @@ def detector(network: nn.Module, **reading: Any) -> DetectorObject:
     if not gradient:
         object.__setattr__(victim, "answers", "scores")
     return victim
+
+
+def _class_of(network: object) -> str:
+    return f"{type(network).__module__}.{type(network).__qualname__}"
 
 
 def _tried(victim: DetectorObject, found: FileDetector) -> Tensor | None:

@@ -65,7 +65,8 @@ class Foreign(DetectorVictim):
             "normalised": (False, True),
         }
         if self.names in ("", *coco.NUMBERINGS):
-            choices["names"] = (self.names, *coco.NUMBERINGS)
+            # Labels are numbered in one of three ways; "no object" is no label.
+            choices["names"] = (self.names, "coco80", "coco90", "coco91")
         found: list[tuple[int, str, Foreign]] = []
         for values in itertools.product(*choices.values()):
             given = dict(zip(choices, values, strict=True))

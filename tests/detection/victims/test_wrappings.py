@@ -292,6 +292,17 @@ def test_a_module_of_the_session_is_read_alike(wrap: Callable[[Tensor, Tensor], 
     assert victim.answers == "gradients"
 
 
+def test_wrong_settings_of_a_module_are_told_before_a_run() -> None:
+    class Bytes(Anywhere):
+        def forward(self, pictures: Tensor) -> Any:
+            return super().forward(pictures / 255)
+
+    victim = detector_of(Bytes(RedCells()), names=NAMES)
+    (said,) = try_detector(victim.load(0, RedStreet().facts), victim, RedStreet(), alone=True)
+    assert "with scaling='byte' it has 1.00" in said
+    assert detector_of(victim.load(0, RedStreet().facts)).alternatives() == {}
+
+
 class Anywhere(nn.Module):
     """A network that takes images of any size: it looks at their upper left corner."""
 
