@@ -11,6 +11,7 @@ import pandas as pd
 from cavbench.core import registry
 from cavbench.errors import UserError
 from cavbench.latex import booktabs, escaped, estimate
+from cavbench.scenarios.axes import written
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -97,8 +98,9 @@ def _cells(tables: Sequence[pd.DataFrame], axes: Axes) -> None:
     role = next(role for role in ("strongest", "attacked", "clean", "baseline") if (scores["role"] == role).any())
     own = scores[scores["role"] == role]
     own = own[(own[list(NAMES)] == own[list(NAMES)].iloc[0]).all(axis=1)]
-    down = own[names[:-1]].astype(str).agg(" × ".join, axis=1) if len(names) > 1 else pd.Series("", own.index)
-    across = own[names[-1]].astype(str)
+    texts = own[names].map(written)
+    down = texts[names[:-1]].agg(" × ".join, axis=1) if len(names) > 1 else pd.Series("", own.index)
+    across = texts[names[-1]]
     values = dict(zip(zip(down, across, strict=True), own[metric(scores)], strict=True))
     _heat(axes, list(dict.fromkeys(down)), list(dict.fromkeys(across)), values, metric(scores))
     axes.set_ylabel(" × ".join(names[:-1]))

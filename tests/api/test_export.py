@@ -65,7 +65,7 @@ def test_the_cells_are_a_heat_map_of_the_strongest_attack(scored: Any) -> None:
     axes = scores.plot("cells")
     strongest = scores[scores.role == "strongest"]
     np.testing.assert_allclose(np.ravel(axes.images[0].get_array()), strongest.safe_progress)
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["3 × 1.0", "4 × 1.0"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["3 × 1", "4 × 1"]
     with pytest.raises(cavbench.UserError, match="by='cell'"):
         scored().plot("cells")
 
