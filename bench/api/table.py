@@ -57,11 +57,11 @@ class Scores(pd.DataFrame):
         shown = str(pd.DataFrame(self)._repr_html_())
         return shown + "".join(f"<p>⚠ {escape(str(one))}</p>" for one in self.remarks if one.name not in NOT_SAID)
 
-    def to_latex(self, *given: Any, **options: Any) -> str:  # type: ignore[override]
+    def to_latex(self, *given: Any, **options: Any) -> str:
         """The main columns for LaTeX (booktabs), scores with their intervals; with arguments, what pandas makes of them."""
         return str(super().to_latex(*given, **options)) if given or options else export.latex(self)
 
-    def plot(self, kind: export.Plot = "matrix", *others: Scores, axes: Axes | None = None) -> Axes:  # type: ignore[override]
+    def plot(self, kind: export.Plot = "matrix", *others: Scores, axes: Axes | None = None) -> Axes:
         """A plot, for which matplotlib must be installed: `pip install 'cavbench[plot]'`.
 
         Args:
