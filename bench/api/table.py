@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from cavbench.api import export
 from cavbench.core.pair import Pair
 from cavbench.core.track import Track
 from cavbench.run.plan import Plan
@@ -21,6 +22,9 @@ from cavbench.statistics.doubts import Remark
 from cavbench.statistics.episodes import Episodes
 from cavbench.statistics.estimates import Array, Interval, share_interval
 from cavbench.statistics.strongest import strongest_of, under
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 STRONGEST = "strongest"
 """Name of the row in which the strongest attack of each cell counts."""
@@ -52,6 +56,24 @@ class Scores(pd.DataFrame):
         """The table of a notebook, with the remarks below."""
         shown = str(pd.DataFrame(self)._repr_html_())
         return shown + "".join(f"<p>⚠ {escape(str(one))}</p>" for one in self.remarks if one.name not in NOT_SAID)
+
+    def to_latex(self, *given: Any, **options: Any) -> str:
+        """The main columns for LaTeX (booktabs), scores with their intervals; with arguments, what pandas makes of them."""
+        return str(super().to_latex(*given, **options)) if given or options else export.latex(self)
+
+    def plot(self, kind: export.Plot = "matrix", *others: Scores, axes: Axes | None = None) -> Axes:
+        """A plot, for which matplotlib must be installed: `pip install 'cavbench[plot]'`.
+
+        Args:
+            kind: `matrix`, attack by defence; `cells`, a heat map under the strongest attack, for `score(..., by="cell")`; or
+                `budget`, scores against the budget.
+            others: for `budget`, the scores under other budgets.
+            axes: matplotlib's axes to draw on; by default new ones.
+
+        Raises:
+            UserError: if matplotlib is not installed, or the scores do not have what the plot shows.
+        """
+        return export.plot(self, kind, others, axes)
 
     @property
     def remarks(self) -> list[Remark]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Self
 
 from rich.progress import DownloadColumn, TextColumn
@@ -14,15 +15,18 @@ from cavbench.terminal import Console
 class TrainingProgress(OnTerminal):
     """Shows the progress of a training (`cavbench.core.contracts.Progress`): a bar on a terminal, a line every 10 % elsewhere."""
 
-    def __init__(self, console: Console, label: str) -> None:
+    def __init__(self, console: Console, label: str, also: Callable[[float, str], None] | None = None) -> None:
         self.console = console
         self.label = label
+        self.also = also
         self.started = time.perf_counter()
         self.tenths = 0
         self.bar = bar(console, TextColumn("{task.percentage:>3.0f}%"))
         self.task = self.bar.add_task(label, total=1.0)
 
     def __call__(self, share: float, text: str) -> None:
+        if self.also:
+            self.also(share, text)
         self.bar.update(self.task, completed=share, description=f"{self.label}  {text}")
         if not self.console.is_terminal and int(share * 10) > self.tenths:
             self.tenths = int(share * 10)

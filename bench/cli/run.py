@@ -10,13 +10,13 @@ import pyarrow as pa
 from rich.table import Table
 from rich.text import Text
 
-from cavbench.cli.as_json import show_results
+from cavbench.cli.as_json import results, show_results
 from cavbench.cli.gates import NOT_PASSED, Gate
 from cavbench.cli.progress import show_downloads
 from cavbench.core.track import Track
 from cavbench.errors import UnfinishedError, UserError
 from cavbench.records import reading
-from cavbench.run import runner, stops
+from cavbench.run import logs, runner, stops
 from cavbench.run.cost import HOUR, spoken
 from cavbench.run.plan import Plan
 from cavbench.run.progress import RunProgress
@@ -59,6 +59,8 @@ def run(
         show_results(plan.out, {} if records is None else {plan.track.name: records}, errors)
     else:
         _print(plan, records, console, report)
+    if plan.log and records is not None:
+        logs.log_pairs(plan.log, plan.out, results(plan.out, {plan.track.name: records})["pairs"])
     passed = gate.passes(records, errors, Console(stderr=True))
     if unfinished is not None:
         raise unfinished

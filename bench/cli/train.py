@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import shlex
 import time
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 from rich.text import Text
@@ -18,6 +20,7 @@ from cavbench.core.track import track
 from cavbench.errors import UserError
 from cavbench.files import check_folder
 from cavbench.run.config import TrainConfig
+from cavbench.run.logs import FOLDER, Log, log_card
 from cavbench.run.process import settle
 from cavbench.terminal import Console
 
@@ -29,6 +32,8 @@ def train(asked: TrainConfig, console: Console) -> None:
         UserError: if there is nothing to train, or the zoo cannot be written.
     """
     settle()
+    # Its notes on storages would stand between the lines of the progress.
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     config = _behind(asked)
     trained = config.trained
     if trained.kind != "defense" and not trained.component.learns:
@@ -43,8 +48,17 @@ def train(asked: TrainConfig, console: Console) -> None:
         check_folder(folder, "the zoo")
     for seed in config.seeds:
         start = time.perf_counter()
-        with TrainingProgress(Console(stderr=True), f"{recipe.name}, seed {seed}") as progress:
+        name = f"{recipe.name}, seed {seed}"
+        log = (
+            None
+            if config.log is None
+            else Log(config.log, Path(FOLDER), f"{recipe.key}-seed{seed}", _settings(config, seed))
+        )
+        with TrainingProgress(Console(stderr=True), name, log.progress if log else None) as progress:
             made = _trained(config, component, seed, progress)
+        if log:
+            log_card(log, made.card)
+            log.close()
         path = zoo.save(
             made.network,
             recipe,
@@ -59,6 +73,12 @@ def train(asked: TrainConfig, console: Console) -> None:
         console.print(Text(line), soft_wrap=True)
     use = recipe.use if config is asked else _use(config, component, asked.defense)
     console.print(Text(f"To use it: {use}"), soft_wrap=True)
+
+
+def _settings(config: TrainConfig, seed: int) -> dict[str, object]:
+    """What a log is of: the components with their parameters, and the seed."""
+    parts = {part.kind: f"{part.name} {part.params}" for part in _parts(config)}
+    return parts | {"world": f"{config.world.name} {config.world.params}", "seed": seed}
 
 
 def _behind(config: TrainConfig) -> TrainConfig:

@@ -16,7 +16,7 @@ from cavbench.core.pair import Chosen, Pair, check_track
 from cavbench.core.registry import KINDS, Kind
 from cavbench.core.suites import combined
 from cavbench.errors import UserError, short
-from cavbench.run import config_file
+from cavbench.run import config_file, logs
 from cavbench.run.gates import Gates
 from cavbench.run.options import RunOptions, TrainOptions
 from cavbench.run.plan import Plan, check_seeds
@@ -34,6 +34,7 @@ class TrainConfig:
         world: world to train in.
         seeds: training seeds.
         out: zoo to save to; None for the user's zoo.
+        log: kind of log (`cavbench.run.logs`); None for none.
     """
 
     victim: Chosen[Any]
@@ -42,6 +43,7 @@ class TrainConfig:
     world: Chosen[Any]
     seeds: tuple[int, ...] = (0,)
     out: Path | None = None
+    log: str | None = None
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
@@ -97,6 +99,7 @@ def plan_of(words: Sequence[str], start: Callable[[str], None] = lambda executor
             until=settings["until"],
             device=settings["device"],
             gates=_gates(settings),
+            log=_log(settings["log"]),
             words=_repeating(words, given, standard, settings["seeds"]),
         )
 
@@ -198,7 +201,15 @@ def training_of(words: Sequence[str], start: Callable[[str], None] = lambda exec
             world=one["world"],
             seeds=tuple(settings["seeds"]),
             out=Path(settings["out"]).expanduser() if settings["out"] else None,
+            log=_log(settings["log"]),
         )
+
+
+def _log(kind: str | None) -> str | None:
+    """The kind of log, refused before anything is driven if it cannot be written."""
+    if kind is not None:
+        logs.check(kind)
+    return kind
 
 
 def component(kind: Kind, name: str, values: Mapping[str, str]) -> Any:

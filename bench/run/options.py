@@ -68,6 +68,9 @@ class RunOptions:
         default=None, metadata=_meaning("Exit code 3 if a pair is significantly worse than there.", "off", "FOLDER")
     )
     junit: str | None = field(default=None, metadata=_meaning("Write JUnit XML with a case a pair.", "none", "FILE"))
+    log: str | None = field(
+        default=None, metadata=_meaning("Scores to OUT/logs: tensorboard, mlflow, wandb or csv.", "none")
+    )
 
 
 @dataclass
@@ -76,3 +79,6 @@ class TrainOptions:
 
     seeds: list[int] = field(default_factory=lambda: [0], metadata=_meaning("Training seeds.", "0"))
     out: str | None = field(default=None, metadata=_meaning("Zoo to save to.", "your own zoo", "FOLDER"))
+    log: str | None = field(
+        default=None, metadata=_meaning("Curves to the folder logs: tensorboard, mlflow, wandb or csv.", "none")
+    )

@@ -51,6 +51,7 @@ class Plan:
         device: where victims compute: `auto` is a GPU if there is one, and becomes `cpu` or `cuda` here.
         until: half the width of the interval at which a row has enough scenarios (`cavbench.run.rounds`); None drives them all.
         gates: what it must reach to pass.
+        log: kind of log of its scores (`cavbench.run.logs`); None for none.
         words: the options that repeat the run, by key (`cavbench.run.config_file`); empty for a run from Python.
 
     Raises:
@@ -74,6 +75,7 @@ class Plan:
     until: float | None = None
     device: str = CPU
     gates: Gates = field(default_factory=Gates)
+    log: str | None = None
     words: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

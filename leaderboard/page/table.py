@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from cavbench.errors import plain
+from cavbench.latex import booktabs, escaped, estimate
 
 BOARD = ("track", "world", "grid", "threat_norm", "threat_budget", "threat_access", "threat_queries", "threat_share")
 """The columns of the CSV that say which leaderboard a row is on; those of the row follow (`ranking.columns`)."""
@@ -20,15 +21,6 @@ PAIRS = (
     *("kept", "queries", "training_seeds", "cells", "scenarios", "pair"),
 )
 """The columns of the CSV of a run."""
-SPECIAL = {
-    **{letter: f"\\{letter}" for letter in "&%$#_{}"},
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "×": r"$\times$",
-    "−": "$-$",
-}
-"""What LaTeX writes for a letter that means something to it."""
 
 
 def table(made: Mapping[str, Any]) -> str:
@@ -84,12 +76,12 @@ def _pairs_tabular(made: Mapping[str, Any], track: str) -> str:
     failure = said["failure_title"].capitalize()
     lines = []
     for one in (one for one in made["pairs"] if one["track"] == track):
-        names = [_escaped(one[kind]["label"]) for kind in ("victim", "defense", "attack")]
+        names = [escaped(one[kind]["label"]) for kind in ("victim", "defense", "attack")]
         kept = "" if one["kept"] is None else f"{one['kept']:.2f}"
         failed = [_written(one["failed"], columns[0])] if failure else []
         lines.append([*names, _written(one["score"], columns[0]), kept, *failed])
     heads = [*heads, "Kept", *([failure] if failure else [])]
-    return _booktabs(f"{track}: mean and 95 % interval", "lll" + "r" * (len(heads) - 3), heads, lines)
+    return booktabs(f"{track}: mean and 95 % interval", "lll" + "r" * (len(heads) - 3), heads, lines)
 
 
 def _ends(name: str) -> list[str]:
@@ -112,29 +104,8 @@ def _tabular(board: Mapping[str, Any]) -> str:
     title = f"{board['track']}, {board['grid']}: {threat['norm']} {threat['budget']:g}, access {threat['access']}"
     lines = [[_written(row["values"][column["name"]], column) for column in listed] for row in board["rows"]]
     kinds = "".join("l" if column["kind"] == "text" else "r" for column in listed)
-    heads = [_escaped(column["title"]) for column in listed]
-    return _booktabs(f"{title}, {threat['queries']} queries", kinds, heads, lines)
-
-
-def _booktabs(title: str, kinds: str, heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A table under a comment with its title; `kinds` are the letters of the columns."""
-    return "\n".join(
-        (
-            f"% {plain(title)}",
-            f"\\begin{{tabular}}{{{kinds}}}",
-            r"\toprule",
-            _line(heads),
-            r"\midrule",
-            *map(_line, lines),
-            r"\bottomrule",
-            r"\end{tabular}",
-            "",
-        )
-    )
-
-
-def _line(cells: Sequence[str]) -> str:
-    return " & ".join(cells) + r" \\"
+    heads = [escaped(column["title"]) for column in listed]
+    return booktabs(f"{title}, {threat['queries']} queries", kinds, heads, lines)
 
 
 def _written(value: Any, column: Mapping[str, Any]) -> str:
@@ -142,17 +113,11 @@ def _written(value: Any, column: Mapping[str, Any]) -> str:
     if value is None:
         return ""
     if isinstance(value, str):
-        return _escaped(value)
+        return escaped(value)
     digits = column["digits"]
     if not isinstance(value, dict):
         return f"{value:.{digits}f}"
-    low, high = value["low"], value["high"]
-    bounds = "" if low is None else rf" {{\scriptsize [{low:.{digits}f}, {high:.{digits}f}]}}"
-    return f"{value['estimate']:.{digits}f}{bounds}"
-
-
-def _escaped(text: str) -> str:
-    return "".join(SPECIAL.get(letter, letter) for letter in plain(text))
+    return estimate(value["estimate"], value["low"], value["high"], digits)
 
 
 def cell(value: object) -> object:

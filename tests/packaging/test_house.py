@@ -13,7 +13,7 @@ from tests.tree import FOLDERS, ROOT
 
 FLOORS = (
     {"compiled", "errors", "exports", "identity", "scenarios"},
-    {"bounded", "documents", "files", "isolation", "recording", "terminal"},
+    {"bounded", "documents", "files", "isolation", "latex", "recording", "terminal"},
     {"archive", "core"},
     {"checks", "formats", "records", "statistics", "zoo"},
     {"detection", "driving", "run"},

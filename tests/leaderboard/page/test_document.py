@@ -150,7 +150,7 @@ def test_a_card_says_what_to_type() -> None:
     words = run_command(attacked).split()
     assert words[:3] == ["bench", "run", "attack=pgd"]
     assert "threat.budget=0.1" in words
-    left_out = ("attack.steps=", "victim=", "defense=", "lanes=", "episodes=", "seeds=")
+    left_out = ("attack.steps=", "defense=", "lanes=", "episodes=", "seeds=")
     assert not [word for word in words if word.startswith(left_out)], "defaults, and the whole of the grid"
 
 
@@ -158,7 +158,7 @@ def test_a_card_says_which_part_of_the_grid_and_what_is_no_default() -> None:
     own = drive(attack="pgd", attack_params={"steps": 11, "restarts": 4}, cells=CLEAR[:2], runs=(1,), episodes=5)
     (one,) = read_tracks({"driving": own})
     words = run_command(one).split()
-    assert {"attack.steps=11", "lanes=3", "density=1,2", "weather=clear", "episodes=5", "seeds=1"} <= set(words)
+    assert {"attack.steps=11", "lanes=3", "weather=clear", "episodes=5", "seeds=1"} <= set(words)
     assert "attack.restarts=4" not in words
 
 
