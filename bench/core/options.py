@@ -29,7 +29,7 @@ from cavbench.core.contracts import Access, Defense, ThreatModel
 from cavbench.core.outline import outline
 from cavbench.core.pair import Chosen, choose
 from cavbench.core.parameters import Parameter, flattened, parameters
-from cavbench.core.registry import Kind
+from cavbench.core.registry import KINDS, Kind
 from cavbench.core.suites import Suite
 from cavbench.core.track import track
 from cavbench.errors import PluginError, UserError, message, short
@@ -497,7 +497,9 @@ def _read(kind: str, owned: dict[str, Parameter], arguments: Any) -> dict[str, A
             continue
         choices = owned[key].choices
         if choices and value is not None and value not in choices:
-            raise UserError(registry.unknown(f"{kind}.{key} {short(str(value))!r}", str(value), map(str, choices)))
+            line = registry.unknown(f"{kind}.{key} {short(str(value))!r}", str(value), map(str, choices))
+            component = f"; {value!r} is a {kind}: write {kind}={value}"
+            raise UserError(line + (component if kind in KINDS and str(value) in registry.names(kind) else ""))
         if isinstance(value, list):
             values[key] = tuple(value)
     return values

@@ -233,8 +233,6 @@ def _inner(key: str, given: Any, known: tuple[str, ...]) -> Mapping[str, Any]:
         raise ValueError(
             f"config.{key} has the key {short(strange[0])!r}, which the engine does not know; known: {', '.join(known)}"
         )
-    if "type" in known and "type" not in given:
-        raise ValueError(f"config.{key} needs its type, as in highway-env, which replaces all of {key}")
     return given
 
 

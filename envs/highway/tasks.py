@@ -17,6 +17,7 @@ from cavbench.scenarios import Cell
 
 NAMES = ("x", "y", "vx", "vy")
 TOP_SPEED, LANE = 40.0, 4.0
+TYPES = {"observation": "Kinematics", "action": "DiscreteMetaAction"}
 DENSE = 1.5
 """Above this density most cars that only brake crash, because they cannot be told to drive below 20 m/s."""
 
@@ -38,7 +39,7 @@ class HighwayTask(StraightRoad):
     """
 
     brakes_by: ClassVar[str] = (
-        "'world.config={action: {type: DiscreteMetaAction, target_speeds: [10, 15, 20, 25, 30]}}' lets it, and is another task"
+        "'world.config={action: {target_speeds: [10, 15, 20, 25, 30]}}' lets it, and is another task"
     )
     defaults: ClassVar[Mapping[str, Any]]
     """Fields of `HighwayConfig` that differ from those of all tasks; `duration` in seconds."""
@@ -62,8 +63,11 @@ class HighwayTask(StraightRoad):
         import highway_env
 
         gymnasium.register_envs(highway_env)
+        given = parsed(self.config)
+        # highway-env replaces all of `observation` and of `action`, and then needs their type.
+        typed = {key: {"type": kind, **given[key]} for key, kind in TYPES.items() if key in given}
         axes = {key: cell[axis] for key, axis in AXES_THERE.items() if cell[axis] != self.home[axis]}
-        return gymnasium.make(self.name, config=parsed(self.config) | axes)
+        return gymnasium.make(self.name, config=given | typed | axes)
 
     @property
     def observed_rows(self) -> int:

@@ -220,7 +220,7 @@ def _home(shape: tuple[int, ...], facts: DrivingFacts) -> str:
     features = 1 + len(facts.features.names)
     if len(shape) != 2 or shape[1] != features:
         return ""
-    rows = f"'world.config={{observation: {{type: Kinematics, vehicles_count: {shape[0]}}}}}'"
+    rows = f"'world.config={{observation: {{vehicles_count: {shape[0]}}}}}'"
     if facts.unbounded:
         return rows
     return " or ".join(f"world={task}" for task in TASKS) + ("" if shape[0] == ROWS else f", with {rows}")

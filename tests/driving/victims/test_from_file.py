@@ -108,7 +108,7 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
         lambda path: saved(path, "ppo", spaces(continuous=False, seen=np.inf)),
         "was trained on Box(-inf, inf, (10, 5)), this world shows Box(-1, 1, (10, 5)). A policy of highway-env's own tasks is "
         "scored in its task: world=highway-fast-v0 or world=highway-v0, with 'world.config={observation: "
-        "{type: Kinematics, vehicles_count: 10}}'",
+        "{vehicles_count: 10}}'",
     ),
     "two frames": (
         "sb3",

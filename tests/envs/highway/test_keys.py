@@ -66,7 +66,6 @@ def test_what_only_draws_or_says_the_default_changes_nothing() -> None:
         ({"controlled_vehicles": 2}, "config.controlled_vehicles is 1 in the engine, got 2"),
         ({"other_vehicles_type": "mine"}, "config.other_vehicles_type is .*IDMVehicle"),
         ({"observation": "Kinematics"}, "config.observation takes keys and values, got 'Kinematics'"),
-        ({"observation": {"vehicles_count": 9}}, "config.observation needs its type, as in highway-env"),
         ({"observation": {"type": "OccupancyGrid"}}, 'config.observation.type is "Kinematics" in the engine'),
         ({"observation": {"type": "Kinematics", "order": "shuffled"}}, 'observation.order is "sorted" in the engine'),
         ({"observation": {"type": "Kinematics", "features": ["x", "y"]}}, "config.observation.features is"),

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 
 import cavbench
 import cavbench.gym
+from cavbench.core.options import configured
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Job, track
 from cavbench.driving.threat import ObservationThreat
@@ -175,7 +176,7 @@ def test_a_policy_of_highway_env_is_told_where_it_is_at_home() -> None:
     with pytest.raises(UserError, match=r"Box\(-inf, inf, \(5, 5\)\).*world=highway-fast-v0 or world=highway-v0$"):
         Expected(facts=HighwayWorld().facts).fit("dqn.zip", (5, 5), BOX)
     ten = Bounds(shape=(10, 5), low=BOX.low, high=BOX.high)
-    rows = r"'world.config=\{observation: \{type: Kinematics, vehicles_count: 10\}\}'$"
+    rows = r"'world.config=\{observation: \{vehicles_count: 10\}\}'$"
     for world in (HighwayWorld(), HighwayFastV0()):
         with pytest.raises(UserError, match=rows):
             Expected(facts=world.facts).fit("dqn.zip", (10, 5), ten)
@@ -201,6 +202,15 @@ def test_a_model_that_has_its_environment_says_in_which_task_it_was_trained(tmp_
 def test_a_preset_of_that_name_leads_to_the_world() -> None:
     with pytest.raises(ValueError, match=r"highway-env's own tasks are worlds: world=highway-fast-v0$"):
         HighwayWorld(preset="highway-fast-v0")  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"'highway-v0' is a world: write world=highway-v0$"):
+        configured("world", "highway", {"preset": "highway-v0"})
+
+
+def test_its_configuration_is_given_on_the_command_line_as_in_python() -> None:
+    given = configured("world", "highway-v0", {"config": "{duration:60,observation:{vehicles_count:7}}"})
+    assert given.component == HighwayV0(config={"duration": 60, "observation": {"vehicles_count": 7}})
+    assert given.component.facts.max_steps == 60
+    assert given.component.facts.rows == 7
 
 
 def test_a_filter_and_an_attack_run_in_a_task(tmp_path: Path) -> None:
