@@ -1,7 +1,6 @@
 """The lines of docs/pitfalls.md that cavbench depends on hold for the installed libraries, and each finding is on the page.
 
-If an upgrade fails here, the library changed. Look whether what cavbench does about it is still right, then change page, finding and
-test.
+If an upgrade fails here, the library changed: look whether what cavbench does about it is still right. Then change page and test.
 """
 
 from __future__ import annotations
