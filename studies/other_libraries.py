@@ -3,7 +3,7 @@
     pip install skrl==2.1.1 tianshou==2.0.1 'ray[rllib]==2.60.0'     # beside cavbench[gym]
     python studies/other_libraries.py skrl                           # or tianshou, rllib, cleanrl
 
-Each trains for some hundred steps in the highway. The victim's decisions on 500 observations are compared with the library's own most
+Each trains for some hundred steps in the highway. Decisions on 500 observations are compared with the library's own most
 likely actions. Results of 2026-11-28, torch 2.13.0, two cores, a minute each: equal on 500 of 500 for all.
 """
 
