@@ -191,7 +191,7 @@ def _fitting(name: str, module: nn.Module, native: Tensor) -> tuple[nn.Module, t
     Raises:
         UserError: if it takes none, or two shapes that it answers differently.
     """
-    network = (ActorNetwork(module) if is_actor(module) else copy.deepcopy(module)).cpu().eval()
+    network = _copied(name, module)
     others = {weight.dtype for weight in network.parameters() if weight.is_floating_point()} - {torch.float32}
     # The weights of another precision compute in float32, as the world does, unless the network itself asks for their own.
     networks = [copy.deepcopy(network).float(), network] if others else [network]
@@ -216,6 +216,24 @@ def _fitting(name: str, module: nn.Module, native: Tensor) -> tuple[nn.Module, t
             f"nn.Sequential(nn.Flatten(), network), or nn.Sequential(nn.Unflatten(1, {first}), network)"
         )
     return one, shape, answer
+
+
+def _copied(name: str, module: nn.Module) -> nn.Module:
+    """A copy of a network in eval mode, so that no run can change the user's object.
+
+    Raises:
+        UserError: if torch cannot copy it.
+    """
+    try:
+        return (ActorNetwork(module) if is_actor(module) else copy.deepcopy(module)).cpu().eval()
+    except UserError:
+        raise
+    # The network may raise anything; torch copies no tensor that has a graph.
+    except Exception as error:
+        raise UserError(
+            f"{name} cannot be copied ({reason(error)}); if it keeps results of its last call, a distribution, call it under "
+            "torch.no_grad() once, or give a torch.nn.Module without them"
+        ) from error
 
 
 def _answer(network: nn.Module, observation: Tensor) -> Tensor | str:

@@ -324,6 +324,27 @@ def test_a_network_that_needs_its_own_precision_keeps_it(kind: type[Exact]) -> N
     assert torch.equal(scores, network(observation.to(network.linear.weight.dtype)).float())
 
 
+class Keeps(nn.Module):
+    """Keeps its last distribution, as models of skrl do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(50, 5)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        self.last = torch.distributions.Categorical(logits=self.linear(observation.flatten(1)))
+        return self.last.logits
+
+
+def test_a_network_that_keeps_a_graph_is_told_what_to_do() -> None:
+    network, observation = Keeps(), torch.from_numpy(OBSERVATION)
+    network(observation)
+    refused(network, r"Keeps cannot be copied \(RuntimeError: .*\); .* call it under torch.no_grad\(\) once")
+    with torch.no_grad():
+        network(observation)
+    assert loaded(network).scores(observation).shape == (4, 5)
+
+
 @pytest.mark.parametrize(("algorithm", "part"), [("sac", "actor"), ("sac", "policy"), ("ppo", "policy")])
 def test_a_part_of_a_model_that_samples_its_actions_is_refused(algorithm: str, part: str) -> None:
     model = sb3_model(algorithm, spaces(continuous=True))
