@@ -99,5 +99,7 @@ def _stack(model: Any, name: str) -> Stack | None:
 def _kept(model: Any, name: str, bounds: Bounds) -> Any:
     """The last observations of a model's training [n, V * F]; None if it keeps none."""
     kept = getattr(model, name, None)
+    if isinstance(kept, dict):
+        kept = np.concatenate([np.reshape(part, (len(part), -1)) for _, part in sorted(kept.items())], -1)
     size = int(np.prod(bounds.shape))
     return kept.reshape(-1, size) if isinstance(kept, np.ndarray) and kept.size and kept.size % size == 0 else None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 from typing import Any
 
 import numpy as np
@@ -73,15 +74,19 @@ class ModelNetwork(nn.Module):
                 f"{type(model).__name__} has a predict() of its own, by which it would not be driven. {INSTEAD}"
             )
         space, actions = model.observation_space, model.action_space
-        if type(space).__name__ != "Box":
-            raise UserError(f"the model takes observations of {short(str(space))}; the type must be Box. {INSTEAD}")
+        parts = dict(space.spaces) if type(space).__name__ == "Dict" else {}
+        if any(type(part).__name__ != "Box" for part in (*parts.values(), *(() if parts else (space,)))):
+            raise UserError(
+                f"the model takes observations of {short(str(space))}; the type must be Box, or a Dict of Boxes. {INSTEAD}"
+            )
+        self.parts = {name: tuple(part.shape) for name, part in parts.items()}
         if type(actions).__name__ not in ("Discrete", "Box"):
             raise UserError(
                 f"the model takes actions of {short(str(actions))}; the type must be Discrete or Box. {INSTEAD}"
             )
         if int(getattr(actions, "start", 0)):
             raise UserError(f"the model numbers its actions from {actions.start}; they must be numbered from 0")
-        self.bounds = Bounds.of(space)
+        self.bounds = Bounds.of(space) if not parts else Bounds.of_parts(parts)
         self.shape = self.bounds.shape
         self.action_type: ActionType = "discrete" if type(actions).__name__ == "Discrete" else "continuous"
         self.range = Bounds.of(actions) if self.action_type == "continuous" else None
@@ -99,6 +104,8 @@ class ModelNetwork(nn.Module):
         self.of_frame: Normaliser | None = None
         if env is None or not env.norm_obs:
             return
+        if self.parts:
+            raise UserError(f"the model was trained on parts behind VecNormalize, which is not supported. {INSTEAD}")
         found = Normaliser(env.obs_rms.mean, env.obs_rms.var, env.epsilon, float(env.clip_obs))
         if found.shape == self.shape:
             self.normaliser = found
@@ -159,9 +166,18 @@ class ModelNetwork(nn.Module):
         finally:
             self.policy.action_dist = kept
 
-    def normalised(self, observation: Tensor) -> Tensor:
-        """The observation as the model's networks receive it."""
+    def normalised(self, observation: Tensor) -> Any:
+        """The observation as the model's networks receive it; of a `Dict` its parts, which a world shows one after the other."""
+        if self.parts:
+            found = observation.split([math.prod(shape) for shape in self.parts.values()], -1)
+            named = zip(self.parts.items(), found, strict=True)
+            return {name: part.reshape(len(observation), *shape) for (name, shape), part in named}
         return observation if self.normaliser is None else self.normaliser(observation)
+
+    def _as_predict_takes(self, observation: Tensor) -> Any:
+        """The observation as NumPy's."""
+        shown = self.normalised(observation)
+        return {name: part.numpy() for name, part in shown.items()} if self.parts else shown.numpy()
 
     def _scaled(self, action: Tensor) -> Tensor:
         """An action of the space's range on the [-1, 1] scale."""
@@ -181,7 +197,7 @@ class ModelNetwork(nn.Module):
             answer, _ = self(observation, empty(self.memory, torch.arange(len(observation))))
         else:
             answer = self(observation)
-        wanted, _ = copy.deepcopy(self.policy).predict(self.normalised(observation).numpy(), deterministic=True)
+        wanted, _ = copy.deepcopy(self.policy).predict(self._as_predict_takes(observation), deterministic=True)
         if self.range is None:
             same = bool((answer.argmax(-1).numpy() == wanted).all())
         else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,6 +43,13 @@ class Bounds:
         """The bounds of a `gymnasium.spaces.Box`."""
         low, high = ([float(number) for number in side.reshape(-1)] for side in (space.low, space.high))
         return cls(shape=tuple(int(side) for side in space.shape), low=_short(low), high=_short(high))
+
+    @classmethod
+    def of_parts(cls, spaces: Mapping[str, Any]) -> Bounds:
+        """The bounds of the parts of a `Dict`, one after the other as `gymnasium.spaces.flatten` writes them."""
+        limits = [limit for space in spaces.values() for limit in cls.of(space).limits()]
+        low, high = zip(*limits, strict=True)
+        return cls(shape=(len(limits),), low=_short(low), high=_short(high))
 
     @property
     def unbounded(self) -> bool:

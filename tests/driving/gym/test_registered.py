@@ -303,3 +303,47 @@ def test_worlds_of_one_id_are_equal_and_can_be_keys() -> None:
     assert isinstance(first, RegisteredWorld)
     assert first == second
     assert len({first, second}) == 1
+
+
+def driven(predict: Any, env: Any, seed: int, steps: int) -> float:
+    """The return of a model in its own environment."""
+    observation, _ = env.reset(seed=seed)
+    total = 0.0
+    for _ in range(steps):
+        action, _ = predict(observation)
+        observation, reward, terminated, truncated, _ = env.step(action if np.ndim(action) else int(action))
+        total += float(reward)
+        if terminated or truncated:
+            break
+    return total
+
+
+@pytest.mark.slow
+def test_models_of_their_libraries_earn_here_what_they_earn_there(tmp_path: Path) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    vec = pytest.importorskip("stable_baselines3.common.vec_env")
+    parts = sb3.SAC(
+        "MultiInputPolicy", gymnasium.make("highway_env:parking-v0"), learning_starts=5, seed=0, device="cpu"
+    )
+    parts.learn(8)
+    venv = vec.VecNormalize(vec.DummyVecEnv([lambda: gymnasium.make("CartPole-v1")]), norm_reward=False)
+    scaled = sb3.PPO("MlpPolicy", venv, n_steps=32, batch_size=32, seed=0, device="cpu").learn(32)
+    venv.training = False
+    scaled.save(tmp_path / "model.zip")
+    venv.save(tmp_path / "statistics.pkl")
+    saved = cavbench.component(
+        "victim", "sb3", path=str(tmp_path / "model.zip"), normalize=str(tmp_path / "statistics.pkl")
+    )
+
+    def normalised(observation: Any) -> Any:
+        return scaled.predict(venv.normalize_obs(observation), deterministic=True)
+
+    for name, victim, predict, steps in (
+        ("highway_env:parking-v0", parts, lambda seen: parts.predict(seen, deterministic=True), 10),
+        ("CartPole-v1", scaled, normalised, 60),
+        ("CartPole-v1", saved, normalised, 60),
+    ):
+        world = cavbench.gym.world(name, max_steps=steps)
+        found = cavbench.score(victim, "none", world=world, episodes=2, baselines=False, out=tmp_path / "out").records
+        for seed, total in zip(found["seed"], found["return"], strict=True):
+            assert total == pytest.approx(driven(predict, gymnasium.make(name), int(seed), steps), abs=1e-4)
