@@ -164,7 +164,12 @@ def of_victim(records: pa.Table, clean: pa.Table | None, track: Track, about: st
             "rate, order of features); state it with victim.trained_in=…",
         )
     # The recipes of the zoo list parameters instead (`vehicles=5`); a run compares them with its world before it drives.
-    elif trained_in and not ("=" in trained_in and "(" not in trained_in) and trained_in != (world := _world(records)):
+    elif (
+        trained_in
+        and not ("=" in trained_in and "(" not in trained_in)
+        and trained_in != _environment(records)
+        and trained_in != (world := _world(records))
+    ):
         yield Remark("trained_elsewhere", about, f"trained in {trained_in}, scored in {world}")
     if clean is None or not clean.num_rows:
         return
@@ -221,3 +226,9 @@ def _world(records: pa.Table) -> str:
         return label("world", name, json.loads(records["world_params"][0].as_py() or "{}"))
     except (UserError, ValueError):
         return str(name)
+
+
+def _environment(records: pa.Table) -> str:
+    """The id of the gymnasium environment that a world is made of, if it names one and changes nothing in it."""
+    params = json.loads(records["world_params"][0].as_py() or "{}")
+    return "" if params.get("config") or params.get("axes") else str(params.get("id", ""))
