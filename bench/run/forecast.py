@@ -28,6 +28,7 @@ class Part:
         pair: its pair.
         group: what units of one batch have in common.
         cost: CPU seconds that it should take.
+        episodes: of a unit.
         share: share that is done.
         started: when it began; NaN before.
     """
@@ -36,6 +37,7 @@ class Part:
     pair: Pair
     group: Hashable
     cost: float
+    episodes: int
     share: float = 0.0
     started: float = math.nan
 
@@ -69,7 +71,7 @@ class Forecast:
         for task in tasks:
             pair, group = task.pair, (task.step, task.pair.id, task.unit.training_seed)
             cost = next(costs) if task.step == "drive" else rates(pair).artefact
-            self.parts[_key(task)] = Part(str(task), pair, group, cost)
+            self.parts[_key(task)] = Part(str(task), pair, group, cost, len(task.unit.seeds))
         self.running: dict[str, Part] = {}
         self.spent: dict[Hashable, list[float]] = {}
 
@@ -80,12 +82,13 @@ class Forecast:
                 part.started = self.now()
                 self.running[key] = part
 
-    def reached(self, name: str, share: float) -> None:
-        """So much is done of what is called so, and of all that is in one batch with it."""
+    def reached(self, name: str, share: float, episodes: int = 0) -> None:
+        """So much is done of what is called so; with more episodes than its own, of all that is in one batch with it."""
         for parts in self._under_way().values():
-            if any(part.name == name for part in parts):
-                for part in parts:
-                    part.share = max(part.share, min(share, 1.0))
+            named = [part for part in parts if part.name == name]
+            together = bool(named) and episodes > named[0].episodes
+            for part in parts if together else named:
+                part.share = max(part.share, min(share, 1.0))
 
     def finished(self, task: Task, seconds: float) -> None:
         """A task of a unit is done; it took so many seconds of a worker."""

@@ -107,7 +107,7 @@ class RunProgress(OnTerminal):
 
     def preparing(self, task: str, share: float, text: str, episodes: int = 0) -> None:
         if self.left.forecast is not None:
-            self.left.forecast.reached(task, share)
+            self.left.forecast.reached(task, share, episodes)
         self._say()
         if episodes:
             self.under_way[task] = share * episodes

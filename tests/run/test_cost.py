@@ -160,6 +160,15 @@ def test_after_a_tenth_of_the_work_the_time_left_is_right_within_a_quarter(slowe
     assert forecast.left == 0
 
 
+def test_units_of_one_task_may_be_driven_together_or_one_after_the_other() -> None:
+    tasks = [task for task in tasks_of("attack=pgd", *SHORT, "reference=false") if task.pair.attack.name == "pgd"][:2]
+    for episodes, expected in ((4, [0.5, 0.5]), (2, [0.5, 0.0])):
+        forecast = Forecast(tasks, 1, Clock())
+        forecast.working(tasks)
+        forecast.reached(str(tasks[0]), 0.5, episodes)
+        assert [forecast.parts[task.unit.fingerprint].share for task in tasks] == expected
+
+
 def test_a_log_file_has_one_line_a_minute_with_the_time_left() -> None:
     tasks = tasks_of("attack=pgd", *SHORT, "reference=false")
     clock, out = Clock(), StringIO()
