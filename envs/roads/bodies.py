@@ -31,7 +31,7 @@ def put_body(road: Road, body: Body, kind: int, x: float, y: float, heading: flo
     body.steering = body.acceleration = 0.0
     body.impact_x = body.impact_y = 0.0
     body.impact = body.crashed = False
-    body.changes_lanes = True
+    body.changes_lanes, body.yielding = True, False
     body.route, body.route_place = -1, 0
 
 

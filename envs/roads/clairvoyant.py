@@ -26,7 +26,7 @@ def roll_batch(
     given = parameters[0]
     copy, episode = np.empty_like(bodies[0]), np.empty_like(episodes[:1])
     generator, corners = np.empty_like(generators[0]), np.empty((2, 5, 2))
-    control, parts = np.zeros(2), np.zeros(PARTS)
+    control, parts = np.zeros(3), np.zeros(PARTS)
     for row in range(actions.shape[0]):
         road = roads[episodes[row].network]
         for plan in range(actions.shape[1]):
@@ -35,7 +35,7 @@ def roll_batch(
             episode[:] = episodes[row : row + 1]
             now, total, step = episode[0], 0.0, 0
             while step < actions.shape[2]:
-                drive(road, copy, now, actions[row, plan, step], control, given, corners, parts)
+                drive(road, copy, now, given.actions[actions[row, plan, step]], control, given, corners, parts)
                 if now.crashed or now.offroad:
                     break
                 total += now.progress

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cavbench.driving.features import ActionType, Driver
 from cavbench.envs.highway.config import check_target_speeds
-from cavbench.envs.roads.state import MOST_COLUMNS, MOST_SPEEDS, PARAMETERS, Feature, Kind
+from cavbench.envs.roads.state import MOST_COLUMNS, MOST_SPEEDS, PARAMETERS, Feature, Kind, ViewKind
 
 
 class TaskKind(IntEnum):
@@ -21,10 +21,19 @@ class TaskKind(IntEnum):
     MERGE_CLASSIC = 0
     MERGE_GENERIC = 1
     ROUNDABOUT = 2
+    INTERSECTION = 3
+    EXIT = 4
+    TWO_WAY = 5
+    U_TURN = 6
+    RACETRACK = 7
 
 
 DEFAULT_SPEEDS = (20.0, 25.0, 30.0)
 """MDPVehicle.DEFAULT_TARGET_SPEEDS in m/s."""
+
+
+REGULATIONS = 2
+"""RegulatedRoad.REGULATION_FREQUENCY in Hz."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,6 +73,11 @@ class RoadsConfig:
         action_repeat: number of decisions for which an action is held; lane changes are sent once, then IDLE.
         target_speeds: increasing speeds in m/s for FASTER and SLOWER.
         reward_speed_range: speeds in m/s at which highway-env's speed reward is 0 and 1.
+        actions: numbers of the discrete actions LANE_LEFT to SLOWER, by the task's own numbers.
+        idm: comfortable acceleration and braking in m/s2 and jam distance in m of the other cars.
+        regulated: whether cars give way at crossings.
+        view: what an observation is; the fields after `horizon` are for rows.
+        horizon: seconds of a grid of times to collision.
         features: names of the columns of an observation.
         low, high: ranges of x, y, vx, vy that map to [-1, 1]; None for highway-env's defaults, which depend on the road.
         clipped: whether these four are clipped.
@@ -87,6 +101,11 @@ class RoadsConfig:
     action_repeat: int = 1
     target_speeds: tuple[float, ...] = DEFAULT_SPEEDS
     reward_speed_range: tuple[float, float] = (20.0, 30.0)
+    actions: tuple[int, ...] = (0, 1, 2, 3, 4)
+    idm: tuple[float, float, float] = (3.0, 5.0, 10.0)
+    regulated: bool = False
+    view: ViewKind = ViewKind.ROWS
+    horizon: float = 0.0
     features: tuple[str, ...] = ("presence", "x", "y", "vx", "vy")
     low: tuple[float, ...] | None = None
     high: tuple[float, ...] | None = None
@@ -133,6 +152,15 @@ class RoadsConfig:
         return self.simulation_frequency // self.policy_frequency
 
     @property
+    def observed(self) -> tuple[int, int]:
+        """Rows and columns of an observation."""
+        if self.view == ViewKind.OCCUPANCY:
+            return 24, 12
+        if self.view == ViewKind.TIMES:
+            return 9, int(self.horizon * self.policy_frequency)
+        return self.observed_vehicles, len(self.features)
+
+    @property
     def ego(self) -> Kind:
         """What the ego is."""
         if self.driver == "idm":
@@ -144,16 +172,29 @@ def parameters(config: RoadsConfig) -> NDArray[np.void]:
     """The configuration for the compiled engine: an array of one record `PARAMETERS`."""
     table = np.zeros(1, dtype=PARAMETERS)
     values = table[0]
-    for name in ("task", "ego", "substeps", "max_steps", "action_repeat", "duration", "offroad_terminal"):
+    values["layout"] = config.view
+    for name in (
+        "simulation_frequency",
+        "task",
+        "ego",
+        "substeps",
+        "max_steps",
+        "action_repeat",
+        "duration",
+        "offroad_terminal",
+    ):
         values[name] = getattr(config, name)
     for name in ("clipped", "relative", "obstacles"):
         values[name] = getattr(config, name)
     values["dt"], values["period"] = 1 / config.simulation_frequency, 1 / config.policy_frequency
     values["speeds"], values["columns"] = len(config.target_speeds), len(config.features)
     values["target_speeds"][: len(config.target_speeds)] = config.target_speeds
+    values["actions"][: len(config.actions)] = config.actions
+    values["horizon"] = int(config.horizon / values["period"])
+    values["regulation"] = int(1 / values["dt"] / REGULATIONS) if config.regulated else 0
     values["default_speeds"] = DEFAULT_SPEEDS
     values["features"][: len(config.features)] = [Feature[name.upper()] for name in config.features]
-    values["idm_acceleration"], values["idm_braking"], values["jam_distance"] = 3.0, 5.0, 10.0
+    values["idm_acceleration"], values["idm_braking"], values["jam_distance"] = config.idm
     values["gap_scale"] = 2 * math.sqrt(values["idm_acceleration"] * values["idm_braking"])
     values["reward_speed_low"], values["reward_speed_high"] = config.reward_speed_range
     values["default_range"] = config.low is None

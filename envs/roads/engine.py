@@ -27,16 +27,22 @@ from cavbench.envs.highway.engine import (
     check_seeds,
     physical_controls,
 )
+from cavbench.envs.roads import exit_rules as leave
+from cavbench.envs.roads import intersection_rules as intersection
 from cavbench.envs.roads import merge_rules as merge
+from cavbench.envs.roads import racetrack_rules as racetrack
 from cavbench.envs.roads import roundabout_rules as roundabout
+from cavbench.envs.roads import two_way_rules as two_way
+from cavbench.envs.roads import u_turn_rules as u_turn
 from cavbench.envs.roads.bodies import settle_ego
-from cavbench.envs.roads.collision import find_collisions
 from cavbench.envs.roads.config import RoadsConfig, Scene, TaskKind, parameters
 from cavbench.envs.roads.generator import WORDS, Generator, seed_generator
+from cavbench.envs.roads.grids import occupancy, times_to_collision
 from cavbench.envs.roads.lanes import is_on
-from cavbench.envs.roads.motion import apply_meta_action, move
+from cavbench.envs.roads.motion import apply_meta_action
 from cavbench.envs.roads.network import WIDTH
 from cavbench.envs.roads.rows import observe
+from cavbench.envs.roads.simulation import advance
 from cavbench.envs.roads.state import (
     BODY,
     EPISODE,
@@ -48,19 +54,24 @@ from cavbench.envs.roads.state import (
     Kind,
     Parameters,
     Road,
+    ViewKind,
 )
-from cavbench.envs.roads.traffic import act, lane_distance, neighbours
+from cavbench.envs.roads.traffic import lane_distance, neighbours
 
-ACTIONS = 5
+MOST_SIDE_LANES = 16
 PARTS = 5
 """Largest number of parts of a task's reward."""
 MERGE_CLASSIC, MERGE_GENERIC = int(TaskKind.MERGE_CLASSIC), int(TaskKind.MERGE_GENERIC)
-ROUNDABOUT = int(TaskKind.ROUNDABOUT)
+ROUNDABOUT, INTERSECTION, EXIT = int(TaskKind.ROUNDABOUT), int(TaskKind.INTERSECTION), int(TaskKind.EXIT)
+TWO_WAY, U_TURN, RACETRACK = int(TaskKind.TWO_WAY), int(TaskKind.U_TURN), int(TaskKind.RACETRACK)
+OCCUPANCY, TIMES = int(ViewKind.OCCUPANCY), int(ViewKind.TIMES)
 DISCRETE, CONTINUOUS = int(Kind.DISCRETE), int(Kind.CONTINUOUS)
 
 
 @inner
-def spawn(road: Road, bodies: Bodies, episode: Episode, generator: Generator, parameters: Parameters) -> None:
+def spawn(
+    road: Road, bodies: Bodies, episode: Episode, generator: Generator, parameters: Parameters, corners: Floats
+) -> None:
     """The start of an episode, from its random numbers."""
     if parameters.task == MERGE_CLASSIC:
         merge.spawn_classic(road, bodies, episode, generator, parameters)
@@ -68,9 +79,67 @@ def spawn(road: Road, bodies: Bodies, episode: Episode, generator: Generator, pa
         merge.spawn_generic(road, bodies, episode, generator, parameters)
     elif parameters.task == ROUNDABOUT:
         roundabout.spawn(road, bodies, episode, generator, parameters)
+    elif parameters.task == INTERSECTION:
+        intersection.spawn(road, bodies, episode, generator, parameters, corners)
+    elif parameters.task == EXIT:
+        leave.spawn(road, bodies, episode, generator, parameters)
+    elif parameters.task == TWO_WAY:
+        two_way.spawn(road, bodies, episode, generator, parameters)
+    elif parameters.task == U_TURN:
+        u_turn.spawn(road, bodies, episode, generator, parameters)
+    else:
+        racetrack.spawn(road, bodies, episode, generator, parameters)
     ego = bodies[episode.ego]
     settle_ego(ego, parameters)
     episode.range_y = WIDTH * road.edges[road.lanes[ego.lane].edge].lanes
+
+
+@inner
+def reward(
+    road: Road,
+    bodies: Bodies,
+    episode: Episode,
+    action: int,
+    control: Floats,
+    on_road: bool,
+    parameters: Parameters,
+    parts: Floats,
+) -> float:
+    """The reward of the task, and its parts."""
+    ego = bodies[episode.ego]
+    if parameters.task == ROUNDABOUT:
+        return roundabout.reward(bodies, episode, action, on_road, parameters, parts)
+    if parameters.task == INTERSECTION:
+        return intersection.reward(road, ego, on_road, parameters, parts)
+    if parameters.task == EXIT:
+        return leave.reward(road, ego, parameters, parts)
+    if parameters.task == TWO_WAY:
+        return two_way.reward(road, bodies, episode, parameters, parts)
+    if parameters.task == U_TURN:
+        return u_turn.reward(road, bodies, episode, on_road, parameters, parts)
+    if parameters.task == RACETRACK:
+        return racetrack.reward(road, ego, control[2], on_road, parts)
+    return merge.reward(road, bodies, episode, action, parameters, parts)
+
+
+@inner
+def look(
+    road: Road,
+    bodies: Bodies,
+    episode: Episode,
+    parameters: Parameters,
+    rows: Integers,
+    work: Floats,
+    grid: NDArray[np.float64],
+    observation: NDArray[np.float32],
+) -> None:
+    """Fill an observation; `rows`, `work` and `grid` are work arrays."""
+    if parameters.layout == OCCUPANCY:
+        occupancy(road, bodies, episode, observation)
+    elif parameters.layout == TIMES:
+        times_to_collision(road, bodies, episode, parameters, grid, observation)
+    else:
+        observe(road, bodies, episode, parameters, rows, work, observation)
 
 
 @inner
@@ -86,19 +155,18 @@ def progress(road: Road, bodies: Bodies, episode: Episode, parameters: Parameter
 
 
 @inner
-def score(road: Road, bodies: Bodies, episode: Episode, action: int, parameters: Parameters, parts: Floats) -> None:
+def score(
+    road: Road, bodies: Bodies, episode: Episode, action: int, control: Floats, parameters: Parameters, parts: Floats
+) -> None:
     """Update the episode's record after one decision; reward and progress are sums over a held action."""
     ego = bodies[episode.ego]
     on_road = is_on(road.lanes[ego.lane], ego.along, ego.across, 0.0)
-    if parameters.task == ROUNDABOUT:
-        episode.reward += roundabout.reward(bodies, episode, action, on_road, parameters, parts)
-    else:
-        episode.reward += merge.reward(road, bodies, episode, action, parameters, parts)
+    episode.reward += reward(road, bodies, episode, action, control, on_road, parameters, parts)
     episode.crashed = ego.crashed
     episode.offroad = not on_road
     if on_road and not ego.crashed:
         episode.progress += progress(road, bodies, episode, parameters)
-    arrived = ego.x > road.end
+    arrived = ego.x > road.end or (parameters.task == INTERSECTION and intersection.has_arrived(road, ego))
     episode.terminated = ego.crashed or arrived or (parameters.offroad_terminal and not on_road)
     episode.truncated = episode.steps >= parameters.max_steps or episode.time >= parameters.duration
 
@@ -128,16 +196,6 @@ def apply_action(road: Road, ego: Body, action: int, control: Floats, first: boo
 
 
 @inner
-def advance(road: Road, bodies: Bodies, cars: int, parameters: Parameters, corners: Floats) -> None:
-    """AbstractEnv._simulate: the physics frames of one decision."""
-    for _ in range(parameters.substeps):
-        act(road, bodies, cars, parameters)
-        for number in range(cars):
-            move(road, bodies[number], parameters.dt)
-        find_collisions(bodies, cars, parameters.dt, corners)
-
-
-@inner
 def drive(
     road: Road,
     bodies: Bodies,
@@ -153,9 +211,9 @@ def drive(
     for held in range(parameters.action_repeat):
         apply_action(road, bodies[episode.ego], action, control, held == 0, parameters)
         episode.time += parameters.period
-        advance(road, bodies[: episode.bodies], episode.cars, parameters, corners)
+        advance(road, bodies[: episode.bodies], episode, parameters.substeps, parameters, corners)
         episode.steps += 1
-        score(road, bodies, episode, action, parameters, parts)
+        score(road, bodies, episode, action, control, parameters, parts)
         if episode.terminated or episode.truncated:
             break
 
@@ -187,6 +245,7 @@ def step_batch(
     actions: Integers,
     controls: Floats,
     paused: NDArray[np.bool_],
+    generators: NDArray[np.uint64],
     parameters: NDArray[np.void],
     observation: NDArray[np.float32],
     numbers: NDArray[np.float32],
@@ -196,6 +255,7 @@ def step_batch(
     """One action of every unfinished episode. See `RoadsEngine.step`."""
     corners, given = np.empty((2, 5, 2)), parameters[0]
     rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
+    grid = np.zeros((given.speeds, MOST_SIDE_LANES, max(given.horizon, 1)))
     for number in range(episodes.size):
         episode, cars = episodes[number], bodies[number]
         if paused[number] or episode.terminated or episode.truncated:
@@ -203,9 +263,11 @@ def step_batch(
             numbers[PROGRESS, number] = 0.0
             continue
         road = roads[episode.network]
-        drive(road, cars, episode, actions[number], controls[number], given, corners, parts[number])
-        observe(road, cars, episode, given, rows, work, observation[number])
+        drive(road, cars, episode, given.actions[actions[number]], controls[number], given, corners, parts[number])
+        look(road, cars, episode, given, rows, work, grid, observation[number])
         report(road, cars, episode, numbers, flags, number)
+        if given.task == INTERSECTION:
+            intersection.after_step(road, cars, episode, generators[number])
 
 
 @entry_point
@@ -223,17 +285,18 @@ def start_batch(
 ) -> None:
     """Start the episodes `chosen` [R] from `seeds` [R]. See `RoadsEngine.reset`."""
     rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
-    given = parameters[0]
+    corners, given = np.empty((2, 5, 2)), parameters[0]
+    grid = np.zeros((given.speeds, MOST_SIDE_LANES, max(given.horizon, 1)))
     for row in range(chosen.size):
         number = chosen[row]
         episode, cars = episodes[number], bodies[number]
         road = roads[episode.network]
-        episode.seed, episode.steps, episode.time = seeds[row], 0, 0.0
+        episode.seed, episode.steps, episode.frames, episode.time = seeds[row], 0, 0, 0.0
         episode.reward = episode.progress = 0.0
         episode.crashed = episode.offroad = episode.terminated = episode.truncated = False
         seed_generator(generators[number], seeds[row])
-        spawn(road, cars, episode, generators[number], given)
-        observe(road, cars, episode, given, rows, work, observation[number])
+        spawn(road, cars, episode, generators[number], given, corners)
+        look(road, cars, episode, given, rows, work, grid, observation[number])
         report(road, cars, episode, numbers, flags, number)
 
 
@@ -259,7 +322,7 @@ class RoadsEngine:
         self.bodies = np.zeros((batch, max(scene.capacity for scene in config.scenes)), dtype=BODY)
         self.episodes = np.zeros(batch, dtype=EPISODE)
         self.generators = np.zeros((batch, WORDS), dtype=np.uint64)
-        self.observation = np.zeros((batch, config.observed_vehicles, len(config.features)), dtype=np.float32)
+        self.observation = np.zeros((batch, *config.observed), dtype=np.float32)
         self.numbers = np.zeros((len(Number), batch), dtype=np.float32)
         self.flags = np.zeros((len(Flag), batch), dtype=np.bool_)
         self.parts = np.zeros((batch, PARTS))
@@ -269,7 +332,7 @@ class RoadsEngine:
         # No episode runs before its reset.
         self.episodes["truncated"] = True
         self._no_actions = np.full(batch, IDLE, dtype=np.int64)
-        self._no_controls = np.zeros((batch, 2))
+        self._no_controls = np.zeros((batch, 3))
         self._no_pause = np.zeros(batch, dtype=np.bool_)
 
     def reset(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
@@ -292,6 +355,11 @@ class RoadsEngine:
             self.flags,
         )
 
+    def _controls(self, action: NDArray[np.floating]) -> Floats:
+        """[B, 3] acceleration in m/s2, steering in rad, and the size of the action; one column [B, 1] is steering alone."""
+        both = action if action.shape[1] == 2 else np.concatenate([np.zeros_like(action), action], 1)
+        return np.concatenate([physical_controls(both), np.linalg.norm(action, axis=1)[:, None]], 1)
+
     def step(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None = None) -> None:
         """Execute one action in each episode; finished and paused episodes do not change and have reward 0.
 
@@ -306,10 +374,11 @@ class RoadsEngine:
         if self.config.ego == Kind.DISCRETE:
             # Always one memory layout: numba would compile again for another one.
             actions = np.ascontiguousarray(action, dtype=np.int64)
-            if actions.min() < 0 or actions.max() >= ACTIONS:
-                raise ValueError(f"actions must be between 0 and {ACTIONS - 1}, got {actions.tolist()}")
+            last = len(self.config.actions) - 1
+            if actions.min() < 0 or actions.max() > last:
+                raise ValueError(f"actions must be between 0 and {last}, got {actions.tolist()}")
         elif self.config.ego == Kind.CONTINUOUS:
-            controls = physical_controls(np.asarray(action))
+            controls = self._controls(np.asarray(action))
         step_batch(
             self.roads,
             self.bodies,
@@ -317,6 +386,7 @@ class RoadsEngine:
             actions,
             controls,
             self._no_pause if paused is None else paused,
+            self.generators,
             self.parameters,
             self.observation,
             self.numbers,

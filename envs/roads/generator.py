@@ -120,6 +120,17 @@ def next_below(generator: Generator, bound: int) -> np.int64:
 
 
 @inner
+def next_pair(generator: Generator) -> tuple[np.int64, np.int64]:
+    """Generator.choice(4, size=2, replace=False): Floyd's method, then a shuffle."""
+    first, second = next_below(generator, 3), next_below(generator, 4)
+    if second == first:
+        second = np.int64(3)
+    if next_below(generator, 2) == 0:
+        return second, first
+    return first, second
+
+
+@inner
 def hash_word(value: np.uint64, constant: NDArray[np.uint64]) -> np.uint64:
     """SeedSequence's hashmix on 32 bits; `constant` [1] is updated."""
     value = (value ^ constant[0]) & LOW_HALF

@@ -142,7 +142,7 @@ LANE = record_type(LaneRecord)
 EDGE = record_type(EdgeRecord)
 
 MOST_LANES, MOST_EDGES, MOST_LINKED, MOST_SPOTS = 64, 48, 8, 8
-MOST_ROUTES, LONGEST_ROUTE = 256, 16
+MOST_ROUTES, LONGEST_ROUTE, DEPTH = 256, 16, 3
 """Sizes of the tables. They are fixed, so that one compiled engine serves all networks."""
 
 ROAD = np.dtype(
@@ -150,6 +150,7 @@ ROAD = np.dtype(
         ("lane_count", np.int64),
         ("edge_count", np.int64),
         ("end", np.float64),  # m along x, where the task is done
+        ("factor", np.float64),  # by which the spacing of cars is reduced
         ("spots", np.int64, (MOST_SPOTS,)),  # lanes that the task names
         ("lanes", LANE, (MOST_LANES,)),
         ("edges", EDGE, (MOST_EDGES,)),  # roads, in highway-env's order
@@ -157,6 +158,11 @@ ROAD = np.dtype(
         ("offsets", np.float64, (MOST_LANES, MOST_LINKED)),  # m, where they begin on the lane
         ("routes", np.int16, (MOST_ROUTES, LONGEST_ROUTE)),  # roads from a lane to a destination, -1 after the end
         ("route_lanes", np.int16, (MOST_ROUTES, LONGEST_ROUTE)),  # the lane on each of them, -1 for any
+        (
+            "reach",
+            np.int8,
+            (DEPTH + 1, MOST_EDGES, MOST_EDGES),
+        ),  # whether one road leads to another within so many roads
     ],
     align=True,
 )
@@ -251,7 +257,12 @@ def _fill(place: np.void, lane: Lane) -> None:
 
 
 def record(
-    network: Network, *, spots: Sequence[int] = (), destinations: Sequence[str] = (), end: float = np.inf
+    network: Network,
+    *,
+    spots: Sequence[int] = (),
+    destinations: Sequence[str] = (),
+    end: float = np.inf,
+    factor: float = 1.0,
 ) -> NDArray[np.void]:
     """A network as an array of one record `ROAD`.
 
@@ -260,6 +271,7 @@ def record(
         spots: numbers of the lanes that the task names.
         destinations: nodes to which routes are planned; the route from lane l to destination d is row l * D + d.
         end: place in m along x at which the task is done.
+        factor: by which the spacing of cars is reduced at the start.
 
     Raises:
         ValueError: if the network is larger than the tables.
@@ -272,6 +284,7 @@ def record(
     table = np.zeros(1, dtype=ROAD)
     road = table[0]
     road["lane_count"], road["edge_count"], road["end"] = lanes, len(roads), end
+    road["factor"], road["reach"] = factor, _reach(roads)
     road["spots"][: len(spots)] = spots
     road["routes"] = road["route_lanes"] = -1
     number = 0
@@ -290,4 +303,17 @@ def record(
                 road["routes"][row, : len(route)] = [towards for towards, _ in route]
                 road["route_lanes"][row, : len(route)] = [wanted for _, wanted in route]
             number += 1
+    return table
+
+
+def _reach(roads: Sequence[tuple[str, str, list[Lane]]]) -> NDArray[np.int8]:
+    """[DEPTH + 1, E, E] RoadNetwork.is_connected_road without a route: whether a road is, or comes after, another one."""
+    table = np.zeros((DEPTH + 1, MOST_EDGES, MOST_EDGES), dtype=np.int8)
+    for edge, (start, _, _) in enumerate(roads):
+        for goal, (_, end, _) in enumerate(roads):
+            table[:, edge, goal] = int(edge == goal or end == start)
+    for depth in range(1, DEPTH + 1):
+        for edge, (_, end, _) in enumerate(roads):
+            after = [number for number, (start, _, _) in enumerate(roads) if start == end]
+            table[depth, edge] |= table[depth - 1, after].max(0, initial=0)
     return table

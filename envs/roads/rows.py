@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from cavbench.compiled import inner
 from cavbench.envs.highway.dynamics import clip, linear_map
 from cavbench.envs.highway.sensor import FEATURES, add_noise
-from cavbench.envs.roads.lanes import heading_at, wrap_to_pi
-from cavbench.envs.roads.state import Bodies, Body, Episode, Feature, Floats, Integers, Parameters, Road
+from cavbench.envs.roads.exit import EXIT_LANE
+from cavbench.envs.roads.lanes import heading_at, local_coordinates, wrap_to_pi
+from cavbench.envs.roads.state import Bodies, Body, Episode, Feature, Floats, Integers, Parameters, Road, ViewKind
 from cavbench.envs.roads.traffic import lane_distance
 
+EXIT_ROWS = int(ViewKind.EXIT_ROWS)
 BEHIND = -10.0
 """Bodies farther behind than this in m, along the ego's lane, are not seen: two lengths of a car."""
 WIDEST_X, WIDEST_V = 200.0, 80.0
@@ -122,6 +124,8 @@ def observe(
     measured = work[:FEATURES]
     observation[:] = 0.0
     measure(ego, ego, False, measured)
+    if parameters.layout == EXIT_ROWS:
+        measured[0], _ = local_coordinates(road.lanes[road.spots[EXIT_LANE]], ego.x, ego.y)
     write_row(road, ego, episode, measured, parameters, observation[0])
     found = nearest_bodies(road, bodies, episode, parameters.obstacles, rows, work[FEATURES:])
     for row in range(found):

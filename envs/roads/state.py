@@ -42,6 +42,15 @@ class Feature(IntEnum):
     ANG_OFF = 9
 
 
+class ViewKind(IntEnum):
+    """What an observation is: rows of cars, rows with the place of the exit, a grid of cells, or of times to collision."""
+
+    ROWS = 0
+    EXIT_ROWS = 1
+    OCCUPANCY = 2
+    TIMES = 3
+
+
 class Body:
     """One car or obstacle."""
 
@@ -71,6 +80,7 @@ class Body:
     impact: bool  # whether one is pending
     crashed: bool
     changes_lanes: bool  # whether MOBIL is on
+    yielding: bool  # whether it waits at a crossing
 
 
 class Episode:
@@ -83,6 +93,7 @@ class Episode:
     traffic: int  # number of cars that the cell asks for
     seed: int  # scenario seed
     steps: int  # decisions so far
+    frames: int  # physics frames so far, on a regulated road
     time: float  # s, as highway-env adds it up
     sensor_range: float  # m
     noise_sigma: float  # m and m/s
@@ -109,6 +120,7 @@ class Bodies(Protocol):
     def __getitem__(self, number: int) -> Body: ...
     @overload
     def __getitem__(self, number: slice) -> Bodies: ...
+    def __setitem__(self, number: slice, bodies: Bodies) -> None: ...
 
 
 class Lanes(Protocol):
@@ -129,6 +141,7 @@ class Road(Protocol):
     lane_count: int
     edge_count: int
     end: float
+    factor: float
     spots: Integers
     lanes: Lanes
     edges: Edges
@@ -136,6 +149,7 @@ class Road(Protocol):
     offsets: Floats
     routes: Integers
     route_lanes: Integers
+    reach: NDArray[np.int8]
 
 
 class Parameters(Protocol):
@@ -144,11 +158,16 @@ class Parameters(Protocol):
     task: int
     ego: int
     substeps: int
+    simulation_frequency: int
+    regulation: int  # frames between two decisions about the right of way, 0 for never
     dt: float
     period: float
     duration: float
     max_steps: int
     action_repeat: int
+    actions: Integers  # the five discrete actions, by the task's numbers
+    layout: int  # `ViewKind`
+    horizon: int  # steps of a grid of times to collision
     speeds: int  # number of target speeds
     target_speeds: Floats
     default_speeds: Floats  # highway-env's
@@ -174,6 +193,7 @@ _SHAPES = {
     "target_speeds": (MOST_SPEEDS,),
     "default_speeds": (3,),
     "features": (MOST_COLUMNS,),
+    "actions": (5,),
     "low": (4,),
     "high": (4,),
 }

@@ -1,8 +1,8 @@
 """Drive highway-env and the engine side by side through whole episodes, and count all differences.
 
-    python -m tests.envs.roads.side_by_side TASK SEEDS [FIRST]
+    python -m tests.envs.roads.side_by_side TASK[,TASK...] SEEDS [FIRST]
 
-prints the counts as JSON. One process a task: making an intersection rewrites constants of highway-env's classes.
+prints the counts as JSON. An intersection needs a process of its own: making one rewrites constants of highway-env's classes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,13 @@ def exact_environment() -> dict[str, str]:
 
 
 def action(space: Any, generator: np.random.Generator, seed: int, step: int) -> Any:
-    """Five kinds of drivers by seed: random, IDLE, random every third decision, mostly fast, and random again."""
+    """Five kinds of drivers by seed: random, IDLE, random every third decision, mostly fast, and random again.
+
+    Continuous actions are random and of five sizes.
+    """
+    if not hasattr(space, "n"):
+        size = np.float32((1, 0.3, 0.05, 0.02, 0.1)[seed % 5])
+        return generator.uniform(-1, 1, space.shape).astype(np.float32) * size
     count = int(space.n)
     chosen, kind = int(generator.integers(count)), seed % 5
     if kind == 1 or (kind == 2 and step % 3):
@@ -46,7 +52,7 @@ def compare(task: str, seeds: range) -> Counter[str]:
     from cavbench.envs.roads.engine import RoadsEngine
     from cavbench.envs.roads.originals import original
 
-    simulator, engine = gymnasium.make(task).unwrapped, RoadsEngine(original(task))
+    simulator, engine = gymnasium.make(task, disable_env_checker=True), RoadsEngine(original(task))
     counts: Counter[str] = Counter()
     for seed in seeds:
         found = _compare_one(simulator, engine, seed)
@@ -71,14 +77,14 @@ def _compare_one(simulator: Any, engine: Any, seed: int) -> Counter[str]:
         counts.update(_differing_end(engine, reward, terminated, truncated, info))
         ended, step = terminated or truncated, step + 1
     counts["steps"] += step
-    counts["crashed cars"] += sum(car.crashed for car in simulator.road.vehicles)
-    counts["crashed egos"] += int(simulator.vehicle.crashed)
+    counts["crashed cars"] += sum(car.crashed for car in simulator.unwrapped.road.vehicles)
+    counts["crashed egos"] += int(simulator.unwrapped.vehicle.crashed)
     return counts
 
 
 def _differing(simulator: Any, engine: Any, observation: np.ndarray) -> Iterator[str]:
     """Names of the parts of the state and of the observation that differ."""
-    cars = simulator.road.vehicles
+    cars = simulator.unwrapped.road.vehicles
     ours = engine.bodies[0][: engine.episodes["cars"][0]]
     if len(cars) != len(ours):
         yield "differs: number of cars"
@@ -90,7 +96,7 @@ def _differing(simulator: Any, engine: Any, observation: np.ndarray) -> Iterator
     targets = [car for car in cars if hasattr(car, "target_speed")]
     if len(targets) == len(cars) and (ours["target_speed"] != [car.target_speed for car in cars]).any():
         yield "differs: target speed"
-    if (engine.observation[0] != observation).any():
+    if (engine.observation[0].ravel() != observation.ravel()).any():
         yield "differs: observation"
 
 
@@ -113,5 +119,6 @@ def _differing_end(
 
 if __name__ == "__main__":
     FIRST = int(sys.argv[3]) if len(sys.argv) > 3 else 0
-    found = compare(sys.argv[1], range(FIRST, FIRST + int(sys.argv[2])))
-    sys.stdout.write(json.dumps(dict(sorted(found.items()))) + "\n")
+    for name in sys.argv[1].split(","):
+        found = compare(name, range(FIRST, FIRST + int(sys.argv[2])))
+        sys.stdout.write(json.dumps({"task": name} | dict(sorted(found.items()))) + "\n")
