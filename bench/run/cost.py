@@ -25,7 +25,6 @@ from cavbench.run.unit import Unit
 
 if TYPE_CHECKING:
     from cavbench.core.pair import Pair
-    from cavbench.run.plan import Plan
 
 EFFORT = {"steps": 1.0, "restarts": 1.0, "directions": 1.0, "views": 1.0, "batch": 1.0, "window": 1.0, "horizon": 1.0}
 """Parameters of attacks that their cost grows with, and by which power."""
@@ -229,14 +228,28 @@ def shares(units: Sequence[Unit], workers: int, recorded: Collection[str] = ()) 
     return [found[id(unit)] for unit in units]
 
 
-def cost_of(plan: Plan) -> Cost:
-    """What a plan costs, all of it; of a run with `until` the most. No network is loaded for it."""
-    asked = {pair.id for pair in plan.pairs}
-    baselines = {pair.id for pair in plan.baselines} - asked
-    weights = {task.unit.networks: ("", "") for task in plan.loadings}
-    units = [unit for part in plan.rounds for unit in part.units(weights)]
-    workers = 1 if plan.executor == "serial" else plan.workers or cores()
-    every = {pair.id: rates(pair) for pair in plan.driven}
+def cost_of(
+    asked: Collection[str],
+    baselines: Collection[str],
+    driven: Sequence[Pair],
+    units: Sequence[Unit],
+    workers: int,
+    *,
+    recordings: int,
+    at_most: bool,
+) -> Cost:
+    """What some units cost, all of them. No network is loaded for it.
+
+    Args:
+        asked: the pairs that were asked for, by name.
+        baselines: the pairs that others are compared with, by name.
+        driven: these pairs and their clean controls.
+        units: of these pairs.
+        workers: processes that drive them.
+        recordings: episodes that are recorded.
+        at_most: whether it may end with fewer units.
+    """
+    every = {pair.id: rates(pair) for pair in driven}
     seeds = {(unit.pair.id, unit.training_seed) for unit in units if every[unit.pair.id].artefact}
     by_pair = dict.fromkeys(every, (0, 0.0))
     for name, _ in seeds:
@@ -246,20 +259,18 @@ def cost_of(plan: Plan) -> Cost:
         by_pair[unit.pair.id] = (before[0] + len(unit.seeds), before[1] + seconds)
     episodes = sum(count for count, _ in by_pair.values())
     return Cost(
-        pairs=len(plan.pairs),
+        pairs=len(asked),
         episodes=episodes,
-        controls=sum(count for name, (count, _) in by_pair.items() if name not in asked | baselines),
+        controls=sum(count for name, (count, _) in by_pair.items() if name not in {*asked, *baselines}),
         baselines=sum(count for name, (count, _) in by_pair.items() if name in baselines),
         cpu_s=sum(seconds for _, seconds in by_pair.values()),
         workers=min(workers, max(1, len(units))),
-        disk_bytes=_disk(plan, units, episodes) + len(seeds) * ARTEFACT_BYTES,
+        disk_bytes=_disk(len(units), episodes, recordings) + len(seeds) * ARTEFACT_BYTES,
         unknown=tuple(dict.fromkeys(name for one in every.values() for name in one.unknown)),
-        at_most=plan.until is not None,
+        at_most=at_most,
         by_pair=by_pair,
     )
 
 
-def _disk(plan: Plan, units: Sequence[Unit], episodes: int) -> int:
-    recorded = len(plan.pairs) * (1 if plan.record is None else plan.record * len(plan.grid.cells()))
-    loose = len(units) % UNITS
-    return loose * UNIT_BYTES + episodes * EPISODE_BYTES + recorded * RECORDING_BYTES
+def _disk(units: int, episodes: int, recordings: int) -> int:
+    return units % UNITS * UNIT_BYTES + episodes * EPISODE_BYTES + recordings * RECORDING_BYTES
