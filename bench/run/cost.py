@@ -25,7 +25,6 @@ from cavbench.run.unit import Unit
 
 if TYPE_CHECKING:
     from cavbench.core.pair import Pair
-    from cavbench.run.plan import Plan
 
 EFFORT = {"steps": 1.0, "restarts": 1.0, "directions": 1.0, "views": 1.0, "batch": 1.0, "window": 1.0, "horizon": 1.0}
 """Parameters of attacks that their cost grows with, and by which power."""
@@ -229,8 +228,8 @@ def shares(units: Sequence[Unit], workers: int, recorded: Collection[str] = ()) 
     return [found[id(unit)] for unit in units]
 
 
-def cost_of(plan: Plan) -> Cost:
-    """What a plan costs, all of it; of a run with `until` the most. No network is loaded for it."""
+def cost_of(plan: Any) -> Cost:
+    """What a `cavbench.run.plan.Plan` costs, all of it; of a run with `until` the most. No network is loaded for it."""
     asked = {pair.id for pair in plan.pairs}
     baselines = {pair.id for pair in plan.baselines} - asked
     weights = {task.unit.networks: ("", "") for task in plan.loadings}
@@ -259,7 +258,7 @@ def cost_of(plan: Plan) -> Cost:
     )
 
 
-def _disk(plan: Plan, units: Sequence[Unit], episodes: int) -> int:
+def _disk(plan: Any, units: Sequence[Unit], episodes: int) -> int:
     recorded = len(plan.pairs) * (1 if plan.record is None else plan.record * len(plan.grid.cells()))
     loose = len(units) % UNITS
     return loose * UNIT_BYTES + episodes * EPISODE_BYTES + recorded * RECORDING_BYTES
