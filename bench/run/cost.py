@@ -228,28 +228,14 @@ def shares(units: Sequence[Unit], workers: int, recorded: Collection[str] = ()) 
     return [found[id(unit)] for unit in units]
 
 
-def cost_of(
-    asked: Collection[str],
-    baselines: Collection[str],
-    driven: Sequence[Pair],
-    units: Sequence[Unit],
-    workers: int,
-    *,
-    recordings: int,
-    at_most: bool,
-) -> Cost:
-    """What some units cost, all of them. No network is loaded for it.
-
-    Args:
-        asked: the pairs that were asked for, by name.
-        baselines: the pairs that others are compared with, by name.
-        driven: these pairs and their clean controls.
-        units: of these pairs.
-        workers: processes that drive them.
-        recordings: episodes that are recorded.
-        at_most: whether it may end with fewer units.
-    """
-    every = {pair.id: rates(pair) for pair in driven}
+def cost_of(plan: Any) -> Cost:
+    """What a `cavbench.run.plan.Plan` costs, all of it; of a run with `until` the most. No network is loaded for it."""
+    asked = {pair.id for pair in plan.pairs}
+    baselines = {pair.id for pair in plan.baselines} - asked
+    weights = {task.unit.networks: ("", "") for task in plan.loadings}
+    units = [unit for part in plan.rounds for unit in part.units(weights)]
+    workers = 1 if plan.executor == "serial" else plan.workers or cores()
+    every = {pair.id: rates(pair) for pair in plan.driven}
     seeds = {(unit.pair.id, unit.training_seed) for unit in units if every[unit.pair.id].artefact}
     by_pair = dict.fromkeys(every, (0, 0.0))
     for name, _ in seeds:
@@ -259,18 +245,20 @@ def cost_of(
         by_pair[unit.pair.id] = (before[0] + len(unit.seeds), before[1] + seconds)
     episodes = sum(count for count, _ in by_pair.values())
     return Cost(
-        pairs=len(asked),
+        pairs=len(plan.pairs),
         episodes=episodes,
-        controls=sum(count for name, (count, _) in by_pair.items() if name not in {*asked, *baselines}),
+        controls=sum(count for name, (count, _) in by_pair.items() if name not in asked | baselines),
         baselines=sum(count for name, (count, _) in by_pair.items() if name in baselines),
         cpu_s=sum(seconds for _, seconds in by_pair.values()),
         workers=min(workers, max(1, len(units))),
-        disk_bytes=_disk(len(units), episodes, recordings) + len(seeds) * ARTEFACT_BYTES,
+        disk_bytes=_disk(plan, units, episodes) + len(seeds) * ARTEFACT_BYTES,
         unknown=tuple(dict.fromkeys(name for one in every.values() for name in one.unknown)),
-        at_most=at_most,
+        at_most=plan.until is not None,
         by_pair=by_pair,
     )
 
 
-def _disk(units: int, episodes: int, recordings: int) -> int:
-    return units % UNITS * UNIT_BYTES + episodes * EPISODE_BYTES + recordings * RECORDING_BYTES
+def _disk(plan: Any, units: Sequence[Unit], episodes: int) -> int:
+    recorded = len(plan.pairs) * (1 if plan.record is None else plan.record * len(plan.grid.cells()))
+    loose = len(units) % UNITS
+    return loose * UNIT_BYTES + episodes * EPISODE_BYTES + recorded * RECORDING_BYTES

@@ -20,7 +20,6 @@ from cavbench.run.cost import Cost, cost_of
 from cavbench.run.gates import Gates
 from cavbench.run.networks import Weights, hashes
 from cavbench.run.options import EXECUTORS, half_of_memory
-from cavbench.run.process import cores
 from cavbench.run.task import Limits, Task
 from cavbench.run.unit import Unit
 from cavbench.scenarios import Cell, Grid
@@ -153,18 +152,8 @@ class Plan:
 
     @cached_property
     def cost(self) -> Cost:
-        """What it will cost, known before it does anything; with `until` at most."""
-        asked = {pair.id for pair in self.pairs}
-        weights = {task.unit.networks: ("", "") for task in self.loadings}
-        return cost_of(
-            asked,
-            {pair.id for pair in self.baselines} - asked,
-            self.driven,
-            [unit for part in self.rounds for unit in part.units(weights)],
-            1 if self.executor == "serial" else self.workers or cores(),
-            recordings=len(self.pairs) * (1 if self.record is None else self.record * len(self.grid.cells())),
-            at_most=self.until is not None,
-        )
+        """What it will cost, known before it does anything."""
+        return cost_of(self)
 
     def units(self, weights: Weights | None = None) -> list[Unit]:
         """The distinct units, or those of the shard, whose networks could be loaded.
