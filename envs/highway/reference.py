@@ -30,7 +30,7 @@ LANE_CHANGES = (ACTIONS.index("LANE_LEFT"), ACTIONS.index("LANE_RIGHT"))
 
 def farama_config(config: HighwayConfig, cell: Cell) -> dict[str, Any]:
     """highway-env's configuration dictionary for `config` and one of its cells."""
-    features = config.features
+    features = config.features_on(cell.lanes)
     ranges = {name: [low, high] for name, low, high in zip(features.names, features.low, features.high, strict=True)}
     discrete: dict[str, Any] = {"type": "DiscreteMetaAction", "target_speeds": list(config.target_speeds)}
     continuous = {"type": "ContinuousAction"}
@@ -49,7 +49,7 @@ def farama_config(config: HighwayConfig, cell: Cell) -> dict[str, Any]:
             "type": "Kinematics",
             "vehicles_count": config.observed_vehicles,
             "features": ["presence", *features.names],
-            "features_range": None if config.lane_range else ranges,
+            "features_range": ranges,
         },
         "collision_reward": config.collision_reward,
         "right_lane_reward": config.right_lane_reward,
