@@ -15,3 +15,15 @@ see() {
     (cd "$folder" && OMP_NUM_THREADS=1 venv/bin/python -W ignore seen.py 2>"$folder/errors.log") ||
         { status=$?; tail -5 "$folder/errors.log" >&2; exit "$status"; }
 }
+
+# `fresh_node PACKAGE@VERSION ...` and `see_node` are the same for JavaScript; they need node and npm.
+fresh_node() {
+    folder=$(mktemp -d)
+    trap 'rm -rf "$folder"' EXIT
+    (cd "$folder" && npm install --silent --no-audit --no-fund "$@" >npm.log 2>&1) || { cat "$folder/npm.log" >&2; exit 2; }
+}
+
+see_node() {
+    cat >"$folder/seen.js"
+    (cd "$folder" && node seen.js 2>errors.log) || { tail -5 "$folder/errors.log" >&2; exit 1; }
+}

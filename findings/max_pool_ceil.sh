@@ -1,18 +1,13 @@
-#!/bin/sh
-# Guess: a MaxPool with ceil_mode has one size, in every library and in ONNX's own shape inference.
+#!/usr/bin/env bash
+# One guesses: a MaxPool with ceil_mode has one size, in every library and in ONNX's own shape inference.
 # What happens: with 7 pixels, windows of 2, steps of 2 and a border of 1, ONNX Runtime returns 4 x 4 (as torch does:
 # no window begins in the border), OpenVINO returns 5 x 5, and ONNX's shape inference says 5 x 5. What is flattened
 # after that has another number of predictions.
 # Versions: onnx 1.23.2, onnxruntime 1.32.0, openvino 2026.4.1 (CPU). Source: the ONNX operator MaxPool, the formula
 # of its output.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-"${PYTHON:-python3}" -m venv env
-env/bin/pip install --quiet --disable-pip-version-check \
-    numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1 2>log || { cat log >&2; exit 2; }
-OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1
+see <<'P'
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -63,4 +58,4 @@ sizes = {
 }
 print(sizes)
 assert sizes == {"shape inference": [1, 1, 5, 5], "onnxruntime": [1, 1, 4, 4], "openvino": [1, 1, 5, 5]}
-END
+P

@@ -1,18 +1,14 @@
-#!/bin/sh
-# Guess: on x86 ncnn computes in float32, because half precision is for Arm and Vulkan; a fully connected layer is
-# exact to 1e-6.
+#!/usr/bin/env bash
+# One guesses: on x86 ncnn computes in float32, because half precision is for Arm and Vulkan; a fully connected layer
+# is exact to 1e-6.
 # What happens: where the processor has F16C, the weights of InnerProduct are rounded to half precision by default,
 # and the answer is 3e-4 of its range away. Convolutions are not. use_fp16_storage and use_fp16_packed off make it
 # exact. The classes of a detector with a fully connected head differ from all other runtimes.
-# Versions: ncnn 1.0.20261020. On a processor without F16C nothing is rounded; then this prints so and passes.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-"${PYTHON:-python3}" -m venv env
-env/bin/pip install --quiet --disable-pip-version-check \
-    numpy==2.4.6 ncnn==1.0.20261020 2>log || { cat log >&2; exit 2; }
-OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
+# Versions: ncnn 1.0.20261020. On a processor without F16C nothing is rounded; then this prints so and passes. Source:
+# the options of ncnn.Net, one by one.
+source "$(dirname "$0")/fresh.sh"
+fresh numpy==2.4.6 ncnn==1.0.20261020
+see <<'P'
 import ncnn
 import numpy as np
 
@@ -45,4 +41,4 @@ f16c = "f16c" in open("/proc/cpuinfo").read()
 print("ncnn", ncnn.__version__, f"largest error {half:.1e} by default, {single:.1e} without half precision; F16C: {f16c}")
 assert single < 1e-6
 assert half > 1e-4 if f16c else half < 1e-6
-END
+P

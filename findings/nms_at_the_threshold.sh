@@ -1,17 +1,12 @@
-#!/bin/sh
-# Guess: two boxes whose overlap equals the threshold of NonMaxSuppression get one answer from every library.
+#!/usr/bin/env bash
+# One guesses: two boxes whose overlap equals the threshold of NonMaxSuppression get one answer from every library.
 # What happens: ONNX Runtime keeps the second box (only more overlap than the threshold suppresses), OpenVINO drops
 # it. Overlaps of exactly one half are common where boxes lie on a grid.
 # Versions: onnxruntime 1.32.0, openvino 2026.4.1 (CPU, float32). Source: ONNX's text of iou_threshold does not say
 # which.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-"${PYTHON:-python3}" -m venv env
-env/bin/pip install --quiet --disable-pip-version-check \
-    numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1 2>log || { cat log >&2; exit 2; }
-OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1
+see <<'P'
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -58,4 +53,4 @@ given = {"boxes": np.float32([[[0, 0, 2, 1], [0, 0, 1, 1]]]), "scores": np.float
 kept = {"onnxruntime": onnx_runtime(made, **given)[0][:, 2].tolist(), "openvino": openvino(made, **given)[0][:, 2].tolist()}
 print("boxes kept at an overlap of exactly the threshold:", kept)
 assert kept == {"onnxruntime": [0, 1], "openvino": [0]}
-END
+P

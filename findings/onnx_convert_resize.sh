@@ -1,18 +1,13 @@
-#!/bin/sh
-# Guess: onnx.version_converter keeps what a model computes.
+#!/usr/bin/env bash
+# One guesses: onnx.version_converter keeps what a model computes.
 # What happens: a Resize of opset 10 counts pixels from their corners; from opset 11 on the default counts from their
 # centres. The converter adds no attribute, so after a conversion from 10 to 13 every bilinear Resize is shifted by up
 # to half a pixel, without a word. An older detector that is brought to a newer opset has other feature maps, and its
 # boxes move. (RoiAlign, whose centres changed too, is converted rightly.)
 # Versions: onnx 1.23.2, onnxruntime 1.32.0. Source: onnx/version_converter/adapters/resize_10_11.h.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-"${PYTHON:-python3}" -m venv env
-env/bin/pip install --quiet --disable-pip-version-check \
-    numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 2>log || { cat log >&2; exit 2; }
-OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0
+see <<'P'
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -51,4 +46,4 @@ print("onnx", onnx.__version__, "first row before", before[0, 0, 0].tolist(), "a
 assert [one.name for one in new.graph.node[-1].attribute] == ["mode"]
 assert np.allclose(before[0, 0, 0, :4], [0, 0.5, 1, 1.5])
 assert np.allclose(after[0, 0, 0, :4], [0, 0.25, 0.75, 1.25])
-END
+P

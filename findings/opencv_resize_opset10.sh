@@ -1,16 +1,11 @@
-#!/bin/sh
-# Guess: OpenCV reads a Resize by the rules of the opset that the model names.
+#!/usr/bin/env bash
+# One guesses: OpenCV reads a Resize by the rules of the opset that the model names.
 # What happens: a bilinear Resize of opset 10, which counts pixels from their corners, is computed as one of opset 11
 # and later, from their centres: up to half a pixel away. ONNX Runtime and OpenVINO compute what the model says.
 # Versions: OpenCV 5.0.0, onnxruntime 1.32.0. Source: the ONNX operator Resize, opsets 10 and 11.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-"${PYTHON:-python3}" -m venv env
-env/bin/pip install --quiet --disable-pip-version-check \
-    numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 opencv-python-headless==5.0.0.93 2>log || { cat log >&2; exit 2; }
-OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 opencv-python-headless==5.0.0.93
+see <<'P'
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -55,4 +50,4 @@ meant, centres, found = onnx_runtime(ten, x=x)[0], onnx_runtime(thirteen, x=x)[0
 print("OpenCV", cv2.__version__, found[0, 0, 0].tolist(), "and ONNX Runtime", meant[0, 0, 0].tolist())
 assert float(abs(found - meant).max()) > 1
 assert float(abs(found - centres).max()) < 1e-5
-END
+P

@@ -1,16 +1,11 @@
-#!/bin/sh
-# Guess: OpenVINO's preprocessing resizes images of bytes in floating point.
+#!/usr/bin/env bash
+# One guesses: OpenVINO's preprocessing resizes images of bytes in floating point.
 # What happens: a resize before convert_element_type returns whole numbers; after it, it does not. The two orders
 # differ by half a grey level, and the first has no gradient that finite differences could find below one level.
 # Versions: openvino 2026.4.1 (CPU, float32). Source: openvino.preprocess.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-"${PYTHON:-python3}" -m venv env
-env/bin/pip install --quiet --disable-pip-version-check \
-    numpy==2.4.6 onnx==1.23.2 openvino==2026.4.1 2>log || { cat log >&2; exit 2; }
-OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh numpy==2.4.6 onnx==1.23.2 openvino==2026.4.1
+see <<'P'
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -57,4 +52,4 @@ difference = float(abs(resized("resize") - resized("convert")).max())
 print("openvino", openvino.__version__.partition("-")[0], "whole numbers, by what comes first:", whole, f"difference {difference:.2f}")
 assert whole == {"resize": True, "convert": False}
 assert 0.3 < difference <= 0.5
-END
+P

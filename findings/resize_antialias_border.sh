@@ -1,18 +1,13 @@
-#!/bin/sh
-# Guess: a Resize with mode=linear and antialias=1 is Pillow's bilinear resize, up to rounding.
+#!/usr/bin/env bash
+# One guesses: a Resize with mode=linear and antialias=1 is Pillow's bilinear resize, up to rounding.
 # What happens: inside the image they agree to 1e-4, at the border they differ by about 11 of 255. ONNX repeats the
 # pixels at the border, Pillow (and torch) leave them out and weigh the others more. What was trained behind Pillow
 # and is exported with the Resize inside sees another frame around each image.
 # Versions: onnxruntime 1.32.0, Pillow 13.0.0. Source: onnx.reference has the border of ONNX Runtime;
 # exclude_outside=1 gives Pillow's to 2e-5.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-"${PYTHON:-python3}" -m venv env
-env/bin/pip install --quiet --disable-pip-version-check \
-    numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 pillow==13.0.0 2>log || { cat log >&2; exit 2; }
-OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 pillow==13.0.0
+see <<'P'
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -53,4 +48,4 @@ inside, border = float(difference[2:-2, 2:-2].max()), float(difference.max())
 print(f"largest difference inside {inside:.1e}, at the border {border:.1f} of 255")
 assert inside < 1e-3
 assert border > 3
-END
+P

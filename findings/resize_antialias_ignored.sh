@@ -1,17 +1,12 @@
-#!/bin/sh
-# Guess: a runtime that does not know antialias=1 of Resize refuses the model.
+#!/usr/bin/env bash
+# One guesses: a runtime that does not know antialias=1 of Resize refuses the model.
 # What happens: OpenVINO and OpenCV read it, and resize without antialiasing; a shrunk image differs from ONNX
 # Runtime's by a third of the range. A detector that shrinks its input within the graph sees another patch.
 # Versions: onnxruntime 1.32.0, openvino 2026.4.1 (CPU, float32), OpenCV 5.0.0. Source: the ONNX operator Resize,
 # opset 18.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-"${PYTHON:-python3}" -m venv env
-env/bin/pip install --quiet --disable-pip-version-check \
-    numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1 opencv-python-headless==5.0.0.93 2>log || { cat log >&2; exit 2; }
-OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1 opencv-python-headless==5.0.0.93
+see <<'P'
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -72,4 +67,4 @@ far, near = ({name: round(float(abs(one - other).max()), 4) for name, one in fou
 print("with antialias=1, largest difference to ONNX Runtime with it", far, "and without", near)
 assert min(far.values()) > 0.2
 assert max(near.values()) < 1e-4
-END
+P

@@ -1,14 +1,11 @@
-#!/bin/sh
-# Guess: an average pool with padding "same" and its gradient divide by the same number of pixels.
+#!/usr/bin/env bash
+# One guesses: an average pool with padding "same" and its gradient divide by the same number of pixels.
 # What happens: forward, TensorFlow.js leaves out what lies beyond the border, so ones stay ones; the gradient divides
 # by the whole window. At the border it is too small: here all of it sums to less than the number of outputs.
 # Versions: @tensorflow/tfjs 4.22.0 on the CPU. Source: avgMultiplier in kernels/AvgPoolGrad of tfjs-backend-cpu.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-npm install --silent --no-audit --no-fund @tensorflow/tfjs@4.22.0 || exit 2
-cat > seen.js <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh_node @tensorflow/tfjs@4.22.0
+see_node <<'P'
 const tf = require("@tensorflow/tfjs");
 // No advertisement.
 tf.env().set("IS_TEST", true);
@@ -21,5 +18,4 @@ const said = `ones become ${forward}; the gradient of their sum adds up to ${gra
 console.log(`TensorFlow.js ${tf.version["tfjs-core"]}: ${said}`);
 assert(forward.every((value) => Math.abs(value - 1) < 1e-6));
 assert(Math.abs(gradient - 25 / 9) < 1e-3);
-END
-node seen.js
+P

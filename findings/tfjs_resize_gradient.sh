@@ -1,17 +1,14 @@
-#!/bin/sh
-# Guess: the gradient of resizeBilinear in TensorFlow.js is that of what it computes.
+#!/usr/bin/env bash
+# One guesses: the gradient of resizeBilinear in TensorFlow.js is that of what it computes.
 # What happens: with halfPixelCenters the gradient is computed as if pixels were counted from their corners. It
 # differs from finite differences by up to half of its size; without halfPixelCenters both agree. A patch that is
 # optimised in TensorFlow.js through a detector with such an upsampling (NanoDet has four) follows other directions
 # than those that lower the score most.
 # Versions: @tensorflow/tfjs 4.22.0 on the CPU. Source: kernels/ResizeBilinearGrad of tfjs-backend-cpu, which knows no
 # half pixels.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-npm install --silent --no-audit --no-fund @tensorflow/tfjs@4.22.0 || exit 2
-cat > seen.js <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh_node @tensorflow/tfjs@4.22.0
+see_node <<'P'
 const tf = require("@tensorflow/tfjs");
 // No advertisement.
 tf.env().set("IS_TEST", true);
@@ -37,5 +34,4 @@ const said = `from corners ${corners.toExponential(1)}, from centres ${centres.t
 console.log(`TensorFlow.js ${tf.version["tfjs-core"]}: gradient minus finite differences, ${said}`);
 assert(corners < 1e-3);
 assert(centres > 0.1);
-END
-node seen.js
+P

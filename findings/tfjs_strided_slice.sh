@@ -1,15 +1,12 @@
-#!/bin/sh
-# Guess: stridedSlice with steps that also drops an axis returns what numpy's x[0:1, ::2, 1::2, 2] returns.
+#!/usr/bin/env bash
+# One guesses: stridedSlice with steps that also drops an axis returns what numpy's x[0:1, ::2, 1::2, 2] returns.
 # What happens: it returns other elements, of the right shape: steps and begins are taken for the wrong axes once an
 # axis is dropped. Without the dropped axis it is right. Graphs that pick a coordinate of every second cell have this.
 # Versions: @tensorflow/tfjs 4.22.0 on the CPU. Source: kernels/StridedSlice of tfjs-backend-cpu, which uses
 # finalShapeSparse.
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-npm install --silent --no-audit --no-fund @tensorflow/tfjs@4.22.0 || exit 2
-cat > seen.js <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh_node @tensorflow/tfjs@4.22.0
+see_node <<'P'
 const tf = require("@tensorflow/tfjs");
 // No advertisement.
 tf.env().set("IS_TEST", true);
@@ -21,5 +18,4 @@ const [kept, dropped] = [0, 8].map((mask) => Array.from(tf.stridedSlice(x, begin
 console.log(`TensorFlow.js ${tf.version["tfjs-core"]}: with the axis ${kept}; with it dropped ${dropped}`);
 assert.deepStrictEqual(kept, [6, 14, 22, 54, 62, 70, 102, 110, 118]);
 assert.notDeepStrictEqual(dropped, kept);
-END
-node seen.js
+P

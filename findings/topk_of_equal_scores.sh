@@ -1,18 +1,13 @@
-#!/bin/sh
-# Guess: of equal scores TopK takes the one with the lower number first, as ONNX says.
+#!/usr/bin/env bash
+# One guesses: of equal scores TopK takes the one with the lower number first, as ONNX says.
 # What happens: OpenVINO on the CPU takes others, and in another order: of 100 scores with ties one of the ten best is
 # another prediction than in ONNX Runtime. An end-to-end detector that keeps its best 300 returns other boxes where
 # scores tie, as they do after a quantisation and on flat images.
 # Versions: onnxruntime 1.32.0, openvino 2026.4.1 (CPU, float32). Source: the ONNX operator TopK ("the element with
 # the lower index will appear first").
-set -eu
-folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
-cd "$folder"
-"${PYTHON:-python3}" -m venv env
-env/bin/pip install --quiet --disable-pip-version-check \
-    numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1 2>log || { cat log >&2; exit 2; }
-OMP_NUM_THREADS=1 env/bin/python -W ignore - <<'END'
+source "$(dirname "$0")/fresh.sh"
+fresh numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1
+see <<'P'
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -60,4 +55,4 @@ print("onnxruntime", first[0].tolist(), "openvino", second[0].tolist())
 assert first[0].tolist() == np.argsort(-x[0], stable=True)[:10].tolist()
 assert set(second[0]) != set(first[0])
 assert sorted(x[0, second[0]]) == sorted(x[0, first[0]])
-END
+P
