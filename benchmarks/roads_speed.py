@@ -1,0 +1,88 @@
+"""Measures how much faster than highway-env the engine of road networks is, per CPU second of one thread:
+
+    python benchmarks/roads_speed.py [TASK ...] [--seconds 3] [--batch 64]
+
+Whole episodes with random actions, resets included; of a racetrack's steering a twentieth. Compilation is not counted. Give the
+tasks of an intersection a run of their own: making one changes the traffic of all later tasks of the process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import gymnasium
+import highway_env  # noqa: F401
+import numpy as np
+from rich.console import Console
+
+from cavbench.envs.highway.engine import Flag
+from cavbench.envs.roads.engine import RoadsEngine
+from cavbench.envs.roads.originals import ORIGINALS, original
+
+STEERING = 0.05
+GOAL = 1000
+
+
+def reference_rate(task: str, seconds: float) -> float:
+    """highway-env's steps per CPU second."""
+    env = gymnasium.make(task, disable_env_checker=True)
+    generator, steps, seed, start = np.random.default_rng(0), 0, 0, time.process_time()
+    while time.process_time() - start < seconds:
+        env.reset(seed=seed)
+        seed, ended = seed + 1, False
+        while not ended:
+            _, _, terminated, truncated, _ = env.step(drawn(env.action_space, generator))
+            ended, steps = terminated or truncated, steps + 1
+    return steps / (time.process_time() - start)
+
+
+def drawn(space: Any, generator: np.random.Generator) -> Any:
+    """A random action."""
+    if hasattr(space, "n"):
+        return int(generator.integers(space.n))
+    return (generator.uniform(-1, 1, space.shape) * STEERING).astype(np.float32)
+
+
+def engine_rate(task: str, seconds: float, batch: int) -> float:
+    """The engine's steps per CPU second, all episodes together."""
+    config = original(task, batch)
+    engine, generator = RoadsEngine(config), np.random.default_rng(0)
+    if config.action_type == "discrete":
+        actions = generator.integers(0, len(config.actions), (512, batch))
+    else:
+        actions = (generator.uniform(-1, 1, (512, batch, 1)) * STEERING).astype(np.float32)
+    engine.reset(np.arange(batch), np.arange(batch))
+    engine.step(actions[0])
+    steps, turn, seed, start = 0, 0, batch, time.process_time()
+    while time.process_time() - start < seconds:
+        steps += int((~engine.flags[Flag.DONE]).sum())
+        engine.step(actions[turn % len(actions)])
+        turn += 1
+        done = np.flatnonzero(engine.flags[Flag.DONE])
+        if len(done):
+            engine.reset(done, np.arange(seed, seed + len(done)))
+            seed += len(done)
+    return steps / (time.process_time() - start)
+
+
+def main() -> None:
+    """Measure the tasks that the command line names."""
+    parser = argparse.ArgumentParser(description="Speed of the engine of road networks against highway-env.")
+    parser.add_argument("tasks", nargs="*", default=list(ORIGINALS), metavar="TASK")
+    parser.add_argument("--seconds", type=float, default=3.0)
+    parser.add_argument("--batch", type=int, default=64)
+    options = parser.parse_args()
+    console = Console()
+    for task in options.tasks:
+        theirs = reference_rate(task, options.seconds)
+        ours = engine_rate(task, options.seconds, options.batch)
+        console.print(f"{task}: {theirs:.0f} and {ours:.0f} steps a CPU second, {ours / theirs:.0f} x (goal {GOAL} x)")
+
+
+if __name__ == "__main__":
+    main()
