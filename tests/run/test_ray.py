@@ -21,7 +21,6 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install 'cavbench[r
 
 CELLS = ("attack=nudge", "victim=toy", "world=toy", "lanes=3,4,5", "density=1", "weather=clear,fog", "seeds=0,1")
 RUN = ("run", *CELLS, "episodes=4", "record=0", "reference=false")
-UNITS = 3 * 2 * 2 * 2
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +75,7 @@ def test_two_nodes_write_the_records_of_one_process_and_a_killed_node_loses_noth
     cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False)
     _, err = process.communicate(timeout=240)
     assert process.returncode == 0, err
-    assert err.count(" episodes | ") == UNITS
+    assert "failed" not in err
     assert comparable(reading.read(out, track=track("driving"))).equals(serial)
 
 
