@@ -65,10 +65,9 @@ def audit(both: Audit, console: Console, *, as_json: bool = False) -> int:
     console.print(Text(f"Drawn scenarios: {again}."), soft_wrap=True)
     units: list[str] = []
     aside = Console(stderr=True)
-    for name, part in (("public", both.public), ("drawn", both.drawn)):
-        aside.print(Text(f"{name}: {part.cost}"), soft_wrap=True)
     with RunProgress(aside) as progress:
-        for part in (both.public, both.drawn):
+        for name, part in (("public", both.public), ("drawn", both.drawn)):
+            progress.cost = f"{name}: {part.cost}"
             try:
                 units += runner.run(part, progress)
             except KeyboardInterrupt:

@@ -41,8 +41,7 @@ def run(
     gate = Gate(plan)
     show_downloads()
     aside = Console(stderr=True)
-    aside.print(Text(f"{plan.cost}"), soft_wrap=True)
-    with RunProgress(aside, partial(permit, aside, yes=yes)) as progress:
+    with RunProgress(aside, str(plan.cost), partial(permit, aside, yes=yes)) as progress:
         for line in plan.skipped:
             progress.warn(line)
         unfinished = None

@@ -65,6 +65,7 @@ class RunProgress(OnTerminal):
 
     Args:
         console: console to draw on; standard error, so that tables can be piped.
+        cost: a line that says what the run costs; it is printed before the first unit is driven.
         permit: is asked with the seconds that the run takes, and may raise UserError.
         now: a clock in seconds.
     """
@@ -72,10 +73,11 @@ class RunProgress(OnTerminal):
     def __init__(
         self,
         console: Console,
+        cost: str = "",
         permit: Callable[[float], None] = lambda seconds: None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.console, self.permit, self.now = console, permit, now
+        self.console, self.cost, self.permit, self.now = console, cost, permit, now
         self.left = LeftColumn()
         self.bar = bar(console, MofNCompleteColumn(), left=self.left)
         self.started = self.said = now()
@@ -88,6 +90,8 @@ class RunProgress(OnTerminal):
         self.total, self.done = episodes, finished
         self.left.forecast = forecast
         self.bar.reset(self.task, total=episodes, completed=finished, description="")
+        if self.cost and finished < episodes:
+            self.console.print(Text(self.cost), soft_wrap=True)
         if finished:
             self.console.print(f"{finished} of {episodes} episodes are already done", style="dim", highlight=False)
         if forecast is not None:

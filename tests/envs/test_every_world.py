@@ -5,8 +5,10 @@ from __future__ import annotations
 from tests.checks.rules import broken, built_in, each
 
 WORLDS = built_in("world")
+NEEDS = {"gym": {"id": "merge-v0"}}
+"""Parameters that a world needs."""
 
 
 @each(WORLDS)
 def test_it_keeps_the_rules(name: str) -> None:
-    assert broken("world", name) == {}
+    assert broken("world", name, **NEEDS.get(name, {})) == {}

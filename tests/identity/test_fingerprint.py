@@ -79,7 +79,7 @@ def test_the_digest_covers_a_component_and_its_imports(tmp_path: Path, monkeypat
 
     def digest() -> str:
         fingerprint.code_digest.cache_clear()
-        fingerprint._code.cache_clear()
+        fingerprint._parsed.cache_clear()
         fingerprint._imports.cache_clear()
         return fingerprint.code_digest(("some_plugin.attack",))
 
@@ -99,7 +99,7 @@ def test_comments_docstrings_and_layout_outdate_no_record(tmp_path: Path, monkey
     def digest(text: str) -> str:
         module.write_text(text)
         fingerprint.code_digest.cache_clear()
-        fingerprint._code.cache_clear()
+        fingerprint._parsed.cache_clear()
         fingerprint._imports.cache_clear()
         return fingerprint.code_digest(("lone_plugin",))
 
