@@ -13,7 +13,7 @@ import pytest
 from cavbench import bounded
 from cavbench.archive import Archive
 from cavbench.detection.victims import yolov5_file
-from cavbench.detection.victims.from_file import _listed
+from cavbench.detection.victims.reading import _listed
 from cavbench.errors import UserError
 from cavbench.formats.trial import hashed
 from cavbench.records import columns

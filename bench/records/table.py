@@ -36,8 +36,11 @@ def read_table(path: Path, track: Track, names: Sequence[str] | None = None) -> 
     try:
         file = pq.ParquetFile(path, read_dictionary=[one.name for one in schema(track) if pa.types.is_string(one.type)])
         _check_size(file, path)
-        return together([file.read(columns=wanted.names, use_threads=False).cast(wanted)])
-    except (pa.ArrowException, OSError) as error:
+        records = file.read(columns=wanted.names, use_threads=False)
+        # Arrow believes a file that its text is UTF-8, and where its lists end.
+        records.validate(full=True)
+        return together([records.cast(wanted)])
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = "missing" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
         raise UserError(f"the record {path} is {reason}; delete it and run again to recreate it") from None
 

@@ -95,12 +95,21 @@ def print_boards(boards: Sequence[Board], console: Console) -> None:
         mine = _of_mine(board)
         flagged = BELOW if any(row.flagged for row in board.rows) else ""
         console.print(Padding(Text(mine + flagged + SHARED, style="dim"), (0, 1)))
+        for line in _without_rank(board):
+            console.print(Padding(Text(line, style="yellow"), (0, 1)))
         for name, drive in board.baselines.items():
             score = estimate(share_interval(drive.column(board.track.metric)), style=BASELINE)
             console.print(Padding(Text.assemble(f"{name}: ", score), (0, 3)))
         console.print()
         print_attackers(board, console)
     console.print()
+
+
+def _without_rank(board: Board) -> Iterator[str]:
+    """Why rows have no rank, a line each."""
+    for row in board.rows:
+        if row.hopeless:
+            yield from (f"{_name(row, board)}: {one.text}" for one in row.remarks if one.name == "hopeless")
 
 
 def _title(board: Board) -> Text:

@@ -248,7 +248,7 @@ def test_a_folder_holds_both_tracks_and_every_command_reads_them(tmp_path: Path,
     assert bench("run", *TOY, *monkey).code == 0
     made = bench("run", *SMALL.split(), *monkey)
     assert made.code == 0, made.err
-    assert "patch, seed 1" in made.err
+    assert "18/18 episodes" in made.err
     assert "frames" in made.out
     both = reading.read_all(tmp_path)
     assert {name: set(records["victim"].to_pylist()) for name, records in both.items()} == {

@@ -85,7 +85,7 @@ def test_the_dynamics_of_an_attack_are_its_own() -> None:
     object.__setattr__(given.config.features, "low", (0.0,) * 4)
     given.parameters.low[:] = 0.0
     assert world.features.low == (-100.0, -20.0, -40.0, -20.0)
-    assert dynamics.parameters.low.tolist() == [-100.0, -20.0, -40.0, -20.0]
+    assert {tuple(row) for row in dynamics.parameters.low.tolist()} == {(-100.0, -20.0, -40.0, -20.0)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -199,7 +199,7 @@ def _detects(file: str) -> Callable[[Path], object]:
     def read(folder: Path) -> None:
         path = folder / file
         victim = choose("victim", "detector", path=str(path), names=str(folder / "names.txt")).component
-        names, sha256 = victim._names(), bounded.sha256(path, most=bounded.WEIGHTS)
+        names, sha256 = victim.class_names(), bounded.sha256(path, most=bounded.WEIGHTS)
         _check(victim, names, sha256)
         victim.read(names, sha256)
 
