@@ -8,23 +8,8 @@ fresh numpy==2.4.6 onnx==1.23.2 openvino==2026.4.1
 see <<'P'
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
-
-
-def model(operation, inputs, outputs, constants, opset, types=(), **attributes):
-    """A model of one operation; shapes of its inputs by name."""
-    kinds = dict(types)
-    values = [
-        [helper.make_tensor_value_info(name, kinds.get(name, TensorProto.FLOAT), shape) for name, shape in part]
-        for part in (inputs, outputs)
-    ]
-    names = attributes.pop("names")
-    nodes = [helper.make_node(operation, names, [name for name, _ in outputs], **attributes)]
-    kept = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "one", *values, kept)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
-
 import openvino
+from onnx_model import model
 from openvino.preprocess import PrePostProcessor, ResizeAlgorithm
 
 same = model("Identity", [("x", [1, 1, 24, 24])], [("y", [1, 1, 24, 24])], {}, 17, names=["x"])

@@ -9,41 +9,8 @@ source "$(dirname "$0")/fresh.sh"
 fresh numpy==2.4.6 onnx==1.23.2 onnxruntime==1.32.0 openvino==2026.4.1
 see <<'P'
 import numpy as np
-import onnx
-from onnx import TensorProto, helper, numpy_helper
-
-
-def model(operation, inputs, outputs, constants, opset, types=(), **attributes):
-    """A model of one operation; shapes of its inputs by name."""
-    kinds = dict(types)
-    values = [
-        [helper.make_tensor_value_info(name, kinds.get(name, TensorProto.FLOAT), shape) for name, shape in part]
-        for part in (inputs, outputs)
-    ]
-    names = attributes.pop("names")
-    nodes = [helper.make_node(operation, names, [name for name, _ in outputs], **attributes)]
-    kept = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "one", *values, kept)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
-
-
-def onnx_runtime(made, **given):
-    import onnxruntime
-
-    onnxruntime.set_default_logger_severity(3)
-    session = onnxruntime.InferenceSession(made.SerializeToString(), providers=["CPUExecutionProvider"])
-    return session.run(None, given)
-
-
-def openvino(made, **given):
-    import openvino
-
-    onnx.save(made, "one.onnx")
-    core = openvino.Core()
-    compiled = core.compile_model(core.read_model("one.onnx"), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
-    found = compiled(given)
-    return [found[one] for one in compiled.outputs]
-
+from onnx import TensorProto
+from onnx_model import model, onnx_runtime, openvino
 
 made = model(
     "TopK", [("x", [1, 100])], [("values", [1, 10]), ("places", [1, 10])], {"k": np.array([10])}, 17,
