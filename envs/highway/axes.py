@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from cavbench.scenarios import Axes, Axis, Grid
 
 AXES = Axes(
@@ -47,13 +49,5 @@ HIGHWAY_V0 = Grid(
 )
 """highway-env's `highway-v0`, whose own road is lanes=4 density=1 weather=clear, and roads around it."""
 
-FAST_V0 = Grid(
-    name="highway-env-fast-v1",
-    world="highway-fast-v0",
-    axes=AXES,
-    values={"lanes": (3, 4, 5), "density": (1.0, 1.5), "weather": ("clear", "rain", "fog")},
-    episodes=30,
-    block=10,
-    training_seeds=10,
-)
+FAST_V0 = replace(HIGHWAY_V0, name="highway-env-fast-v1", world="highway-fast-v0")
 """highway-env's `highway-fast-v0`, whose own road is lanes=3 density=1 weather=clear, and roads around it."""

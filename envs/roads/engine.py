@@ -11,22 +11,8 @@ from numpy.typing import NDArray
 from cavbench.compiled import entry_point, inner
 from cavbench.envs.highway.dynamics import clip, linear_map
 from cavbench.envs.highway.ego import FASTER, IDLE, PROGRESS_LANE, PROGRESS_SPEED, SLOWER
-from cavbench.envs.highway.engine import (
-    CRASHED,
-    DONE,
-    OFFROAD,
-    PROGRESS,
-    REWARD,
-    SPEED,
-    TERMINATED,
-    TRUNCATED,
-    TTC,
-    Flag,
-    Number,
-    X,
-    check_seeds,
-    physical_controls,
-)
+from cavbench.envs.highway.engine import PROGRESS, REWARD, Flag, Number, check_seeds, physical_controls
+from cavbench.envs.highway.engine import report as copy_record
 from cavbench.envs.roads import exit_rules as leave
 from cavbench.envs.roads import intersection_rules as intersection
 from cavbench.envs.roads import merge_rules as merge
@@ -223,18 +209,8 @@ def report(
     road: Road, bodies: Bodies, episode: Episode, numbers: NDArray[np.float32], flags: NDArray[np.bool_], number: int
 ) -> None:
     """Copy an episode's record into column `number` of the outputs."""
-    ego = bodies[episode.ego]
     episode.ttc = time_to_collision(road, bodies[: episode.bodies], episode)
-    numbers[REWARD, number] = episode.reward
-    numbers[PROGRESS, number] = episode.progress
-    numbers[SPEED, number] = ego.speed
-    numbers[X, number] = ego.x
-    numbers[TTC, number] = episode.ttc
-    flags[DONE, number] = episode.terminated or episode.truncated
-    flags[TERMINATED, number] = episode.terminated
-    flags[TRUNCATED, number] = episode.truncated
-    flags[CRASHED, number] = episode.crashed
-    flags[OFFROAD, number] = episode.offroad
+    copy_record(bodies[episode.ego], episode, numbers, flags, number)
 
 
 @entry_point
