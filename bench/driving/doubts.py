@@ -42,7 +42,7 @@ def other_features(pair: Pair, default_world: str) -> str:
     here: Any = pair.world.component.facts
     for name, part in _named(pair):
         home = _home(part, default_world) if _in_zoo(part, pair) else None
-        if home is not None and len(home.features.names) != len(here.features.names):
+        if home is not None and home.features.names != here.features.names:
             listed = ", ".join(here.features.names[:SHOWN]) + (", …" if len(here.features.names) > SHOWN else "")
             return (
                 f"was trained on {', '.join(home.features.names)}, this world measures {listed}: give a "

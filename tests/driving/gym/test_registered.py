@@ -276,6 +276,13 @@ def test_what_is_missing_in_it_is_said_at_once(bench: Bench, words: list[str], l
     assert re.search(line, said.err)
 
 
+@pytest.mark.parametrize("name", ["CartPole-v1", "Acrobot-v1"])
+def test_a_network_of_the_zoo_is_refused_where_its_features_are_others_be_they_as_many(bench: Bench, name: str) -> None:
+    said = bench("run", "world=gym", f"world.id={name}", "attack=noise", "victim=dqn")
+    assert said.code == 2
+    assert "it was trained on x, y, vx, vy, this world measures " in said.err.splitlines()[-1]
+
+
 def test_the_id_of_an_environment_is_no_name_of_a_world(bench: Bench) -> None:
     said = bench("run", "world=merge-v0")
     assert "a gymnasium environment is given as world=gym world.id=merge-v0" in said.err
