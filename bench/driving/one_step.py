@@ -23,6 +23,9 @@ from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import Watch
 from cavbench.scenarios import Cell
 
+ROUNDING = 1e-5
+"""A share of a range may be so far outside of [-1, 1]."""
+
 
 @dataclass(frozen=True)
 class Attacked:
@@ -109,7 +112,7 @@ class Form:
         given: observations: an array or a tensor.
 
     Raises:
-        UserError: if it is neither form.
+        UserError: if it is neither form, or its numbers cannot be those of the world.
     """
 
     def __init__(self, facts: DrivingFacts, given: Any) -> None:
@@ -135,6 +138,11 @@ class Form:
             )
         if not bool(self.values.isfinite().all()):
             raise UserError("the observation contains NaN or infinity")
+        if not self.native and float(self.values.abs().max()) > 1 + ROUNDING:
+            raise UserError(
+                "the observation has numbers outside of [-1, 1]: those of this world are shares of its ranges, as its "
+                "environment in cavbench.gym returns them"
+            )
         self.single = len(shape) == len(one)
         self.dtype = given.dtype
 

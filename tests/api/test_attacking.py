@@ -77,6 +77,7 @@ def test_the_budget_of_queries_holds(observed: Any) -> None:
     [
         ({"observation": np.zeros((10, 4))}, r"has the shape \[10, 5\], or \[B, …\] for several, got \[10, 4\]"),
         ({"observation": np.full((10, 5), np.nan)}, "contains NaN or infinity"),
+        ({"observation": np.full((10, 5), 1.5)}, r"has numbers outside of \[-1, 1\]"),
         ({"observation": "x"}, "an array or a tensor of numbers, got str"),
         ({"attack": "pdg"}, "did you mean 'pgd'"),
         ({"threat": {"access": "scores"}}, "needs access 'gradients'"),
