@@ -78,3 +78,12 @@ def test_each_thing_that_goes_wrong_is_seen(
         assert said in verdict.text
         # The next file is read in a new process, where the last one ended it.
         assert trials.tried({"x": b""}).kind == "wrong"
+
+
+def test_memory_that_was_freed_before_does_not_hide_what_a_reader_takes(tmp_path: Path) -> None:
+    blocks = [bytes(100_000) for _ in range(10_000)]
+    last = bytes(100_000)
+    del blocks
+    with Trials(lambda folder: harm("memory", folder), (UserError,)) as trials:
+        assert "MB (read )" in trials.tried({"x": b""}).text
+    assert len(last) == 100_000
