@@ -73,7 +73,9 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
         "setting": kit.starts[cast(Kind, kind)].setting,
         "grid": grid,
         "modules": ", ".join(f'"{each}"' for each in modules),
-        "more": f'\n[project.entry-points."cavbench.grids"]\n{grid} = "{modules[-1]}:GRID"\n' if kind == "world" else "",
+        "more": f'\n[project.entry-points."cavbench.grids"]\n{grid} = "{modules[-1]}:GRID"\n'
+        if kind == "world"
+        else "",
     }
     common, special = (resources.files(package) / "templates" for package in ("cavbench.checks", kit.package))
     files = {
@@ -112,8 +114,9 @@ def kit_of(kind: str, track: str) -> Kit:
         raise UserError(registry.unknown(f"track {track!r}", track, known))
     kit = kits.kit(track)
     if kit is None or kind not in kit.starts:
+        others = [name for name in kits.kits() if (other := kits.kit(name)) is not None and kind in other.starts]
         raise UserError(
-            f"the track {track!r} has no template for {NOUNS[kind]}; tracks with templates: {', '.join(kits.kits())}"
+            f"the track {track!r} has no template for {NOUNS[kind]}; tracks with templates: {', '.join(others)}"
         )
     return kit
 

@@ -61,7 +61,7 @@ def world(
     engine.reset(np.array([0]), np.array([SEED]))
     low_x, high_x, low_y, high_y = box
     flat = high_x - low_x > 3 * (high_y - low_y)
-    made = style.figure(6.8, f"{name}: {', '.join(f'{axis} {value}' for axis, value in cell.items())}")
+    made = style.figure(3.8, f"{name}: {', '.join(f'{axis} {value}' for axis, value in cell.items())}")
     every = made.subplots(2, 1) if flat else made.subplots(1, 2)
     for axes, moment in zip(every, moments, strict=True):
         while engine.episodes["steps"][0] < moment:
