@@ -267,21 +267,24 @@ class Way:
         roads: the roads of the way as pairs of nodes; the goal is on the last one.
         goal: where the goal is on that road, in m from its beginning.
         astray: roads from which the goal cannot be reached any more.
+        sideways: metres that a lane to the right counts, where the goal is on the right.
     """
 
     roads: tuple[tuple[str, str], ...]
     goal: float
     astray: tuple[tuple[str, str], ...] = ()
+    sideways: float = 0.0
 
     def write(self, network: Network, road: np.void) -> None:
         """Write the way into a record `ROAD`. All lanes of a road count as long as its first one."""
-        left = 0.0
+        left, most = 0.0, max(len(network.graph[start][end]) for start, end in self.roads)
         for start, end in reversed(self.roads):
             lanes = network.graph[start][end]
             length = lanes[0].length if (start, end) != self.roads[-1] else self.goal
             first = network.number(start, end, 0)
             road["way_length"][first : first + len(lanes)] = length
-            road["way_after"][first : first + len(lanes)] = left
+            beside = most - 1 - np.arange(len(lanes)) if (start, end) != self.roads[-1] else np.zeros(1)
+            road["way_after"][first : first + len(lanes)] = left + self.sideways * beside
             left += length
         for start, end in self.astray:
             first = network.number(start, end, 0)

@@ -79,11 +79,11 @@ def roundabout(*, connected: bool, radius: float = RADIUS) -> Network:
     net = Network(connected)
     alpha, shift = placed(radius)
     ring(net, radius, alpha)
-    access, dev, a = ACCESS, DEV, SWING
+    dev, a = DEV, SWING
     delta = 0.2 * dev
     reach = dev - delta
     w = 2 * np.pi / dev
-    half, near, access = dev / 2 + shift, dev / 2 - delta + shift, access + shift
+    half, near, access = dev / 2 + shift, dev / 2 - delta + shift, ACCESS + shift
     enter, leave = -np.pi / 2, -np.pi / 2 + w * reach
     both = (C, C)
     net.add("ser", "ses", straight([2, access], [2, half], lines=(S, C)))
