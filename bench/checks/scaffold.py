@@ -18,8 +18,10 @@ from cavbench.core.options import DEFAULTS
 from cavbench.core.registry import Kind
 from cavbench.errors import UserError
 
-NewKind = Literal["attack", "defense", "victim"]
-NOUNS = {"attack": "an attack", "defense": "a defence", "victim": "a victim"}
+NewKind = Literal["attack", "defense", "victim", "world"]
+NOUNS = {"attack": "an attack", "defense": "a defence", "victim": "a victim", "world": "a world"}
+GRID = "_grid"
+"""The end of the name of a world's second module, which has its axes and its grid."""
 
 
 def default_track() -> str:
@@ -41,7 +43,7 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
     """Write the package of a new component and return its folder.
 
     Args:
-        kind: attack, defense or victim.
+        kind: attack, defense, victim or world.
         name: name on the command line.
         track: a track with templates.
         folder: a folder that is empty or does not exist; by default `cavbench-NAME` in the current folder.
@@ -57,6 +59,8 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} exists and is not empty; nothing was written: choose another folder with out=")
     article, noun = NOUNS[kind].split()
+    grid = f"{name.replace('_', '-')}-v1"
+    modules = [module, f"{module}{GRID}"] if kind == "world" else [module]
     values = {
         "kind": kind,
         "name": name,
@@ -67,6 +71,11 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
         "noun": noun,
         "run": first_run(kind, name, track),
         "setting": kit.starts[cast(Kind, kind)].setting,
+        "grid": grid,
+        "modules": ", ".join(f'"{each}"' for each in modules),
+        "more": f'\n[project.entry-points."cavbench.grids"]\n{grid} = "{modules[-1]}:GRID"\n'
+        if kind == "world"
+        else "",
     }
     common, special = (resources.files(package) / "templates" for package in ("cavbench.checks", kit.package))
     files = {
@@ -75,6 +84,8 @@ def write(kind: str, name: str, *, track: str, folder: Path | None = None) -> Pa
         f"{module}.py": special / f"{kind}.py.tmpl",
         f"tests/test_{name}.py": special / f"test_{kind}.py.tmpl",
     }
+    if kind == "world":
+        files[f"{module}{GRID}.py"] = special / f"{kind}{GRID}.py.tmpl"
     try:
         (folder / "tests").mkdir(parents=True)
         for path, template in files.items():
@@ -103,8 +114,9 @@ def kit_of(kind: str, track: str) -> Kit:
         raise UserError(registry.unknown(f"track {track!r}", track, known))
     kit = kits.kit(track)
     if kit is None or kind not in kit.starts:
+        others = [name for name in kits.kits() if (other := kits.kit(name)) is not None and kind in other.starts]
         raise UserError(
-            f"the track {track!r} has no template for {NOUNS[kind]}; tracks with templates: {', '.join(kits.kits())}"
+            f"the track {track!r} has no template for {NOUNS[kind]}; tracks with templates: {', '.join(others)}"
         )
     return kit
 

@@ -112,7 +112,7 @@ def list_components(
 
 @app.command()
 def new(
-    kind: Annotated[str, typer.Argument(help="attack, defense or victim.")],
+    kind: Annotated[str, typer.Argument(help="attack, defense, victim or world.")],
     name: Annotated[str, typer.Argument(help="Its name on the command line, for instance my_attack.")],
     words: Annotated[
         list[str] | None,

@@ -132,6 +132,14 @@ def _docstring(component: type) -> str:
 
 
 def _meanings(component: type) -> dict[str, str]:
+    """The meanings of all parameters: those of a base class stand in its docstring, unless the class says them itself."""
+    found: dict[str, str] = {}
+    for parent in reversed(component.__mro__):
+        found |= _args(parent)
+    return found
+
+
+def _args(component: type) -> dict[str, str]:
     """The Args of a Google-style docstring: `name: meaning` or `name, name: meaning`, continued on indented lines."""
     _, _, section = _docstring(component).partition("Args:\n")
     found: dict[str, str] = {}

@@ -108,6 +108,19 @@ class Features:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LaneShape:
+    """A lane from above.
+
+    Args:
+        width: in m.
+        line: points x, y of its centre in m, in driving direction; y points to the right of x.
+    """
+
+    width: float
+    line: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class DrivingFacts(Facts):
     """The facts of a world that are given to driving policies and defences.
 
@@ -122,6 +135,7 @@ class DrivingFacts(Facts):
         rows: V, the number of rows in its observations; None if the world does not say.
         controls: names of the controls of a continuous action, each in [-1, 1]; empty if it takes none.
         unbounded: whether the world's own environment declares Box(-inf, inf) for values in [-1, 1], as highway-env does.
+        lanes: the lanes of the road in a cell, for recordings; empty if they are straight, parallel and 4 m wide.
         environment: the call that makes the world's gymnasium environment, for messages; empty if the world does not say.
     """
 
@@ -134,6 +148,7 @@ class DrivingFacts(Facts):
     rows: int | None = None
     controls: tuple[str, ...] = CONTROLS
     unbounded: bool = False
+    lanes: tuple[LaneShape, ...] = ()
     environment: str = ""
 
     def native(self, observation: Tensor) -> Tensor:
@@ -175,7 +190,7 @@ class DrivingFacts(Facts):
             "drivers": list(self.drivers),
         }
         # No report reads them.
-        for name in ("kinematics", "shape", "limits", "rows", "unbounded", "environment"):
+        for name in ("kinematics", "shape", "limits", "rows", "unbounded", "lanes", "environment"):
             del values[name]
         # As in records from before it.
         if self.controls in (CONTROLS, ()):

@@ -8,7 +8,7 @@ from cavbench.compiled import inner
 from cavbench.envs.highway.ego import nearest_target_speed
 from cavbench.envs.roads.lanes import update_lane
 from cavbench.envs.roads.motion import update_direction
-from cavbench.envs.roads.state import Body, Kind, Parameters, Road
+from cavbench.envs.roads.state import Bodies, Body, Kind, Parameters, Road
 
 DISCRETE, OBSTACLE = int(Kind.DISCRETE), int(Kind.OBSTACLE)
 DEFAULT_DELTA = 4.0
@@ -33,6 +33,16 @@ def put_body(road: Road, body: Body, kind: int, x: float, y: float, heading: flo
     body.impact = body.crashed = False
     body.changes_lanes, body.yielding = True, False
     body.route, body.route_place = -1, 0
+
+
+@inner
+def is_free(bodies: Bodies, cars: int, x: float, y: float, room: float) -> bool:
+    """Whether no car is within `room` m of a point."""
+    free = True
+    for number in range(cars):
+        off_x, off_y = bodies[number].x - x, bodies[number].y - y
+        free &= off_x * off_x + off_y * off_y >= room * room
+    return free
 
 
 @inner

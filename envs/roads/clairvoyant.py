@@ -40,6 +40,8 @@ def roll_batch(
                     break
                 total += now.progress
                 step += 1
+                if now.arrived:
+                    step = actions.shape[2]
             failed[row, plan] = step
             progress[row, plan] = total
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cavbench.driving.features import ActionType, Driver
 from cavbench.envs.highway.config import check_target_speeds
-from cavbench.envs.roads.state import MOST_COLUMNS, MOST_SPEEDS, PARAMETERS, Feature, Kind, ViewKind
+from cavbench.envs.roads.state import MOST_COLUMNS, MOST_SPEEDS, PARAMETERS, Feature, Kind, Measure, ViewKind
 
 
 class TaskKind(IntEnum):
@@ -44,6 +44,10 @@ class Scene:
         road: the network, from `cavbench.envs.roads.network.record`.
         traffic: number of cars besides the ego, where the task lets it vary.
         capacity: the largest number of bodies: cars and obstacles.
+        oncoming: number of cars on the opposite lane, where there is one.
+        density, opposing: by what the distances between cars are divided at the start, here and on the opposite lane.
+        arrivals: the chance that a car comes after a decision, where cars come.
+        goal: number of the ego's destination among those of the road, where it has one.
         sensor_range: in m.
         noise_sigma: of the sensor, in m and m/s.
     """
@@ -51,6 +55,11 @@ class Scene:
     road: NDArray[np.void]
     traffic: int = 0
     capacity: int
+    oncoming: int = 0
+    density: float = 1.0
+    opposing: float = 1.0
+    arrivals: float = 0.0
+    goal: int = 0
     sensor_range: float = 200.0
     noise_sigma: float = 0.0
 
@@ -73,6 +82,9 @@ class RoadsConfig:
         action_repeat: number of decisions for which an action is held; lane changes are sent once, then IDLE.
         target_speeds: increasing speeds in m/s for FASTER and SLOWER.
         reward_speed_range: speeds in m/s at which highway-env's speed reward is 0 and 1.
+        progress: what is called progress.
+        lane_weight: weight of the lane to the right in the progress of the highway; that of the speed is 0.4.
+        reference_speed: speed in m/s that makes a progress of 1 on the way to the goal or along the lane.
         actions: numbers of the discrete actions LANE_LEFT to SLOWER, by the task's own numbers.
         idm: comfortable acceleration and braking in m/s2 and jam distance in m of the other cars.
         regulated: whether cars give way at crossings.
@@ -85,6 +97,8 @@ class RoadsConfig:
         obstacles: whether obstacles are observed.
         observed_vehicles: number of rows in an observation, including the ego; at least 2.
         offroad_terminal: whether leaving the road ends the episode.
+        odometer: whether `x` is the distance driven, because no direction is the forward one.
+        shoulder: metres beside a lane in which a car has not left the road yet, for roads whose lanes do not meet exactly.
 
     Raises:
         ValueError: if a value is not allowed; the message is one line with the allowed values.
@@ -101,6 +115,9 @@ class RoadsConfig:
     action_repeat: int = 1
     target_speeds: tuple[float, ...] = DEFAULT_SPEEDS
     reward_speed_range: tuple[float, float] = (20.0, 30.0)
+    progress: Measure = Measure.HIGHWAY
+    lane_weight: float = 0.1
+    reference_speed: float = 30.0
     actions: tuple[int, ...] = (0, 1, 2, 3, 4)
     idm: tuple[float, float, float] = (3.0, 5.0, 10.0)
     regulated: bool = False
@@ -114,6 +131,8 @@ class RoadsConfig:
     obstacles: bool = True
     observed_vehicles: int = 5
     offroad_terminal: bool = False
+    odometer: bool = False
+    shoulder: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.scenes:
@@ -173,6 +192,7 @@ def parameters(config: RoadsConfig) -> NDArray[np.void]:
     table = np.zeros(1, dtype=PARAMETERS)
     values = table[0]
     values["layout"] = config.view
+    values["full_steps"] = config.max_steps
     for name in (
         "simulation_frequency",
         "task",
@@ -182,6 +202,11 @@ def parameters(config: RoadsConfig) -> NDArray[np.void]:
         "action_repeat",
         "duration",
         "offroad_terminal",
+        "progress",
+        "lane_weight",
+        "reference_speed",
+        "odometer",
+        "shoulder",
     ):
         values[name] = getattr(config, name)
     for name in ("clipped", "relative", "obstacles"):

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.compiled import entry_point, inner
-from cavbench.envs.highway.dynamics import clip, linear_map
-from cavbench.envs.highway.ego import FASTER, IDLE, PROGRESS_LANE, PROGRESS_SPEED, SLOWER
-from cavbench.envs.highway.engine import PROGRESS, REWARD, Flag, Number, check_seeds, physical_controls
+from cavbench.envs.highway.ego import FASTER, IDLE, SLOWER
+from cavbench.envs.highway.engine import PROGRESS, REWARD, Flag, Number, X, check_seeds, physical_controls
 from cavbench.envs.highway.engine import report as copy_record
 from cavbench.envs.roads import exit_rules as leave
 from cavbench.envs.roads import intersection_rules as intersection
@@ -27,6 +26,7 @@ from cavbench.envs.roads.grids import occupancy, times_to_collision
 from cavbench.envs.roads.lanes import is_on
 from cavbench.envs.roads.motion import apply_meta_action
 from cavbench.envs.roads.network import WIDTH
+from cavbench.envs.roads.progress import progress, way_left
 from cavbench.envs.roads.rows import observe
 from cavbench.envs.roads.simulation import advance
 from cavbench.envs.roads.state import (
@@ -38,6 +38,7 @@ from cavbench.envs.roads.state import (
     Floats,
     Integers,
     Kind,
+    Measure,
     Parameters,
     Road,
     ViewKind,
@@ -45,6 +46,17 @@ from cavbench.envs.roads.state import (
 from cavbench.envs.roads.traffic import lane_distance, neighbours
 
 MOST_SIDE_LANES = 16
+OF_SCENE = (
+    "traffic",
+    "oncoming",
+    "density",
+    "opposing",
+    "arrivals",
+    "goal",
+    "sensor_range",
+    "noise_sigma",
+)
+"""Fields of a scene that its episode has, too."""
 PARTS = 5
 """Largest number of parts of a task's reward."""
 MERGE_CLASSIC, MERGE_GENERIC = int(TaskKind.MERGE_CLASSIC), int(TaskKind.MERGE_GENERIC)
@@ -52,6 +64,7 @@ ROUNDABOUT, INTERSECTION, EXIT = int(TaskKind.ROUNDABOUT), int(TaskKind.INTERSEC
 TWO_WAY, U_TURN, RACETRACK = int(TaskKind.TWO_WAY), int(TaskKind.U_TURN), int(TaskKind.RACETRACK)
 OCCUPANCY, TIMES = int(ViewKind.OCCUPANCY), int(ViewKind.TIMES)
 DISCRETE, CONTINUOUS = int(Kind.DISCRETE), int(Kind.CONTINUOUS)
+WAY = int(Measure.WAY)
 
 
 @inner
@@ -77,6 +90,8 @@ def spawn(
         racetrack.spawn(road, bodies, episode, generator, parameters)
     ego = bodies[episode.ego]
     settle_ego(ego, parameters)
+    episode.driven, episode.arrived = 0.0, False
+    episode.ahead = way_left(road, ego) if parameters.progress == WAY else 0.0
     episode.range_y = WIDTH * road.edges[road.lanes[ego.lane].edge].lanes
 
 
@@ -129,18 +144,6 @@ def look(
 
 
 @inner
-def progress(road: Road, bodies: Bodies, episode: Episode, parameters: Parameters) -> float:
-    """Thesis Eq. 4.1 without its offset, in [0, 1]: the lane to the right, and the forward speed from 20 to 30 m/s."""
-    ego = bodies[episode.ego]
-    lane = road.lanes[ego.lane if ego.kind == CONTINUOUS else ego.target_lane]
-    last = road.edges[0].lanes - 1
-    right = min(lane.number, last) / max(last, 1)
-    low, high = parameters.reward_speed_low, parameters.reward_speed_high
-    speed = clip(linear_map(ego.speed * ego.cos_heading, low, high, 0.0, 1.0), 0.0, 1.0)
-    return (PROGRESS_LANE * right + PROGRESS_SPEED * speed) / (PROGRESS_LANE + PROGRESS_SPEED)
-
-
-@inner
 def score(
     road: Road, bodies: Bodies, episode: Episode, action: int, control: Floats, parameters: Parameters, parts: Floats
 ) -> None:
@@ -149,11 +152,16 @@ def score(
     on_road = is_on(road.lanes[ego.lane], ego.along, ego.across, 0.0)
     episode.reward += reward(road, bodies, episode, action, control, on_road, parameters, parts)
     episode.crashed = ego.crashed
-    episode.offroad = not on_road
-    if on_road and not ego.crashed:
+    near = on_road or is_on(road.lanes[ego.lane], ego.along, ego.across, parameters.shoulder)
+    episode.offroad = not near or road.astray[ego.lane] > 0
+    episode.driven += ego.speed * parameters.period
+    episode.arrived = ego.x > road.end or (parameters.task == INTERSECTION and intersection.has_arrived(road, ego))
+    if not (episode.offroad or ego.crashed):
         episode.progress += progress(road, bodies, episode, parameters)
-    arrived = ego.x > road.end or (parameters.task == INTERSECTION and intersection.has_arrived(road, ego))
-    episode.terminated = ego.crashed or arrived or (parameters.offroad_terminal and not on_road)
+        if parameters.progress == WAY and way_left(road, ego) <= 0.0:
+            episode.arrived = True
+            episode.progress += parameters.full_steps - episode.steps
+    episode.terminated = ego.crashed or episode.arrived or (parameters.offroad_terminal and episode.offroad)
     episode.truncated = episode.steps >= parameters.max_steps or episode.time >= parameters.duration
 
 
@@ -206,11 +214,19 @@ def drive(
 
 @inner
 def report(
-    road: Road, bodies: Bodies, episode: Episode, numbers: NDArray[np.float32], flags: NDArray[np.bool_], number: int
+    road: Road,
+    bodies: Bodies,
+    episode: Episode,
+    parameters: Parameters,
+    numbers: NDArray[np.float32],
+    flags: NDArray[np.bool_],
+    number: int,
 ) -> None:
-    """Copy an episode's record into column `number` of the outputs."""
+    """Copy an episode's record into column `number` of the outputs; where roads bend, x is the distance driven."""
     episode.ttc = time_to_collision(road, bodies[: episode.bodies], episode)
     copy_record(bodies[episode.ego], episode, numbers, flags, number)
+    if parameters.odometer:
+        numbers[X, number] = episode.driven
 
 
 @entry_point
@@ -241,7 +257,7 @@ def step_batch(
         road = roads[episode.network]
         drive(road, cars, episode, given.actions[actions[number]], controls[number], given, corners, parts[number])
         look(road, cars, episode, given, rows, work, grid, observation[number])
-        report(road, cars, episode, numbers, flags, number)
+        report(road, cars, episode, given, numbers, flags, number)
         if given.task == INTERSECTION:
             intersection.after_step(road, cars, episode, generators[number])
 
@@ -273,7 +289,7 @@ def start_batch(
         seed_generator(generators[number], seeds[row])
         spawn(road, cars, episode, generators[number], given, corners)
         look(road, cars, episode, given, rows, work, grid, observation[number])
-        report(road, cars, episode, numbers, flags, number)
+        report(road, cars, episode, given, numbers, flags, number)
 
 
 class RoadsEngine:
@@ -303,7 +319,7 @@ class RoadsEngine:
         self.flags = np.zeros((len(Flag), batch), dtype=np.bool_)
         self.parts = np.zeros((batch, PARTS))
         self.episodes["network"] = [places[id(scene.road)] for scene in config.scenes]
-        for name in ("traffic", "sensor_range", "noise_sigma"):
+        for name in OF_SCENE:
             self.episodes[name] = [getattr(scene, name) for scene in config.scenes]
         # No episode runs before its reset.
         self.episodes["truncated"] = True

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavbench.envs.roads.network import WIDTH, Network, circular
+from cavbench.envs.roads.network import WIDTH, Network, Way, circular
 
 LENGTH, EXIT_PLACE, EXIT_LENGTH, EXIT_RADIUS = 1000.0, 400.0, 100.0, 150.0
 """Of the motorway and of the lane to the exit, in m."""
 DESTINATIONS = ("3",)
+WAY = Way(roads=(("0", "1"), ("1", "2"), ("2", "exit")), goal=20.0, astray=(("2", "3"),), sideways=50.0)
+"""The way of the ego, to 20 m behind the beginning of the exit; beyond it, the motorway does not lead there.
+
+A lane to the right counts as much as 50 m, so that a car that looks four seconds ahead begins to change lanes in time."""
 START, EXIT_LANE, RAMP = 0, 1, 2
 """Columns of `ROAD.spots`: the first lane, the lane to the exit, and the exit."""
 

@@ -10,7 +10,7 @@ from cavbench.envs.roads.generator import Generator, next_double, next_uniform
 from cavbench.envs.roads.lanes import local_coordinates, position
 from cavbench.envs.roads.state import Bodies, Body, Episode, Floats, Kind, Parameters, Road
 
-EGO_SPEED, EGO_SPACING, DENSITY = 25.0, 2.0, 1.5
+EGO_SPEED, EGO_SPACING = 25.0, 2.0
 CONTINUOUS, IDM = int(Kind.CONTINUOUS), int(Kind.IDM)
 
 
@@ -65,7 +65,7 @@ def spawn(road: Road, bodies: Bodies, episode: Episode, generator: Generator, pa
     for number in range(1, episode.traffic + 1):
         lane = draw_lane(generator, lanes)
         speed = road.lanes[road.spots[START] + lane].speed_limit
-        put_ahead(road, bodies, episode, generator, lane, IDM, speed, 1 / DENSITY)
+        put_ahead(road, bodies, episode, generator, lane, IDM, speed, 1 / episode.density)
         bodies[number].route = bodies[number].lane
         bodies[number].changes_lanes = False
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cavbench.envs.roads.network import WIDTH, Line, Network, circular, straight
+from cavbench.envs.roads.network import WIDTH, Line, Network, Way, circular, straight
 
 ACCESS = 100.0
 """Length of the arms in m."""
@@ -17,6 +17,9 @@ SPEED_LIMIT = 10.0
 DESTINATIONS = ("o0", "o1", "o2", "o3")
 ENTRIES, EXITS = 0, 4
 """The first columns of `ROAD.spots`: the lanes into the crossing, by arm, and those out of it."""
+
+ARRIVED = 25.0
+"""The ego has arrived so far behind the crossing, in m."""
 
 N, C, S = Line.NONE, Line.CONTINUOUS, Line.STRIPED
 
@@ -52,6 +55,12 @@ def intersection(*, connected: bool) -> Network:
         arm = (corner - 1) % 4
         net.add(f"il{arm}", f"o{arm}", straight(end, start, lines=(N, C), **options))
     return net
+
+
+def way(goal: int) -> Way:
+    """The way of the ego, which comes from arm 0, to another arm."""
+    roads = (("o0", "ir0"), ("ir0", f"il{goal}"), (f"il{goal}", f"o{goal}"))
+    return Way(roads=roads, goal=ARRIVED, astray=tuple((f"il{arm}", f"o{arm}") for arm in range(4) if arm != goal))
 
 
 def spots(network: Network) -> list[int]:

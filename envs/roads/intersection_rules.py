@@ -8,20 +8,19 @@ from cavbench.compiled import inner
 from cavbench.envs.highway.dynamics import clip, linear_map
 from cavbench.envs.roads.bodies import put_body
 from cavbench.envs.roads.generator import Generator, next_double, next_normal, next_pair, next_uniform
-from cavbench.envs.roads.intersection import ENTRIES, EXITS
+from cavbench.envs.roads.intersection import ARRIVED, ENTRIES, EXITS
 from cavbench.envs.roads.lanes import heading_at, position
 from cavbench.envs.roads.simulation import advance
 from cavbench.envs.roads.state import Bodies, Body, Episode, Floats, Kind, Parameters, Road
 
-CARS, CHANCE, SPREAD_OVER = 10, 0.6, 80.0
-"""Cars that may be there at the start, the chance of each, and the length of the arm in m over which they are spread."""
+CHANCE, SPREAD_OVER = 0.6, 80.0
+"""The chance of each of the cars that may be there at the start, and the length of the arm in m over which they are spread."""
 SECONDS_BEFORE = 3
 """The traffic drives so long before the ego is put into it."""
 ROOM, EGO_ROOM = 15.0, 20.0
 """No car is put nearer than this in m to another one; around the ego they are taken away."""
-EGO_GOAL = 1
-LEAVING, ARRIVED = 20.0, 25.0
-"""A car is taken away so far in m before the end of its arm; the ego has arrived so far behind the crossing."""
+LEAVING = 20.0
+"""A car is taken away so far in m before the end of its arm."""
 IDM = int(Kind.IDM)
 
 
@@ -85,8 +84,8 @@ def spawn(
     """IntersectionEnv._make_vehicles."""
     episode.cars = episode.bodies = 0
     episode.ego = -1
-    for number in range(CARS - 1):
-        along = number * (SPREAD_OVER / (CARS - 1))
+    for number in range(episode.traffic - 1):
+        along = number * (SPREAD_OVER / (episode.traffic - 1))
         spawn_car(road, bodies, episode, generator, along, 1.0, 1.0, CHANCE, False)
     frames = SECONDS_BEFORE * parameters.simulation_frequency
     advance(road, bodies[: episode.bodies], episode, frames, parameters, corners)
@@ -96,7 +95,7 @@ def spawn(
     episode.ego = episode.cars
     ego = bodies[episode.ego]
     put_body(road, ego, parameters.ego, x, y, heading_at(lane, 60.0), lane.speed_limit)
-    ego.route = ego.lane * 4 + EGO_GOAL
+    ego.route = ego.lane * 4 + episode.goal
     episode.cars += 1
     episode.bodies = episode.cars
     number = 0
@@ -127,7 +126,7 @@ def after_step(road: Road, bodies: Bodies, episode: Episode, generator: Generato
             remove(bodies, episode, number)
         else:
             number += 1
-    spawn_car(road, bodies, episode, generator, 0.0, 1.0, 1.0, CHANCE, False)
+    spawn_car(road, bodies, episode, generator, 0.0, 1.0, 1.0, episode.arrivals, False)
 
 
 @inner

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar
@@ -32,31 +33,14 @@ def _road(ramp: float, connected: bool) -> NDArray[np.void]:
 
 @dataclass(frozen=True, kw_only=True)
 class MergeWorld(RoadsWorld):
-    """A motorway with an on-ramp that ends: highway-env 1.12.1's `merge-generic`, 15 Hz, 20 seconds.
+    """A motorway with an on-ramp that ends: highway-env 1.12.1's `merge-generic`, 15 Hz, 20 seconds."""
 
-    Args:
-        connected: whether cars look for their neighbours on the lanes before and after their own, too: highway-env's v1 of the
-            task; without it, v0.
-        observed_vehicles: number of rows in an observation, including the ego.
-        target_speeds: speeds in m/s for FASTER and SLOWER.
-        simulation_frequency, policy_frequency: physics frames and decisions per second.
-        max_steps: number of decisions until an episode is truncated.
-        offroad_terminal: whether leaving the road ends the episode.
-
-    Raises:
-        ValueError: if a value is not allowed; the message is one line.
-    """
-
+    name: ClassVar[str] = MERGE_V1.world
     axes: ClassVar[Axes] = MERGE
     grid: ClassVar[str] = MERGE_V1.name
-    gym_name: ClassVar[str] = "merge"
-    start_speed: ClassVar[float] = 30.0
-
-    def _some_cell(self) -> Cell:
-        return MERGE.cell(density=1.0, ramp=80.0)
-
-    def task(self) -> dict[str, Any]:
-        return {"task": TaskKind.MERGE_GENERIC}
+    home: ClassVar[Cell] = MERGE.cell(density=1.0, ramp=80.0)
+    rules: ClassVar[Mapping[str, Any]] = {"task": TaskKind.MERGE_GENERIC}
+    start_speed: ClassVar[float | None] = 30.0
 
     def scene(self, cell: Cell) -> Scene:
         cars = max(1, round(CARS * cell.density))

@@ -163,6 +163,9 @@ ROAD = np.dtype(
             np.int8,
             (DEPTH + 1, MOST_EDGES, MOST_EDGES),
         ),  # whether one road leads to another within so many roads
+        ("way_after", np.float64, (MOST_LANES,)),  # m from the end of a lane to the goal
+        ("way_length", np.float64, (MOST_LANES,)),  # m of the way on a lane, 0 if it is not on the way
+        ("astray", np.int8, (MOST_LANES,)),  # whether the goal cannot be reached any more from a lane
     ],
     align=True,
 )
@@ -256,6 +259,38 @@ def _fill(place: np.void, lane: Lane) -> None:
     place["center_x"], place["center_y"] = lane.center
 
 
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """The way to a goal.
+
+    Args:
+        roads: the roads of the way as pairs of nodes; the goal is on the last one.
+        goal: where the goal is on that road, in m from its beginning.
+        astray: roads from which the goal cannot be reached any more.
+        sideways: metres that a lane to the right counts, where the goal is on the right.
+    """
+
+    roads: tuple[tuple[str, str], ...]
+    goal: float
+    astray: tuple[tuple[str, str], ...] = ()
+    sideways: float = 0.0
+
+    def write(self, network: Network, road: np.void) -> None:
+        """Write the way into a record `ROAD`. All lanes of a road count as long as its first one."""
+        left, most = 0.0, max(len(network.graph[start][end]) for start, end in self.roads)
+        for start, end in reversed(self.roads):
+            lanes = network.graph[start][end]
+            length = lanes[0].length if (start, end) != self.roads[-1] else self.goal
+            first = network.number(start, end, 0)
+            road["way_length"][first : first + len(lanes)] = length
+            beside = most - 1 - np.arange(len(lanes)) if (start, end) != self.roads[-1] else np.zeros(1)
+            road["way_after"][first : first + len(lanes)] = left + self.sideways * beside
+            left += length
+        for start, end in self.astray:
+            first = network.number(start, end, 0)
+            road["astray"][first : first + len(network.graph[start][end])] = 1
+
+
 def record(
     network: Network,
     *,
@@ -263,6 +298,7 @@ def record(
     destinations: Sequence[str] = (),
     end: float = np.inf,
     factor: float = 1.0,
+    way: Way | None = None,
 ) -> NDArray[np.void]:
     """A network as an array of one record `ROAD`.
 
@@ -272,6 +308,7 @@ def record(
         destinations: nodes to which routes are planned; the route from lane l to destination d is row l * D + d.
         end: place in m along x at which the task is done.
         factor: by which the spacing of cars is reduced at the start.
+        way: the way to the ego's goal, for worlds whose progress it is.
 
     Raises:
         ValueError: if the network is larger than the tables.
@@ -287,6 +324,8 @@ def record(
     road["factor"], road["reach"] = factor, _reach(roads)
     road["spots"][: len(spots)] = spots
     road["routes"] = road["route_lanes"] = -1
+    if way is not None:
+        way.write(network, road)
     number = 0
     for edge, (start, last, members) in enumerate(roads):
         road["edges"][edge] = (number, len(members), nodes[start], nodes[last])

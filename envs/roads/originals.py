@@ -31,7 +31,7 @@ def _roundabout(*, connected: bool) -> RoadsConfig:
     road = record(net, spots=roundabout.spots(net), destinations=roundabout.DESTINATIONS)
     return RoadsConfig(
         task=TaskKind.ROUNDABOUT,
-        scenes=(Scene(road=road, capacity=5),),
+        scenes=(Scene(road=road, traffic=4, capacity=5, goal=roundabout.STRAIGHT),),
         duration=11.0,
         target_speeds=(0.0, 8.0, 16.0),
         low=(-100.0, -100.0, -15.0, -15.0),
@@ -45,7 +45,7 @@ def _intersection(*, connected: bool) -> RoadsConfig:
     road = record(net, spots=intersection.spots(net), destinations=intersection.DESTINATIONS)
     return RoadsConfig(
         task=TaskKind.INTERSECTION,
-        scenes=(Scene(road=road, capacity=32),),
+        scenes=(Scene(road=road, traffic=10, capacity=32, arrivals=0.6, goal=1),),
         duration=13.0,
         target_speeds=(0.0, 4.5, 9.0),
         reward_speed_range=(7.0, 9.0),
@@ -66,7 +66,7 @@ def _exit(*, connected: bool) -> RoadsConfig:
     road = record(net, spots=spots, destinations=leave.DESTINATIONS, factor=leave.spacing_factor(6))
     return RoadsConfig(
         task=TaskKind.EXIT,
-        scenes=(Scene(road=road, traffic=20, capacity=21),),
+        scenes=(Scene(road=road, traffic=20, density=1.5, capacity=21),),
         simulation_frequency=5,
         duration=18.0,
         target_speeds=(18.0, 24.0, 30.0),
@@ -83,7 +83,7 @@ def _two_way() -> RoadsConfig:
     road = record(net, spots=two_way.spots(net))
     return RoadsConfig(
         task=TaskKind.TWO_WAY,
-        scenes=(Scene(road=road, capacity=6),),
+        scenes=(Scene(road=road, traffic=3, oncoming=2, capacity=6),),
         max_steps=15,
         view=ViewKind.TIMES,
         horizon=5.0,
@@ -95,7 +95,7 @@ def _u_turn(*, connected: bool) -> RoadsConfig:
     road = record(net, spots=u_turn.spots(net), destinations=u_turn.DESTINATIONS)
     return RoadsConfig(
         task=TaskKind.U_TURN,
-        scenes=(Scene(road=road, capacity=7),),
+        scenes=(Scene(road=road, traffic=6, capacity=7),),
         duration=10.0,
         target_speeds=(8.0, 16.0, 24.0),
         reward_speed_range=(8.0, 24.0),
@@ -109,7 +109,7 @@ def _racetrack(*, connected: bool) -> RoadsConfig:
     road = record(net, spots=racetrack.spots(net))
     return RoadsConfig(
         task=TaskKind.RACETRACK,
-        scenes=(Scene(road=road, capacity=2),),
+        scenes=(Scene(road=road, traffic=1, capacity=2),),
         policy_frequency=5,
         duration=300.0,
         action_type="continuous",

@@ -8,18 +8,20 @@ import numpy as np
 
 from cavbench.compiled import inner
 from cavbench.envs.highway.dynamics import linear_map
-from cavbench.envs.roads.bodies import put_body
+from cavbench.envs.roads.bodies import is_free, put_body
 from cavbench.envs.roads.generator import Generator, next_below, next_uniform
 from cavbench.envs.roads.lanes import CIRCULAR, heading_at, position
 from cavbench.envs.roads.racetrack import FIRST_BEND, START
 from cavbench.envs.roads.state import Bodies, Body, Episode, Floats, Kind, Parameters, Road
 
 IDM = int(Kind.IDM)
+ROOM = 20.0
+"""A further car is so far in m from all others, or left out."""
 
 
 @inner
 def spawn(road: Road, bodies: Bodies, episode: Episode, generator: Generator, parameters: Parameters) -> None:
-    """RacetrackEnv._make_vehicles with one other car, as it is by default."""
+    """RacetrackEnv._make_vehicles with one other car, as it is by default, or more, each on a random lane with some room."""
     own = next_below(generator, 2)
     lane = road.lanes[road.spots[START] + own]
     along = next_uniform(generator, 20.0, 50.0)
@@ -30,7 +32,16 @@ def spawn(road: Road, bodies: Bodies, episode: Episode, generator: Generator, pa
     speed = 6.0 + next_uniform(generator, 0.0, 3.0)
     x, y = position(lane, along, 0.0)
     put_body(road, bodies[1], IDM, x, y, heading_at(lane, along), speed)
-    episode.ego, episode.cars, episode.bodies = 0, 2, 2
+    episode.ego, episode.cars = 0, 2
+    for _ in range(1, episode.traffic):
+        lane = road.lanes[next_below(generator, road.lane_count)]
+        along = next_uniform(generator, 0.0, lane.length)
+        speed = 6.0 + next_uniform(generator, 0.0, 3.0)
+        x, y = position(lane, along, 0.0)
+        if is_free(bodies, episode.cars, x, y, ROOM):
+            put_body(road, bodies[episode.cars], IDM, x, y, heading_at(lane, along), speed)
+            episode.cars += 1
+    episode.bodies = episode.cars
 
 
 @inner

@@ -5,16 +5,21 @@ from __future__ import annotations
 from cavbench.compiled import inner
 from cavbench.envs.highway.dynamics import linear_map
 from cavbench.envs.highway.ego import LANE_LEFT, LANE_RIGHT, nearest_target_speed
-from cavbench.envs.roads.bodies import put_body
+from cavbench.envs.roads.bodies import is_free, put_body
 from cavbench.envs.roads.generator import Generator, next_below, next_normal, next_uniform
 from cavbench.envs.roads.lanes import heading_at, position
-from cavbench.envs.roads.roundabout import DESTINATIONS, EAST, SOUTH, WEST_INNER, WEST_OUTER
+from cavbench.envs.roads.roundabout import DESTINATIONS, EAST, ENTRIES, SOUTH, WEST_INNER, WEST_OUTER
 from cavbench.envs.roads.state import Bodies, Episode, Floats, Kind, Parameters, Road
 
 EGO_PLACE, EGO_SPEED = 125.0, 8.0
 SPREAD, SPEED = 2.0, 16.0
 """Standard deviation of places in m and of speeds in m/s, and the mean speed."""
-ALL, EGO_GOAL = len(DESTINATIONS), len(DESTINATIONS) - 1
+ALL, GOALS = len(DESTINATIONS), 3
+"""Number of destinations, and of those of the other cars."""
+CARS = ((WEST_OUTER, 5.0), (WEST_INNER, 20.0), (WEST_INNER, -20.0), (EAST, 50.0))
+"""Lane and place in m of highway-env's four cars."""
+ARMS, ARM, ROOM, TRIES = 3, 127.5, 15.0, 10
+"""More cars come from three arms of so many m; each is so far in m from all others, or left out after so many tries."""
 DELTA_LOW, DELTA_HIGH = 3.5, 4.5
 DISCRETE, IDM = int(Kind.DISCRETE), int(Kind.IDM)
 
@@ -32,9 +37,21 @@ def put_car(road: Road, bodies: Bodies, episode: Episode, generator: Generator, 
     speed = SPEED + next_normal(generator) * SPREAD
     x, y = position(road.lanes[lane], along, 0.0)
     put_body(road, bodies[episode.cars], IDM, x, y, heading_at(road.lanes[lane], along), speed)
-    plan_route(road, bodies, episode.cars, next_below(generator, ALL - 1))
+    plan_route(road, bodies, episode.cars, next_below(generator, GOALS))
     bodies[episode.cars].delta = next_uniform(generator, DELTA_LOW, DELTA_HIGH)
     episode.cars += 1
+
+
+@inner
+def put_on_an_arm(road: Road, bodies: Bodies, episode: Episode, generator: Generator) -> None:
+    """One more car than highway-env has, on its way to the ring."""
+    for _ in range(TRIES):
+        lane = road.spots[ENTRIES + next_below(generator, ARMS)]
+        along = next_uniform(generator, 0.0, ARM)
+        x, y = position(road.lanes[lane], along, 0.0)
+        if is_free(bodies, episode.cars, x, y, ROOM):
+            put_car(road, bodies, episode, generator, lane, along)
+            return
 
 
 @inner
@@ -43,12 +60,15 @@ def spawn(road: Road, bodies: Bodies, episode: Episode, generator: Generator, pa
     lane = road.lanes[road.spots[SOUTH]]
     x, y = position(lane, EGO_PLACE, 0.0)
     put_body(road, bodies[0], parameters.ego, x, y, heading_at(lane, EGO_PLACE), EGO_SPEED)
-    plan_route(road, bodies, 0, EGO_GOAL)
+    plan_route(road, bodies, 0, episode.goal)
+    # highway-env's IDM driver may miss its exit from the inner lane.
+    bodies[0].changes_lanes = False
     episode.ego, episode.cars = 0, 1
-    put_car(road, bodies, episode, generator, road.spots[WEST_OUTER], 5.0)
-    put_car(road, bodies, episode, generator, road.spots[WEST_INNER], 20.0)
-    put_car(road, bodies, episode, generator, road.spots[WEST_INNER], -20.0)
-    put_car(road, bodies, episode, generator, road.spots[EAST], 50.0)
+    for number in range(min(episode.traffic, len(CARS))):
+        spot, place = CARS[number]
+        put_car(road, bodies, episode, generator, road.spots[spot], place)
+    for _ in range(len(CARS), episode.traffic):
+        put_on_an_arm(road, bodies, episode, generator)
     episode.bodies = episode.cars
 
 

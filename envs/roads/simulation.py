@@ -6,8 +6,10 @@ from cavbench.compiled import inner
 from cavbench.envs.roads.collision import find_collisions
 from cavbench.envs.roads.motion import move
 from cavbench.envs.roads.regulation import enforce_rules
-from cavbench.envs.roads.state import Bodies, Episode, Floats, Parameters, Road
+from cavbench.envs.roads.state import Bodies, Episode, Floats, Kind, Parameters, Road
 from cavbench.envs.roads.traffic import act
+
+IDM = int(Kind.IDM)
 
 
 @inner
@@ -15,6 +17,10 @@ def advance(road: Road, bodies: Bodies, episode: Episode, frames: int, parameter
     """Drive some frames; `bodies` are those of the episode, without the empty records after them."""
     for _ in range(frames):
         act(road, bodies, episode.cars, parameters)
+        if parameters.ego == IDM and episode.ego >= 0:
+            # highway-env's IDM reverses behind a car that stands; a rule-based driver of the ego does not.
+            ego = bodies[episode.ego]
+            ego.acceleration = max(ego.acceleration, -ego.speed / parameters.dt)
         episode.frames += 1
         if parameters.regulation > 0 and episode.frames % parameters.regulation == 0:
             enforce_rules(road, bodies, episode.cars)

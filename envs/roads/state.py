@@ -51,6 +51,14 @@ class ViewKind(IntEnum):
     TIMES = 3
 
 
+class Measure(IntEnum):
+    """What a world calls progress: that of the highway, metres of the way to a goal, or speed along the lane."""
+
+    HIGHWAY = 0
+    WAY = 1
+    LANE = 2
+
+
 class Body:
     """One car or obstacle."""
 
@@ -91,10 +99,17 @@ class Episode:
     bodies: int  # number of cars and obstacles
     ego: int  # number of the ego
     traffic: int  # number of cars that the cell asks for
+    oncoming: int  # number of those on the opposite lane
+    density: float  # by which the distances between cars are divided at the start
+    opposing: float  # the same on the opposite lane
+    arrivals: float  # chance that a car comes after a decision
+    goal: int  # number of the ego's destination
     seed: int  # scenario seed
     steps: int  # decisions so far
     frames: int  # physics frames so far, on a regulated road
     time: float  # s, as highway-env adds it up
+    driven: float  # m since the start
+    ahead: float  # m of the way to the goal that have not counted as progress yet
     sensor_range: float  # m
     noise_sigma: float  # m and m/s
     range_y: float  # m, the default range of y in observations, fixed at the reset
@@ -103,6 +118,7 @@ class Episode:
     ttc: float  # s, time to collision
     crashed: bool
     offroad: bool
+    arrived: bool
     terminated: bool
     truncated: bool
 
@@ -150,6 +166,9 @@ class Road(Protocol):
     routes: Integers
     route_lanes: Integers
     reach: NDArray[np.int8]
+    way_after: Floats
+    way_length: Floats
+    astray: NDArray[np.int8]
 
 
 class Parameters(Protocol):
@@ -164,6 +183,7 @@ class Parameters(Protocol):
     period: float
     duration: float
     max_steps: int
+    full_steps: int  # `max_steps` of the world, also in a planner's copies
     action_repeat: int
     actions: Integers  # the five discrete actions, by the task's numbers
     layout: int  # `ViewKind`
@@ -177,7 +197,12 @@ class Parameters(Protocol):
     jam_distance: float
     reward_speed_low: float
     reward_speed_high: float
+    progress: int  # `Measure`
+    lane_weight: float
+    reference_speed: float  # m/s
     offroad_terminal: bool
+    odometer: bool
+    shoulder: float  # m
     columns: int  # of an observation
     features: Integers  # numbers of `Feature`
     low: Floats  # of x, y, vx, vy

@@ -23,10 +23,11 @@ def put_car(
     place: float,
     speed: float,
     spread: float,
+    density: float,
 ) -> None:
     """A car about `place` m from the beginning of a lane, which never changes lanes."""
     own = road.lanes[lane]
-    along = place + 10.0 * next_normal(generator)
+    along = place + 10.0 / density * next_normal(generator)
     driven = speed + spread * next_normal(generator)
     x, y = position(own, along, 0.0)
     put_body(road, bodies[episode.cars], IDM, x, y, own.heading, driven)
@@ -37,14 +38,16 @@ def put_car(
 
 @inner
 def spawn(road: Road, bodies: Bodies, episode: Episode, generator: Generator, parameters: Parameters) -> None:
-    """TwoWayEnv._make_vehicles: three cars ahead and two that come."""
+    """TwoWayEnv._make_vehicles, whose three cars are 40 m apart and whose two cars that come are 100 m apart."""
     x, y = position(road.lanes[road.spots[WITH]], EGO_PLACE, 0.0)
     put_body(road, bodies[0], parameters.ego, x, y, 0.0, EGO_SPEED)
     episode.ego, episode.cars = 0, 1
-    for number in range(3):
-        put_car(road, bodies, episode, generator, road.spots[WITH], 70.0 + 40.0 * number, 24.0, 2.0)
-    for number in range(2):
-        put_car(road, bodies, episode, generator, road.spots[AGAINST], 200.0 + 100.0 * number, 20.0, 5.0)
+    for number in range(episode.traffic):
+        place = 70.0 + 40.0 / episode.density * number
+        put_car(road, bodies, episode, generator, road.spots[WITH], place, 24.0, 2.0, episode.density)
+    for number in range(episode.oncoming):
+        place = 200.0 + 100.0 / episode.opposing * number
+        put_car(road, bodies, episode, generator, road.spots[AGAINST], place, 20.0, 5.0, episode.opposing)
         bodies[episode.cars - 1].target_lane = road.spots[AGAINST]
 
 

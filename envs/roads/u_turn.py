@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavbench.envs.roads.network import WIDTH, Line, Network, circular, straight
+from cavbench.envs.roads.network import WIDTH, Line, Network, Way, circular, straight
 
 LENGTH, RADIUS = 128.0, 20.0
 DESTINATIONS = ("d",)
+WAY = Way(roads=(("a", "b"), ("b", "c"), ("c", "d")), goal=100.0)
+"""The way of the ego, to 100 m behind the half circle."""
 
 N, C, S, L = Line.NONE, Line.CONTINUOUS, Line.STRIPED, Line.CONTINUOUS_LINE
 

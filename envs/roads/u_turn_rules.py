@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from cavbench.compiled import inner
 from cavbench.envs.highway.dynamics import clip, linear_map
-from cavbench.envs.roads.bodies import put_body
-from cavbench.envs.roads.generator import Generator, next_normal, next_uniform
+from cavbench.envs.roads.bodies import is_free, put_body
+from cavbench.envs.roads.generator import Generator, next_below, next_normal, next_uniform
 from cavbench.envs.roads.lanes import heading_at, position
 from cavbench.envs.roads.state import Bodies, Episode, Floats, Kind, Parameters, Road
 
@@ -13,26 +13,34 @@ EGO_SPEED = 16.0
 PARTS, LANES = (0, 0, 1, 1, 2, 2), (0, 1, 1, 0, 0, 1)
 PLACES, SPEEDS = (25.0, 56.0, 0.5, 17.5, 1.0, 30.0), (13.5, 14.5, 4.5, 5.5, 3.5, 5.5)
 """Part of the road, lane, place in m and speed in m/s of the six cars, about."""
-SPREAD = 2.0
+SPREAD, ROOM = 2.0, 15.0
+"""Standard deviation in m and m/s; a further car is so far in m from all others, or left out."""
 IDM = int(Kind.IDM)
 
 
 @inner
 def spawn(road: Road, bodies: Bodies, episode: Episode, generator: Generator, parameters: Parameters) -> None:
-    """UTurnEnv._make_vehicles; only the first of the six cars draws its exponent."""
+    """UTurnEnv._make_vehicles; only the first of the six cars draws its exponent. Further cars are anywhere."""
     x, y = position(road.lanes[road.spots[0]], 0.0, 0.0)
     put_body(road, bodies[0], parameters.ego, x, y, 0.0, EGO_SPEED)
     bodies[0].route = bodies[0].lane
-    for number in range(6):
-        lane = road.lanes[road.spots[PARTS[number]] + LANES[number]]
-        along = PLACES[number] + next_normal(generator) * SPREAD
-        speed = SPEEDS[number] + next_normal(generator) * SPREAD
+    episode.ego, episode.cars = 0, 1
+    for number in range(episode.traffic):
+        more = number >= len(PLACES)
+        part = next_below(generator, len(PARTS) // 2) if more else PARTS[number]
+        lane = road.lanes[road.spots[part] + (next_below(generator, 2) if more else LANES[number])]
+        along = next_uniform(generator, 0.0, lane.length) if more else PLACES[number] + next_normal(generator) * SPREAD
+        speed = SPEEDS[number % len(SPEEDS)] + next_normal(generator) * SPREAD
         x, y = position(lane, along, 0.0)
-        put_body(road, bodies[number + 1], IDM, x, y, heading_at(lane, along), speed)
-        bodies[number + 1].route = bodies[number + 1].lane
+        if more and not is_free(bodies, episode.cars, x, y, ROOM):
+            continue
+        car = bodies[episode.cars]
+        put_body(road, car, IDM, x, y, heading_at(lane, along), speed)
+        car.route = car.lane
         if number == 0:
-            bodies[1].delta = next_uniform(generator, 3.5, 4.5)
-    episode.ego, episode.cars, episode.bodies = 0, 7, 7
+            car.delta = next_uniform(generator, 3.5, 4.5)
+        episode.cars += 1
+    episode.bodies = episode.cars
 
 
 @inner

@@ -1,9 +1,9 @@
-"""What the worlds of road networks have in common."""
+"""What the worlds of road networks have in common. A world is its roads, its rules and its numbers; everything else is here."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -11,20 +11,26 @@ from cavbench.core.parameters import differing
 from cavbench.driving import Control, Driver, DrivingFacts, DrivingWorld, Features, Kinematics
 from cavbench.envs.highway.config import ACTIONS, KINEMATICS, STANDARD_FEATURES, STANDARD_TARGET_SPEEDS
 from cavbench.envs.roads.config import RoadsConfig, Scene
+from cavbench.envs.roads.shape import drawn
 from cavbench.envs.weather import WEATHERS
 from cavbench.scenarios import Cell
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
+PLANE = replace(STANDARD_FEATURES, low=(-160.0, -160.0, -30.0, -30.0), high=(160.0, 160.0, 30.0, 30.0))
+"""Ranges for roads that bend: no direction is the forward one."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RoadsWorld(DrivingWorld):
     """A world on the engine of road networks, with the cars, features and decisions of `highway`.
 
+    A world names its axes, its grid, a cell (`home`) and its `rules`, and implements `scene`.
+
     Args:
         connected: whether cars look for their neighbours on the lanes before and after their own, too: highway-env's v1 of the
-            task; without it, v0.
+            task (v2 of the intersection); without it, v0.
         observed_vehicles: number of rows in an observation, including the ego.
         target_speeds: speeds in m/s for FASTER and SLOWER.
         simulation_frequency, policy_frequency: physics frames and decisions per second.
@@ -38,10 +44,14 @@ class RoadsWorld(DrivingWorld):
     features: ClassVar[Features] = STANDARD_FEATURES
     actions: ClassVar[tuple[str, ...]] = ACTIONS
     drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm", "clairvoyant")
-    gym_name: ClassVar[str]
-    """The name of the world in `cavbench.gym.make`."""
-    start_speed: ClassVar[float]
-    """The ego's speed at the start in m/s."""
+    name: ClassVar[str]
+    """The name of the world on the command line and in `cavbench.gym.make`."""
+    home: ClassVar[Cell]
+    """A cell of this world, for checks that do not depend on it."""
+    rules: ClassVar[Mapping[str, Any]]
+    """The arguments of `RoadsConfig` that name the task, its traffic and its progress."""
+    start_speed: ClassVar[float | None] = None
+    """The ego's speed at the start in m/s, if it drives on straight parallel lanes, so that a policy can predict its motion."""
 
     connected: bool = True
     observed_vehicles: int = 10
@@ -60,26 +70,20 @@ class RoadsWorld(DrivingWorld):
             raise ValueError(
                 f"policy_frequency must divide simulation_frequency ({self.simulation_frequency}), got {self.policy_frequency}"
             )
-        self._configured((self.scene(self._some_cell()),), Control())
-
-    @abstractmethod
-    def _some_cell(self) -> Cell:
-        """A cell of this world, for checks that do not depend on it."""
+        self._configured((self.scene(self.home),), Control())
 
     @abstractmethod
     def scene(self, cell: Cell) -> Scene:
-        """The road of a cell; equal roads must be the same object."""
-
-    @abstractmethod
-    def task(self) -> dict[str, Any]:
-        """The arguments of `RoadsConfig` that name the task."""
+        """The road and the traffic of a cell; equal roads must be the same object."""
 
     @property
     def decision_hz(self) -> float:
         return self.policy_frequency
 
     @property
-    def kinematics(self) -> Kinematics:
+    def kinematics(self) -> Kinematics | None:
+        if self.start_speed is None:
+            return None
         frames = self.simulation_frequency // self.policy_frequency
         constants = {**KINEMATICS, "start_speed": self.start_speed}
         return Kinematics(frames=frames, target_speeds=self.target_speeds, **constants)
@@ -91,7 +95,11 @@ class RoadsWorld(DrivingWorld):
     @property
     def facts(self) -> DrivingFacts:
         options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
-        return replace(super().facts, environment=f'cavbench.gym.make("{self.gym_name}"{options})')
+        return replace(super().facts, environment=f'cavbench.gym.make("{self.name}"{options})')
+
+    def facts_at(self, cell: Cell) -> DrivingFacts:
+        """The facts in a cell: with the lanes of its road."""
+        return replace(self.facts, lanes=drawn(self.scene(cell).road[0]))
 
     def config(self, cells: Sequence[Cell], control: Control | None = None) -> RoadsConfig:
         """The environment's full configuration; arguments as in `DrivingWorld.build`."""
@@ -107,7 +115,7 @@ class RoadsWorld(DrivingWorld):
 
     def _configured(self, scenes: tuple[Scene, ...], control: Control) -> RoadsConfig:
         return RoadsConfig(
-            **self.task(),
+            **self.rules,
             scenes=scenes,
             simulation_frequency=self.simulation_frequency,
             policy_frequency=self.policy_frequency,

@@ -80,7 +80,7 @@ def test_a_built_in_component_is_four_files(bench: Bench, checkout: Path) -> Non
         (("attack", "zo"), "attack 'zo' is already shipped by cavbench"),
         (("attack", "suites"), "suites.py exists; nothing was written: choose another name"),
         (("attack", "MyAttack"), "'MyAttack' is not a valid name"),
-        (("world", "my_world"), "unknown kind 'world'"),
+        (("world", "my_world"), "the track 'driving' has no place for a built-in world"),
     ],
 )
 def test_a_name_that_is_taken_or_bad_is_refused_and_nothing_is_written(

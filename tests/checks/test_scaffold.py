@@ -22,8 +22,8 @@ from tests.tree import PLUGINS
 
 Bench = Callable[..., Said]
 TOY_TRACK = PLUGINS / "toy_track.py"
-EVERY = list(itertools.product(("attack", "defense", "victim"), ("driving", "detection")))
-TESTS = 13
+EVERY = [*itertools.product(("attack", "defense", "victim"), ("driving", "detection")), ("world", "driving")]
+TESTS = 15
 """Tests of all templates: two each, three of a defence of a driver."""
 
 
@@ -79,7 +79,12 @@ def test_an_existing_folder_is_not_overwritten(bench: Bench, tmp_path: Path) -> 
         (("defense", "class"), "'class' is not a valid name for a defence"),
         (("victim", "a" * 41), "at most 40 characters"),
         (("atack", "my_attack"), "unknown kind 'atack'; did you mean 'attack'?"),
-        (("world", "my_world"), "unknown kind 'world'; known: attack, defense, victim"),
+        (("planet", "my_planet"), "unknown kind 'planet'; known: attack, defense, victim, world"),
+        (("world", "merge"), "world 'merge' is already shipped by cavbench"),
+        (
+            ("world", "my_world", "track=detection"),
+            "the track 'detection' has no template for a world; tracks with templates: driving",
+        ),
         (("attack", "my_attack", "track=street"), "unknown track 'street'; known: detection, driving"),
         (("attack", "my_attack", "trak=driving"), "unknown option 'trak=driving'"),
         (("attack", "my_attack", "out=/proc/none/here"), "cannot be written"),

@@ -11,6 +11,7 @@ import torch
 from rerun.chunk import Chunk, RrdReader
 
 from cavbench.driving import DrivingFacts, Features, ObservationThreat
+from cavbench.driving.features import LaneShape
 from cavbench.driving.recording import save
 from cavbench.driving.recording.episode import Episode
 from cavbench.driving.rollout import Trace
@@ -141,13 +142,44 @@ def test_ghosts_stand_where_the_perturbation_puts_them(path: Path) -> None:
     trace = made_up(8)
     save(trace, facts=FACTS, meta=META, path=path)
     chunks = read(path)
-    shown = values(chunks["/traffic/shown"], "centers")
+    shown = values(chunks["/traffic/shown"], "strips")
     measured = values(chunks["/traffic/measured"], "strips")
     for t in range(8):
         offset = (trace.steps["perturbed"][t] - trace.steps["observation"][t])[0, 1:, 1:3]
         offset = offset[trace.steps["observation"][t][0, 1:, 0] > 0] * np.array([100.0, 20.0])
         middles = np.asarray(measured[t]).reshape(-1, 2, 2).mean(1)
-        np.testing.assert_allclose(np.asarray(shown[t]).reshape(-1, 2) - middles, offset, atol=1e-3)
+        # An outline of five points, the last of which is the first one.
+        ghosts = np.asarray(shown[t]).reshape(-1, 5, 2)[:, :4].mean(1)
+        np.testing.assert_allclose(ghosts - middles, offset, atol=1e-3)
+
+
+def points(chunks: dict[str, list[Chunk]], entity: str) -> list[np.ndarray]:
+    """The strips of an entity as points [N, 2], for each step."""
+    return [np.concatenate([np.asarray(strip) for strip in strips]) for strips in values(chunks[entity], "strips")]
+
+
+def test_a_road_that_bends_stands_and_the_ego_drives_in_it(path: Path) -> None:
+    angles = np.linspace(0, 2 * np.pi, 40)
+    ring = tuple((float(90 * np.cos(angle)), float(90 * np.sin(angle))) for angle in angles)
+    trace, features = made_up(6), replace(FEATURES, low=(-160.0,) * 2 + (-30.0,) * 2, high=(160.0,) * 2 + (30.0,) * 2)
+    save(trace, facts=replace(FACTS, features=features, lanes=(LaneShape(width=4.0, line=ring),)), meta=META, path=path)
+    chunks = read(path)
+    assert all(chunk.is_static for chunk in chunks["/road/surface"])
+    for t, strip in enumerate(points(chunks, "/ego/measured")):
+        place, speed = np.split(trace.steps["observation"][t][0, 0, 1:] * ([160.0] * 2 + [30.0] * 2), 2)
+        np.testing.assert_allclose(strip.mean(0), place, atol=1e-2)
+        length = strip[1] - strip[0]
+        np.testing.assert_allclose(length / np.linalg.norm(length), speed / np.linalg.norm(speed), atol=1e-3)
+
+
+def test_a_ramp_beside_a_straight_road_goes_by_with_the_ego(path: Path) -> None:
+    road = LaneShape(width=4.0, line=((0.0, 0.0), (1000.0, 0.0)))
+    ramp = LaneShape(width=4.0, line=((150.0, 14.0), (190.0, 11.0), (230.0, 8.0)))
+    save(made_up(6), facts=replace(FACTS, lanes=(road, ramp)), meta=META, path=path)
+    for t, strip in enumerate(points(read(path), "/road/surface")):
+        x = 100.0 + 25.0 * t / 15
+        np.testing.assert_allclose(strip[:2], [[-60, 0], [140, 0]], atol=1e-3)
+        np.testing.assert_allclose(strip[2:], np.array(ramp.line) - [x, 0], atol=1e-2)
 
 
 def test_the_perturbation_never_leaves_its_budget(path: Path) -> None:

@@ -40,6 +40,10 @@ KIT = Kit(
         "attack": Start(run=f"bench run attack={{name}} attack.strength=2 {ROAD}", setting="attack.strength=2"),
         "defense": Start(run=f"bench run attack=noise,pgd defense={{name}} {ROAD}", setting="defense.step_size=0.05"),
         "victim": Start(run=f"bench run attack=noise,pgd victim={{name}} {ROAD}", setting="victim.gap_m=60"),
+        "world": Start(
+            run="bench run world={name} victim=random attack=none gap=20 braking=2 episodes=20",
+            setting="world.max_steps=100",
+        ),
     },
     package="cavbench.driving.checks",
     homes={

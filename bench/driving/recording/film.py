@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 from itertools import cycle, islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.driving.recording.episode import Array, Episode
+from cavbench.driving.recording.plan import Plan
 from cavbench.driving.recording.scene import CAR_LENGTH, CAR_WIDTH, DASH, DASH_EVERY, LANE_WIDTH, edges
 from cavbench.recording import about
 from cavbench.recording.film.drawing import (
@@ -26,6 +28,7 @@ from cavbench.recording.film.drawing import (
     blank,
     box,
     line,
+    stroke,
     write,
 )
 from cavbench.recording.film.film import Film, Picture
@@ -35,6 +38,9 @@ BEHIND, AHEAD = 35.0, 85.0
 """Metres of road behind and ahead of the ego that are shown."""
 SCALE = WIDTH / (BEHIND + AHEAD)
 """Pixels a metre."""
+HIGH = 56.0
+"""Metres of the picture from above to below the ego, where the road bends."""
+GRASS: Colour = (228, 233, 222)
 HEADER, MARGIN, KEY, BAND, LEGEND, PLOT = 36, 10, 22, 22, 26, 62
 LEFT = 170
 """Where the time axes begin; their labels are before it."""
@@ -51,8 +57,10 @@ class EpisodeFilm(Film):
     def __init__(self, episode: Episode) -> None:
         self.episode, self.fps = episode, episode.facts.decision_hz
         self.has_road = {"x", "y"} <= set(episode.features.names)
+        self.plan = Plan(episode) if episode.facts.lanes and self.has_road else None
+        self.stands = self.plan is not None and self.plan.bends
         if self.has_road:
-            self.low, self.high = edges(episode)
+            self.low, self.high = (-HIGH / 2, HIGH / 2) if self.stands else edges(episode)
         self.road_top = HEADER
         self.road_height = round((self.high - self.low) * SCALE) if self.has_road else 0
         self.bands_top = self.road_top + (self.road_height + MARGIN + KEY if self.has_road else 0)
@@ -183,6 +191,10 @@ class EpisodeFilm(Film):
     def _road(self, picture: Picture, step: int) -> None:
         road = picture[self.road_top : self.road_top + self.road_height]
         road[:] = ROAD
+        if self.plan is not None:
+            self._network(road, self.plan, step)
+            self._cars(road, step)
+            return
         x = float(self.episode.steps["x"][step])
         first = -BEHIND - (x - BEHIND) % DASH_EVERY
         for y in np.arange(self.low + LANE_WIDTH, self.high - 0.1, LANE_WIDTH):
@@ -192,25 +204,46 @@ class EpisodeFilm(Film):
             road[y : y + 2] = GREY
         self._cars(road, step)
 
+    def _network(self, road: Picture, plan: Plan, step: int) -> None:
+        """The lanes around the ego: asphalt over wider strips of paint, on grass."""
+        road[:] = GRASS
+        x, y = plan.ego[step]
+        around = (BEHIND + AHEAD) / 2 if self.stands else AHEAD
+        lanes = plan.near(float(x), around, around)
+        for colour, off in ((GREY, 0.3), (ROAD, -0.3)):
+            for width, points in lanes:
+                places = [self._pixel(*point) for point in points - [0.0, y if self.stands else 0.0]]
+                stroke(road, places, colour, round((width + off) * SCALE))
+
     def _pixel(self, x: float, y: float) -> tuple[float, float]:
-        """The place on the road's picture of a place in metres, x ahead of the ego."""
-        return (x + BEHIND) * SCALE, (y - self.low) * SCALE
+        """The place on the road's picture of a place in metres, x from the ego, and y too where the picture goes with it."""
+        before = (BEHIND + AHEAD) / 2 if self.stands else BEHIND
+        return (x + before) * SCALE, (y - self.low) * SCALE
+
+    @cached_property
+    def _towards(self) -> Array:
+        """[T, V, 2] where the cars look."""
+        if self.plan is not None and self.stands:
+            return self.plan.directions()
+        shape = self.episode.physical("observation", "x").shape
+        return np.broadcast_to(np.array([1.0, 0.0]), (*shape, 2))
 
     def _cars(self, road: Picture, step: int) -> None:
         episode = self.episode
         half = (CAR_LENGTH / 2 * SCALE, CAR_WIDTH / 2 * SCALE)
-        ego = float(episode.physical("observation", "y")[step, 0])
+        ego = 0.0 if self.stands else float(episode.physical("observation", "y")[step, 0])
+        own, others = self._towards[step, 0], self._towards[step, 1:][episode.present[step]]
         present = episode.present[step]
         places = {
             name: np.stack([episode.physical(name, axis)[step, 1:][present] for axis in ("x", "y")], -1)
             for name in ("observation", "perturbed")
         }
-        for x, y in places["observation"]:
-            box(road, *self._pixel(x, y + ego), half, SKY)
-            box(road, *self._pixel(x, y + ego), half, BLUE, 1)
+        for (x, y), towards in zip(places["observation"], others, strict=True):
+            box(road, *self._pixel(x, y + ego), half, SKY, towards=towards)
+            box(road, *self._pixel(x, y + ego), half, BLUE, 1, towards=towards)
         crashed = bool(episode.steps["crashed"][step])
-        box(road, *self._pixel(0, ego), half, VERMILLION if crashed else GREEN)
-        box(road, *self._pixel(0, ego), half, BLACK, 2 if crashed else 1)
+        box(road, *self._pixel(0, ego), half, VERMILLION if crashed else GREEN, towards=own)
+        box(road, *self._pixel(0, ego), half, BLACK, 2 if crashed else 1, towards=own)
         if episode.attacked:
             self._ghosts(road, step, places, ego, half)
         if crashed:
@@ -221,8 +254,14 @@ class EpisodeFilm(Film):
         self, road: Picture, step: int, places: dict[str, Array], ego: float, half: tuple[float, float]
     ) -> None:
         """What the attack shows, and how far it is from the truth."""
-        for (x, y), (x2, y2) in zip(places["observation"], places["perturbed"], strict=True):
+        others = self._towards[step, 1:][self.episode.present[step]]
+        for number, ((x, y), (x2, y2)) in enumerate(zip(places["observation"], places["perturbed"], strict=True)):
             line(road, self._pixel(x, y + ego), self._pixel(x2, y2 + ego), VERMILLION, 1)
-            box(road, *self._pixel(x2, y2 + ego), half, VERMILLION, 2)
-        shown = float(self.episode.physical("perturbed", "y")[step, 0])
-        box(road, *self._pixel(0, shown), half, VERMILLION, 2)
+            box(road, *self._pixel(x2, y2 + ego), half, VERMILLION, 2, towards=others[number])
+        x, y = (
+            float(
+                self.episode.physical("perturbed", axis)[step, 0] - self.episode.physical("observation", axis)[step, 0]
+            )
+            for axis in "xy"
+        )
+        box(road, *self._pixel(x if self.stands else 0, ego + y), half, VERMILLION, 2, towards=self._towards[step, 0])

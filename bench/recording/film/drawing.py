@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal
 
@@ -33,6 +34,8 @@ CYCLE: tuple[Colour, ...] = (PURPLE, PALE, ORANGE, BLUE, DARK, GREEN, SKY)
 
 SHIFT = 4
 """Bits of OpenCV's subpixel coordinates."""
+EAST = np.array([1.0, 0.0])
+"""The direction of a box along the picture."""
 
 
 def blank(height: int, width: int) -> Picture:
@@ -72,16 +75,29 @@ def write(
     under[:] = (under * (1 - kept) + np.array(colour, np.float32) * kept).astype(np.uint8)
 
 
-def box(picture: Picture, x: float, y: float, half: tuple[float, float], colour: Colour, outline: float = 0.0) -> None:
-    """A box around (x, y) in pixels: filled, or with an outline of so many pixels."""
-    corners = np.array(
-        [[x - half[0], y - half[1]], [x + half[0], y - half[1]], [x + half[0], y + half[1]], [x - half[0], y + half[1]]]
-    )
+def box(
+    picture: Picture,
+    x: float,
+    y: float,
+    half: tuple[float, float],
+    colour: Colour,
+    outline: float = 0.0,
+    towards: NDArray[np.float64] = EAST,
+) -> None:
+    """A box around (x, y) in pixels: filled, or with an outline of so many pixels; `towards` [2] is where its length points."""
+    forward, side = half[0] * towards, half[1] * np.array([-towards[1], towards[0]])
+    corners = np.array([x, y]) + np.stack([-forward - side, forward - side, forward + side, -forward + side])
     points = np.rint(corners * 2**SHIFT).astype(np.int32)
     if outline:
         cv2.polylines(picture, [points], True, colour, round(outline), cv2.LINE_AA, SHIFT)
     else:
         cv2.fillPoly(picture, [points], colour, cv2.LINE_AA, SHIFT)
+
+
+def stroke(picture: Picture, places: Sequence[tuple[float, float]], colour: Colour, width: int) -> None:
+    """A line through places in pixels, with round corners."""
+    points = np.rint(np.array(places) * 2**SHIFT).astype(np.int32)
+    cv2.polylines(picture, [points], False, colour, width, cv2.LINE_AA, SHIFT)
 
 
 def line(
