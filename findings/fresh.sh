@@ -1,6 +1,6 @@
 # Sourced by each finding: `fresh PACKAGE==VERSION ...` makes a temporary folder with an environment of its own, and removes it at the end.
 # `see NAME`, with a program on standard input, runs it there. The program prints what it saw, and exits with 1 if that changed.
-# It may import `onnx_model`.
+# It may import `onnx_model` and `open_drive`.
 set -euo pipefail
 
 fresh() {
@@ -13,7 +13,7 @@ fresh() {
 
 see() {
     cat >"$folder/seen.py"
-    cp "$(dirname "${BASH_SOURCE[0]}")/onnx_model.py" "$folder"
+    cp "$(dirname "${BASH_SOURCE[0]}")"/*.py "$folder"
     (cd "$folder" && OMP_NUM_THREADS=1 venv/bin/python -W ignore seen.py 2>"$folder/errors.log") ||
         { status=$?; tail -5 "$folder/errors.log" >&2; exit "$status"; }
 }

@@ -130,8 +130,8 @@ def _try_batches(detector: Detector, windows: Windows, label: int, found: Tensor
     for where, (pictures, place) in batches.items():
         if abs(float(_best(_predicted(detector, pictures), label)[place] - found[0])) > TOLERANCE:
             raise UserError(
-                f"predicts otherwise for a picture {where}: normalise by fixed statistics, not by those of the batch, and call "
-                "eval() before an export"
+                f"predicts otherwise for a picture {where}: normalise and quantise by fixed statistics, not by those of the "
+                "batch (as quantize_dynamic does), and call eval() before an export"
             )
 
 

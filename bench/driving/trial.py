@@ -197,8 +197,8 @@ def _try_batches(policy: Policy, moment: Moment) -> None:
         for rows in parts:
             if _apart(_answer(policy, moment.of(rows)), whole[rows], TOLERANCE):
                 raise UserError(
-                    f"answers otherwise about an observation {where}: normalise by fixed statistics, not by those of the batch, "
-                    "and call eval() before an export"
+                    f"answers otherwise about an observation {where}: normalise and quantise by fixed statistics, not by those "
+                    "of the batch (as quantize_dynamic does), and call eval() before an export"
                 )
 
 

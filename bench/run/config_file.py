@@ -170,11 +170,32 @@ def _check_events(text: str, path: Path) -> None:
             depth -= 1
         documents += isinstance(event, yaml.DocumentStartEvent)
         nodes += isinstance(event, yaml.NodeEvent)
-        if isinstance(event, yaml.ScalarEvent) and "${" in event.value:
-            raise UserError(f"{path} has a ${{…}}: values are plain text")
+        if isinstance(event, yaml.ScalarEvent):
+            _check_scalar(event, path)
         if depth > DEEPEST or nodes > MOST_NODES or documents > 1:
             what = f"deeper than {DEEPEST} levels" if depth > DEEPEST else f"more than {MOST_NODES} values"
             raise UserError(f"{path} is {what if documents <= 1 else 'more than one document'}")
+
+
+def _check_scalar(event: yaml.ScalarEvent, path: Path) -> None:
+    """Refuse a value that YAML takes for another one than the command line does: 010 is 8, 1:30 is 90, `no` is false."""
+    text = event.value
+    if "${" in text:
+        raise UserError(f"{path} has a ${{…}}: values are plain text")
+    if event.style is not None:
+        return
+    value = yaml.safe_load(text)
+    if isinstance(value, bool):
+        same = text.lower() == str(value).lower()
+    elif isinstance(value, int):
+        # Python reads signs, zeros in front and underscores as the command line does.
+        same = re.fullmatch(r"[+-]?[0-9]+(_[0-9]+)*", text) is not None and int(text) == value
+    else:
+        same = not isinstance(value, float) or ":" not in text
+    if not same:
+        raise UserError(
+            f"{path}: YAML reads {short(text)} as {_word(value, text, path)}; write that, or '{text}' in quotes for the text"
+        )
 
 
 def write(out: Path, words: Mapping[str, str]) -> Path:

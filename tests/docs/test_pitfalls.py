@@ -19,6 +19,7 @@ from torchrl.data import Categorical
 from torchrl.envs import MultiStepTransform, StepCounter, TransformedEnv
 from torchrl.modules import MLP, QValueActor
 
+from cavbench.envs.highway.keys import decisions
 from cavbench.envs.highway.world import HighwayWorld
 from tests.tree import ROOT
 
@@ -80,6 +81,28 @@ def test_a_transformed_env_drops_the_scenario_of_a_reset() -> None:
     assert torch.equal(*seen["alone"])
     assert not torch.equal(*seen["behind"]), (
         "docs/pitfalls.md and the comment in test_torchrl_examples.py are out of date"
+    )
+
+
+@pytest.mark.parametrize("rate", [5, 3])
+def test_a_configuration_of_highway_env_has_its_number_of_decisions(rate: int) -> None:
+    config = {"duration": 30, "policy_frequency": rate, "simulation_frequency": 15, "vehicles_count": 0}
+    gymnasium.register_envs(pytest.importorskip("highway_env"))
+    env = gymnasium.make("highway-fast-v0", config=config)
+    env.reset(seed=0)
+    there = next(step for step in range(1, 200) if env.step(1)[3])
+    assert there == decisions(30.0, rate) == 30 * rate + 1
+
+
+def test_a_clamp_passes_the_gradient_of_black_and_white_pixels_and_a_hardtanh_does_not() -> None:
+    found = {}
+    for name, clamped in {"clamp": torch.clamp, "hardtanh": torch.nn.functional.hardtanh}.items():
+        pixels = torch.tensor([0.0, 1.0], requires_grad=True)
+        clamped(pixels, 0.0, 1.0).sum().backward()
+        assert pixels.grad is not None
+        found[name] = pixels.grad.tolist()
+    assert found == {"clamp": [1.0, 1.0], "hardtanh": [0.0, 0.0]}, (
+        "patches that start black or white are crafted otherwise"
     )
 
 

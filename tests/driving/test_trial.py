@@ -172,7 +172,17 @@ class InPlace(Wraps):
         return self.net(shown)
 
 
+class Quantised(Wraps):
+    """Its activations are quantised by the range of the batch (docs/pitfalls.md)."""
+
+    def begin(self) -> None:
+        torch.manual_seed(0)
+        floats = nn.Sequential(nn.Flatten(), nn.Linear(50, 64), nn.ReLU(), nn.Linear(64, 5))
+        self.net = torch.ao.quantization.quantize_dynamic(floats, {nn.Linear}, dtype=torch.qint8)
+
+
 REFUSED: dict[type[Wraps], str] = {
+    Quantised: "quantise by fixed statistics",
     OfTheBatch: "answers otherwise about an observation",
     OfItsPlace: "answers otherwise about an observation",
     OfItsSize: "in a large batch",

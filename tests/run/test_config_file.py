@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -54,6 +56,38 @@ def test_hydra_composes_the_defaults_and_typed_words_come_last(tmp_path: Path) -
 
 def test_a_path_with_spaces_and_signs_is_read(tmp_path: Path) -> None:
     assert read(made(tmp_path / "a b=c", **{"my study.v2": "attack: zo\n"})) == {"attack": "zo"}
+
+
+@pytest.mark.parametrize(
+    ("written", "read_as"),
+    [("010", "8"), ("0x10", "16"), ("0b11", "3"), ("1:30", "90"), ("1:30.5", "90.5"), ("no", "false"), ("On", "true")],
+)
+def test_a_value_that_yaml_takes_for_another_is_refused(tmp_path: Path, written: str, read_as: str) -> None:
+    path = made(tmp_path, study=f"attack: noise\nepisodes: {written}\n")
+    with pytest.raises(
+        UserError,
+        match=f"YAML reads {re.escape(written)} as {re.escape(read_as)}; write that, or '{re.escape(written)}'",
+    ):
+        expanded([f"config={path}"])
+    quoted = made(tmp_path, study=f"attack: noise\nepisodes: '{written}'\n")
+    assert read(quoted)["episodes"] == written, "what stands in quotes is what is typed"
+
+
+@given(
+    st.one_of(
+        st.integers(), st.floats(allow_nan=False), st.booleans(), st.from_regex(r"[0-9_:.+xob-]{1,6}", fullmatch=True)
+    )
+)
+@settings(max_examples=200, deadline=None)
+def test_a_value_of_a_file_is_the_number_that_is_typed(value: object) -> None:
+    text = str(value)
+    try:
+        config_file._check_events(f"episodes: {text}\n", Path("study.yaml"))
+        found = yaml.safe_load(f"episodes: {text}\n")["episodes"]
+    except (UserError, yaml.YAMLError, TypeError, ValueError):
+        return
+    if isinstance(found, (int, float)) and not isinstance(found, bool):
+        assert float(text) == float(found)
 
 
 BOMB = "a: &a [x, x]\n" + "".join(
