@@ -1,6 +1,6 @@
 """Compares what `bench run` says before and early in a run with what the run then takes:
 
-    python benchmarks/estimates.py                              # the five runs of docs/scale.md
+    python benchmarks/estimates.py                              # the five runs of RUNS
     python benchmarks/estimates.py attack=zo lanes=4 episodes=5 # another one
 
 Each run is driven by one worker in a process of its own, into an empty folder. Times are CPU seconds of that process, because
