@@ -1,12 +1,14 @@
-"""Computes what attacks on defended victims cost, and writes the table that `bench run` estimates with:
+"""Measures what attacks on defended victims cost, and writes the table that `bench run` estimates with:
 
-    python benchmarks/costs.py                   # from the published records
-    python benchmarks/costs.py RESULTS           # renews what a results folder has measured
-    python benchmarks/costs.py --overheads       # measures what a batch costs beside its episodes, too: a CPU minute
+    python benchmarks/costs.py                        # every row of ROWS and WORLDS: about 20 CPU minutes
+    python benchmarks/costs.py dqn+shield yolov5      # these rows
+    python benchmarks/costs.py merge highway-v0       # these worlds
 
-Every record has the wall time of its unit, a share of that of its batch, in a worker with one thread. The table is
-`bench/run/costs.json` (`cavbench.run.cost`): for each attack on each defended victim the median seconds an episode, for the
-default effort of the attack, and of a patch the seconds of its crafting.
+The table is `bench/run/costs.json` (`cavbench.run.cost`), in CPU seconds of one thread. Each attack drives a small and a large
+batch in one cell. What they took is a cost of each step of the longest episode and a cost of each step of every episode. `batch`
+is the first one for all steps that an episode can have, `episode` the second one for a mean episode. `length` is the mean length
+of an episode, as a share of all steps: that of the published records where they have the pair. What is prepared is measured with
+little effort.
 """
 
 from __future__ import annotations
@@ -14,12 +16,13 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
-from statistics import median
+from typing import Any
 
-import pyarrow as pa
+import numpy as np
 
 from cavbench.core import registry
 from cavbench.core.pair import choose
@@ -27,92 +30,172 @@ from cavbench.errors import UserError
 from cavbench.files import whole
 from cavbench.isolation.framework import Snapshot
 from cavbench.leaderboard.published import every_track
-from cavbench.records import reading
 from cavbench.run.attempt import attempt
 from cavbench.run.config import plan_of
 from cavbench.run.cost import effort
 from cavbench.run.process import settle
-from cavbench.run.task import Task
+from cavbench.run.task import Outcome, Task
+from cavbench.run.unit import Unit
 
 TABLE = Path(__file__).parents[1] / "bench" / "run" / "costs.json"
-CELL = ("lanes=4", "density=1", "weather=clear", "seeds=0", "reference=false")
-SMALL, LARGE = 2, 10
-"""Episodes of the two batches whose difference is the cost of an episode."""
-SIDES = {"plain": ("defense=advtrain",), "filtered": ("defense=tracker+shield",)}
-"""Defended victims that do not crash, so that all episodes of a batch are equally long."""
+FEW = ("noise", "pgd", "zo")
+PATCHES = ("none", "grey_patch", "noise_patch", "eot")
+ROWS = {
+    "dqn": ("none", *FEW, "bias", "plan", "rehearse", "pessimist", "two_stage", "paad", "sarsa"),
+    "blind": ("none",),
+    "random": ("none",),
+    "idm": ("none",),
+    "clairvoyant": ("none",),
+    "planner": ("none", *FEW),
+    **dict.fromkeys(("ddpg", "ppo", "sac"), ("none", *FEW)),
+    **{f"dqn+{name}": ("none", *FEW) for name in ("advtrain", "atla", "car", "sa", "smoothing", "tracker")},
+    **{f"dqn+{name}": ("none", *FEW) for name in ("frame_stack", "pessimist_q")},
+    **{f"dqn+{name}": ("none", "noise", "pgd") for name in ("shield", "tracker+shield")},
+    **{name: (*PATCHES, "square_patch") if name == "yolov5" else PATCHES for name in ("yolov5", "yolov3_tiny")},
+    **dict.fromkeys(("fcos", "rcnn"), PATCHES),
+    **{f"yolov5+{name}": PATCHES for name in ("jpeg", "median", "temporal", "advtrain_detection")},
+    **{f"yolov3_tiny+{name}": PATCHES for name in ("masking", "segmenter")},
+}
+WORLDS = ("highway", "merge", "highway-v0", "highway-fast-v0")
+DETECTORS = ("yolov5", "yolov3_tiny", "fcos", "rcnn")
+DRIVEN, DETECTED, SLOW, SLOW_S = (2, 40), (1, 3), 6, 8.0
+"""Episodes of the two batches on each track; and of the second one if the first took longer than so many seconds."""
+WORDS = {
+    "eot": ("attack.steps=15",),
+    "square_patch": ("attack.steps=20",),
+    "plan": ("threat.access=dynamics",),
+    "rehearse": ("threat.access=dynamics",),
+}
+"""What an attack needs more: the right to use the dynamics, or little effort, because crafting is long."""
 
 
-def measured(records: pa.Table) -> dict[str, dict[str, dict[str, float]]]:
-    """By defended victim and attack, the seconds of an episode and of what is prepared, at the default effort."""
-    columns = ["victim", "defense", "attack", "attack_params", "unit", "wall_s"]
-    crafting = "crafting_s" in records.column_names
-    columns += ["crafting_s"] if crafting else []
-    units: dict[tuple[str, ...], list[dict[str, float]]] = defaultdict(list)
-    for row in records.select(columns).to_pylist():
-        name = row["victim"] if row["defense"] == "none" else f"{row['victim']}+{row['defense']}"
-        units[name, row["attack"], row["attack_params"], row["unit"]].append(row)
-    found: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for (name, attack, params, _), rows in units.items():
-        if (times := _effort(attack, params)) is None:
-            continue
-        own = found[name, attack]
-        own["episode"].append(rows[0]["wall_s"] / len(rows) / (1.0 if crafting else times))
-        if crafting and rows[0]["crafting_s"]:
-            own["artefact"].append(rows[0]["crafting_s"] / times)
-    table: dict[str, dict[str, dict[str, float]]] = {}
-    for (name, attack), costs in sorted(found.items()):
-        table.setdefault(name, {})[attack] = {kind: float(f"{median(values):.3g}") for kind, values in costs.items()}
-    return table
-
-
-def _effort(attack: str, params: str) -> float | None:
-    """The effort of the parameters of a record; None if this version has no such attack."""
-    try:
-        return effort(choose("attack", attack, **json.loads(params or "{}")).component)
-    except (UserError, ValueError):
-        return None
-
-
-def overhead(words: tuple[str, ...], framework: Snapshot) -> float:
-    """What a batch costs beside its episodes, in episodes: CPU time of pgd, in this process."""
-    small, large = (
-        _driven((*words, *CELL, "attack=pgd", "attack.steps=1", f"episodes={count}"), framework)
-        for count in (SMALL, LARGE)
-    )
-    episode = (large - small) / (LARGE - SMALL)
-    print(f"{' '.join(words)}: {SMALL} episodes {small:.1f} s, {LARGE} episodes {large:.1f} s")
-    return float(f"{max(small / episode - SMALL, 0):.2g}")
-
-
-def _driven(words: tuple[str, ...], framework: Snapshot) -> float:
-    plan = plan_of(words)
+def measured(words: Sequence[str], framework: Snapshot, cells: Sequence[str]) -> dict[str, float]:
+    """The CPU seconds of a pair: of what is prepared, of a batch, and of each episode in it, at the default effort."""
+    plan = plan_of((*words, *cells, "seeds=0", "reference=false", f"episodes={max(DRIVEN)}", "record=0"))
     unit = next(one for one in plan.units() if one.pair.id == plan.pairs[0].id)
+    times = effort(unit.pair.attack.component)
+    found, artefacts = {}, {}
+    if unit.artefact:
+        outcome, seconds = _timed(Task(unit=unit, step="prepare"), framework)
+        found["artefact"], artefacts = seconds / times, {unit.artefact: outcome.artefact or b""}
+        times = 1.0
+    sizes = DETECTED if unit.track.name == "detection" else DRIVEN
+    few, seconds = _timed(_task(unit, sizes[0], artefacts), framework)
+    many, more = _timed(_task(unit, sizes[1] if seconds < SLOW_S else SLOW, artefacts), framework)
+    steps = getattr(unit.pair.world.component, "max_steps", 1)
+    per_step, per_row = _costs([few, many], [seconds, more])
+    found |= {"batch": per_step * steps / times, "episode": per_row * float(_steps(many).mean()) / times}
+    if unit.track.name == "driving":
+        name = (
+            unit.pair.victim.name
+            if unit.pair.defense.name == "none"
+            else f"{unit.pair.victim.name}+{unit.pair.defense.name}"
+        )
+        found["length"] = lengths().get((name, unit.pair.attack.name), float(_steps(many).mean())) / steps
+    return {name: float(f"{value:.3g}") for name, value in found.items()}
+
+
+@cache
+def lengths() -> dict[tuple[str, str], float]:
+    """The mean steps of an episode in the published records, by row and attack: over all cells, at the default parameters."""
+    table = every_track()["driving"].select(["victim", "defense", "attack", "attack_params", "steps"])
+    means = table.group_by(table.column_names[:-1]).aggregate([("steps", "mean")]).to_pylist()
+    return {
+        (one["victim"] if one["defense"] == "none" else f"{one['victim']}+{one['defense']}", one["attack"]): one[
+            "steps_mean"
+        ]
+        for one in means
+        if _is_default(one["attack"], one["attack_params"])
+    }
+
+
+def _is_default(attack: str, params: str) -> bool:
+    given = json.loads(params or "{}")
+    try:
+        own = json.loads(choose("attack", attack).params)
+    except UserError:
+        return False
+    return all(given.get(name, value) == value for name, value in own.items())
+
+
+def _task(unit: Unit, episodes: int, artefacts: Mapping[str, bytes]) -> Task:
+    """A batch of some of the episodes of a unit."""
+    return Task(unit=replace(unit, seeds=unit.seeds[:episodes]), artefacts=artefacts)
+
+
+def _timed(task: Task, framework: Snapshot) -> tuple[Outcome, float]:
     start = time.process_time()
-    outcome = attempt(Task(unit=unit), lambda *_: None, framework)
+    outcome = attempt(task, lambda *_: None, framework)
     if outcome.failed:
         raise UserError(outcome.why)
-    return time.process_time() - start
+    return outcome, time.process_time() - start
+
+
+def _costs(outcomes: Sequence[Outcome], seconds: Sequence[float]) -> tuple[float, float]:
+    """The seconds of a step of a batch, and of a step of an episode, from what batches of different sizes took."""
+    driven = [_steps(outcome) for outcome in outcomes]
+    longest, total = np.array([one.max() for one in driven]), np.array([one.sum() for one in driven])
+    per_step, per_row = np.linalg.solve(np.stack([longest, total], 1), np.array(seconds))
+    if per_row < 0 or per_step < 0:
+        per_row = max(per_row, 0.0) and seconds[-1] / total[-1]
+        per_step = 0.0 if per_row else seconds[-1] / longest[-1]
+    return float(per_step), float(per_row)
+
+
+def _steps(outcome: Outcome) -> Any:
+    assert outcome.records is not None
+    if "steps" not in outcome.records.column_names:
+        return np.ones(outcome.records.num_rows)
+    return outcome.records["steps"].to_numpy()
+
+
+def row_of(name: str, framework: Snapshot) -> dict[str, dict[str, float]]:
+    """The costs of every attack of a row."""
+    victim, _, defense = name.partition("+")
+    cells = ("lanes=3",) if victim in DETECTORS else ("lanes=4", "density=1", "weather=clear")
+    words = (f"victim={victim}", f"defense={defense or 'none'}")
+    found: dict[str, dict[str, float]] = {}
+    for attack in ROWS[name]:
+        start = time.process_time()
+        try:
+            found[attack] = measured((*words, f"attack={attack}", *WORDS.get(attack, ())), framework, cells)
+        except UserError as error:
+            print(f"{name} {attack}: {error}", flush=True)
+            continue
+        print(f"{name} {attack}: {found[attack]}, {time.process_time() - start:.0f} CPU s", flush=True)
+    return found
+
+
+def world_of(name: str, framework: Snapshot) -> dict[str, float]:
+    """What a victim that computes nothing costs in a world."""
+    cells = ("lanes=4", "density=1", "weather=clear") if name != "merge" else ("density=1", "weather=clear")
+    found = measured((f"world={name}", "victim=idm", "attack=none"), framework, cells)
+    del found["length"]
+    print(name, found, flush=True)
+    return found
 
 
 def main() -> None:
     """The command of this module."""
-    parser = argparse.ArgumentParser(description="Write the table of costs that bench run estimates with.")
-    parser.add_argument("folder", type=Path, nargs="?", help="results folder; without one the published records")
-    parser.add_argument("--overheads", action="store_true", help="measure what a batch costs beside its episodes, too")
-    words = parser.parse_args()
-    table = json.loads(TABLE.read_text()) if TABLE.exists() else {}
-    sources: Mapping[str, pa.Table] = reading.read_all(words.folder) if words.folder else every_track()
-    for name, records in sources.items():
-        known = table.setdefault(name, {"overhead": {"plain": 0.0, "filtered": 0.0}, "rows": {}})
-        for row, costs in measured(records).items():
-            known["rows"].setdefault(row, {}).update(costs)
-    if words.overheads:
-        settle()
-        registry.load("attack", "pgd")
-        framework = Snapshot()
-        table["driving"]["overhead"] = {name: overhead(side, framework) for name, side in SIDES.items()}
-    with whole(TABLE) as file:
-        file.write((json.dumps(table, indent=1, sort_keys=True) + "\n").encode())
+    parser = argparse.ArgumentParser(description="Measure the costs that bench run estimates with.")
+    parser.add_argument("names", nargs="*", help="rows or worlds; without any, all")
+    names = parser.parse_args().names or [*ROWS, *WORLDS]
+    if unknown := [name for name in names if name not in (*ROWS, *WORLDS)]:
+        parser.error(f"no row or world is called {', '.join(unknown)}; there are {', '.join((*ROWS, *WORLDS))}")
+    settle()
+    registry.load("attack", "pgd")
+    framework = Snapshot()
+    for name in names:
+        if name in WORLDS:
+            track, place, found = "driving", "worlds", {name: world_of(name, framework)}
+        else:
+            track = "detection" if name.partition("+")[0] in DETECTORS else "driving"
+            place, found = "rows", {name: row_of(name, framework)}
+        # Read again: another process may measure other rows.
+        table = json.loads(TABLE.read_text())
+        table[track].setdefault(place, {}).update(found)
+        with whole(TABLE) as file:
+            file.write((json.dumps(table, indent=1, sort_keys=True) + "\n").encode())
 
 
 if __name__ == "__main__":

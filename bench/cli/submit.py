@@ -92,13 +92,14 @@ def verify(words: Sequence[str], console: Console, report: Report) -> int:
             with RunProgress(Console(stderr=True)) as progress:
                 verified = verification.drive(found, claim, place, progress, sample=sample, out=out)
             _print_replays(verified, console)
-            holds = verification.hold(verified.again)
+            why = [] if verification.hold(verified.again) else ["what was driven again differs"]
             if options.get("audit", "true") != "false":
-                holds = _audited(found, claim, verified, salt, episodes or EPISODES, console) and holds
+                why += filter(None, [_audited(found, claim, verified, salt, episodes or EPISODES, console)])
             _print_row(found, verified, console, report)
-            if not holds:
+            if why:
                 kept = "" if out is None else f" What was driven here is in {place}; nothing was added to {out}."
-                console.print(Text.assemble(("The submission does not hold.", "bold red"), kept), soft_wrap=True)
+                line = f"The submission does not hold: {', and '.join(why)}."
+                console.print(Text.assemble((line, "bold red"), kept), soft_wrap=True)
                 return 1
             if out is not None:
                 added, there = verification.add(verified, place, out)
@@ -168,15 +169,14 @@ def _row(found: Submission, verified: Verified) -> pa.Table:
 
 def _audited(
     found: Submission, claim: Claim, verified: Verified, salt: int | None, episodes: int, console: Console
-) -> bool:
-    """Drive the pair on scenarios drawn now, and compare them with the submitted ones."""
+) -> str:
+    """Drive the pair on scenarios drawn now, compare them with the submitted ones, and say what is wrong; else nothing."""
     grid, world = claim.plan.grid, claim.pair.world
     if not world.component.redraws:
         console.print(Text(f"World {world.name!r} has a fixed set of scenarios: it is not audited."))
-        return True
+        return ""
     if grid.episodes < ENOUGH_SCENARIOS:
-        console.print(Text(f"Not audited: it has {grid.episodes} scenarios a cell, an audit needs {ENOUGH_SCENARIOS}."))
-        return False
+        return f"it has {grid.episodes} scenarios a cell, and an audit needs {ENOUGH_SCENARIOS} (audit=false leaves it out)"
     salt = secrets.randbelow(SALTS) if salt is None else salt
     drawn = replace(grid, name=AUDIT, episodes=episodes, block=0, first_seed=SeedBlock.AUDIT + salt)
     with scratch() as folder:
@@ -187,4 +187,5 @@ def _audited(
     both = Audit(public=claim.plan, drawn=plan, salt=salt)
     public = _row(found, verified)
     console.print(Text(f"Fresh scenarios (salt={salt}), {drawn.episodes} a cell:"))
-    return verdict(differences(both, pa.concat_tables([public, fresh]), found.track), found.track, console)
+    held = verdict(differences(both, pa.concat_tables([public, fresh]), found.track), found.track, console)
+    return "" if held else "it scores otherwise on fresh scenarios"

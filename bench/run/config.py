@@ -118,7 +118,11 @@ def _repeating(words: Sequence[str], given: Options, grid: Grid, seeds: Sequence
     found["attack"] = ",".join([*filter(None, [found["attack"]]), *(suite.name for suite in given.suites)])
     found["grid"] = grid.name
     found["seeds"] = ",".join(map(str, range(grid.training_seeds) if seeds is None else seeds))
-    return found | {key: value for key, value in typed.items() if key not in KINDS}
+    return found | {key: value for key, value in typed.items() if key not in (*KINDS, *HOW)}
+
+
+HOW = ("executor", "workers", "ray.address", "unit_timeout", "unit_memory", "fail_below", "against", "junit", "log")
+"""Options that decide no record: how a run is carried out, and what is said of it."""
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -1,13 +1,15 @@
 """What a run will cost, known before it does anything: episodes, CPU time, wall time and disk.
 
 It is computed from a table of measured costs, `costs.json`, which `python benchmarks/costs.py` renews. A batch costs a part of
-its own and a part for each episode; an attack adds to both, and behind another defence or victim its questions are dearer.
+its own and a part for each episode. Both are known for an attack on a defended victim in the usual world. Another world has
+costs of its own, and asks the pair as often as it has decisions.
 What the units of a run really take corrects the estimate while it goes on (`cavbench.run.forecast`).
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -33,8 +35,6 @@ LIKE = {
     "detection": {"oblivious": "noise_patch", "scores": "square_patch", "gradients": "eot"},
 }
 """By track and by the access that it needs, the attack that stands for one whose cost nobody measured."""
-FILTERS = ("shield", "tracker", "smoothing", "pessimist_q", "frame_stack")
-"""Defences that compute at every step, so that a batch has a larger part of its own."""
 START_S = 6.0
 """CPU seconds until the first unit begins: imports, and the networks."""
 UNIT_BYTES, EPISODE_BYTES, RECORDING_BYTES, ARTEFACT_BYTES = 46_000, 300, 700_000, 130_000
@@ -123,19 +123,43 @@ class Rates:
 
     Args:
         artefact: of what is prepared once for each training seed.
-        batch: of each batch.
+        batch: of each batch that drives all steps; it ends with its longest episode.
         episode: of each episode in it.
         unknown: its components whose cost nobody measured.
+        length: mean length of an episode, as a share of all steps.
     """
 
     artefact: float
     batch: float
     episode: float
     unknown: tuple[str, ...] = ()
+    length: float = 1.0
 
     def of(self, episodes: int) -> float:
         """A batch of so many episodes."""
-        return self.batch + self.episode * episodes
+        return self.batch * longest(self.length, episodes) + self.episode * episodes
+
+
+@cache
+def longest(length: float, episodes: int) -> float:
+    """How long the longest of so many episodes is, as a share of all steps, if at every step as many fail as at another.
+
+    Args:
+        length: their mean length, as a share of all steps.
+        episodes: how many there are.
+    """
+    if length >= ENDURING:
+        return 1.0
+    low, high = 0.0, 1.0 / length
+    for _ in range(30):
+        rate = (low + high) / 2
+        low, high = (rate, high) if -math.expm1(-rate) / rate > length else (low, rate)
+    steps = 100
+    return sum(1 - (-math.expm1(-rate * (step + 0.5) / steps)) ** episodes for step in range(steps)) / steps
+
+
+ENDURING = 0.99
+"""Episodes that are so long on average go to the end."""
 
 
 def rates(pair: Pair) -> Rates:
@@ -156,19 +180,23 @@ def rates(pair: Pair) -> Rates:
             link for link in split(defense) if link != "none" and not any(link in row.split("+") for row in rows)
         ]
     times = effort(pair.attack.component)
-    episode, artefact = (_of_row(rows, own, attack, kind) for kind in ("episode", "artefact"))
-    if pair.track == "detection":
-        return Rates(artefact * times, 0.0, episode, tuple(unknown))
-    filtered = any(link in FILTERS for link in split(defense))
-    overhead = known["overhead"]["filtered" if filtered else "plain"]
-    # In what was measured, each episode bears a share of the overhead of its batch.
-    usual = LARGE if pair.is_clean or getattr(pair.attack.component, "joint", False) else ALONE
-    alone = episode * times / (1 + overhead / usual)
-    return Rates(0.0, overhead * alone, alone, tuple(unknown))
+    batch, episode, artefact = (_of_row(rows, own, attack, kind) for kind in ("batch", "episode", "artefact"))
+    worlds: Mapping[str, Mapping[str, float]] = known.get("worlds", {})
+    if not worlds:
+        return Rates(artefact * times, batch, episode, tuple(unknown))
+    if pair.world.name not in worlds:
+        unknown.append(pair.world.name)
+    usual = worlds[HOME]
+    here = worlds.get(pair.world.name, usual)
+    # An attack with twice the steps asks twice as often, while the world moves as before.
+    times *= getattr(pair.world.component, "max_steps", STEPS) / STEPS
+    batch = here["batch"] + max(batch - usual["batch"], 0.0) * times
+    episode = here["episode"] + max(episode - usual["episode"], 0.0) * times
+    return Rates(0.0, batch, episode, tuple(unknown), _of_row(rows, own, attack, "length") or 1.0)
 
 
-LARGE, ALONE = 180, 10
-"""Episodes of a batch of the published records: ten scenarios of each cell of a grid; of one cell if an attack is not joint."""
+HOME, STEPS = "highway", 450
+"""The world that rows of driving are measured in, and the decisions of its episodes."""
 
 
 def _of_row(rows: Rows, own: str, attack: str, kind: str) -> float:

@@ -19,7 +19,7 @@ class Watcher(Protocol):
     """Receives the progress of tasks; the command line draws a progress bar."""
 
     def working(self, tasks: Sequence[Task]) -> None:
-        """Called with the tasks in progress, one for each unit."""
+        """Called with the tasks in progress, each with all its units."""
 
     def preparing(self, task: str, share: float, text: str, episodes: int = 0) -> None:
         """Called with the share of a task done in [0, 1]; of a preparation with a text, of units with their episodes."""

@@ -1,22 +1,24 @@
 """How long a run will still take: from what its parts should cost, corrected by what those that are done did cost.
 
 Parts are compared with parts like them. A pair counts for itself; before one of its parts is done, pairs with the same defended
-victim or the same attack do; then all.
+victim or the same attack do; then all. Within a batch the share of the steps counts, of those that such a batch usually drives:
+one in which all episodes end early is done sooner.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Collection, Hashable, Sequence
 from dataclasses import dataclass
 
 from cavbench.core.pair import Pair
-from cavbench.run.cost import rates, shares
+from cavbench.run.cost import longest, rates, shares
 from cavbench.run.task import Task
 
 EARLY = 0.02
 """Share of a batch from which on its time says something of it."""
+REST = 0.1
+"""Share of the steps to come that a batch still drives when it is past its usual end."""
 
 
 @dataclass
@@ -24,27 +26,37 @@ class Part:
     """A unit, or something that is prepared.
 
     Args:
-        name: what it is called while it is under way.
         pair: its pair.
-        group: what units of one batch have in common.
         cost: CPU seconds that it should take.
-        episodes: of a unit.
-        share: share that is done.
-        started: when it began; NaN before.
+    """
+
+    pair: Pair
+    cost: float
+
+
+@dataclass
+class Batch:
+    """What a worker carries out at once.
+
+    Args:
+        name: what it is called while it is under way.
+        parts: the keys of its parts.
+        pair: their pair.
+        cost: CPU seconds that it should take.
+        reach: share of the steps at which it usually ends.
+        episodes: of the first part.
+        started: when it began.
+        share: share of its cost that is done.
     """
 
     name: str
+    parts: tuple[str, ...]
     pair: Pair
-    group: Hashable
     cost: float
+    reach: float
     episodes: int
+    started: float
     share: float = 0.0
-    started: float = math.nan
-
-    @property
-    def left(self) -> float:
-        """CPU seconds that are left of it."""
-        return self.cost * (1 - self.share)
 
 
 class Forecast:
@@ -69,58 +81,78 @@ class Forecast:
         costs = iter(shares(units, workers, recorded))
         self.parts: dict[str, Part] = {}
         for task in tasks:
-            pair, group = task.pair, (task.step, task.pair.id, task.unit.training_seed)
-            cost = next(costs) if task.step == "drive" else rates(pair).artefact
-            self.parts[_key(task)] = Part(str(task), pair, group, cost, len(task.unit.seeds))
-        self.running: dict[str, Part] = {}
+            cost = next(costs) if task.step == "drive" else rates(task.pair).artefact
+            self.parts[_key(task)] = Part(task.pair, cost)
+        self.running: dict[str, Batch] = {}
+        self.ended: dict[str, Part] = {}
         self.spent: dict[Hashable, list[float]] = {}
 
     def working(self, tasks: Sequence[Task]) -> None:
-        """These are under way."""
+        """These are under way, each with all its units, and no others."""
+        running: dict[str, Batch] = {}
         for task in tasks:
-            if (part := self.parts.get(key := _key(task))) and math.isnan(part.started):
-                part.started = self.now()
-                self.running[key] = part
+            keys = tuple(_key(one) for one in task.each)
+            known = self.running.get(keys[0])
+            # The units of a batch that was lost are tried alone.
+            running[keys[0]] = known if known and known.parts == keys else self._begun(task, keys)
+        self.running = running
+
+    def _begun(self, task: Task, keys: tuple[str, ...]) -> Batch:
+        known, drives, episodes = rates(task.pair), task.step == "drive", [len(unit.seeds) for unit in task.units]
+        cost = known.of(sum(episodes)) if drives else known.artefact
+        for key, count in zip(keys, episodes, strict=True):
+            self.parts[key] = Part(task.pair, cost * count / sum(episodes))
+        return Batch(
+            str(task),
+            keys,
+            task.pair,
+            cost,
+            longest(known.length, sum(episodes)) if drives else 1.0,
+            episodes[0],
+            self.now(),
+        )
 
     def reached(self, name: str, share: float, episodes: int = 0) -> None:
-        """So much is done of what is called so; with more episodes than its own, of all that is in one batch with it."""
-        for parts in self._under_way().values():
-            named = [part for part in parts if part.name == name]
-            together = bool(named) and episodes > named[0].episodes
-            for part in parts if together else named:
-                part.share = max(part.share, min(share, 1.0))
+        """So much is done of what is called so; with more episodes than its first part has, of all in one batch with it."""
+        for batch in self.running.values():
+            if batch.name != name:
+                continue
+            # Past its usual end, there is always some left.
+            share /= max(batch.reach, REST + (1 - REST) * share)
+            if len(batch.parts) > 1 and episodes <= batch.episodes:
+                share /= len(batch.parts)
+            batch.share = max(batch.share, min(share, 1.0))
 
     def finished(self, task: Task, seconds: float) -> None:
         """A task of a unit is done; it took so many seconds of a worker."""
-        if part := self.parts.pop(_key(task), None):
-            self.running.pop(_key(task), None)
-            for key in _alike(part.pair):
-                spent = self.spent.setdefault(key, [0.0, 0.0])
+        key = _key(task)
+        # The parts of a batch are told of one after the other, but are done at the same time.
+        for batch in [batch for batch in self.running.values() if key in batch.parts]:
+            del self.running[batch.parts[0]]
+            self.ended |= {one: self.parts.pop(one) for one in batch.parts if one in self.parts}
+        if part := self.ended.pop(key, None) or self.parts.pop(key, None):
+            for alike in _alike(part.pair):
+                spent = self.spent.setdefault(alike, [0.0, 0.0])
                 spent[0], spent[1] = spent[0] + seconds, spent[1] + part.cost
 
     @property
     def left(self) -> float:
         """Seconds until the run is done."""
-        under_way = self._under_way()
-        factors = {key: self._factor_of(parts) or self._factor(parts[0].pair) for key, parts in under_way.items()}
-        batches = [sum(part.left for part in parts) * factors[key] for key, parts in under_way.items()]
+        batches = [batch.cost * (1 - batch.share) * self._factor_of(batch) for batch in self.running.values()]
+        busy = {key for batch in self.running.values() for key in batch.parts}
         by_pair: dict[str, list[Part]] = {}
-        for part in self.parts.values():
-            if math.isnan(part.started):
+        for key, part in self.parts.items():
+            if key not in busy:
                 by_pair.setdefault(part.pair.id, []).append(part)
         waiting = sum(sum(part.cost for part in parts) * self._factor(parts[0].pair) for parts in by_pair.values())
         return max((waiting + sum(batches)) / self.workers, *batches, 0.0)
 
-    def _under_way(self) -> dict[Hashable, list[Part]]:
-        found: dict[Hashable, list[Part]] = {}
-        for part in self.running.values():
-            found.setdefault((part.group, part.started), []).append(part)
-        return found
-
-    def _factor_of(self, parts: Sequence[Part]) -> float:
+    def _pace(self, batch: Batch) -> float:
         """How many times as long as expected a batch that is under way takes; 0 if that cannot be told yet."""
-        done, expected = sum(part.cost * part.share for part in parts), sum(part.cost for part in parts)
-        return (self.now() - parts[0].started) / done if done > EARLY * expected else 0.0
+        return (self.now() - batch.started) / (batch.cost * batch.share) if batch.share > EARLY and batch.cost else 0.0
+
+    def _factor_of(self, batch: Batch) -> float:
+        return self._pace(batch) or self._factor(batch.pair)
 
     def _factor(self, pair: Pair) -> float:
         """How many times as long as expected parts like those of a pair take."""
@@ -129,7 +161,7 @@ class Forecast:
             if expected:
                 return seconds / expected
         # Nothing is done yet: what is under way says the same.
-        known = [factor for parts in self._under_way().values() if (factor := self._factor_of(parts))]
+        known = [pace for batch in self.running.values() if (pace := self._pace(batch))]
         return sum(known) / len(known) if known else 1.0
 
 

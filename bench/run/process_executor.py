@@ -50,7 +50,7 @@ class ProcessExecutor:
                     return
                 if [*map(id, busy.values())] != [*map(id, told)]:
                     told = list(busy.values())
-                    watcher.working([one for task in told for one in task.each])
+                    watcher.working(told)
                 wait([source for worker in busy for source in worker.sources], NEWS_S)
                 self._check_own_memory(before)
                 for worker in list(busy):

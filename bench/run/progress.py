@@ -105,7 +105,8 @@ class RunProgress(OnTerminal):
     def working(self, tasks: Sequence[Task]) -> None:
         if self.left.forecast is not None:
             self.left.forecast.working(tasks)
-        self.working_on = {str(task): self.working_on.get(str(task), "") for task in tasks}
+        names = [str(one) for task in tasks for one in task.each]
+        self.working_on = {name: self.working_on.get(name, "") for name in names}
         self.under_way = {task: done for task, done in self.under_way.items() if task in self.working_on}
         self._describe()
 

@@ -144,7 +144,7 @@ class RayExecutor:
                             actor.task = following
                             actor.pending = actor.handle.carry_out.remote(content)
                         following = retries.next(waiting)
-                watcher.working([one for actor in self.actors if actor.task for one in actor.task.each])
+                watcher.working([actor.task for actor in self.actors if actor.task])
                 for actor, answer in self._answers(watcher):
                     alive = time.monotonic()
                     task, actor.task = actor.task, None

@@ -44,7 +44,7 @@ class SerialExecutor:
                 why = f"was not driven: {culprit} changed this process; use executor=processes"
                 yield [(task, Outcome(why=why))]
                 continue
-            watcher.working(task.each)
+            watcher.working([task])
             outcome, text = self._carried_out(task, watcher, framework)
             # The next unit must not be driven with what this one set.
             settings.restore()

@@ -159,19 +159,22 @@ class Recipe:
 
     @property
     def use(self) -> str:
-        """The command that scores the trained component."""
-        return shlex.join(["bench", "run", *self._components(), *self.options])
+        """The command that scores the trained component, in the world that it was trained in."""
+        return shlex.join(["bench", "run", *self._components(), *self.options, *self._world()])
 
     def train(self, seed: int) -> str:
         """The command that trains it."""
         where = f"{self.trained.kind}.trained_in="
         options = [option for option in self.options if not option.startswith(where)]
-        world = [f"world.{part}" if "=" in part else f"world={part}" for part in shlex.split(self.trained_in)]
-        return shlex.join(["bench", "train", *self._components(), *options, *world, f"seeds={seed}"])
+        return shlex.join(["bench", "train", *self._components(), *options, *self._world(), f"seeds={seed}"])
 
     def described(self) -> dict[str, object]:
         """Its entry in the card."""
         return {"digest": self.digest, **{part.kind: part.described() for part in self.parts}}
+
+    def _world(self) -> list[str]:
+        """The training world, as on the command line; nothing for the default one."""
+        return [f"world.{part}" if "=" in part else f"world={part}" for part in shlex.split(self.trained_in)]
 
     def _components(self) -> list[str]:
         return [f"{part.kind}={part.name}" for part in (*self.beside, *self.parts)]

@@ -79,7 +79,7 @@ def pair(one: Comparison, key: int, called: Labels, folder: Path | None, role: R
         "mine": one.mine,
         "role": role or ("attacked" if one.is_attacked else "clean"),
         "track": track.name,
-        **named(one, ("attack", "defense", "victim"), called),
+        **(named(one, ("attack", "defense", "victim"), called) | _mixture(one)),
         "world": {"name": identity["world"], "params": parameters(identity["world_params"])},
         "grid": identity["grid"],
         "threat": threat([identity[name] for name in THREAT]),
@@ -107,6 +107,17 @@ def named(one: Comparison, kinds: Sequence[str], called: Labels) -> dict[str, An
         }
         for kind in kinds
     }
+
+
+def _mixture(one: Comparison) -> dict[str, Any]:
+    """The victim of a baseline that is another policy in each cell: its title, and all values of what differs; else nothing."""
+    every = [parameters(text) for text in sorted(one.own.table["victim_params"].unique().to_pylist())]
+    if len(every) < 2:
+        return {}
+    title = one.track.baseline_kinds[one.track.baseline_of(one.identity, one.identity)].title
+    values = {name: list({str(params.get(name)): params.get(name) for params in every}.values()) for name in every[0]}
+    params = {name: several if len(several) > 1 else several[0] for name, several in values.items()}
+    return {"victim": {"name": one.identity["victim"], "label": title, "params": params}}
 
 
 def threat(values: Sequence[object]) -> dict[str, object]:

@@ -11,6 +11,7 @@ import torch
 from torchrl.record.loggers.csv import CSVLogger
 
 import cavbench
+from cavbench.driving.gym import trial
 
 PGD: dict[str, Any] = {"objective": "margin", "steps": 2, "restarts": 1}
 NAMES = {f"robust/{attack}/{what}" for attack in ("noise", "clean") for what in ("safe_progress", "crashed")}
@@ -24,7 +25,15 @@ def logged(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)).partition("scalars/")[2]: path.read_text() for path in folder.rglob("*.csv")}
 
 
-def test_a_training_of_stable_baselines3_logs_robust_scores(tmp_path: Path) -> None:
+def test_a_training_of_stable_baselines3_logs_robust_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+
+    def counted(*given: Any) -> Any:
+        asked.append(given)
+        return drive(*given)
+
+    drive = trial._drive
+    monkeypatch.setattr(trial, "_drive", counted)
     sb3 = pytest.importorskip("stable_baselines3")
     from stable_baselines3.common.logger import configure
 
@@ -37,6 +46,7 @@ def test_a_training_of_stable_baselines3_logs_robust_scores(tmp_path: Path) -> N
     )  # fmt: skip
     model.learn(60, callback=callback)
     assert [steps for steps, _ in callback.history] == [30, 60]
+    assert len(asked) == 1, "random steps against the declarations of the world, once"
     scores = callback.history[-1][1]
     assert set(scores) > NAMES
     attacked = [value for name, value in scores.items() if name.endswith("safe_progress") and "clean" not in name]

@@ -190,5 +190,14 @@ def test_the_same_words_have_one_file_and_a_folder_of_two_runs_asks_for_one(tmp_
         plan_of([f"config={tmp_path}"])
 
 
+def test_how_a_run_is_carried_out_is_not_in_its_file() -> None:
+    words = ["attack=noise", "lanes=3", "episodes=1"]
+    plans = [
+        plan_of([*words, *how]) for how in ([], ["executor=serial"], ["workers=1", "unit_timeout=60", "junit=x.xml"])
+    ]
+    assert plans[0].words == plans[1].words == plans[2].words
+    assert plan_of([*words, "device=cpu"]).words["device"] == "cpu"
+
+
 def test_the_limits_are_what_the_page_says() -> None:
     assert (config_file.MOST_BYTES, config_file.DEEPEST, config_file.MOST_FILES) == (50_000, 8, 20)

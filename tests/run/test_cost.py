@@ -11,6 +11,7 @@ import pytest
 from cavbench.cli.run import permit
 from cavbench.core.registry import GROUPS, entries
 from cavbench.errors import UserError
+from cavbench.run.batches import batches
 from cavbench.run.config import plan_of
 from cavbench.run.cost import rates, spoken, table
 from cavbench.run.forecast import Forecast
@@ -42,16 +43,20 @@ def test_the_line_says_pairs_episodes_time_and_disk() -> None:
     assert "at most about" in str(plan_of(["attack=pgd", *SHORT, "until=0.1"]).cost)
 
 
-def test_more_effort_costs_more() -> None:
+def test_more_effort_costs_more_but_the_world_moves_as_before() -> None:
     usual, twice = (rates(plan_of(["attack=pgd", *words]).pairs[0]) for words in ([], ["attack.steps=20"]))
-    assert twice.episode == pytest.approx(2 * usual.episode)
+    assert 1.8 * usual.of(10) < twice.of(10) < 2 * usual.of(10)
+
+
+def test_a_world_with_fewer_decisions_is_cheaper_to_attack() -> None:
+    usual, short = (rates(plan_of(["attack=pgd", f"world={name}"]).pairs[0]) for name in ("highway", "highway-v0"))
+    assert short.of(10) < 0.5 * usual.of(10)
+    assert short.unknown == ()
 
 
 def test_a_filter_and_its_gradients_are_dearer() -> None:
-    episode = [
-        rates(plan_of(["attack=pgd", f"defense={name}"]).pairs[0]).episode for name in ("none", "tracker+shield")
-    ]
-    assert episode[1] > 5 * episode[0]
+    costs = [rates(plan_of(["attack=pgd", f"defense={name}"]).pairs[0]).of(1) for name in ("none", "tracker+shield")]
+    assert costs[1] > 5 * costs[0]
 
 
 def test_what_nobody_measured_is_said() -> None:
@@ -67,6 +72,7 @@ def test_the_suites_are_measured(words: tuple[str, ...]) -> None:
 
 def test_the_table_names_components_that_exist() -> None:
     known = {name for kind in ("attack", "defense", "victim") for name in entries(GROUPS[kind])}
+    assert set(table()["driving"]["worlds"]) <= set(entries(GROUPS["world"]))
     for track in ("driving", "detection"):
         for row, attacks in table()[track]["rows"].items():
             assert {*row.split("+"), *attacks} <= known
@@ -126,17 +132,18 @@ def tasks_of(*words: str) -> list[Task]:
 @pytest.mark.parametrize("slower", [0.4, 3.0])
 @pytest.mark.parametrize("workers", [1, 2])
 def test_after_a_tenth_of_the_work_the_time_left_is_right_within_a_quarter(slower: float, workers: int) -> None:
-    """The machine is slower or faster than the one of the table, and each pair and unit than that says, too."""
+    """The machine is slower or faster than the one of the table, and each pair and batch than that says, too."""
     tasks = tasks_of("attack=pgd,zo,noise", "lanes=3,4", "density=1,2", "weather=clear,rain", "episodes=5", "seeds=0,1")
     clock, chance = Clock(), random.Random(7)
     forecast = Forecast(tasks, workers, clock)
+    together = [
+        Task(unit=first.unit, others=[one.unit for one in others]) for first, *others in batches(tasks, (), workers)
+    ]
     of_pair = {task.pair.id: chance.uniform(0.8, 1.25) for task in tasks}
-    costs = {task.unit.fingerprint: forecast.parts[task.unit.fingerprint].cost for task in tasks}
-    seconds = {
-        id(task): costs[task.unit.fingerprint] * slower * of_pair[task.pair.id] * chance.uniform(0.7, 1.4)
-        for task in tasks
-    }
-    waiting, busy, told = list(tasks), [], []
+    costs = {id(task): sum(forecast.parts[one.unit.fingerprint].cost for one in task.each) for task in together}
+    seconds = {key: cost * slower * chance.uniform(0.7, 1.4) for key, cost in costs.items()}
+    seconds = {id(task): seconds[id(task)] * of_pair[task.pair.id] for task in together}
+    waiting, busy, told = list(together), [], []
     total = sum(seconds.values())
     done = 0.0
     while waiting or busy:
@@ -148,9 +155,12 @@ def test_after_a_tenth_of_the_work_the_time_left_is_right_within_a_quarter(slowe
         for entry in busy:
             entry[1] += step
             done += step
-            forecast.reached(str(entry[0]), entry[1] / seconds[id(entry[0])])
+            episodes = sum(len(unit.seeds) for unit in entry[0].units)
+            reach = next(batch.reach for batch in forecast.running.values() if batch.name == str(entry[0]))
+            forecast.reached(str(entry[0]), reach * entry[1] / seconds[id(entry[0])], episodes)
         for task, spent in [entry for entry in busy if entry[1] >= seconds[id(entry[0])] - 1e-3]:
-            forecast.finished(task, spent)
+            for one in task.each:
+                forecast.finished(one, spent / len(task.units))
         busy = [entry for entry in busy if entry[1] < seconds[id(entry[0])] - 1e-3]
         if 0.1 * total < done < 0.95 * total:
             told.append((clock.time, forecast.left))
@@ -162,11 +172,46 @@ def test_after_a_tenth_of_the_work_the_time_left_is_right_within_a_quarter(slowe
 
 def test_units_of_one_task_may_be_driven_together_or_one_after_the_other() -> None:
     tasks = [task for task in tasks_of("attack=pgd", *SHORT, "reference=false") if task.pair.attack.name == "pgd"][:2]
-    for episodes, expected in ((4, [0.5, 0.5]), (2, [0.5, 0.0])):
+    batch = Task(unit=tasks[0].unit, others=[tasks[1].unit])
+    for episodes, expected in ((4, 0.5), (2, 0.25)):
         forecast = Forecast(tasks, 1, Clock())
-        forecast.working(tasks)
-        forecast.reached(str(tasks[0]), 0.5, episodes)
-        assert [forecast.parts[task.unit.fingerprint].share for task in tasks] == expected
+        forecast.working([batch])
+        (under_way,) = forecast.running.values()
+        forecast.reached(str(batch), 0.5 * under_way.reach, episodes)
+        assert under_way.share == pytest.approx(expected)
+
+
+def test_the_units_of_a_batch_end_together_and_those_of_a_lost_one_begin_again() -> None:
+    tasks = [task for task in tasks_of("attack=pgd", *SHORT, "reference=false") if task.pair.attack.name == "pgd"]
+    clock = Clock()
+    forecast = Forecast(tasks, 1, clock)
+    batch = Task(unit=tasks[0].unit, others=[tasks[1].unit])
+    forecast.working([batch])
+    clock.time = 10.0
+    forecast.working([Task(unit=tasks[0].unit)])
+    (alone,) = forecast.running.values()
+    assert (alone.started, alone.share, len(alone.parts)) == (10.0, 0.0, 1)
+    forecast.working([batch])
+    forecast.finished(tasks[0], 5.0)
+    before = forecast.left
+    forecast.finished(tasks[1], 5.0)
+    assert forecast.left == pytest.approx(before)
+
+
+def test_a_batch_whose_episodes_end_early_is_not_taken_for_a_slow_one() -> None:
+    (task, *others) = [
+        task for task in tasks_of("attack=pgd", *SHORT, "reference=false") if task.pair.attack.name == "pgd"
+    ]
+    clock = Clock()
+    forecast = Forecast([task, *others], 1, clock)
+    forecast.working([task])
+    (batch,) = forecast.running.values()
+    batch.reach = 0.4
+    clock.time = batch.cost / 2
+    forecast.reached(str(task), 0.2, 2)
+    assert forecast._factor_of(batch) == pytest.approx(1.0)
+    forecast.reached(str(task), 0.9, 2)
+    assert batch.share < 1
 
 
 def test_a_log_file_has_one_line_a_minute_with_the_time_left() -> None:

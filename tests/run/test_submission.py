@@ -74,7 +74,7 @@ def test_too_few_scenarios_are_no_evidence(bench: Bench, tmp_path: Path) -> None
     assert bench(*few, f"out={results}").code == 0
     assert bench("submit", "nudge-guard", f"results={results}", f"out={folder}").code == 0
     said = bench("verify", str(folder), "sample=1")
-    assert (said.code, "Not audited: it has 4 scenarios a cell" in said.out) == (1, True)
+    assert (said.code, "does not hold: it has 4 scenarios a cell, and an audit needs 10" in said.out) == (1, True)
     assert "at least 10, got 3" in bench("verify", str(folder), "episodes=3").err
 
 
@@ -102,7 +102,7 @@ def test_changed_scores_are_found_though_the_hashes_fit(bench: Bench, submission
     said = bench("verify", str(submission), "audit=false", "sample=all")
     assert said.code == 1
     assert "though nothing has changed" in said.out
-    assert "The submission does not hold." in said.out
+    assert "The submission does not hold: what was driven again differs" in said.out
 
 
 @pytest.mark.parametrize(

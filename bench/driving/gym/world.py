@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from torchrl.envs import EnvBase
 
@@ -14,6 +15,12 @@ from cavbench.driving.gym.declaration import Declaration
 from cavbench.driving.gym.declared import native_limits, native_shape
 from cavbench.errors import UserError
 from cavbench.scenarios import Cell
+
+
+@lru_cache(maxsize=16)
+def _doubts(world: Declaration, cells: tuple[Cell, ...]) -> tuple[str, ...]:
+    """A training that is scored again and again has one world: what it declares does not change."""
+    return tuple(trial.doubts(world, cells))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +52,13 @@ class GymWorld(Declaration):
         )
 
     def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
-        """What 1,000 random steps say against the declarations of the world (`cavbench.driving.gym.trial`)."""
-        return trial.doubts(self, cells)
+        """What 1,000 random steps say against the declarations of the world (`cavbench.driving.gym.trial`); asked once."""
+        try:
+            hash(self)
+        # A field of a subclass may have none.
+        except TypeError:
+            return trial.doubts(self, cells)
+        return _doubts(self, tuple(cells))
 
     def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
         """See `cavbench.driving.DrivingWorld.build`; an action is never repeated.

@@ -160,7 +160,17 @@ def _algorithm(name: str, data: Mapping[str, Any]) -> Algorithm:
     family = POLICIES.get(module)
     made = re.search(r"<function (\w+)\.", str(data["policy_class"].get("__init__")))
     policy = made[1] if made else ""
-    if family is None or "Cnn" in policy or "MultiInput" in policy:
+    if family is not None and "MultiInput" in policy:
+        # The module has policies of several algorithms, and the file says which by what it trains with.
+        algorithm = {"ppo": "PPO" if "clip_range" in data else "A2C", "td3": "TD3"}.get(family[0], family[0].upper())
+        package, algorithm = (
+            ("sb3_contrib", "RecurrentPPO") if "lstm" in module + policy.lower() else ("stable_baselines3", algorithm)
+        )
+        raise UserError(
+            f"{name} has a MultiInputPolicy, for a Dict of observations: victim=sb3 reads a Box. From Python the model itself is "
+            f'scored: cavbench.score({package}.{algorithm}.load("{name}"), "pgd", world="ID of its environment")'
+        )
+    if family is None or "Cnn" in policy:
         raise UserError(f"{name} has the policy {short(policy or module)} of {short(module)}; {ONLY}")
     if family == ("ppo", "a2c"):
         # TRPO of sb3-contrib uses the same class of policies.

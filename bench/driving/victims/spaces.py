@@ -19,6 +19,8 @@ UNBOUNDED = 1e30
 """Bounds beyond this are none: some environments write the largest float32 instead of infinity."""
 TASKS = ("highway-fast-v0", "highway-v0")
 """The worlds that are highway-env's own tasks."""
+OTHER_TASK = "world=gym world.id=TASK, for instance world.id=merge-v0"
+"""Where policies of any other environment are scored."""
 ROWS = 5
 """Rows of their observations, unless `vehicles_count` says otherwise."""
 SPARE = 0.01
@@ -177,10 +179,10 @@ class Expected:
         if elsewhere and (home := _home(shape, facts)):
             whose = ". A policy of highway-env's own tasks is scored in its task:"
             whose = "; if its environment had another number of rows, write" if facts.unbounded else whose
-            return f"{name} {takes}, this world shows {wanted}{whose} {home}"
+            return f"{name} {takes}, this world shows {wanted}{whose} {home}; of another task, {OTHER_TASK}"
         if elsewhere and not facts.unbounded:
-            why = "; highway-env's own tasks (Box(-inf, inf, …)) have other ranges, rows, order and decision rate"
-        elif frames := self._frames(shape):
+            return f"{name} {takes}, this world shows {wanted}. A policy of another task is scored in that task: {OTHER_TASK}"
+        if frames := self._frames(shape):
             why = f"; if these are {frames} frames, add victim.frames={frames} to victim=sb3"
         elif rows and shape not in self._both((rows, features)) and math.prod(shape) == rows * features:
             why = "; these are as many numbers in another arrangement"

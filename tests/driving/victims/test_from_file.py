@@ -101,7 +101,8 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
         "sb3",
         lambda path: saved(path, "dqn", spaces(continuous=False, shape=(5, 5), seen=np.inf)),
         "was trained on Box(-inf, inf, (5, 5)), this world shows Box(-1, 1, (10, 5)). A policy of highway-env's own tasks is "
-        "scored in its task: world=highway-fast-v0 or world=highway-v0",
+        "scored in its task: world=highway-fast-v0 or world=highway-v0; of another task, world=gym world.id=TASK, for instance "
+        "world.id=merge-v0",
     ),
     "other bounds": (
         "sb3",
@@ -109,6 +110,11 @@ BAD: dict[str, tuple[str, Callable[[Path], dict[str, str]], str]] = {
         "was trained on Box(-inf, inf, (10, 5)), this world shows Box(-1, 1, (10, 5)). A policy of highway-env's own tasks is "
         "scored in its task: world=highway-fast-v0 or world=highway-v0, with 'world.config={observation: "
         "{vehicles_count: 10}}'",
+    ),
+    "another of highway-env's tasks": (
+        "sb3",
+        lambda path: saved(path, "dqn", spaces(continuous=False, shape=(15, 7), seen=np.inf)),
+        "A policy of another task is scored in that task: world=gym world.id=TASK, for instance world.id=merge-v0",
     ),
     "two frames": (
         "sb3",

@@ -17,6 +17,7 @@ from torch import nn
 
 from cavbench.core.pair import choose
 from cavbench.driving.victims.in_process import in_process
+from cavbench.driving.victims.sb3_saved import saved_model
 from cavbench.errors import UserError
 from tests.checks.rules import broken
 from tests.driving.victims.policy_files import (
@@ -133,3 +134,14 @@ def test_only_tensors_of_a_saved_model_are_unpickled(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"it is not a model of Stable-Baselines3"):
         load(**{"policy.pth": (tmp_path / "policy.pth").read_bytes()})
     assert not harm.exists()
+
+
+@pytest.mark.parametrize("algo", ["DQN", "PPO", "A2C"])
+def test_a_policy_of_a_dict_says_what_to_type(tmp_path: Path, algo: str) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.envs import BitFlippingEnv
+
+    path = tmp_path / "dict.zip"
+    getattr(sb3, algo)("MultiInputPolicy", BitFlippingEnv(n_bits=3, max_steps=3), device="cpu").save(path)
+    with pytest.raises(UserError, match=rf"has a MultiInputPolicy.*cavbench\.score\(stable_baselines3\.{algo}\.load\("):
+        saved_model(str(path))

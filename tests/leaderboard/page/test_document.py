@@ -30,6 +30,7 @@ from cavbench.leaderboard.comparisons.reading import measurements, read_tracks
 from cavbench.leaderboard.page import document as document_module
 from cavbench.leaderboard.page.cards import run_command
 from cavbench.leaderboard.page.document import document
+from cavbench.leaderboard.page.run_document import run_content
 from cavbench.leaderboard.page.table import BOARD, latex, table
 from cavbench.leaderboard.page.write import NAME, html, write
 from cavbench.leaderboard.ranking.boards import read_boards
@@ -247,6 +248,22 @@ def test_baselines_of_both_types_of_action_stand_apart() -> None:
     assert list(board.baselines) == names
     better, worse = (board.baselines[name].column("safe_progress").mean() for name in names)
     assert better > worse
+
+
+def test_a_best_blind_policy_that_is_another_in_each_cell_has_no_single_name() -> None:
+    skills = {"idle": {3: 0.9, 4: 0.1}, "slower": {3: 0.1, 4: 0.9}}
+    cells = {lanes: [as_text(cell) for cell in CLEAR if cell.lanes == lanes] for lanes in (3, 4)}
+    blind = [
+        drive("blind", sees=False, skill=skill, victim_params={"policy": policy}).filter(
+            pc.field("cell").isin(cells[lanes])
+        )
+        for policy, by_lanes in skills.items()
+        for lanes, skill in by_lanes.items()
+    ]
+    own = [table.filter(pc.field("cell").isin(cells[3] + cells[4])) for table in (drive(), drive(attack="noise"))]
+    pairs = run_content({"driving": pa.concat_tables([*own, *blind])}, None)["pairs"]
+    mixed = [pair["victim"] for pair in pairs if pair["victim"]["label"] == "best blind policy"]
+    assert [one["params"]["policy"] for one in mixed] == [["idle", "slower"]]
 
 
 def test_a_curve_is_about_the_cells_that_all_its_points_have() -> None:
