@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cavbench.core.pair import Pair, choose
-from cavbench.core.track import Baseline, Contrast, Driven, Job, Measure, Track
+from cavbench.core.track import Baseline, Certified, Contrast, Driven, Job, Measure, Track
 from cavbench.errors import UserError
 from cavbench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, field
 from cavbench.scenarios import Cell
@@ -235,6 +235,13 @@ class DrivingTrack(Track):
         from cavbench.driving.drive import drive_jointly
 
         return drive_jointly(jobs)
+
+    def certify(
+        self, pair: Pair, training_seed: int, cells: Sequence[Cell], seeds: Sequence[int], leaves: int
+    ) -> Certified:
+        from cavbench.driving.bounds.certify import Certifier
+
+        return Certifier(pair, training_seed, cells, seeds).certify(leaves)
 
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         from cavbench.driving.recording import save
