@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
@@ -15,7 +16,7 @@ from cavbench.core.track import Certified
 from cavbench.errors import UserError, short
 from cavbench.run.config import plan_of
 from cavbench.run.plan import Plan
-from cavbench.statistics.estimates import interval
+from cavbench.statistics.estimates import share_interval
 from cavbench.terminal import Console
 
 LEAVES = 16
@@ -95,13 +96,13 @@ def _table() -> Table:
 
 
 def _add(table: Table, pair: Pair, found: Sequence[Certified], shape: tuple[int, int, int]) -> None:
-    def values(name: str) -> np.ndarray:
+    def values(name: str) -> NDArray[np.float64]:
         return np.concatenate([getattr(one, name) for one in found]).astype(float).reshape(shape)
 
     def score(name: str) -> str:
         if np.isnan(values(name)).any():
             return "-"
-        one = interval(values(name))
+        one = share_interval(values(name))
         return f"{one.estimate:.3f}\n[{one.low:.2f}, {one.high:.2f}]"
 
     shares = [f"{100 * values(name).mean():.1f} %" for name in ("interval", "linear", "changed")]

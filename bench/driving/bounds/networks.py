@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -46,7 +46,7 @@ class BoundedNetwork:
             raise UserError(
                 "bounds need discrete actions, those of this victim are continuous: take dqn, ppo, or another such victim"
             )
-        network = getattr(policy, "network", None)
+        network: Any = getattr(policy, "network", None)
         known = type(policy).forward is QPolicy.forward and isinstance(network, QNetwork)
         if not known and not (type(policy) is FilePolicy and isinstance(network, nn.Module) and policy.native is None):
             raise UserError(
@@ -94,14 +94,16 @@ class BoundedNetwork:
         pairs = torch.eye(actions, dtype=torch.float64)
         pairs = (pairs[:, None] - pairs[None, :]).flatten(0, 1)
         weight, bias = pairs @ last.weight[self.first :], pairs @ last.bias[self.first :]
-        box, lines = front.interval(), []
+        box = front.interval()
+        lines: list[Relaxation] = []
         for layer in hidden:
-            by_interval = below, above = affine(layer.weight, layer.bias, box)
+            around = affine(layer.weight, layer.bias, box)
+            below, above = around
             if through:
                 below = torch.maximum(below, self._lower(front, layer.weight, layer.bias, lines))
                 above = torch.minimum(above, -self._lower(front, -layer.weight, -layer.bias, lines))
             lines.append(layer.lines(below, above))
-            box = layer.applied(by_interval)
+            box = layer.applied(around)
         by_interval = affine(weight, bias, box)[0]
         linear = torch.maximum(by_interval, self._lower(front, weight, bias, lines))
         return Leads(by_interval.unflatten(1, (actions, actions)), linear.unflatten(1, (actions, actions)))
@@ -134,7 +136,7 @@ class Layer(NamedTuple):
 
 def _layers(network: nn.Module) -> list[Layer]:
     """The layers of a sequence: flattening, then linear layers with an activation between them."""
-    modules = [module for module in _flat(network) if not isinstance(module, nn.Flatten | nn.Identity)]
+    modules: list[Any] = [module for module in _flat(network) if not isinstance(module, nn.Flatten | nn.Identity)]
     linear, between = modules[::2], modules[1::2]
     if not all(isinstance(one, nn.Linear) for one in linear) or any(type(one) not in LINES for one in between):
         names = ", ".join(dict.fromkeys(type(module).__name__ for module in modules))
