@@ -84,6 +84,28 @@ ASSURED = field(
     high=1,
 )
 
+ALARMS: tuple[pa.Field, ...] = (
+    field(
+        "suspicion",
+        FLOAT,
+        "highest suspicion of the victim's monitor; null without one",
+        "1 is an alarm",
+        nullable=True,
+        low=0,
+        high=inf,
+    ),
+    field("alarms", FLOAT, "alarms that the victim's monitor raised; null without one", "alarms", nullable=True, low=0),
+    field(
+        "alarm_delay_s",
+        FLOAT,
+        "from the first falsified frame to the next alarm; inf if there is none, null without a monitor or a falsified frame",
+        "s",
+        nullable=True,
+        low=0,
+        high=inf,
+    ),
+)
+
 SHIFT = field(
     "shift",
     FLOAT,
@@ -105,7 +127,7 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS, *ALARMS)
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"
