@@ -191,6 +191,19 @@ def audit(words: Words = None, as_json: AsJson = False) -> None:
     raise typer.Exit(cli_audit.audit(asked, Console(stderr=as_json), as_json=as_json))
 
 
+@app.command(cls=RunHelp)
+def certify(words: Words = None) -> None:
+    """Prove which decisions no attack can change, and a lower bound of the score under every attack.
+
+    The options are those of bench run; leaves=NUMBER limits the search for the bound, leaves=0 leaves it out.
+    For instance: bench certify defense=sa threat.budget=0.005 lanes=3 density=1 weather=clear episodes=5 seeds=0
+    """
+    from cavbench.cli import certify as cli_certify
+
+    plan, leaves = cli_certify.asked(words or [], start)
+    cli_certify.certify(plan, leaves, Console())
+
+
 TrainWords = Annotated[
     list[str] | None,
     typer.Argument(
@@ -477,7 +490,9 @@ def _without_dashes(option: str, command: str) -> str:
     from cavbench.cli.completion import known_keys
 
     key = option.lstrip("-").replace("-", "_")
-    if command not in ("run", "audit", "train") or (key not in known_keys() and key.partition(".")[0] not in KINDS):
+    if command not in ("run", "audit", "certify", "train") or (
+        key not in known_keys() and key.partition(".")[0] not in KINDS
+    ):
         return ""
     joined = [word.partition("=")[2] for word in sys.argv if word.startswith(f"{option}=")]
     behind = sys.argv[sys.argv.index(option) + 1 :][:1] if option in sys.argv else []

@@ -66,6 +66,29 @@ class Driven:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Certified:
+    """What is proven of a victim in S scenarios, one value each.
+
+    Args:
+        seeds: scenario seeds.
+        interval, linear: share of the frames without an attack whose decision no attack can change, by bounds with intervals
+            and by linear bounds.
+        changed: share of these frames in which the given attack changes the decision.
+        clean: score without an attack.
+        bound: lower bound of the score under every attack; 0 where the search was given up, NaN where there was none.
+        given_up: where there were more courses than the search may drive.
+    """
+
+    seeds: NDArray[np.int64]
+    interval: NDArray[np.float64]
+    linear: NDArray[np.float64]
+    changed: NDArray[np.float64]
+    clean: NDArray[np.float64]
+    bound: NDArray[np.float64]
+    given_up: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Measure:
     """A column of reports: how a measurement is aggregated over episodes.
 
@@ -282,6 +305,22 @@ class Track(ABC):
             None if they must be carried out one by one.
         """
         return None
+
+    def certify(
+        self, pair: Pair, training_seed: int, cells: Sequence[Cell], seeds: Sequence[int], leaves: int
+    ) -> Certified:
+        """Prove what no attack within the threat model can change.
+
+        Args:
+            pair: the defended victim, the world, the threat model, and an attack that is compared with the bounds.
+            training_seed: training seed of the victim.
+            cells, seeds: cell and seed of each scenario [S].
+            leaves: courses of a scenario that are driven at most; 0 bounds frames alone.
+
+        Raises:
+            UserError: if the decisions of the victim cannot be bounded.
+        """
+        raise UserError(f"the {self.name} track has no bounds of decisions: choose a driver, for instance victim=dqn")
 
     def try_network(self, network: Any, pair: Pair, cells: Sequence[Cell]) -> list[str]:
         """Try the loaded network of a pair before a run: is it what attacks, probes and replays rely on?

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from cavbench.driving.filter import ObservationFilter
     from cavbench.driving.kinematics import Kinematics
     from cavbench.driving.parts import Part, parts_of
-    from cavbench.driving.policy import Passed, Policy, PolicyWrapper, State
+    from cavbench.driving.policy import Passed, Policy, PolicyWrapper, State, Suspicion
     from cavbench.driving.threat import ObservationThreat
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "Policy",
     "PolicyWrapper",
     "State",
+    "Suspicion",
     "TrainingHooks",
     "parts_of",
 ]

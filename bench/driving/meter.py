@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from cavbench.driving.alarms import Alarms
 from cavbench.driving.attacker import Shown
 from cavbench.driving.features import DrivingFacts
 from cavbench.driving.metrics import safe_progress
@@ -49,6 +50,7 @@ class Meter:
         self.end_x = self.start_x.copy()
         self.gradients, self.zero_gradients, self.nan_gradients = np.zeros((3, batch))
         self.assured = np.zeros(batch)
+        self.watched = Alarms(subject.policy, batch, 1 / facts.decision_hz)
         self.queries: list[NDArray[np.int64]] = []
         self.actions: list[NDArray[np.int64]] = []
 
@@ -91,6 +93,7 @@ class Meter:
         np.copyto(self.end_x, info["x"], where=running)
         assured = self.subject.policy.assured(shown.observation, state)
         self.assured += np.nan if assured is None else np.where(running, assured.numpy(), 0.0)
+        self.watched.step(shown.observation, state, running, running & (linf > 0))
         self.gradients += shown.gradients.numpy()
         self.zero_gradients += shown.zero_gradients.numpy()
         self.nan_gradients += shown.nan_gradients.numpy()
@@ -136,6 +139,7 @@ class Meter:
             **{name: sums[name] / steps for name in self.SUMS[3:]},
             "action_counts": self._action_counts(),
             "assured": self.assured / steps,
+            **self.watched.columns(),
             "gradient_queries": self.gradients / steps,
             "zero_gradients": self._share_of_gradients(self.zero_gradients),
             "nan_gradients": self._share_of_gradients(self.nan_gradients),

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cavbench.core.device import CPU, move
-from cavbench.driving.policy import Policy, PolicyWrapper, State
+from cavbench.driving.policy import Policy, PolicyWrapper, State, Suspicion
 
 
 class Placed(PolicyWrapper):
@@ -38,6 +38,10 @@ class Placed(PolicyWrapper):
     def assured(self, observation: Tensor, state: State) -> Tensor | None:
         found = self.policy.assured(observation.to(self._there), self._sent(state))
         return None if found is None else found.to(CPU)
+
+    def suspicion(self, observation: Tensor, state: State) -> Suspicion | None:
+        found = self.policy.suspicion(observation.to(self._there), self._sent(state))
+        return None if found is None else Suspicion(found.level.to(CPU), found.alarm.to(CPU))
 
     def choose(self, scores: Tensor) -> Tensor:
         return self.policy.choose(scores.to(self._there)).to(CPU)

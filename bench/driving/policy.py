@@ -28,6 +28,18 @@ class Passed(NamedTuple):
     allowed: Tensor | None = None
 
 
+class Suspicion(NamedTuple):
+    """What a policy says about being attacked.
+
+    Args:
+        level: how strongly it doubts what it was shown, [B]; the higher, the more.
+        alarm: whether that is enough for an alarm, bool [B].
+    """
+
+    level: Tensor
+    alarm: Tensor
+
+
 class Policy(nn.Module, ABC):
     """A driving policy: a differentiable map from observations to scores, and from scores to an action.
 
@@ -86,6 +98,10 @@ class Policy(nn.Module, ABC):
 
         Records show the share of such frames (`assured`). Arguments as in `advance`.
         """
+        return None
+
+    def suspicion(self, observation: Tensor, state: State) -> Suspicion | None:
+        """Whether it takes what it was shown for falsified; None if it does not watch. Arguments as in `advance`."""
         return None
 
     def passed(self, observation: Tensor, state: State = None) -> Passed:

@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cavbench.core.pair import Pair, choose
-from cavbench.core.track import Baseline, Contrast, Driven, Job, Measure, Track
+from cavbench.core.track import Baseline, Certified, Contrast, Driven, Job, Measure, Track
 from cavbench.errors import UserError
 from cavbench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, field
 from cavbench.scenarios import Cell
@@ -84,6 +84,28 @@ ASSURED = field(
     high=1,
 )
 
+ALARMS: tuple[pa.Field, ...] = (
+    field(
+        "suspicion",
+        FLOAT,
+        "highest suspicion of the victim's monitor; null without one",
+        "1 is an alarm",
+        nullable=True,
+        low=0,
+        high=inf,
+    ),
+    field("alarms", FLOAT, "alarms that the victim's monitor raised; null without one", "alarms", nullable=True, low=0),
+    field(
+        "alarm_delay_s",
+        FLOAT,
+        "from the first falsified frame to the next alarm; inf if there is none, null without a monitor or a falsified frame",
+        "s",
+        nullable=True,
+        low=0,
+        high=inf,
+    ),
+)
+
 SHIFT = field(
     "shift",
     FLOAT,
@@ -105,7 +127,7 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS, *ALARMS)
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"
@@ -235,6 +257,13 @@ class DrivingTrack(Track):
         from cavbench.driving.drive import drive_jointly
 
         return drive_jointly(jobs)
+
+    def certify(
+        self, pair: Pair, training_seed: int, cells: Sequence[Cell], seeds: Sequence[int], leaves: int
+    ) -> Certified:
+        from cavbench.driving.bounds.certify import Certifier
+
+        return Certifier(pair, training_seed, cells, seeds).certify(leaves)
 
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         from cavbench.driving.recording import save
