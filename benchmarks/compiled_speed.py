@@ -1,10 +1,10 @@
-"""Measures what compiled networks and filters save against torch:
+"""Measures what compiled networks save against torch:
 
     python benchmarks/compiled_speed.py [--attacks pgd zo rehearse] [--defense advtrain] [--episodes 20] [--rounds 3]
 
 Prints the CPU time of a pass of the victim, forward and with its gradient, and of whole units, each as torch's over that of the
 compiled code. Both are measured alternately in one process and one thread, on scenarios that tune attacks; the median of the
-ratios of the rounds is printed. `forward` is the time of a unit as a ratio to the forward passes in it alone.
+ratios of the rounds is printed.
 """
 
 from __future__ import annotations

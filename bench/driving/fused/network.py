@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -33,6 +33,9 @@ class Fused:
         scale: factors of the outputs [A]; None for 1.
     """
 
+    marked: ClassVar[tuple[str, ...]] = ("modules", "scale", "widths", "kinds", "last", "outputs", "features", "size")
+    """What the watch compares (`cavbench.isolation.watch.marks`)."""
+
     def __init__(
         self,
         layers: Sequence[tuple[nn.Linear, type[nn.Module] | None]],
@@ -46,6 +49,8 @@ class Fused:
         self.scale = scale
         self.widths = np.array([linears[0].in_features, *(one.out_features for one in linears)], np.int64)
         self.kinds = np.array([ACTIVATIONS[kind] for kind in kinds], np.int64)
+        for sizes in (self.widths, self.kinds):
+            sizes.setflags(write=False)
         self.outputs = int(self.widths[-1]) - dueling
         car, _, pair = encoder or (None, None, None)
         self.features = car.in_features if car else 0
@@ -71,7 +76,7 @@ class Fused:
             return False
         # Views see whatever is written to a weight, but not that it was replaced by another tensor.
         places = [weight.data_ptr() for weight in weights]
-        if places != self._places:
+        if places != self._places or places != [view.data_ptr() for view in self._views]:
             if any(weight.dtype != torch.float32 or weight.device.type != "cpu" for weight in weights):
                 return False
             self._views, self._places = [weight.detach().reshape(-1) for weight in weights], places

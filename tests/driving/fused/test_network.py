@@ -15,6 +15,7 @@ from cavbench.driving.fused.network import Fused, chain
 from cavbench.driving.victims.from_file import FilePolicy
 from cavbench.driving.victims.logits import SoftPolicy
 from cavbench.driving.victims.networks import ActorPolicy, QPolicy
+from cavbench.isolation.watch import marks
 from tests.driving.victims.test_networks import observation
 
 
@@ -139,6 +140,20 @@ def test_torch_answers_where_more_is_wanted(policy: Policy, more: Callable[[Poli
     more(policy)
     asked = x.double() if next(iter(policy.parameters())).dtype == torch.float64 else x
     assert used(lambda: policy.scores(asked))[1] == 0
+
+
+def test_the_watch_sees_that_its_layers_were_exchanged() -> None:
+    policy = POLICIES["dqn"]().requires_grad_(False).eval()
+    assert isinstance(policy, QPolicy)
+    x, before = observation((20,)), marks(policy)
+    scores = policy.scores(x)
+    assert marks(policy) == before
+    fused = policy.network.fused
+    # A copy of the weights in the place of a view of them changes nothing: it is not the weights.
+    fused._views[0] = fused._views[0] * 2
+    assert torch.equal(policy.scores(x), scores)
+    fused.modules = tuple(copy.deepcopy(fused.modules))
+    assert marks(policy)["methods"] != before["methods"]
 
 
 def test_a_training_has_the_numbers_of_torch() -> None:
