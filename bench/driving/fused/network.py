@@ -114,7 +114,8 @@ class Fused:
 
     def _weights(self) -> list[Tensor]:
         """All weights in the order of `kernels.forward`."""
-        found = [weight for module in self.modules for weight in module._parameters.values() if weight is not None]
+        own = (weight for module in self.modules for weight in module._parameters.values())
+        found: list[Tensor] = [weight for weight in own if weight is not None]
         return found if self.scale is None else [*found, self.scale]
 
 
