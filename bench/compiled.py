@@ -46,6 +46,11 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
 
 
+def rounded_once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As `inner`; a product and the sum that it is added to are rounded once, where the processor can. Sums keep their order."""
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, fastmath={"contract"})(function)
+
+
 def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that is called from Python: it releases the GIL and is cached in `__pycache__` or the user's cache."""
     dispatcher = njit(nogil=True)(function)

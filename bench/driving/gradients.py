@@ -8,6 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.driving.threat import finite
+
 
 class Gradients:
     """Counts the gradients of a step.
@@ -35,8 +37,7 @@ class Gradients:
                 attack nothing.
         """
         places = torch.arange(self.counts.shape[1]) if rows is None else rows
-        # One sum is cheaper than a look at every entry.
-        if not bool(gradient.sum().isfinite()):
+        if not finite(gradient):
             lost = ~gradient.isfinite()
             gradient = gradient.masked_fill(lost, 0.0)
             if observed:

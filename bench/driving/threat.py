@@ -105,10 +105,15 @@ def bounds(observation: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
 def within(perturbed: Tensor, observation: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """`perturbed`, clipped to the bounds, with NaN replaced by the observation."""
     clipped = torch.clamp(perturbed, low, high)
-    # One sum is cheaper than a torch.where on every call.
-    if bool(clipped.sum().isfinite()):
+    if finite(clipped):
         return clipped
     return torch.where(clipped.isnan(), observation.clamp(-1.0, 1.0), clipped)
+
+
+def finite(values: Tensor) -> bool:
+    """Whether the sum of the values is neither NaN nor infinite: cheaper than a look at each of them in every call."""
+    total = values.sum().item()
+    return bool(total - total == 0)
 
 
 class PerturbationSet:

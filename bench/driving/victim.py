@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from cavbench.driving.policy import Policy, State
+from cavbench.driving.threat import finite
 from cavbench.errors import UserError
 from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import Side, TamperError, Watch
@@ -168,8 +169,7 @@ class CountedPolicy:
         scores = self.policy.scores(observation, state)
         if type(scores) is not Tensor:
             raise TamperError(f"the victim's scores are a {type(scores).__name__}, not a torch.Tensor", "defense")
-        # One sum is cheaper than a look at every score.
-        if not bool(scores.sum().isfinite()) and not bool(scores.isfinite().all()):
+        if not finite(scores) and not bool(scores.isfinite().all()):
             raise UserError(f"the victim ({type(self.policy).__name__}) answered NaN or infinite scores {where}")
         if scores.is_complex():
             raise UserError(f"the victim ({type(self.policy).__name__}) answered complex scores")

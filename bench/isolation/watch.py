@@ -117,8 +117,9 @@ def marks(network: nn.Module) -> Mapping[str, str]:
     for name, module in network.named_modules():
         hooks += [(name, kind, len(getattr(module, kind, ()))) for kind in HOOKS]
         mode += [(name, module.training)]
+        # What an object computes with, if it says so, is part of its method.
         own = [
-            (key, id(value))
+            (key, id(value), [id(getattr(value, name)) for name in getattr(type(value), "marked", ())])
             for key, value in vars(module).items()
             if callable(value) and not isinstance(value, nn.Module)
         ]

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from cavbench.driving.features import Features
+from cavbench.driving.intervals import box_kernels
 from cavbench.driving.threat import Norm
 
 ALONG = ("x", "vx")
@@ -55,30 +59,43 @@ class Assumed:
         Args:
             shown: the observation that the policy received, [..., V, F], on the normalised scale.
         """
-        features, measured = self.features, shown[..., 1:]
-        half = features.half_range().to(measured)
-        centre = ((torch.tensor(features.low) + torch.tensor(features.high)) / 2).to(measured)
-        value = measured * half + centre
-        if self.norm == "linf":
-            reach = self.budget * half
-            low, high = value - reach, value + reach
-        else:
-            floor = torch.tensor(features.floors or (0.0,) * len(features.names)).to(measured) * (self.budget / 0.1)
-            larger, smaller = value / max(1 - self.budget, 1e-3), value / (1 + self.budget)
-            low = torch.minimum(value - floor, torch.minimum(larger, smaller))
-            high = torch.maximum(value + floor, torch.maximum(larger, smaller))
-        if features.fixed:
-            forged = features.forgeable().to(value) > 0
-            low, high = torch.where(forged, low, value), torch.where(forged, high, value)
-        noise = torch.tensor([self.noise if name in ALONG else 0.0 for name in features.names]).to(value)
-        noise = noise * (torch.arange(value.shape[-2]) > 0).to(value).unsqueeze(-1)
-        low, high = low - noise, high + noise
-        end = half * (1 - 1e-5)
-        low = torch.where(low - centre <= -end, -torch.inf, low)
-        high = torch.where(high - centre >= end, torch.inf, high)
+        low, high = _Boxes.apply(shown, self._set)
         return Boxes(shown[..., 0] > 0, low, high)
+
+    @cached_property
+    def _set(self) -> box_kernels.Set:
+        """The set as the compiled loop takes it."""
+        features, half = self.features, self.features.half_range()
+        centre, forged = (torch.tensor(features.low) + torch.tensor(features.high)) / 2, features.forgeable() > 0
+        relative, count = self.norm == "relative", len(features.names)
+        floor = torch.tensor(features.floors or (0.0,) * count) * (self.budget / 0.1)
+        reach = torch.where(forged, floor if relative else self.budget * half, 0.0)
+        divisors = (max(1 - self.budget, 1e-3), 1 + self.budget) if relative else (1.0, 1.0)
+        larger, smaller = (torch.where(forged, torch.full((count,), one), 1.0) for one in divisors)
+        noise = torch.tensor([self.noise if name in ALONG else 0.0 for name in features.names])
+        return box_kernels.Set(*(one.float().numpy() for one in (half, centre, reach, larger, smaller, noise)))
 
     def normalised(self, values: Tensor) -> Tensor:
         """Physical values of the measured features [..., F - 1] on the scale of observations, clipped to [-1, 1]."""
         low, high = (torch.tensor(bound).to(values) for bound in (self.features.low, self.features.high))
         return ((values - low) / (high - low) * 2 - 1).clamp(-1, 1)
+
+
+class _Boxes(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, shown: Tensor, of: box_kernels.Set) -> tuple[Tensor, Tensor]:
+        rows, size = shown.shape[-2:]
+        given = shown.detach().float().cpu().reshape(shown.shape[:-2].numel(), rows, size).contiguous().numpy()
+        low, high = np.empty((2, len(given), rows, size - 1), np.float32)
+        slopes = np.empty((2, len(given) if shown.requires_grad else 0, rows, size - 1), np.float32)
+        box_kernels.boxes(given, of, low, high, slopes)
+        if shown.requires_grad:
+            ctx.slopes = torch.from_numpy(slopes).to(shown).view(2, *shown.shape[:-1], size - 1)
+        lower, upper = (torch.from_numpy(each).to(shown).view(*shown.shape[:-1], size - 1) for each in (low, high))
+        return lower, upper
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_low: Tensor, by_high: Tensor) -> tuple[Tensor, None]:
+        lower, upper = ctx.slopes
+        return torch.nn.functional.pad(by_low * lower + by_high * upper, (1, 0)), None

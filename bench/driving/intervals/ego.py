@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cavbench.driving.features import ActionType
+from cavbench.driving.intervals import motion_kernels
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.kinematics import Kinematics
 
@@ -42,6 +45,11 @@ class Ego(NamedTuple):
     target_lane: Tensor
     target_speed: Tensor
     edge: Tensor
+
+
+def stacked(ego: Ego) -> Tensor:
+    """The fields of egos [N] as one tensor [N, 6], for the compiled loops; a copy without a gradient."""
+    return torch.stack([one.detach().float().cpu() for one in ego], -1)
 
 
 class DeadReckoning:
@@ -91,10 +99,41 @@ class DeadReckoning:
         )
 
     def after(self, ego: Ego, action: Tensor) -> TensorDict:
-        """The state after an action, int64 [B] or float [B, 2]."""
-        moved = self._steered(ego, action) if self.action_type == "continuous" else self._driven(ego, action)
-        return TensorDict(
-            {**moved._asdict(), "known": torch.ones_like(ego.y, dtype=torch.bool)}, batch_size=ego.y.shape
+        """The state after an action, int64 [B] or float [B, 2]; without a gradient."""
+        moved = stacked(ego)
+        if self.action_type == "continuous":
+            motion_kernels.steered(moved.numpy(), action.detach().float().cpu().contiguous().numpy(), self._car)
+        else:
+            orders, turns = self._changes[action.cpu()].unbind(-1)
+            motion_kernels.driven(moved.numpy(), orders.numpy(), turns.numpy(), self._car)
+        fields = dict(zip(Ego._fields, moved.T.contiguous().to(ego.y).unbind(0), strict=True))
+        return TensorDict({**fields, "known": torch.ones_like(ego.y, dtype=torch.bool)}, batch_size=ego.y.shape)
+
+    @cached_property
+    def _changes(self) -> Tensor:
+        """[A, 2] how each discrete action changes the target speed and the target lane."""
+        changes = {"FASTER": (1, 0), "SLOWER": (-1, 0), "LANE_RIGHT": (0, 1), "LANE_LEFT": (0, -1)}
+        return torch.tensor([changes.get(name, (0, 0)) for name in self.numbers])
+
+    @cached_property
+    def _car(self) -> motion_kernels.Car:
+        """The kinematics as the compiled loops take them."""
+        car = self.kinematics
+        low, high, last = car.target_speeds[0], car.target_speeds[-1], len(car.target_speeds) - 1
+        single = {
+            "dt": self.dt,
+            "half_length": car.length / 2,
+            "lowest": low,
+            "range": high - low,
+            "spacing": (high - low) / last,
+            **{
+                name: getattr(car, name)
+                for name in motion_kernels.Car._fields
+                if hasattr(car, name) and name != "frames"
+            },
+        }
+        return motion_kernels.Car(
+            frames=car.frames, last=last, **{name: np.float32(value) for name, value in single.items()}
         )
 
     def commanded(self, ego: Ego, change: int) -> Tensor:
@@ -111,33 +150,6 @@ class DeadReckoning:
         kept = (1 - self.kinematics.speed_gain * self.dt) ** self.kinematics.frames
         return target + (speed - target) * kept
 
-    def _driven(self, ego: Ego, action: Tensor) -> Ego:
-        target, lane = ego.target_speed, ego.target_lane
-        for name, change in (("FASTER", 1), ("SLOWER", -1)):
-            target = torch.where(action == self.numbers[name], self.commanded(ego, change), target)
-        for name, change in (("LANE_RIGHT", 1), ("LANE_LEFT", -1)):
-            lane = torch.where(action == self.numbers[name], lane + change, lane)
-        lane = torch.minimum(lane.clamp(min=0), ego.edge)
-        width = self.kinematics.lane_width
-        # A lane farther away than two lane widths cannot be chosen (highway-env's AbstractLane.is_reachable_from).
-        lane = torch.where((ego.y - width * lane).abs() <= 2 * width, lane, ego.target_lane)
-        ego = ego._replace(target_lane=lane, target_speed=target)
-        for _ in range(self.kinematics.frames):
-            gain = self.kinematics.speed_gain
-            ego = self._moved(ego, gain * (target - ego.speed), self._steering(ego))
-        return ego
-
-    def _steered(self, ego: Ego, action: Tensor) -> Ego:
-        limits = self.kinematics
-        action = action.clamp(-1, 1)
-        for _ in range(limits.frames):
-            ego = self._moved(ego, action[..., 0] * limits.acceleration_limit, action[..., 1] * limits.steering_limit)
-        return ego._replace(target_lane=torch.minimum((ego.y / limits.lane_width).round().clamp(min=0), ego.edge))
-
-    def _steering(self, ego: Ego) -> Tensor:
-        """The steering angle in rad towards the middle of the target lane."""
-        return self.steering(ego, self.kinematics.lane_width * ego.target_lane)
-
     def steering(self, ego: Ego, place: Tensor) -> Tensor:
         """ControlledVehicle.steering_control: the steering angle [...] in rad towards a place across the road, in m."""
         car = self.kinematics
@@ -147,13 +159,3 @@ class DeadReckoning:
         rate = car.heading_gain * (wanted - ego.heading)
         slip = (car.length / 2 / speed * rate).clamp(-1, 1).asin()
         return (2 * slip.tan()).atan().clamp(-car.max_steering, car.max_steering)
-
-    def _moved(self, ego: Ego, acceleration: Tensor, steering: Tensor) -> Ego:
-        """Vehicle.step: one frame of the kinematic bicycle model."""
-        # Vehicle.clip_actions
-        excess = ego.speed - self.kinematics.top_speed
-        acceleration = torch.where(excess > 0, torch.minimum(acceleration, -excess), acceleration)
-        slip = (0.5 * steering.tan()).atan()
-        y = ego.y + ego.speed * (ego.heading + slip).sin() * self.dt
-        heading = ego.heading + ego.speed * slip.sin() / (self.kinematics.length / 2) * self.dt
-        return ego._replace(y=y, heading=heading, speed=ego.speed + acceleration * self.dt)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from functools import cache
+
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from cavbench.driving.intervals import motion_kernels
 from cavbench.driving.intervals.boxes import Boxes
-from cavbench.driving.intervals.ego import Ego
+from cavbench.driving.intervals.ego import Ego, stacked
 from cavbench.driving.intervals.rooms import met
 from cavbench.driving.kinematics import Kinematics
 
@@ -29,35 +33,24 @@ def predicted(boxes: Boxes, before: Ego, after: TensorDictBase, car: Kinematics,
         car: kinematics of the world's cars.
         period: seconds per decision.
     """
-    cos, sin = before.heading.cos(), before.heading.sin()
-    own = torch.stack([torch.zeros_like(cos), before.y, before.speed * cos, before.speed * sin], -1).unsqueeze(-2)
-    heading = after["heading"]
-    driven = (before.speed + after["speed"]) / 2 * cos * period
-    then = torch.stack([driven, after["y"], after["speed"] * heading.cos(), after["speed"] * heading.sin()], -1)
-    low, high = _later((boxes.low[..., 1:, :] + own), (boxes.high[..., 1:, :] + own), car, period)
-    then = then.unsqueeze(-2)
-    return {"present": boxes.present[..., 1:], "low": low - then - ROUNDING, "high": high - then + ROUNDING}
+    then = Ego(*(after[name] for name in Ego._fields))
+    low, high = (one.detach().float().cpu().contiguous().numpy() for one in (boxes.low, boxes.high))
+    lower, upper = np.empty((2, len(low), low.shape[1] - 1, low.shape[2]), np.float32)
+    motion_kernels.later(low, high, stacked(before).numpy(), stacked(then).numpy(), _limits(car, period), lower, upper)
+    present, like = boxes.present[..., 1:], boxes.low
+    return {"present": present, "low": torch.from_numpy(lower).to(like), "high": torch.from_numpy(upper).to(like)}
 
 
-def _later(low: Tensor, high: Tensor, car: Kinematics, period: float) -> tuple[Tensor, Tensor]:
-    """Bounds [..., 4] of x, y, vx and vy one decision later, in the road's frame.
+@cache
+def _limits(car: Kinematics, period: float) -> motion_kernels.Limits:
+    """How a car may move in one decision.
 
     A car's speed v changes by at most `LONGITUDINAL`, its lateral speed by at most `LATERAL`. As vx = sqrt(v^2 - vy^2), it
     loses vx when it turns. A car that turns at the rate w slips sideways by w times half its length.
     """
-    (x_low, y_low, vx_low, vy_low), (x_high, y_high, vx_high, vy_high) = low.unbind(-1), high.unbind(-1)
-    across = torch.maximum(-vy_low, vy_high)
-    slowest = torch.hypot(vx_low.clamp(min=0), torch.maximum(vy_low, -vy_high).clamp(min=0))
-    fastest = torch.hypot(vx_high, across) + LONGITUDINAL * period
-    slip = (car.length / 2 * LATERAL / slowest.clamp(min=0.1).square()).clamp(max=LARGEST_SLIP)
-    across = across + LATERAL * period
-    vx = ((slowest - LONGITUDINAL * period).clamp(min=0).square() - across.square()).clamp(min=0).sqrt()
-    vy_low, vy_high = vy_low - LATERAL * period, vy_high + LATERAL * period
-    x_low = x_low + (vx * (1 - slip.square()).sqrt() - across * slip) * period
-    y_low, y_high = y_low + (vy_low - fastest * slip) * period, y_high + (vy_high + fastest * slip) * period
-    return torch.stack([x_low, y_low, vx, vy_low], -1), torch.stack(
-        [x_high + fastest * period, y_high, fastest, vy_high], -1
-    )
+    slipping = car.length / 2 * LATERAL
+    found = period, LONGITUDINAL * period, LATERAL * period, slipping, LARGEST_SLIP, ROUNDING
+    return motion_kernels.Limits(*map(np.float32, found))
 
 
 def narrowed(boxes: Boxes, tracks: TensorDictBase) -> Boxes:

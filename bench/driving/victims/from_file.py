@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from cavbench.core.ranges import Count
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
+from cavbench.driving.fused.network import chain
 from cavbench.driving.victims.spaces import UNKNOWN, Bounds, Expected
 from cavbench.errors import UserError, short
 from cavbench.formats.trial import RefusedError, failure, hashed, refuse_harm
@@ -51,6 +52,7 @@ class FilePolicy(Policy):
         self.shape, self.width = tuple(shape), width
         self.action_type, self.weights_sha256 = action_type, sha256
         self.clips = action_type == "continuous"
+        self.fused = chain(network)
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> FilePolicy:
@@ -60,7 +62,11 @@ class FilePolicy(Policy):
 
     def forward(self, observation: Tensor) -> Tensor:
         shown = self._shown(observation)
-        return self._answered(self.network(shown) if len(shown) else None, observation)
+        if not len(shown):
+            return self._answered(None, observation)
+        if self.fused is not None and self.fused.fits(flat := shown.flatten(1)):
+            return self._answered(self.fused(flat), observation)
+        return self._answered(self.network(shown), observation)
 
     def _shown(self, observation: Tensor) -> Tensor:
         """What the network is given for observations [..., V, F]: [N, *shape]."""

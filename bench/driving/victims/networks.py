@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from cavbench.driving import Policy, State
+from cavbench.driving.fused.network import Fused
 
 
 class Encoder(nn.Module):
@@ -25,6 +26,11 @@ class Encoder(nn.Module):
         self.pair = nn.Linear(self.width, self.pooled)
         self.out_features = features - 1 + self.pooled
 
+    @property
+    def layers(self) -> tuple[nn.Linear, nn.Linear, nn.Linear]:
+        """The layers of the cars, of the ego and of their pairs."""
+        return self.car, self.ego, self.pair
+
     def forward(self, observation: Tensor) -> Tensor:
         ego, cars = observation[..., 0, 1:], observation[..., 1:, :]
         # One product on contiguous rows is a third faster than one per layer; it dominates the cost of a query.
@@ -42,6 +48,7 @@ class QNetwork(nn.Module):
         super().__init__()
         self.encoder = Encoder(features)
         self.head = _head(self.encoder.out_features, actions + 1, hidden)
+        self.fused = Fused(_layers(self.head), encoder=self.encoder.layers, dueling=True)
 
     def forward(self, observation: Tensor) -> Tensor:
         value, advantage = self.head(self.encoder(observation)).tensor_split([1], -1)
@@ -67,7 +74,8 @@ FEW = 16
 def whatever_the_batch(network: nn.Module, observation: Tensor, *more: Tensor) -> Tensor:
     """The output [..., A] of a network for observations [..., V, F], to the last bit the same in every batch.
 
-    Fewer than `FEW` observations are filled up. Units that are driven together thus have the results that each has alone.
+    Units that are driven together thus have the results that each has alone. A network that is `fused` is one compiled call;
+    torch fills up fewer than `FEW` observations.
 
     Args:
         network: called with all inputs.
@@ -77,6 +85,10 @@ def whatever_the_batch(network: nn.Module, observation: Tensor, *more: Tensor) -
     if torch.compiler.is_exporting():
         # An exported program has one graph for every size of the batch.
         return network(observation, *more)
+    fused = getattr(network, "fused", None)
+    # A training has torch's numbers, also those of its target networks.
+    if isinstance(fused, Fused) and not (more or network.training) and fused.fits(observation):
+        return fused(observation)
     leading = observation.shape[:-2]
     missing = FEW - leading.numel()
     if not 0 < missing < FEW:
@@ -119,6 +131,7 @@ class Actor(nn.Module):
         self.head = _head(self.encoder.out_features, 2, hidden)
         self.limit: Tensor
         self.register_buffer("limit", limit, persistent=False)
+        self.fused = Fused(_layers(self.head, nn.Tanh), encoder=self.encoder.layers, scale=limit)
 
     def forward(self, observation: Tensor) -> Tensor:
         return self.head(self.encoder(observation)).tanh() * self.limit
@@ -141,6 +154,12 @@ class Critic(nn.Module):
             found = layer(found)
         # The last bit of a product of a matrix and a vector depends on the number of rows; that of these sums does not.
         return (found * last.weight[0]).sum(-1, keepdim=True) + last.bias
+
+
+def _layers(head: MLP, last: type[nn.Module] | None = None) -> list[tuple[nn.Linear, type[nn.Module] | None]]:
+    """The linear layers of a head, each with the activation after it; `last` follows the last one."""
+    linears = [layer for layer in head if isinstance(layer, nn.Linear)]
+    return [*((linear, nn.ReLU) for linear in linears[:-1]), (linears[-1], last)]
 
 
 def _head(inputs: int, outputs: int, hidden: int) -> MLP:

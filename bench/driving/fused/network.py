@@ -1,0 +1,162 @@
+"""A small network in one compiled call, forward and backward; torch computes whatever it is not made for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from cavbench.driving.fused import kernels
+
+ACTIVATIONS: dict[type[nn.Module] | None, int] = {
+    None: kernels.LINEAR,
+    nn.ReLU: kernels.RELU,
+    nn.Tanh: kernels.TANH,
+}
+
+
+class Fused:
+    """A chain of linear layers, behind an encoder of the cars or alone, that is evaluated without torch.
+
+    Its answers are those of torch to about 1e-6, and the same to the last bit in every batch. It reads the weights anew in
+    every call. It answers only where nothing else can be wanted of the network than its output and the gradient in its input
+    (`fits`): torch trains, exports and runs hooks.
+
+    Args:
+        layers: linear layers with bias, each with what follows it: `ReLU`, `Tanh` or nothing.
+        encoder: its layers `car`, `ego` and `pair`; None for a network that reads all values of an observation.
+        dueling: whether the outputs are a state value and advantages.
+        scale: factors of the outputs [A]; None for 1.
+    """
+
+    marked: ClassVar[tuple[str, ...]] = ("modules", "scale", "widths", "kinds", "last", "outputs", "features", "size")
+    """What the watch compares (`cavbench.isolation.watch.marks`)."""
+
+    def __init__(
+        self,
+        layers: Sequence[tuple[nn.Linear, type[nn.Module] | None]],
+        *,
+        encoder: tuple[nn.Linear, nn.Linear, nn.Linear] | None = None,
+        dueling: bool = False,
+        scale: Tensor | None = None,
+    ) -> None:
+        linears, kinds = zip(*layers, strict=True)
+        self.modules: tuple[nn.Linear, ...] = (*(encoder or ()), *linears)
+        self.scale = scale
+        self.widths = np.array([linears[0].in_features, *(one.out_features for one in linears)], np.int64)
+        self.kinds = np.array([ACTIVATIONS[kind] for kind in kinds], np.int64)
+        for sizes in (self.widths, self.kinds):
+            sizes.setflags(write=False)
+        self.outputs = int(self.widths[-1]) - dueling
+        car, _, pair = encoder or (None, None, None)
+        self.features = car.in_features if car else 0
+        self.size, self.kept = self.features or int(self.widths[0]), int(self.widths.sum())
+        self.width, self.pooled = (car.out_features, pair.out_features) if car and pair else (0, 0)
+        self._views: list[Tensor] = []
+        self._places: list[int] = []
+        self.last = kernels.DUELING if dueling else kernels.PLAIN if scale is None else kernels.SCALED
+
+    def fits(self, observation: Tensor) -> bool:
+        """Whether it can answer about observations [..., V, F], or [..., n] without an encoder."""
+        if observation.dtype != torch.float32 or observation.device.type != "cpu" or torch.compiler.is_compiling():
+            return False
+        shape = observation.shape
+        if shape[-1] != self.size or (self.width and shape[-2] < 2) or torch._C._are_functorch_transforms_active():
+            return False
+        for module in self.modules:
+            # Hooks count who evaluates the network past the oracle.
+            if module._forward_pre_hooks or module._forward_hooks or module._backward_hooks:
+                return False
+        weights = self._weights()
+        if any(weight.requires_grad for weight in weights):
+            return False
+        # Views see whatever is written to a weight, but not that it was replaced by another tensor.
+        places = [weight.data_ptr() for weight in weights]
+        if places != self._places or places != [view.data_ptr() for view in self._views]:
+            if any(weight.dtype != torch.float32 or weight.device.type != "cpu" for weight in weights):
+                return False
+            self._views, self._places = [weight.detach().reshape(-1) for weight in weights], places
+        return True
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        """The answers [..., A] about observations that it `fits`, differentiable once in them."""
+        if observation.requires_grad and torch.is_grad_enabled():
+            answer: Tensor = _Pass.apply(observation, self)
+            return answer
+        return self.forward(observation, keeps=False)[0]
+
+    def forward(self, observation: Tensor, *, keeps: bool) -> tuple[Tensor, Any]:
+        """The answers [..., A], and what the gradient needs besides them (`kernels.forward`)."""
+        leading = observation.shape[: -2 if self.width else -1]
+        count = leading.numel()
+        points = observation.detach().reshape(count, observation.shape[len(leading) :].numel()).contiguous().numpy()
+        weights = torch.cat(self._views).numpy()
+        blocks = -(-count // kernels.LANES) if keeps else 1
+        out = np.empty((count, self.outputs), np.float32)
+        kept = np.empty((blocks, self.kept, kernels.LANES), np.float32)
+        best, chosen = np.empty((2, blocks, self.pooled, kernels.LANES), np.float32)
+        given = points, weights, self.form(points.shape[1]), self.widths, self.kinds
+        kernels.forward(*given, out, kept, best, chosen)
+        return torch.from_numpy(out).view(*leading, self.outputs), (*given, kept, best, chosen)
+
+    def form(self, size: int) -> kernels.Form:
+        """The network for points of `size` values."""
+        rows = size // self.features if self.features else 1
+        return kernels.Form(rows, self.features, self.width, self.pooled, self.last)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy has weights of its own.
+        return {**self.__dict__, "_views": [], "_places": []}
+
+    def _weights(self) -> list[Tensor]:
+        """All weights in the order of `kernels.forward`."""
+        own = (weight for module in self.modules for weight in module._parameters.values())
+        found: list[Tensor] = [weight for weight in own if weight is not None]
+        return found if self.scale is None else [*found, self.scale]
+
+
+def chain(network: object) -> Fused | None:
+    """A sequence of layers as a fused network of flat observations [..., n]; None if there is another module among them."""
+    found: list[tuple[nn.Linear, type[nn.Module] | None]] = []
+    size = None
+    for layer in _flat(network):
+        kind = type(layer)
+        if kind is nn.Flatten and not found and (layer.start_dim, layer.end_dim) == (1, -1):
+            continue
+        if kind is nn.Linear and layer.bias is not None and size in (None, layer.in_features):
+            found.append((layer, None))
+            size = layer.out_features
+        elif kind in ACTIVATIONS and found and found[-1][1] is None:
+            found[-1] = found[-1][0], kind
+        else:
+            return None
+    return Fused(found) if found else None
+
+
+def _flat(network: object) -> Iterator[Any]:
+    """The modules of a sequence and of the sequences in it, in order; a subclass may do something else."""
+    if type(network) is nn.Sequential:
+        for one in network:
+            yield from _flat(one)
+    else:
+        yield network
+
+
+class _Pass(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, observation: Tensor, network: Fused) -> Tensor:
+        answer, ctx.kept = network.forward(observation, keeps=True)
+        ctx.shape, ctx.network = observation.shape, network
+        return answer
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_answer: Tensor) -> tuple[Tensor, None]:
+        by_points = np.empty_like(ctx.kept[0])
+        by_out = by_answer.detach().reshape(len(by_points), ctx.network.outputs).contiguous().numpy()
+        kernels.backward(*ctx.kept, by_out, by_points)
+        return torch.from_numpy(by_points).view(ctx.shape), None

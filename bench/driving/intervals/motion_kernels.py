@@ -1,0 +1,178 @@
+"""Compiled loops over the episodes: where the ego is after a decision, and where the other cars may be. float32 throughout."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavbench.compiled import entry_point, inner
+from cavbench.driving.intervals.kernels import Floats
+
+Y, HEADING, SPEED, LANE, TARGET, EDGE = range(6)
+"""The fields of `cavbench.driving.intervals.ego.Ego`."""
+
+
+class Car(NamedTuple):
+    """The ego's kinematics (`cavbench.driving.kinematics.Kinematics`), float32 but for the counts.
+
+    Args:
+        frames: physics frames per decision.
+        last: number of the highest target speed.
+        dt: seconds per frame.
+        half_length: half the length of a car, in m.
+        lane_width, top_speed, speed_gain, heading_gain, lateral_gain, max_heading, max_steering: as there.
+        acceleration_limit, steering_limit: as there.
+        lowest, range: the lowest target speed, and the highest less the lowest, in m/s.
+        spacing: from one target speed to the next, in m/s.
+    """
+
+    frames: int
+    last: int
+    dt: np.float32
+    half_length: np.float32
+    lane_width: np.float32
+    top_speed: np.float32
+    speed_gain: np.float32
+    heading_gain: np.float32
+    lateral_gain: np.float32
+    max_heading: np.float32
+    max_steering: np.float32
+    acceleration_limit: np.float32
+    steering_limit: np.float32
+    lowest: np.float32
+    range: np.float32
+    spacing: np.float32
+
+
+@inner
+def _clipped(value: np.float32, low: np.float32, high: np.float32) -> np.float32:
+    """`value` between the bounds; NaN stays."""
+    return low if value < low else high if value > high else value
+
+
+@inner
+def _steering(ego: Floats, car: Car) -> np.float32:
+    """ControlledVehicle.steering_control towards the middle of the target lane, in rad."""
+    one, speed = np.float32(1), max(ego[SPEED], np.float32(0.01))
+    lateral = ego[Y] - car.lane_width * ego[LANE]
+    wanted = np.arcsin(_clipped(-car.lateral_gain * lateral / speed, -one, one))
+    wanted = _clipped(wanted, -car.max_heading, car.max_heading)
+    rate = car.heading_gain * (wanted - ego[HEADING])
+    slip = np.arcsin(_clipped(car.half_length / speed * rate, -one, one))
+    return _clipped(np.arctan(np.float32(2) * np.tan(slip)), -car.max_steering, car.max_steering)
+
+
+@inner
+def _move(ego: Floats, acceleration: np.float32, steering: np.float32, car: Car) -> None:
+    """Vehicle.step: one frame of the kinematic bicycle model."""
+    excess, speed, heading = ego[SPEED] - car.top_speed, ego[SPEED], ego[HEADING]
+    if excess > 0:
+        acceleration = min(acceleration, -excess)
+    slip = np.arctan(np.float32(0.5) * np.tan(steering))
+    ego[Y] += speed * np.sin(heading + slip) * car.dt
+    ego[HEADING] = heading + speed * np.sin(slip) / car.half_length * car.dt
+    ego[SPEED] = speed + acceleration * car.dt
+
+
+@entry_point
+def driven(egos: Floats, orders: NDArray[np.int64], turns: NDArray[np.int64], car: Car) -> None:
+    """The egos [N, 6] one decision later, in place, after discrete actions.
+
+    Args:
+        egos: in the order of `Y`, `HEADING` and so on.
+        orders: 1 for FASTER, -1 for SLOWER, 0 for another action, [N].
+        turns: 1 for LANE_RIGHT, -1 for LANE_LEFT, 0 for another action, [N].
+        car: the kinematics.
+    """
+    top = np.float32(car.last)
+    for n in range(len(egos)):
+        ego = egos[n]
+        if orders[n] != 0:
+            index = np.rint((ego[SPEED] - car.lowest) / car.range * top)
+            index = _clipped(index, np.float32(0), top) + np.float32(orders[n])
+            ego[TARGET] = car.lowest + _clipped(index, np.float32(0), top) * car.spacing
+        lane = min(max(ego[LANE] + np.float32(turns[n]), np.float32(0)), ego[EDGE])
+        # A lane farther away than two lane widths cannot be chosen (highway-env's AbstractLane.is_reachable_from).
+        if np.abs(ego[Y] - car.lane_width * lane) <= np.float32(2) * car.lane_width:
+            ego[LANE] = lane
+        for _ in range(car.frames):
+            _move(ego, car.speed_gain * (ego[TARGET] - ego[SPEED]), _steering(ego, car), car)
+
+
+@entry_point
+def steered(egos: Floats, controls: Floats, car: Car) -> None:
+    """The egos [N, 6] one decision later, in place, after acceleration and steering `controls` [N, 2] in [-1, 1]."""
+    one = np.float32(1)
+    for n in range(len(egos)):
+        acceleration = _clipped(controls[n, 0], -one, one) * car.acceleration_limit
+        steering = _clipped(controls[n, 1], -one, one) * car.steering_limit
+        for _ in range(car.frames):
+            _move(egos[n], acceleration, steering, car)
+        lane = max(np.rint(egos[n, Y] / car.lane_width), np.float32(0))
+        egos[n, LANE] = min(lane, egos[n, EDGE])
+
+
+class Limits(NamedTuple):
+    """How a car may move (`cavbench.driving.intervals.tracks`); float32.
+
+    Args:
+        period: seconds per decision.
+        gained, turned: largest change of the speed along and across its direction in a decision, in m/s.
+        slipping: half a car's length times the largest acceleration across, in m2/s2.
+        largest_slip: sine of the largest angle between where it points and where it moves.
+        rounding: by how much the boxes are wider on every side.
+    """
+
+    period: np.float32
+    gained: np.float32
+    turned: np.float32
+    slipping: np.float32
+    largest_slip: np.float32
+    rounding: np.float32
+
+
+@entry_point
+def later(low: Floats, high: Floats, before: Floats, after: Floats, of: Limits, lower: Floats, upper: Floats) -> None:
+    """The boxes of the other cars one decision later, relative to the ego; fills `lower` and `upper` [N, V - 1, 4].
+
+    Args:
+        low, high: the boxes now, [N, V, 4]; the ego's own is not read.
+        before, after: the egos now and then, [N, 6].
+        of: the limits.
+        lower, upper: the bounds of x relative to the ego, and of y, vx and vy relative to its own.
+    """
+    zero, one = np.float32(0), np.float32(1)
+    for n in range(len(low)):
+        speed, cos, sin = before[n, SPEED], np.cos(before[n, HEADING]), np.sin(before[n, HEADING])
+        own_y, own_vx, own_vy = before[n, Y], speed * cos, speed * sin
+        driven_x = (speed + after[n, SPEED]) / np.float32(2) * cos * of.period
+        then_y = after[n, Y]
+        then_vx, then_vy = after[n, SPEED] * np.cos(after[n, HEADING]), after[n, SPEED] * np.sin(after[n, HEADING])
+        for c in range(lower.shape[1]):
+            x_low, y_low = low[n, c + 1, 0], low[n, c + 1, 1] + own_y
+            x_high, y_high = high[n, c + 1, 0], high[n, c + 1, 1] + own_y
+            vx_low, vy_low = low[n, c + 1, 2] + own_vx, low[n, c + 1, 3] + own_vy
+            vx_high, vy_high = high[n, c + 1, 2] + own_vx, high[n, c + 1, 3] + own_vy
+            across = max(-vy_low, vy_high)
+            slowest = np.hypot(max(vx_low, zero), max(max(vy_low, -vy_high), zero))
+            fastest = np.hypot(vx_high, across) + of.gained
+            least = max(slowest, np.float32(0.1))
+            slip = min(of.slipping / (least * least), of.largest_slip)
+            across += of.turned
+            kept = max(slowest - of.gained, zero)
+            vx = np.sqrt(max(kept * kept - across * across, zero))
+            vy_low, vy_high = vy_low - of.turned, vy_high + of.turned
+            x_low += (vx * np.sqrt(one - slip * slip) - across * slip) * of.period
+            y_low += (vy_low - fastest * slip) * of.period
+            y_high += (vy_high + fastest * slip) * of.period
+            x_high += fastest * of.period
+            lower[n, c, 0] = x_low - driven_x - of.rounding
+            lower[n, c, 1] = y_low - then_y - of.rounding
+            lower[n, c, 2] = vx - then_vx - of.rounding
+            lower[n, c, 3] = vy_low - then_vy - of.rounding
+            upper[n, c, 0] = x_high - driven_x + of.rounding
+            upper[n, c, 1] = y_high - then_y + of.rounding
+            upper[n, c, 2] = fastest - then_vx + of.rounding
+            upper[n, c, 3] = vy_high - then_vy + of.rounding
