@@ -24,7 +24,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cavbench.core import budgets, registry, suites
+from cavbench.core import budgets, registry, sets, suites
 from cavbench.core.contracts import Access, Defense, ThreatModel
 from cavbench.core.outline import outline
 from cavbench.core.pair import Chosen, choose
@@ -270,15 +270,24 @@ class Options:
         owned = parameters(model)
         keys = [key for key in self.values if key.startswith("threat.")]
         names = [key.removeprefix("threat.") for key in keys]
-        if strange := [key for key, name in zip(keys, names, strict=True) if name not in owned]:
-            known = [f"threat.{name}" for name in owned]
+        nested = {name: parameters(kind) for name, kind in sets.of(model).items()}
+        every = [name for name in owned if name not in nested]
+        every += [f"{name}.{inner}" for name, known in nested.items() for inner in known]
+        if strange := [key for key, name in zip(keys, names, strict=True) if name not in every]:
+            known = [f"threat.{name}" for name in every]
             raise UserError(registry.unknown(f"key {strange[0]!r} of the {track_name} track", strange[0], known))
         found = []
         for values in itertools.product(*(self.values[key] for key in keys)):
             given = dict(zip(names, values, strict=True))
             budget, confirmed = budgets.read(given.get("budget"))
             given |= {} if budget is None else {"budget": str(budget)}
-            arguments = _arguments("threat", "model", owned, given)
+            flat = {name: value for name, value in given.items() if "." not in name}
+            arguments = _arguments("threat", "model", {name: owned[name] for name in every if name in owned}, flat)
+            for name, known in nested.items():
+                inner = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{name}.")}
+                own = _arguments(f"threat.{name}", name, known, inner)
+                # Those that were not typed keep their defaults.
+                arguments |= {name: {key: own[key] for key in inner}} if inner else {}
             try:
                 found.append(budgets.checked(model(**arguments), confirmed=confirmed))
             except ValueError as error:
@@ -464,12 +473,13 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
         return {}
     schema = _schema(owned)
     try:
-        config = OmegaConf.create({kind: OmegaConf.structured(schema)})
+        config = OmegaConf.create()
+        OmegaConf.update(config, kind, OmegaConf.structured(schema))
     except OmegaConfBaseException as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"the parameters of {kind} {name!r} cannot be set on the command line: {reason}") from error
     overrides = [f"{kind}.{key}={value}" for key, value in given.items()]
-    composed = _composed(config, overrides, schema)[kind]
+    composed = OmegaConf.select(_composed(config, overrides, schema), kind)
     arguments = OmegaConf.to_object(composed)
     return _read(kind, owned, arguments)
 

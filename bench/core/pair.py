@@ -173,7 +173,11 @@ class Pair:
     def identity(self) -> Mapping[str, str]:
         """Names and parameters of everything in the pair."""
         named = {part.kind: part.name for part in self.parts}
-        return named | {f"{part.kind}_params": part.params for part in self.parts} | {"threat": canonical(self.threat)}
+        return (
+            named
+            | {f"{part.kind}_params": part.params for part in self.parts}
+            | {"threat": canonical(self.threat.written)}
+        )
 
     @property
     def id(self) -> str:

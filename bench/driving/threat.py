@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -15,6 +15,8 @@ from torch import Tensor
 from cavbench.core.contracts import ThreatModel
 from cavbench.core.ranges import Natural, Share
 from cavbench.driving.features import Features
+from cavbench.driving.sets import Actuator, Held, Latency, Presence, Traffic
+from cavbench.driving.surroundings import Surroundings
 
 Norm = Literal["relative", "linf"]
 
@@ -30,15 +32,27 @@ class ObservationThreat(ThreatModel):
         budget: size of the set, in [0, 2]. Users may write it in per cent, 10% for 0.1, and must from 100 % of a value on.
         queries: largest number of policy evaluations per episode and step.
         share: share of the frames of a full episode that may be attacked, rounded down; the attack chooses the frames.
+        presence: cars that may be hidden or invented.
+        latency: how late the sensor may be.
+        held: how long the sensor may be frozen.
+        actuator: how late and how far off commands may be executed.
+        traffic: cars of the traffic that the attacker drives.
+        dynamics: how the traffic drives and what the ego weighs, of which the victim is not told.
 
-    `presence` and the `fixed` features of the world cannot be changed, and absent rows cannot be filled. Values are clipped to
-    [-1, 1], the range of every sensor.
+    The last six are empty by default, and combine (`cavbench.driving.sets`). `fixed` features of the world cannot be changed.
+    Values are clipped to [-1, 1], the range of every sensor. Without the set `presence` no row comes or goes.
     """
 
     norm: Norm = "relative"
     budget: Annotated[float, Interval(ge=0, le=2)] = 0.1
     queries: Natural = 1000
     share: Share = 1.0
+    presence: Presence = field(default_factory=Presence)
+    latency: Latency = field(default_factory=Latency)
+    held: Held = field(default_factory=Held)
+    actuator: Actuator = field(default_factory=Actuator)
+    traffic: Traffic = field(default_factory=Traffic)
+    dynamics: Surroundings = field(default_factory=Surroundings)
 
     def slip(self) -> str:
         if self.norm != "relative" or self.budget < 1:

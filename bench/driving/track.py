@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from cavbench.core import sets
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Baseline, Contrast, Driven, Job, Measure, Track
 from cavbench.errors import UserError
@@ -184,6 +185,7 @@ class DrivingTrack(Track):
         return BEST_BLIND if other["victim"] == "blind" else str(other["victim"])
 
     def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
+        norm, others = sets.split(norm)
         deviation = f"{100 * budget:g} % of itself" if norm == "relative" else f"{budget:g} on the [-1, 1] scale"
         features = facts.get("features", {})
         floors = features.get("floors", ()) if norm == "relative" else ()
@@ -194,7 +196,11 @@ class DrivingTrack(Track):
         by_floor = f", or by its floor ({', '.join(minima)})" if minima else ""
         fixed = features.get("fixed", ())
         named = fixed if len(fixed) <= FEW else [f"{len(fixed)} fixed features"]
-        return f"each measured value may be off by {deviation}{by_floor}; {' and '.join(['presence', *named])} cannot be forged"
+        if any(word.startswith("presence.") for word in others):
+            forged = f"{' and '.join(named)} cannot be forged" if named else ""
+        else:
+            forged = f"{' and '.join(['presence', *named])} cannot be forged"
+        return "; ".join(filter(None, (f"each measured value may be off by {deviation}{by_floor}", forged, *others)))
 
     def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
         steps = column("steps")
