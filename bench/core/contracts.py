@@ -207,6 +207,11 @@ class Attack(Component):
     adversary: Any = None
     """The network of an attack that learns, in a run; otherwise None. It is no parameter."""
 
+    @property
+    def forges(self) -> tuple[str, ...]:
+        """What it needs of the threat model beside changed values: at least one of these words, such as `presence.hidden=1`."""
+        return ()
+
     def zoo_name(self, victim: Any) -> str:
         """The name of its entries in the zoo; the names of victim and defence follow if it `adapts` to them."""
         raise NotImplementedError(f"{type(self).__name__} does not learn")
@@ -321,6 +326,10 @@ class ThreatModel:
     def of_nobody(cls) -> Self:
         """The threat model of all clean runs, so that runs under different threat models share them."""
         return cls(budget=0.0, access="oblivious", queries=0)  # type: ignore[call-arg]
+
+    def lacks(self, world: Any, victim: Any) -> str:
+        """Which of its sets the world cannot carry out, or makes no sense for the victim, in one line; empty for none."""
+        return ""
 
     def slip(self) -> str:
         """What its budget would mean, if that is probably a slip of the pen; empty otherwise. A user confirms it in per cent."""

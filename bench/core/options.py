@@ -264,6 +264,8 @@ class Options:
         model = self.chosen("victim")[0].component.threat
         if self.suites and "threat.access" not in self.values:
             self.values["threat.access"] = (max((suite.access for suite in self.suites), key=get_args(Access).index),)
+        for name, value in suites.allowed(self.suites).items():
+            self.values.setdefault(f"threat.{name}", (str(value),))
         return self._threats(model, self.track)
 
     def _threats(self, model: type[ThreatModel], track_name: str) -> list[ThreatModel]:
@@ -283,9 +285,9 @@ class Options:
             given |= {} if budget is None else {"budget": str(budget)}
             flat = {name: value for name, value in given.items() if "." not in name}
             arguments = _arguments("threat", "model", {name: owned[name] for name in every if name in owned}, flat)
-            for name, known in nested.items():
+            for name, own_fields in nested.items():
                 inner = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{name}.")}
-                own = _arguments(f"threat.{name}", name, known, inner)
+                own = _arguments(f"threat.{name}", name, own_fields, inner)
                 # Those that were not typed keep their defaults.
                 arguments |= {name: {key: own[key] for key in inner}} if inner else {}
             try:

@@ -9,14 +9,12 @@ import re
 import typing
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from functools import cache
 from typing import Annotated, Any, get_args, get_origin
 
 WRITTEN = re.compile(r"[a-z0-9_]+(\+[a-z_]+\.[a-z_]+=-?[0-9][0-9.e+-]*)*")
 """A perturbation set with the others, as records have it in `threat_norm`."""
 
 
-@cache
 def of(model: type[Any]) -> Mapping[str, type[Any]]:
     """The classes of the sets of a threat model, by name of the field."""
     hints = typing.get_type_hints(model)
@@ -49,6 +47,12 @@ def made(name: str, kind: type[Any], given: Any) -> Any:
         return kind(**given)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name}.{error}") from None
+
+
+def allows(threat: Any, word: str) -> bool:
+    """Whether a threat model allows something in a field of a set: a `word` such as `presence.hidden=1`, whatever its number."""
+    name, _, field = word.partition("=")[0].partition(".")
+    return field in changed(getattr(threat, name, None)) if name in of(type(threat)) else False
 
 
 def words(threat: Any) -> list[str]:
@@ -93,7 +97,6 @@ def changed(one: Any) -> dict[str, Any]:
     return {item.name: getattr(one, item.name) for item in fields(one) if getattr(one, item.name) != item.default}
 
 
-@cache
 def _types(kind: type[Any]) -> Mapping[str, type[Any]]:
     """The type of each field, without its range."""
     hints = typing.get_type_hints(kind, include_extras=True)

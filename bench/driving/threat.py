@@ -12,9 +12,11 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.core import sets
 from cavbench.core.contracts import ThreatModel
 from cavbench.core.ranges import Natural, Share
 from cavbench.driving.features import Features
+from cavbench.driving.invented import NEEDED
 from cavbench.driving.sets import Actuator, Held, Latency, Presence, Traffic
 from cavbench.driving.surroundings import Surroundings
 
@@ -89,6 +91,19 @@ class ObservationThreat(ThreatModel):
             bound = bound * features.there(observation)
         return torch.cat((torch.zeros_like(observation[..., :1]), bound), -1)
 
+    def lacks(self, world: Any, victim: Any) -> str:
+        """Which set the world cannot carry out, in one line; empty if it can."""
+        for name in sets.present(self):
+            if name not in world.offers:
+                return f"threat.{name} is a set that the world does not carry out: it has {', '.join(world.offers)}"
+        if self.presence != Presence():
+            needed = NEEDED if self.presence.invented else NEEDED[:1]
+            if missing := [one for one in needed if one not in world.features.names]:
+                return f"threat.presence needs rows of cars with {', '.join(needed)}, the world does not measure {missing[0]}"
+        if (self.actuator.offset or self.actuator.noise) and victim.action_type != "continuous":
+            return "threat.actuator.offset and .noise need continuous actions, the victim's are discrete"
+        return ""
+
     def reach(self, rows: int, features: Features, steps: int) -> float:
         """The largest L2 norm of all that an attack can change in an episode, on the normalised scale.
 
@@ -97,6 +112,9 @@ class ObservationThreat(ThreatModel):
             features: names and ranges of the measured features.
             steps: decisions of a full episode.
         """
+        if any((self.presence != Presence(), self.latency != Latency(), self.held != Held())):
+            # Another frame, or another car, may be anything.
+            return 2 * math.sqrt(rows * (1 + len(features.names)) * self.frames(steps))
         extremes = torch.ones(rows, 1 + len(features.names)) * torch.tensor([1.0, -1.0])[:, None, None]
         extremes[..., 0] = 1.0
         largest = self.radius(extremes, features).amax(0)

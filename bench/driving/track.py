@@ -97,6 +97,35 @@ SHIFT = field(
 )
 
 
+FORGED = (
+    field(
+        "hidden",
+        FLOAT,
+        "cars hidden from the victim, mean over the steps; null if the threat model allows none",
+        "cars",
+        nullable=True,
+        low=0,
+    ),
+    field("invented", FLOAT, "cars invented, mean over the steps; null as `hidden`", "cars", nullable=True, low=0),
+    field(
+        "age",
+        FLOAT,
+        "age of the frame that the victim was shown, mean over the steps; null as `hidden`",
+        "decisions",
+        nullable=True,
+        low=0,
+    ),
+    field(
+        "acted",
+        FLOAT,
+        "steps on which the car executed another command than the victim's; null as `hidden`",
+        "share, 0 to 1",
+        nullable=True,
+    ),
+)
+"""What was used of the sets beside changed values."""
+
+
 class DrivingTrack(Track):
     """Driving policies on a road, attacked through their observations, ranked by `safe_progress`."""
 
@@ -106,7 +135,7 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS, *FORGED)
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"
