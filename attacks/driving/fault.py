@@ -211,7 +211,10 @@ def _placed(place: Tensor, observation: Tensor, features: Features) -> Tensor:
     `place` is [B, K, 4] in [0, 1).
     """
     low, high = torch.tensor((5.0, -6.0, -5.0, 0.0)), torch.tensor((60.0, 6.0, 5.0, 0.0))
-    return _rows(low + place * (high - low), features, observation)
+    physical = low + place * (high - low)
+    # Along the road, however the ego moves across it.
+    physical[..., 3] = -features.physical(observation[:, 0])[:, features.names.index("vy"), None]
+    return _rows(physical, features, observation)
 
 
 def _moved(cars: Tensor, before: Tensor, ego: Tensor, oracle: Oracle) -> Tensor:

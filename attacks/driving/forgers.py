@@ -102,7 +102,10 @@ class Forger(DrivingAttack):
     def _worst(self, belief: TensorDict, oracle: Oracle) -> Tensor:
         """The number of the worst forgery [B]; the present one if no other is worse by more than `KEEPING`."""
         copies = self.options(oracle)
+        # A rehearsal has its own draws of a random victim.
         affordable = int(oracle.remaining.min()) * oracle.draws // copies
+        if not affordable:
+            return torch.zeros_like(belief["which"])
         decisions = min(max(1, round(self.horizon / oracle.dynamics.period)), affordable)
         world, victim = oracle.dynamics.rehearsal(belief, copies), oracle.imagined(copies)
         which = torch.arange(copies)[:, None].expand(-1, len(belief))

@@ -139,12 +139,13 @@ class Forging:
         actuator, forgery = self.threat.actuator, self.answer
         if actuator == Actuator():
             return action
-        self.actions = [action.clone(), *self.actions[: actuator.delay]]
-        coin = self._tossed() if actuator.replaced else None
-        if forgery is None:
+        if actuator.delay:
+            self.actions = [action.clone(), *self.actions[: actuator.delay]]
+        if forgery is None or (forgery.action is None and forgery.shift is None and forgery.delay is None):
             return action
+        coin = self._tossed() if actuator.replaced and forgery.action is not None else None
         own, rows = action[self.rows], self.rows
-        if forgery.delay is not None:
+        if forgery.delay is not None and actuator.delay:
             kept = torch.stack(self.actions)[:, rows]
             back = forgery.delay.clamp(max=len(self.actions) - 1)
             own = kept[back, torch.arange(len(rows))]
@@ -170,7 +171,7 @@ class Forging:
         return torch.where(given < 0, own, given.to(own.dtype))
 
     def _tossed(self) -> Tensor:
-        """[B] whether the attacker's action is executed. Every episode has a coin in every step, whatever the others do."""
+        """[B] whether the attacker's action is executed. Every episode has a coin, whatever the others do."""
         drawn = torch.cat([torch.rand(count, generator=generator) for count, generator in self.coins])
         return drawn < self.threat.actuator.replaced
 
