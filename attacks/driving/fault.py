@@ -39,6 +39,8 @@ LOST = (0.05, 0.2, 0.5)
 """Probability that a command is lost in a frame."""
 IDLE = 1
 """The discrete action of a car whose command is lost; a continuous one is 0."""
+MEMORYLESS = ("dropout", "latency", "quantise", "late", "lost")
+"""Modes in which a frame does not depend on those before it."""
 NEEDS: dict[str, tuple[str, ...]] = {
     "dropout": ("presence.hidden=9",),
     "ghosts": ("presence.invented=3",),
@@ -93,6 +95,8 @@ class Fault(DrivingAttack):
         return NEEDS.get(self.mode, ())
 
     def initial(self, observation: Tensor, oracle: Oracle) -> State:
+        if self.mode in MEMORYLESS:
+            return None
         batch = observation.shape[:1]
         state = TensorDict({"step": torch.zeros(batch, dtype=torch.int64)}, batch_size=batch)
         if self.mode == "ghosts":
@@ -108,12 +112,13 @@ class Fault(DrivingAttack):
         return state
 
     def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor | Forgery, State]:
-        assert state is not None
+        if state is None:
+            return getattr(self, f"_{self.mode}")(observation, oracle), None
         after = state.clone()
         after["step"] += 1
         return getattr(self, f"_{self.mode}")(observation, oracle, after), after
 
-    def _dropout(self, observation: Tensor, oracle: Oracle, state: TensorDict) -> Forgery:
+    def _dropout(self, observation: Tensor, oracle: Oracle) -> Forgery:
         missing = _uniform(oracle, observation.shape[1]) < DROPPED[self.severity - 1]
         missing[:, 0] = False
         missing &= observation[..., 0] > 0
@@ -134,12 +139,9 @@ class Fault(DrivingAttack):
         cars[..., 0] = ((rest > 0) & (oracle.left("presence") > 0)[:, None]).to(cars)
         return Forgery(invented=cars.clone())
 
-    def _latency(self, observation: Tensor, oracle: Oracle, state: TensorDict) -> Forgery:
-        return Forgery(
-            age=torch.full_like(state["step"], min(LATE[self.severity - 1], oracle.threat.latency.frames)).minimum(
-                state["step"] - 1
-            )
-        )
+    def _latency(self, observation: Tensor, oracle: Oracle) -> Forgery:
+        # The run shows the first frame until there is one as old as that.
+        return Forgery(age=torch.full((len(observation),), min(LATE[self.severity - 1], oracle.threat.latency.frames)))
 
     def _freeze(self, observation: Tensor, oracle: Oracle, state: TensorDict) -> Forgery:
         chance, frames = FREEZING[self.severity - 1]
@@ -150,7 +152,7 @@ class Fault(DrivingAttack):
         state["age"] = torch.where(frozen, state["age"] + 1, 0)
         return Forgery(age=state["age"].clone())
 
-    def _quantise(self, observation: Tensor, oracle: Oracle, state: TensorDict) -> Tensor:
+    def _quantise(self, observation: Tensor, oracle: Oracle) -> Tensor:
         size = _resolution(oracle.features).to(observation) * STEPS[self.severity - 1]
         return _shifted(observation, (observation[..., 1:] / size).round() * size - observation[..., 1:], oracle)
 
@@ -166,10 +168,12 @@ class Fault(DrivingAttack):
         size = _resolution(oracle.features).to(observation) * DEVIATION[self.severity - 1]
         return _shifted(observation, size * state["error"], oracle)
 
-    def _late(self, observation: Tensor, oracle: Oracle, state: TensorDict) -> Forgery:
-        return Forgery(delay=torch.full_like(state["step"], min(LATE[self.severity - 1], oracle.threat.actuator.delay)))
+    def _late(self, observation: Tensor, oracle: Oracle) -> Forgery:
+        return Forgery(
+            delay=torch.full((len(observation),), min(LATE[self.severity - 1], oracle.threat.actuator.delay))
+        )
 
-    def _lost(self, observation: Tensor, oracle: Oracle, state: TensorDict) -> Forgery:
+    def _lost(self, observation: Tensor, oracle: Oracle) -> Forgery:
         # The run replaces a command with the probability of the threat model.
         chance = LOST[self.severity - 1] / max(oracle.threat.actuator.replaced, LOST[self.severity - 1])
         lost = _uniform(oracle, 1)[:, 0] < chance
