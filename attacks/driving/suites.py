@@ -7,3 +7,4 @@ from pathlib import Path
 from cavbench.core.suites import Suite
 
 STANDARD_2 = Suite.read(Path(__file__).with_name("standard-2.toml"))
+FAULTS_1 = Suite.read(Path(__file__).with_name("faults-1.toml"))

@@ -244,6 +244,9 @@ def threat_of(
     if chosen_suites and "access" not in values:
         values["access"] = max((suite.access for suite in chosen_suites), key=get_args(Access).index)
     model = victim.component.threat
+    for name, value in suites.allowed(chosen_suites).items():
+        of, _, field = name.rpartition(".")
+        (values.setdefault(of, {}) if of else values).setdefault(field, value)
     try:
         return budgets.checked(model(**values), confirmed=confirmed, python=True)
     except UserError:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, get_args
 
-from cavbench.core import ranges
+from cavbench.core import ranges, sets
 from cavbench.errors import UserError
 from cavbench.scenarios import Axes, Grid
 
@@ -207,6 +207,11 @@ class Attack(Component):
     adversary: Any = None
     """The network of an attack that learns, in a run; otherwise None. It is no parameter."""
 
+    @property
+    def forges(self) -> tuple[str, ...]:
+        """What it needs of the threat model beside changed values: at least one of these words, such as `presence.hidden=1`."""
+        return ()
+
     def zoo_name(self, victim: Any) -> str:
         """The name of its entries in the zoo; the names of victim and defence follow if it `adapts` to them."""
         raise NotImplementedError(f"{type(self).__name__} does not learn")
@@ -312,6 +317,8 @@ class ThreatModel:
     def __post_init__(self) -> None:
         try:
             ranges.check(self)
+            for name, kind in sets.of(type(self)).items():
+                object.__setattr__(self, name, sets.made(name, kind, getattr(self, name)))
         except ValueError as error:
             raise ValueError(f"threat.{error}") from None
 
@@ -320,19 +327,40 @@ class ThreatModel:
         """The threat model of all clean runs, so that runs under different threat models share them."""
         return cls(budget=0.0, access="oblivious", queries=0)  # type: ignore[call-arg]
 
+    def lacks(self, world: Any, victim: Any) -> str:
+        """Which of its sets the world cannot carry out, or makes no sense for the victim, in one line; empty for none."""
+        return ""
+
     def slip(self) -> str:
         """What its budget would mean, if that is probably a slip of the pen; empty otherwise. A user confirms it in per cent."""
         return ""
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Its columns of records, `threat_NAME` for each field; `threat_share` is 1 where the track has no such limit."""
-        return {"threat_share": 1.0} | {f"threat_{name}": value for name, value in asdict(self).items()}
+        """Its columns of records, `threat_NAME` for each field; `threat_share` is 1 where the track has no such limit.
+
+        Sets that are not empty are named in `threat_norm` (`cavbench.core.sets`).
+        """
+        found = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in sets.of(type(self))}
+        found["norm"] = "+".join([self.norm, *sets.words(self)])
+        return {"threat_share": 1.0} | {f"threat_{name}": value for name, value in found.items()}
+
+    @property
+    def written(self) -> dict[str, Any]:
+        """Its fields without the sets that are empty: the hash of a pair is that of records from before a set."""
+        empty = sets.of(type(self)).keys() - sets.present(self).keys()
+        return {item.name: getattr(self, item.name) for item in fields(self) if item.name not in empty}
 
     @classmethod
     def recorded(cls, record: Mapping[str, Any]) -> Self:
-        """The threat model of a record."""
-        return cls(**{field.name: record[f"threat_{field.name}"] for field in fields(cls)})
+        """The threat model of a record.
+
+        Raises:
+            ValueError: if it has no such set, or a value is not allowed.
+        """
+        norm, words = sets.split(record["threat_norm"])
+        own = {item.name: record[f"threat_{item.name}"] for item in fields(cls) if item.name not in sets.of(cls)}
+        return cls(**own | {"norm": norm} | sets.read(cls, words))
 
     def allows(self, access: Access) -> bool:
         """Whether this threat model allows an attack that needs `access`."""

@@ -24,7 +24,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cavbench.core import budgets, registry, suites
+from cavbench.core import budgets, registry, sets, suites
 from cavbench.core.contracts import Access, Defense, ThreatModel
 from cavbench.core.outline import outline
 from cavbench.core.pair import Chosen, choose
@@ -264,21 +264,32 @@ class Options:
         model = self.chosen("victim")[0].component.threat
         if self.suites and "threat.access" not in self.values:
             self.values["threat.access"] = (max((suite.access for suite in self.suites), key=get_args(Access).index),)
+        for name, value in suites.allowed(self.suites).items():
+            self.values.setdefault(f"threat.{name}", (str(value),))
         return self._threats(model, self.track)
 
     def _threats(self, model: type[ThreatModel], track_name: str) -> list[ThreatModel]:
         owned = parameters(model)
         keys = [key for key in self.values if key.startswith("threat.")]
         names = [key.removeprefix("threat.") for key in keys]
-        if strange := [key for key, name in zip(keys, names, strict=True) if name not in owned]:
-            known = [f"threat.{name}" for name in owned]
+        nested = {name: parameters(kind) for name, kind in sets.of(model).items()}
+        every = [name for name in owned if name not in nested]
+        every += [f"{name}.{inner}" for name, known in nested.items() for inner in known]
+        if strange := [key for key, name in zip(keys, names, strict=True) if name not in every]:
+            known = [f"threat.{name}" for name in every]
             raise UserError(registry.unknown(f"key {strange[0]!r} of the {track_name} track", strange[0], known))
         found = []
         for values in itertools.product(*(self.values[key] for key in keys)):
             given = dict(zip(names, values, strict=True))
             budget, confirmed = budgets.read(given.get("budget"))
             given |= {} if budget is None else {"budget": str(budget)}
-            arguments = _arguments("threat", "model", owned, given)
+            flat = {name: value for name, value in given.items() if "." not in name}
+            arguments = _arguments("threat", "model", {name: owned[name] for name in every if name in owned}, flat)
+            for name, own_fields in nested.items():
+                inner = {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{name}.")}
+                own = _arguments(f"threat.{name}", name, own_fields, inner)
+                # Those that were not typed keep their defaults.
+                arguments |= {name: {key: own[key] for key in inner}} if inner else {}
             try:
                 found.append(budgets.checked(model(**arguments), confirmed=confirmed))
             except ValueError as error:
@@ -464,12 +475,13 @@ def _arguments(kind: str, name: str, owned: dict[str, Parameter], given: Mapping
         return {}
     schema = _schema(owned)
     try:
-        config = OmegaConf.create({kind: OmegaConf.structured(schema)})
+        config = OmegaConf.create()
+        OmegaConf.update(config, kind, OmegaConf.structured(schema))
     except OmegaConfBaseException as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"the parameters of {kind} {name!r} cannot be set on the command line: {reason}") from error
     overrides = [f"{kind}.{key}={value}" for key, value in given.items()]
-    composed = _composed(config, overrides, schema)[kind]
+    composed = OmegaConf.select(_composed(config, overrides, schema), kind)
     arguments = OmegaConf.to_object(composed)
     return _read(kind, owned, arguments)
 

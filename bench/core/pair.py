@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
-from cavbench.core import registry, sources
+from cavbench.core import registry, sets, sources
 from cavbench.core.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
 from cavbench.core.parameters import differing, parameters
 from cavbench.core.registry import Kind
@@ -142,6 +142,13 @@ class Pair:
                 f"attack {self.attack.name!r} needs access {asked!r}, but victim {self.victim.name!r} is a black box "
                 f"that supports {victim.answers!r} at most"
             )
+        if why := "" if self.is_clean else self.threat.lacks(self.world.component, victim):
+            raise UserError(f"attack {self.attack.name!r} does not fit world {self.world.name!r}: {why}")
+        if not self.is_clean and attack.forges and not any(sets.allows(self.threat, word) for word in attack.forges):
+            raise UserError(
+                f"attack {self.attack.name!r} can do nothing under this threat model: allow it "
+                f"{' or '.join(f'threat.{word}' for word in attack.forges)}"
+            )
         if not self.threat.allows(attack.access):
             raise UserError(
                 f"attack {self.attack.name!r} needs access {attack.access!r}, but the threat model allows "
@@ -173,7 +180,11 @@ class Pair:
     def identity(self) -> Mapping[str, str]:
         """Names and parameters of everything in the pair."""
         named = {part.kind: part.name for part in self.parts}
-        return named | {f"{part.kind}_params": part.params for part in self.parts} | {"threat": canonical(self.threat)}
+        return (
+            named
+            | {f"{part.kind}_params": part.params for part in self.parts}
+            | {"threat": canonical(self.threat.written)}
+        )
 
     @property
     def id(self) -> str:

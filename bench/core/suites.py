@@ -66,6 +66,7 @@ class Suite:
         meaning: one sentence.
         access: the access that its members need, allowed by default in a run of the suite.
         members: the attacks.
+        threat: what else of the threat model is allowed by default, such as {"presence.hidden": 9}.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Suite:
     meaning: str
     access: Access
     members: tuple[Member, ...]
+    threat: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def read(cls, path: Path) -> Suite:
@@ -129,6 +131,19 @@ def suite(name: str, track: str = "") -> Suite:
     if not isinstance(found, Suite) or found.name != newest:
         raise UserError(f"suite {newest!r} is not a cavbench.core.suites.Suite with that name")
     return found
+
+
+def allowed(suites: Sequence[Suite]) -> dict[str, Any]:
+    """What suites allow by default of a threat model beside the access: values by the name that follows `threat.`.
+
+    Raises:
+        UserError: if they allow different things.
+    """
+    told = [suite.threat for suite in suites]
+    if any(one != told[0] for one in told):
+        named = " and ".join(suite.name for suite in suites)
+        raise UserError(f"the suites {named} allow different threat models by default: start one run for each")
+    return dict(told[0]) if told else {}
 
 
 def combined(

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from cavbench.driving.dynamics import Dynamics, Forecast
     from cavbench.driving.features import ActionType, Control, Driver, DrivingFacts, Features
     from cavbench.driving.filter import ObservationFilter
+    from cavbench.driving.forgery import Forgery, composed
     from cavbench.driving.kinematics import Kinematics
     from cavbench.driving.parts import Part, parts_of
     from cavbench.driving.policy import Passed, Policy, PolicyWrapper, State, Suspicion
@@ -27,6 +28,7 @@ __all__ = [
     "Dynamics",
     "Features",
     "Forecast",
+    "Forgery",
     "Kinematics",
     "ObservationFilter",
     "ObservationThreat",
@@ -38,8 +40,20 @@ __all__ = [
     "State",
     "Suspicion",
     "TrainingHooks",
+    "composed",
     "parts_of",
 ]
 
-_MODULES = ("access", "contracts", "dynamics", "features", "filter", "kinematics", "parts", "policy", "threat")
+_MODULES = (
+    "access",
+    "contracts",
+    "dynamics",
+    "features",
+    "filter",
+    "forgery",
+    "kinematics",
+    "parts",
+    "policy",
+    "threat",
+)
 __getattr__ = exported(__name__, __all__, _MODULES)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import NoReturn
+from typing import Literal, NoReturn
 
 import numpy as np
 import torch
@@ -19,6 +19,8 @@ from torch.nn import Parameter
 from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.features import ActionType, Features
+from cavbench.driving.forgery import Forgery
+from cavbench.driving.forging import Forging
 from cavbench.driving.gradients import Gradients, Tangent
 from cavbench.driving.parts import Part, parts_of
 from cavbench.driving.policy import State, repeated, rows_of
@@ -27,6 +29,8 @@ from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
 from cavbench.isolation.watch import TamperError
 
+STEPS = 450
+"""Decisions of a full episode, where there is no episode."""
 DRAWS = 8
 """How often a random victim is asked about each point."""
 
@@ -151,6 +155,21 @@ class Oracle:
         return self._mean(value)
 
     @property
+    def period(self) -> float:
+        """Seconds between decisions."""
+        return self._enforcer.forged.period
+
+    def past(self, age: int) -> Tensor:
+        """The true observation [B, V, F] of some decisions ago; the oldest that may still be shown, if that is younger."""
+        kept = self._enforcer.forged.past(age)[self._enforcer.rows]
+        return kept if self._rows is None else kept[self._rows]
+
+    def left(self, of: Literal["presence", "held"]) -> Tensor:
+        """int64 [B] frames in which cars may still be hidden or invented, or the sensor held."""
+        rows = self._enforcer.rows
+        return self._enforcer.forged.left(of, rows if self._rows is None else rows[self._rows])
+
+    @property
     def dynamics(self) -> Dynamics:
         """The world's rules of motion; needs access `dynamics`, and a world that offers them."""
         permit("dynamics", self._enforcer.access)
@@ -243,11 +262,19 @@ class Enforcer:
         # What the attack is given is its own: what it does to it reaches neither the run, nor the world, nor the victim.
         self._shown = deepcopy(threat), deepcopy(features)
         self.dynamics = deepcopy(dynamics)
+        self.forging: Forging | None = None
         self.asked: list[tuple[Tensor | None, Tensor]] | None = None
         self.rehearsed: tuple[int, Tensor | None] | None = None
         self._step = 0
 
-    def begin(self, observation: Tensor, state: State = None, scale: float = 1.0, parts: Sequence[Part] = ()) -> Oracle:
+    def begin(
+        self,
+        observation: Tensor,
+        state: State = None,
+        scale: float = 1.0,
+        parts: Sequence[Part] = (),
+        rows: Tensor | None = None,
+    ) -> Oracle:
         """The oracle of a step, with counters at 0; the oracle of the step before answers no more.
 
         Args:
@@ -255,7 +282,12 @@ class Enforcer:
             state: the victim's state for these B episodes.
             scale: multiplies the budget.
             parts: the units of these episodes; by default they are one unit, with the generator of the enforcer.
+            rows: int64 [B], their places among the episodes that `forging` goes on with; by default each step is the first one.
         """
+        if rows is None:
+            self.forging = Forging(self.threat, self.features, 1 / 15, STEPS, [(len(observation), 0)])
+            self.forging.see(observation)
+        self.rows = torch.arange(len(observation)) if rows is None else rows
         radius = self.threat.radius(observation, self.features, scale)
         low, high = bounds(observation, radius)
         self._set = PerturbationSet(observation, radius, low, high)
@@ -315,9 +347,21 @@ class Enforcer:
             return None if self._state is None else self._state.clone()
         return rows_of(self._state, rows)
 
-    def project(self, answer: Tensor) -> tuple[Tensor, Tensor]:
-        """As `PerturbationSet.project`: the answer in the perturbation set, and how far it was from it."""
+    def project(self, answer: Tensor | Forgery, name: str = "the attack") -> tuple[Tensor, Tensor]:
+        """The answer in the sets of the threat model, and how far it was from them (`PerturbationSet.project`, `Forging.show`).
+
+        Raises:
+            UserError: if a forgery is more than the threat model allows.
+        """
+        if isinstance(answer, Forgery):
+            return self.forged.show(answer, self.rows, name)
         return self._set.project(answer)
+
+    @property
+    def forged(self) -> Forging:
+        """What enforces the other sets of the threat model."""
+        assert self.forging is not None
+        return self.forging
 
     def close(self) -> None:
         """End the step, and check what the attack did.

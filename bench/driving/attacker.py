@@ -14,6 +14,8 @@ from cavbench.driving.access import Enforcer
 from cavbench.driving.contracts import DrivingAttack
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.features import Features
+from cavbench.driving.forgery import Forgery
+from cavbench.driving.forging import Forging, Used
 from cavbench.driving.parts import Part, parts_of
 from cavbench.driving.policy import State, rows_of
 from cavbench.driving.threat import ObservationThreat
@@ -32,6 +34,7 @@ class Shown:
             of those that were NaN or infinite where the attack may change the value.
         excess: [B] L-inf distance from the attack's answer before projection to the set, on the normalised scale.
         milliseconds: the attack's wall time for the whole batch.
+        used: what was used of the other sets of the threat model.
     """
 
     observation: Tensor
@@ -41,6 +44,7 @@ class Shown:
     nan_gradients: Tensor
     excess: Tensor
     milliseconds: float = 0.0
+    used: Used | None = None
 
 
 class Attacker:
@@ -55,6 +59,9 @@ class Attacker:
             seed are one unit, and stand together.
         dynamics: the world's rules of motion; None if the world does not offer them.
         frames: frames of each episode that may be attacked (`ObservationThreat.frames`); None for all.
+        period: seconds between decisions.
+        steps: decisions of a full episode.
+        actions: number of discrete actions.
     """
 
     def __init__(
@@ -67,6 +74,9 @@ class Attacker:
         seed: int | Sequence[int],
         dynamics: Dynamics | None = None,
         frames: int | None = None,
+        period: float = 1 / 15,
+        steps: int = 450,
+        actions: int = 5,
     ) -> None:
         self.attack, self.subject = attack, subject
         access = attack.access if attack else "oblivious"
@@ -77,8 +87,10 @@ class Attacker:
             for start, end in pairwise([*starts, len(seeds)])
         ]
         self.enforcer = Enforcer(subject, threat, access, features, self.parts[0].generator, dynamics)
-        self.frames = frames
+        self.seeds = [seeds[part.rows.start] for part in self.parts]
+        self.frames, self.period, self.steps, self.actions = frames, period, steps, actions
         self.changed = torch.zeros(0, dtype=torch.int64)
+        self.differs = torch.zeros(0, dtype=torch.bool)
         self.state: State = None
         self.begun = False
 
@@ -99,6 +111,9 @@ class Attacker:
             return Shown(observation, counts[0], counts[1], counts[2], counts[3], excess)
         if not self.begun:
             self._begin(self.attack, observation, policy_state)
+        forging = self.enforcer.forging
+        assert forging is not None
+        forging.see(observation)
         if self.frames is not None:
             running = running & (self.changed < self.frames)
         rows = running.nonzero().squeeze(-1)
@@ -108,10 +123,21 @@ class Attacker:
             perturbed[rows], excess[rows] = self._answer(
                 self.attack, observation[rows], rows, rows_of(policy_state, rows)
             )
-            self.changed += (perturbed != observation).flatten(1).any(1)
             counts[:, rows] = torch.stack(self.enforcer.counts)
+        self.differs = (perturbed != observation).flatten(1).any(1)
+        self.changed += self.differs
+        forging.close(observation, rows)
         milliseconds = (time.perf_counter() - start) * 1000
-        return Shown(perturbed, counts[0], counts[1], counts[2], counts[3], excess, milliseconds)
+        return Shown(perturbed, counts[0], counts[1], counts[2], counts[3], excess, milliseconds, forging.used)
+
+    def execute(self, action: Tensor) -> Tensor:
+        """What the cars execute of the victim's decisions [B] or [B, 2]. A command that is executed otherwise attacks a frame."""
+        if self.attack is None or self.enforcer.forging is None:
+            return action
+        executed = self.enforcer.forging.execute(action, self.subject.action_type, self.actions)
+        if executed is not action:
+            self.changed += (executed != action).reshape(len(action), -1).any(1) & ~self.differs
+        return executed
 
     def _begin(self, attack: DrivingAttack, observation: Tensor, policy_state: State) -> None:
         """Get the attack's initial state. It may not query the victim: no record would count these queries.
@@ -119,36 +145,51 @@ class Attacker:
         The run keeps its own copy of the state and updates it in place.
         """
         self.changed = torch.zeros(len(observation), dtype=torch.int64)
-        oracle = self.enforcer.begin(
-            observation, policy_state, parts=parts_of(self.parts, torch.arange(len(observation)))
-        )
+        self._prepare(len(observation)).see(observation)
+        rows = torch.arange(len(observation))
+        oracle = self.enforcer.begin(observation, policy_state, parts=parts_of(self.parts, rows), rows=rows)
         with self.subject.turn():
             state = attack.initial(observation.clone(), oracle)
         self.enforcer.close()
         if bool(self.enforcer.counts[0].any()):
             raise UserError(f"{type(attack).__name__}.initial asked the victim: ask in step, where queries are counted")
         self.state, self.begun = None if state is None else state.detach().clone(), True
+        # The first frame is seen in its step.
+        self._prepare(len(observation))
+
+    def _prepare(self, batch: int) -> Forging:
+        sizes = [batch] if len(self.parts) == 1 else [part.rows.stop - part.rows.start for part in self.parts]
+        parts = list(zip(sizes, self.seeds, strict=True))
+        threat, features = self.enforcer.threat, self.enforcer.features
+        self.enforcer.forging = Forging(threat, features, self.period, self.steps, parts)
+        return self.enforcer.forging
 
     def _answer(
         self, attack: DrivingAttack, observation: Tensor, rows: Tensor, policy_state: State
     ) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and its distance to the perturbation set."""
-        oracle = self.enforcer.begin(observation, policy_state, parts=parts_of(self.parts, rows))
+        oracle = self.enforcer.begin(observation, policy_state, parts=parts_of(self.parts, rows), rows=rows)
         name = type(attack).__name__
         with self.subject.turn():
             answer, state = attack.step(observation, oracle, rows_of(self.state, rows))
         self.enforcer.close()
-        # A subclass of Tensor could change what its methods answer.
-        if type(answer) is not Tensor or answer.shape != observation.shape:
-            got = f"shape {tuple(answer.shape)}" if type(answer) is Tensor else f"a {type(answer).__name__}"
-            raise UserError(f"{name}.perturb returned {got}, not a torch.Tensor of shape {tuple(observation.shape)}")
-        if answer.is_complex():
-            raise UserError(f"{name}.perturb returned complex numbers")
         if (self.state is None) != (state is None):
             raise UserError(f"{name}.step and {name}.initial must both return a state or both return None")
         if self.state is not None and state is not None:
             self.state[rows] = state.detach()
-        shown, excess = self.enforcer.project(answer.detach().to(observation.dtype))
+        given = answer if isinstance(answer, Forgery) else _values(answer, observation, name)
+        shown, excess = self.enforcer.project(given, name)
         if not bool(excess.isfinite().all()):
             raise UserError(f"{name}.perturb returned numbers that are NaN or infinite")
         return shown, excess
+
+
+def _values(answer: Tensor, observation: Tensor, name: str) -> Tensor:
+    """The perturbed values of an attack's answer."""
+    # A subclass of Tensor could change what its methods answer.
+    if type(answer) is not Tensor or answer.shape != observation.shape:
+        got = f"shape {tuple(answer.shape)}" if type(answer) is Tensor else f"a {type(answer).__name__}"
+        raise UserError(f"{name}.perturb returned {got}, not a torch.Tensor of shape {tuple(observation.shape)}")
+    if answer.is_complex():
+        raise UserError(f"{name}.perturb returned complex numbers")
+    return answer.detach().to(observation.dtype)

@@ -12,6 +12,7 @@ from cavbench.core.contracts import Attack, Defense, Progress, ThreatModel, Trai
 from cavbench.driving.access import Oracle
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.features import ActionType, Control, Driver, DrivingFacts, Features
+from cavbench.driving.forgery import Forgery
 from cavbench.driving.kinematics import Kinematics
 from cavbench.driving.policy import Policy, State
 from cavbench.driving.threat import ObservationThreat
@@ -42,6 +43,8 @@ class DrivingWorld(World):
     """Number of decisions in an episode that is not terminated early."""
     drivers: ClassVar[tuple[Driver, ...]] = ("agent",)
     """The values of `driver` that `make` supports."""
+    offers: ClassVar[tuple[str, ...]] = ("presence", "latency", "held", "actuator")
+    """Names of the sets of a threat model that it can carry out."""
     brakes_by: ClassVar[str] = "give world.target_speeds a lower first speed"
     """What a user does so that SLOWER ends at a lower speed."""
 
@@ -245,8 +248,8 @@ class DrivingAttack(Attack):
         """
         return None
 
-    def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor, State]:
-        """The observation for the victim, as in `perturb`, and the state for the next step.
+    def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor | Forgery, State]:
+        """The observation for the victim, as in `perturb`, or a `Forgery`; and the state for the next step.
 
         Args:
             observation, oracle: as in `perturb`.
@@ -254,7 +257,7 @@ class DrivingAttack(Attack):
         """
         return self.perturb(observation, oracle), state
 
-    def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor:
+    def perturb(self, observation: Tensor, oracle: Oracle) -> Tensor | Forgery:
         """The perturbed observation for the victim, [B, V, F], from a stateless attack.
 
         Args:

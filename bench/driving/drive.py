@@ -8,7 +8,21 @@ from itertools import accumulate, pairwise
 
 from cavbench.core.pair import Pair
 from cavbench.core.track import Driven, Job
-from cavbench.driving import access, attacker, gradients, meter, parts, probes, shadows, threat, victim
+from cavbench.driving import (
+    access,
+    attacker,
+    forgery,
+    forging,
+    gradients,
+    invented,
+    meter,
+    parts,
+    probes,
+    sets,
+    shadows,
+    threat,
+    victim,
+)
 from cavbench.driving import rollout as rollouts
 from cavbench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
 from cavbench.driving.meter import Columns
@@ -20,7 +34,22 @@ from cavbench.errors import UserError
 from cavbench.isolation.seal import Seal
 from cavbench.isolation.streams import Stream
 
-SEAL = Seal(access, attacker, gradients, meter, parts, probes, rollouts, shadows, threat, victim)
+SEAL = Seal(
+    access,
+    attacker,
+    forgery,
+    forging,
+    gradients,
+    invented,
+    meter,
+    parts,
+    probes,
+    rollouts,
+    sets,
+    shadows,
+    threat,
+    victim,
+)
 
 
 def drive(job: Job, traced: Sequence[int]) -> Driven:

@@ -13,6 +13,7 @@ from torch import Tensor
 from cavbench.driving.alarms import Alarms
 from cavbench.driving.attacker import Shown
 from cavbench.driving.features import DrivingFacts
+from cavbench.driving.forging import Used
 from cavbench.driving.metrics import safe_progress
 from cavbench.driving.policy import State, rows_of
 from cavbench.driving.victim import CountedPolicy
@@ -32,11 +33,13 @@ class Meter:
         subject: the victim.
         facts: facts of the world.
         start_x: [B] place along the road before the first step, in m.
+        forges: whether the threat model allows more than changed values.
     """
 
+    FORGED = ("hidden", "invented", "age", "acted")
     SUMS = ("steps", "return", "progress", "mean_speed", "changed", "linf", "l2", "linf_m", "linf_mps", "attack_ms")
 
-    def __init__(self, subject: CountedPolicy, facts: DrivingFacts, start_x: Tensor) -> None:
+    def __init__(self, subject: CountedPolicy, facts: DrivingFacts, start_x: Tensor, *, forges: bool = False) -> None:
         batch = len(start_x)
         self.subject, self.facts = subject, facts
         features = facts.features
@@ -51,6 +54,7 @@ class Meter:
         self.gradients, self.zero_gradients, self.nan_gradients = np.zeros((3, batch))
         self.assured = np.zeros(batch)
         self.watched = Alarms(subject.policy, batch, 1 / facts.decision_hz)
+        self.used = np.full((len(self.FORGED), batch), 0.0 if forges else np.nan)
         self.queries: list[NDArray[np.int64]] = []
         self.actions: list[NDArray[np.int64]] = []
 
@@ -101,6 +105,21 @@ class Meter:
         if self.subject.action_type == "discrete":
             self.actions.append(np.where(running, action.numpy(), -1))
 
+    def forged(self, used: Used | None, executed: Tensor, action: Tensor, driven: Tensor) -> None:
+        """Count what was used of the other sets of the threat model in a step.
+
+        Args:
+            used: cars hidden and invented, and the age of the frame.
+            executed: what the cars executed.
+            action: what the victim decided.
+            driven: bool [B], the episodes that were running before the step.
+        """
+        if used is None:
+            return
+        acted = executed is not action and (executed != action).reshape(len(action), -1).any(1).numpy()
+        counted = (used.hidden.numpy(), used.invented.numpy(), used.age.numpy(), acted)
+        self.used += np.where(driven.numpy(), np.stack(np.broadcast_arrays(*counted)), 0.0)
+
     def _changed(self, truth: Tensor, action: Tensor, state: State, touched: NDArray[np.bool_]) -> NDArray[np.float64]:
         """[B] 1 where the attack changed the victim's decision, which needs a perturbed observation (`touched`, bool [B])."""
         changed = np.zeros(len(touched))
@@ -143,6 +162,7 @@ class Meter:
             "gradient_queries": self.gradients / steps,
             "zero_gradients": self._share_of_gradients(self.zero_gradients),
             "nan_gradients": self._share_of_gradients(self.nan_gradients),
+            **dict(zip(self.FORGED, self.used / steps, strict=True)),
         }
 
     def _share_of_gradients(self, count: NDArray[np.float64]) -> NDArray[np.float64]:

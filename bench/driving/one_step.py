@@ -85,7 +85,16 @@ class Session:
         self.subject = CountedPolicy(policy, self.watch, Stream("attack", seed))
         frames = None if threat.share == 1 else threat.frames(self.facts.max_steps)
         self.attacker = Attacker(
-            attack, self.subject, threat, self.facts.features, seed=seed, dynamics=dynamics, frames=frames
+            attack,
+            self.subject,
+            threat,
+            self.facts.features,
+            seed=seed,
+            dynamics=dynamics,
+            frames=frames,
+            period=1 / self.facts.decision_hz,
+            steps=self.facts.max_steps,
+            actions=len(self.facts.actions),
         )
         self.state = self.subject.initial(torch.arange(len(cells)))
         self._stream = Stream("victim", seed)

@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from cavbench.core import sets
 from cavbench.core.progress import share_done
 from cavbench.driving.attacker import Attacker, Shown
 from cavbench.driving.contracts import DrivingAttack
@@ -110,10 +111,21 @@ def rollout(
         Watch(policy, "victim", listens=attack is not None) as watch,
     ):
         subject = CountedPolicy(policy, watch, attacks_draws)
-        attacker = Attacker(attack, subject, threat, facts.features, seed=attack_seed, dynamics=dynamics, frames=frames)
+        attacker = Attacker(
+            attack,
+            subject,
+            threat,
+            facts.features,
+            seed=attack_seed,
+            dynamics=dynamics,
+            frames=frames,
+            period=1 / facts.decision_hz,
+            steps=facts.max_steps,
+            actions=len(facts.actions),
+        )
         td = env.reset(TensorDict({"seed": episodes}, batch_size=env.batch_size))
         state = subject.initial(torch.cat([opaque([seed], salt) for seed, salt in zip(seeds, salts, strict=True)]))
-        meter = Meter(subject, facts, td["info", "x"].squeeze(-1))
+        meter = Meter(subject, facts, td["info", "x"].squeeze(-1), forges=bool(sets.present(threat)))
         probe = Probe(len(seeds), subject, entropy, rehearsed=attack is not None and attack.access == "dynamics")
         _check_actions(subject, td["observation"], state, facts)
         if several:
@@ -130,10 +142,12 @@ def rollout(
                 scores, action = probe.driven(shown.observation, truth, running, state, asked, rehearsal)
             else:
                 scores, action = subject.driven(shown.observation, state)
-            td = env.step(td.set("action", action))["next"]
+            executed = attacker.execute(action)
+            td = env.step(td.set("action", executed))["next"]
             meter.step(truth, shown, action, running, state, td)
+            meter.forged(shown.used, executed, action, running)
             if trace is not None:
-                trace.append(_traced(truth, shown, scores, action, running, state, td, subject))
+                trace.append(_traced(truth, shown, scores, action, executed, running, state, td, subject))
             state = subject.advance(shown.observation, action, state)
             if bool(td["done"].all()):
                 break
@@ -191,6 +205,7 @@ def _traced(
     shown: Shown,
     scores: Tensor,
     action: Tensor,
+    executed: Tensor,
     running: Tensor,
     state: State,
     after: TensorDictBase,
@@ -198,12 +213,16 @@ def _traced(
 ) -> dict[str, Tensor]:
     """The values of one step that a recording needs."""
     names = ("progress", "speed", "x", "ttc", "crashed", "offroad")
+    used = shown.used
+    forged = {} if used is None else {"hidden": used.hidden, "invented": used.invented, "age": used.age}
     return {
         "observation": truth,
         "perturbed": shown.observation,
         "scores": scores,
         "clean_scores": subject.aside(truth, state),
         "action": action,
+        "executed": executed,
+        **forged,
         "queries": shown.queries,
         "running": running,
         "reward": after["reward"].squeeze(-1),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -12,9 +12,13 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.core import sets
 from cavbench.core.contracts import ThreatModel
 from cavbench.core.ranges import Natural, Share
 from cavbench.driving.features import Features
+from cavbench.driving.invented import NEEDED
+from cavbench.driving.sets import Actuator, Held, Latency, Presence, Traffic
+from cavbench.driving.surroundings import Surroundings
 
 Norm = Literal["relative", "linf"]
 
@@ -30,15 +34,27 @@ class ObservationThreat(ThreatModel):
         budget: size of the set, in [0, 2]. Users may write it in per cent, 10% for 0.1, and must from 100 % of a value on.
         queries: largest number of policy evaluations per episode and step.
         share: share of the frames of a full episode that may be attacked, rounded down; the attack chooses the frames.
+        presence: cars that may be hidden or invented.
+        latency: how late the sensor may be.
+        held: how long the sensor may be frozen.
+        actuator: how late and how far off commands may be executed.
+        traffic: cars of the traffic that the attacker drives.
+        dynamics: how the traffic drives and what the ego weighs, of which the victim is not told.
 
-    `presence` and the `fixed` features of the world cannot be changed, and absent rows cannot be filled. Values are clipped to
-    [-1, 1], the range of every sensor.
+    The last six are empty by default, and combine (`cavbench.driving.sets`). `fixed` features of the world cannot be changed.
+    Values are clipped to [-1, 1], the range of every sensor. Without the set `presence` no row comes or goes.
     """
 
     norm: Norm = "relative"
     budget: Annotated[float, Interval(ge=0, le=2)] = 0.1
     queries: Natural = 1000
     share: Share = 1.0
+    presence: Presence = field(default_factory=Presence)
+    latency: Latency = field(default_factory=Latency)
+    held: Held = field(default_factory=Held)
+    actuator: Actuator = field(default_factory=Actuator)
+    traffic: Traffic = field(default_factory=Traffic)
+    dynamics: Surroundings = field(default_factory=Surroundings)
 
     def slip(self) -> str:
         if self.norm != "relative" or self.budget < 1:
@@ -75,6 +91,19 @@ class ObservationThreat(ThreatModel):
             bound = bound * features.there(observation)
         return torch.cat((torch.zeros_like(observation[..., :1]), bound), -1)
 
+    def lacks(self, world: Any, victim: Any) -> str:
+        """Which set the world cannot carry out, in one line; empty if it can."""
+        for name in sets.present(self):
+            if name not in world.offers:
+                return f"threat.{name} is a set that the world does not carry out: it has {', '.join(world.offers)}"
+        if self.presence != Presence():
+            needed = NEEDED if self.presence.invented else NEEDED[:1]
+            if missing := [one for one in needed if one not in world.features.names]:
+                return f"threat.presence needs rows of cars with {', '.join(needed)}, the world does not measure {missing[0]}"
+        if (self.actuator.offset or self.actuator.noise) and victim.action_type != "continuous":
+            return "threat.actuator.offset and .noise need continuous actions, the victim's are discrete"
+        return ""
+
     def reach(self, rows: int, features: Features, steps: int) -> float:
         """The largest L2 norm of all that an attack can change in an episode, on the normalised scale.
 
@@ -83,6 +112,9 @@ class ObservationThreat(ThreatModel):
             features: names and ranges of the measured features.
             steps: decisions of a full episode.
         """
+        if any((self.presence != Presence(), self.latency != Latency(), self.held != Held())):
+            # Another frame, or another car, may be anything.
+            return 2 * math.sqrt(rows * (1 + len(features.names)) * self.frames(steps))
         extremes = torch.ones(rows, 1 + len(features.names)) * torch.tensor([1.0, -1.0])[:, None, None]
         extremes[..., 0] = 1.0
         largest = self.radius(extremes, features).amax(0)

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from cavbench.core import sets
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Baseline, Certified, Contrast, Driven, Job, Measure, Track
 from cavbench.errors import UserError
@@ -118,6 +119,35 @@ SHIFT = field(
 )
 
 
+FORGED = (
+    field(
+        "hidden",
+        FLOAT,
+        "cars hidden from the victim, mean over the steps; null if the threat model allows none",
+        "cars",
+        nullable=True,
+        low=0,
+    ),
+    field("invented", FLOAT, "cars invented, mean over the steps; null as `hidden`", "cars", nullable=True, low=0),
+    field(
+        "age",
+        FLOAT,
+        "age of the frame that the victim was shown, mean over the steps; null as `hidden`",
+        "decisions",
+        nullable=True,
+        low=0,
+    ),
+    field(
+        "acted",
+        FLOAT,
+        "steps on which the car executed another command than the victim's; null as `hidden`",
+        "share, 0 to 1",
+        nullable=True,
+    ),
+)
+"""What was used of the sets beside changed values."""
+
+
 class DrivingTrack(Track):
     """Driving policies on a road, attacked through their observations, ranked by `safe_progress`."""
 
@@ -127,7 +157,7 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS, *ALARMS)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS, *ALARMS, *FORGED)
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"
@@ -206,6 +236,7 @@ class DrivingTrack(Track):
         return BEST_BLIND if other["victim"] == "blind" else str(other["victim"])
 
     def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
+        norm, others = sets.split(norm)
         deviation = f"{100 * budget:g} % of itself" if norm == "relative" else f"{budget:g} on the [-1, 1] scale"
         features = facts.get("features", {})
         floors = features.get("floors", ()) if norm == "relative" else ()
@@ -216,7 +247,11 @@ class DrivingTrack(Track):
         by_floor = f", or by its floor ({', '.join(minima)})" if minima else ""
         fixed = features.get("fixed", ())
         named = fixed if len(fixed) <= FEW else [f"{len(fixed)} fixed features"]
-        return f"each measured value may be off by {deviation}{by_floor}; {' and '.join(['presence', *named])} cannot be forged"
+        if any(word.startswith("presence.") for word in others):
+            forged = f"{' and '.join(named)} cannot be forged" if named else ""
+        else:
+            forged = f"{' and '.join(['presence', *named])} cannot be forged"
+        return "; ".join(filter(None, (f"each measured value may be off by {deviation}{by_floor}", forged, *others)))
 
     def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
         steps = column("steps")

@@ -66,7 +66,11 @@ IDENTITY: tuple[pa.Field, ...] = (
     field("action_type", TEXT, "driving track: discrete or continuous; otherwise empty"),
     field("sees", pa.bool_(), "false if the victim ignores its input; perceptual axes are then at their first value"),
     field("training_seed", INT, "of the victim and of the attack's preparation; 0 if neither depends on it", low=0),
-    field("threat_norm", TEXT, "name of the perturbation set; a clean run has budget 0"),
+    field(
+        "threat_norm",
+        TEXT,
+        "name of the perturbation set, and the other sets as +SET.FIELD=VALUE; a clean run has budget 0",
+    ),
     field("threat_budget", FLOAT, "size of the perturbation set", "share or normalised, depending on the norm", low=0),
     field("threat_access", TEXT, "highest access allowed to the attacker"),
     field("threat_queries", INT, "query budget of a step or of a patch", "queries", low=0),

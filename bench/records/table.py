@@ -36,13 +36,21 @@ def read_table(path: Path, track: Track, names: Sequence[str] | None = None) -> 
     try:
         file = pq.ParquetFile(path, read_dictionary=[one.name for one in schema(track) if pa.types.is_string(one.type)])
         _check_size(file, path)
-        records = file.read(columns=wanted.names, use_threads=False)
+        records = _completed(file.read(columns=wanted.names, use_threads=False), wanted)
         # Arrow believes a file that its text is UTF-8, and where its lists end.
         records.validate(full=True)
         return together([records.cast(wanted)])
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = "missing" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
         raise UserError(f"the record {path} is {reason}; delete it and run again to recreate it") from None
+
+
+def _completed(records: pa.Table, wanted: pa.Schema) -> pa.Table:
+    """The records with the nullable columns that there were not yet when they were written."""
+    for column in wanted:
+        if column.nullable and column.name not in records.column_names:
+            records = records.append_column(column, pa.nulls(records.num_rows, column.type))
+    return records.select(wanted.names)
 
 
 def _check_size(file: pq.ParquetFile, path: Path) -> None:

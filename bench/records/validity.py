@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from cavbench.core import sets
 from cavbench.core.contracts import Access
 from cavbench.core.track import Track
 from cavbench.errors import short
@@ -135,7 +136,7 @@ def _unreadable(records: pa.Table, track: Track) -> Iterator[tuple[int, str]]:
     yield from _refused(records, ("cell", "world_facts"), partial(_cell, example={**FACTS, **track.facts}))
     yield from _refused(records, ("threat_access",), partial(_known, known=get_args(Access)))
     if track.norms:
-        yield from _refused(records, ("threat_norm",), partial(_known, known=track.norms))
+        yield from _refused(records, ("threat_norm",), partial(_norm, known=track.norms))
     for name in JSON:
         yield from _refused(records, (name,), _object)
 
@@ -189,6 +190,11 @@ def _alike(value: object, example: object) -> bool:
 def _known(name: str, known: Sequence[str]) -> None:
     if name not in known:
         raise ValueError(f"known: {', '.join(known)}")
+
+
+def _norm(text: str, known: Sequence[str]) -> None:
+    """A perturbation set, with the other sets of its threat model."""
+    _known(sets.split(text)[0], known)
 
 
 def _object(text: str) -> None:

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cavbench import bounded, files
+from cavbench.core import sets
 from cavbench.core.pair import Pair
 from cavbench.core.track import Track
 from cavbench.errors import UserError, short
@@ -195,12 +196,13 @@ def command(records: pa.Table, pair: Pair) -> str:
     """The command that drives a pair as its records say."""
     from cavbench.zoo.recipe import Part
 
-    first = records.slice(0, 1).to_pylist()[0]
     words = [f"{part.kind}={part.name}" for part in pair.parts]
     words += [option for part in pair.parts for option in Part.of(part.kind, part.component).options]
     if not pair.is_clean:
         columns = ("norm", "budget", "access", "queries", "share")
-        words += [f"threat.{name}={_text(first[f'threat_{name}'])}" for name in columns if hasattr(pair.threat, name)]
+        allowed = pair.threat.columns | {"threat_norm": pair.threat.norm}
+        words += [f"threat.{name}={_text(allowed[f'threat_{name}'])}" for name in columns if hasattr(pair.threat, name)]
+        words += [f"threat.{word}" for word in sets.words(pair.threat)]
     cells = [json.loads(text) for text in pc.unique(records["cell"]).to_pylist()]
     words += [f"{axis}={','.join(map(_text, sorted({cell[axis] for cell in cells})))}" for axis in cells[0]]
     seeds = sorted(set(records["training_seed"].to_pylist()))

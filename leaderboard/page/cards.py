@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cavbench.core import registry
+from cavbench.core import registry, sets
 from cavbench.core.registry import KINDS, Kind
 from cavbench.core.sources import defaults_of, summary
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison, parameters
@@ -81,7 +81,10 @@ def run_command(one: Comparison) -> str:
     if one.is_attacked:
         # Every frame is the default, and tracks without frames do not know the option.
         limits = [name for name in THREAT if (name, identity[name]) != ("threat_share", 1)]
-        words += [f"threat.{name.removeprefix('threat_')}={_word(identity[name])}" for name in limits]
+        norm, others = sets.split(str(identity["threat_norm"]))
+        shown = {**identity, "threat_norm": norm}
+        words += [f"threat.{name.removeprefix('threat_')}={_word(shown[name])}" for name in limits]
+        words += [f"threat.{word}" for word in others]
     named = {grid.name for grid in registry.grids(str(identity["world"]))}
     words += [f"grid={name}" for name in _values(one.own.table, "grid") if name in named]
     return shlex.join(["bench", "run", *words, *_part(one)])

@@ -18,6 +18,7 @@ from cavbench.driving import ActionType, DrivingAttack, DrivingWorld, Observatio
 from cavbench.driving.access import Enforcer
 from cavbench.driving.checks.traffic import action_types, observations, victim
 from cavbench.driving.dynamics import Dynamics
+from cavbench.driving.forgery import Forgery
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
 from cavbench.identity.fingerprint import state_digest
@@ -187,7 +188,8 @@ class AttackSuite(Suite):
         try:
             with torch.no_grad():
                 state = self.component.initial(observation, oracle)
-                return self.component.step(observation, oracle, state)[0], enforcer
+                answer = self.component.step(observation, oracle, state)[0]
+                return enforcer.project(answer)[0] if isinstance(answer, Forgery) else answer, enforcer
         except QueryBudgetError:
             raise
         except UserError as error:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cavbench.core import sets
 from cavbench.driving import DrivingFacts, Features, ObservationThreat
 from cavbench.driving.rollout import Trace
 
@@ -93,6 +94,7 @@ class Episode:
     def budget(self) -> dict[str, Array]:
         """[T] for each feature: the largest perturbation allowed for any vehicle, in the feature's unit."""
         known = {name: self.meta[f"threat_{name}"] for name in ("norm", "budget") if f"threat_{name}" in self.meta}
+        known |= {"norm": sets.split(str(known["norm"]))[0]} if "norm" in known else {}
         threat = ObservationThreat(**known)  # type: ignore[arg-type]
         radius = threat.radius(torch.as_tensor(self.steps["observation"]), self.features)[..., 1:]
         physical = (radius * self.features.half_range()).amax(1).double().numpy()

@@ -1,0 +1,118 @@
+"""The sets of the driving track's threat model beside lies about values: each is empty by default, in physical terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Interval
+
+from cavbench.core import ranges
+from cavbench.core.ranges import Share
+from cavbench.core.sets import changed
+
+Frames = Annotated[int, Interval(ge=0, le=450)]
+Cars = Annotated[int, Interval(ge=0, le=50)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Presence:
+    """Cars that are hidden from the victim, and cars that are invented.
+
+    An invented car obeys the ranges of the features. From one frame to the next it moves as a car can
+    (`cavbench.driving.invented`).
+
+    Args:
+        hidden: real cars that may be hidden at once.
+        invented: cars that may be invented at once.
+        share: share of the frames of a full episode in which a car may be hidden or invented, rounded down.
+    """
+
+    hidden: Cars = 0
+    invented: Cars = 0
+    share: Share = 1.0
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+        if self.share != 1 and not (self.hidden or self.invented):
+            raise ValueError("share alone allows nothing: give hidden or invented, too")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latency:
+    """A sensor that is late. What was measured later is never shown earlier.
+
+    Args:
+        frames: largest age of what is shown, in decisions.
+    """
+
+    frames: Frames = 0
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Held:
+    """A frozen sensor: the frame shown before is shown again.
+
+    Args:
+        share: share of the frames of a full episode that may be such repetitions, rounded down.
+        longest: largest number of repetitions in a row.
+    """
+
+    share: Share = 0.0
+    longest: Frames = 0
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+        if bool(self.share) != bool(self.longest):
+            missing = "longest" if self.share else "share"
+            raise ValueError(f"{missing} is 0, so nothing may be held: give both share and longest")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actuator:
+    """Commands that are executed late or otherwise than they were given.
+
+    `noise` and `replaced` are the noisy and the probabilistic action-robust MDP of Tessler et al. 2019 (NR-MDP and PR-MDP).
+
+    Args:
+        delay: frames by which a command may be executed late.
+        offset: largest shift of each control of a continuous action, as a share of its limit (m/s2 or rad).
+        noise: alpha of the NR-MDP: the car executes (1 - alpha) a + alpha b of the victim's continuous action a and the
+            attacker's b.
+        replaced: alpha of the PR-MDP: probability that the attacker's action is executed in a frame; the run draws it.
+    """
+
+    delay: Frames = 0
+    offset: Annotated[float, Interval(ge=0, le=2)] = 0.0
+    noise: Share = 0.0
+    replaced: Share = 0.0
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Traffic:
+    """Cars of the traffic that the attacker drives, within bounds that a careless driver keeps.
+
+    Args:
+        cars: number of cars that the attacker may drive.
+        acceleration: their largest acceleration in m/s2.
+        braking: their hardest braking in m/s2.
+        lateral_speed: their largest speed across the road in m/s.
+        gap: smallest distance to the ego along the road, between bumpers, at which a manoeuvre may begin, in m.
+    """
+
+    cars: Cars = 0
+    acceleration: Annotated[float, Interval(ge=0, le=6)] = 3.0
+    braking: Annotated[float, Interval(ge=0, le=9)] = 6.0
+    lateral_speed: Annotated[float, Interval(ge=0, le=4)] = 1.5
+    gap: Annotated[float, Interval(ge=0, le=100)] = 5.0
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+        if not self.cars and changed(self):
+            raise ValueError("cars is 0, so the attacker drives nobody: give cars, too")
