@@ -47,6 +47,7 @@ class Batch:
         episodes: of the first part.
         started: when it began.
         share: share of its cost that is done.
+        heard: when it was first heard of, and its share then: what was before prepared it, and says little of its pace.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Batch:
     episodes: int
     started: float
     share: float = 0.0
+    heard: tuple[float, float] | None = None
 
 
 class Forecast:
@@ -122,6 +124,7 @@ class Forecast:
             if len(batch.parts) > 1 and episodes <= batch.episodes:
                 share /= len(batch.parts)
             batch.share = max(batch.share, min(share, 1.0))
+            batch.heard = batch.heard or (self.now(), batch.share)
 
     def finished(self, task: Task, seconds: float) -> None:
         """A task of a unit is done; it took so many seconds of a worker."""
@@ -149,7 +152,12 @@ class Forecast:
 
     def _pace(self, batch: Batch) -> float:
         """How many times as long as expected a batch that is under way takes; 0 if that cannot be told yet."""
-        return (self.now() - batch.started) / (batch.cost * batch.share) if batch.share > EARLY and batch.cost else 0.0
+        if batch.share <= EARLY or not batch.cost:
+            return 0.0
+        since, share = batch.heard or (batch.started, 0.0)
+        if batch.share - share <= EARLY:
+            since, share = batch.started, 0.0
+        return (self.now() - since) / (batch.cost * (batch.share - share))
 
     def _factor_of(self, batch: Batch) -> float:
         return self._pace(batch) or self._factor(batch.pair)
