@@ -9,6 +9,7 @@ from cavbench.envs.highway.clairvoyant import ClairvoyantPlanner
 from cavbench.envs.highway.config import HighwayConfig
 from cavbench.envs.highway.engine import HighwayEngine
 from cavbench.envs.highway.environment import HighwayEnv
+from cavbench.envs.highway.orders import view_of
 
 
 class BatchedHighway(HighwayEnv):
@@ -28,6 +29,12 @@ class BatchedHighway(HighwayEnv):
 
     def _drive(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None) -> None:
         self.engine.step(action if self.clairvoyant is None else self.clairvoyant.actions(), paused)
+
+    def _order(self, orders: NDArray[np.float64], paused: NDArray[np.bool_] | None) -> None:
+        self.engine.order_cars(orders, paused)
+
+    def _view(self) -> NDArray[np.float64]:
+        return view_of(self.engine)
 
     def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         return self.engine.observation, self.engine.numbers, self.engine.flags
