@@ -1,6 +1,7 @@
 """What driven cars do to drivers, and who is to blame: the table of docs/traffic.md.
 
-python studies/traffic_blame.py [attack:victim:defense ...] [--scenarios 12] [--cells 3x2 5x2] [--gap 3] [--headway 0.1] [--closing 8]
+python studies/traffic_blame.py [attack:victim:defense ...] [--scenarios 12] [--cells 3x2 5x2] [--gap 3] [--headway 0.1]
+    [--closing 8]
 """
 
 from __future__ import annotations

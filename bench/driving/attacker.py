@@ -184,9 +184,7 @@ class Attacker:
         self, attack: DrivingAttack, observation: Tensor, rows: Tensor, policy_state: State, view: View | None
     ) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and its distance to the perturbation set."""
-        oracle = self.enforcer.begin(
-            observation, policy_state, parts=parts_of(self.parts, rows), rows=rows, view=view
-        )
+        oracle = self.enforcer.begin(observation, policy_state, parts=parts_of(self.parts, rows), rows=rows, view=view)
         name = type(attack).__name__
         with self.subject.turn():
             answer, state = attack.step(observation, oracle, rows_of(self.state, rows))

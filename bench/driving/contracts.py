@@ -49,8 +49,8 @@ class DrivingWorld(World):
     drivers: ClassVar[tuple[Driver, ...]] = ("agent",)
     """The values of `driver` that `make` supports."""
     offers: ClassVar[tuple[str, ...]] = ("presence", "latency", "held", "actuator")
-    """Names of the sets of a threat model that it can carry out. With `traffic` its environments give what an attacker that drives
-    cars sees, `traffic` float64 [B, N, 7] (`cavbench.driving.traffic.View`), and take `orders` float64 [B, N, 3]."""
+    """Names of the sets of a threat model that it can carry out. With `traffic` its environments give what an attacker that
+    drives cars sees, `traffic` float64 [B, N, 7] (`cavbench.driving.traffic.View`), and take `orders` float64 [B, N, 3]."""
     brakes_by: ClassVar[str] = "give world.target_speeds a lower first speed"
     """What a user does so that SLOWER ends at a lower speed."""
 

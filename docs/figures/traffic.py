@@ -37,6 +37,8 @@ def cut_in() -> Figure:
         road.lanes(axes, 3, REACH)
         road.cars(axes, [(float(x), ego + float(y)) for x, y, *_ in rows[1:]], style.BLUE)
         road.cars(axes, [(0.0, ego)], style.ORANGE)
-        axes.set_ylabel(f"{before:g} s before\n{float(rows[0, 2]):.0f} m/s", rotation=0, ha="right", va="center", fontsize=9)
+        axes.set_ylabel(
+            f"{before:g} s before\n{float(rows[0, 2]):.0f} m/s", rotation=0, ha="right", va="center", fontsize=9
+        )
     axes.set_xlabel("m along the road from the victim (orange)")
     return made

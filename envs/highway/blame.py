@@ -65,7 +65,7 @@ def _again(
 ) -> tuple[Moment, NDArray[np.float64]]:
     """Drive the episodes again as they were: the states at `takeover`, and the room at the last manoeuvre of a driven car.
 
-    The room is the distance to the ego, bumper to bumper, over RSS's safe distance of the two; NaN without a manoeuvre in its way.
+    The room is the distance to the ego, bumper to bumper, over RSS's safe distance; NaN without a manoeuvre in its way.
     """
     engine = HighwayEngine(config)
     engine.reset(np.arange(len(rows)), deeds.seeds[rows])
