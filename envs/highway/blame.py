@@ -55,7 +55,8 @@ def blame(
     # Nobody gives orders after the crash.
     orders[np.arange(orders.shape[1]) >= ends[:, None]] = 0.0
     length = ends - takeover + round(AFTERWARDS_S * config.policy_frequency)
-    for name, driver in ((AVOIDABLE, "clairvoyant"), (AVOIDABLE_IDM, "idm")):
+    drivers: tuple[tuple[str, Driver], ...] = ((AVOIDABLE, "clairvoyant"), (AVOIDABLE_IDM, "idm"))
+    for name, driver in drivers:
         found[name][rows] = ~_fails(own, driver, moment, orders, length)
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from cavbench.compiled import entry_point, inner
 from cavbench.envs.highway.dynamics import (
     LANE_WIDTH,
+    MAX_STEERING,
     VEHICLE_LENGTH,
     VEHICLE_WIDTH,
     clip,
@@ -29,8 +31,6 @@ SAME_PLACE = 0.01
 """An order to steer to another place across the road by less than this, in m, changes nothing."""
 STANDSTILL = 2.0
 """Braking fades below so many m/s2 per m/s, so that a driven car stops and does not reverse."""
-LAG = 0.9
-"""Share of the lateral speed that is aimed at: the heading lags behind when the speed changes, by less than the rest."""
 RESERVE = 1.0
 """A driven car keeps the room to brake behind the car ahead, and this in m."""
 BRAKES = 6.0
@@ -136,6 +136,14 @@ def braking_distance(speed: float, braking: float) -> float:
 
 
 @inner
+def kept_slow(car: Vehicle, steering: float, lateral_speed: float) -> float:
+    """The steering angle in rad nearest to `steering` with which the car moves across the road no faster than it may, in m/s."""
+    course = math.asin(min(lateral_speed / max(car.speed, 0.01), 1.0))
+    slip = clip(math.atan(0.5 * math.tan(steering)), -course - car.heading, course - car.heading)
+    return clip(math.atan(2 * math.tan(clip(slip, -1.0, 1.0))), -MAX_STEERING, MAX_STEERING)
+
+
+@inner
 def follow_orders(vehicles: Vehicles, order: Integers, place: int, bounds: Bounds) -> None:
     """Road.act for a car that is driven by orders: its last order, but it does not run into the car ahead."""
     car = vehicles[order[place]]
@@ -150,7 +158,7 @@ def follow_orders(vehicles: Vehicles, order: Integers, place: int, bounds: Bound
                 wanted = -bounds.braking
             break
     car.acceleration = max(wanted, -STANDSTILL * max(car.speed, 0.0))
-    car.steering = steer_to(car, car.ordered_y, LAG * bounds.lateral_speed)
+    car.steering = kept_slow(car, steer_to(car, car.ordered_y, bounds.lateral_speed), bounds.lateral_speed)
 
 
 @entry_point

@@ -140,7 +140,6 @@ class Parameters(NamedTuple):
 
 
 GRAVITY = 9.81
-BOUND_TYPES = {name: int if name == "cars" else float for name in Bounds._fields}
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
@@ -161,7 +160,8 @@ def manners(surroundings: Surroundings, frequency: int) -> Manners:
 def bounds(traffic: Traffic | None) -> Bounds:
     """The bounds of cars that are driven by orders; none is, if they are None."""
     traffic = traffic or Traffic(cars=0)
-    return Bounds(**{name: kind(getattr(traffic, name)) for name, kind in BOUND_TYPES.items()})
+    values = [float(getattr(traffic, name)) for name in Bounds._fields if name != "cars"]
+    return Bounds(int(traffic.cars), *values)
 
 
 def ego_kind(config: HighwayConfig) -> EgoKind:
