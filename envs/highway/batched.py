@@ -9,7 +9,6 @@ from cavbench.envs.highway.clairvoyant import ClairvoyantPlanner
 from cavbench.envs.highway.config import HighwayConfig
 from cavbench.envs.highway.engine import HighwayEngine
 from cavbench.envs.highway.environment import HighwayEnv
-from cavbench.envs.highway.orders import view_of
 
 
 class BatchedHighway(HighwayEnv):
@@ -38,3 +37,19 @@ class BatchedHighway(HighwayEnv):
 
     def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         return self.engine.observation, self.engine.numbers, self.engine.flags
+
+
+def view_of(engine: HighwayEngine) -> NDArray[np.float64]:
+    """[B, N, 7] the cars as `cavbench.driving.traffic.View` has them."""
+    cars = engine.vehicles
+    lanes = np.broadcast_to(engine.episodes["lanes"][:, None], cars.shape)
+    columns = (
+        cars["x"] - cars["x"][:, :1],
+        cars["y"],
+        cars["speed"],
+        cars["heading"],
+        cars["crashed"],
+        cars["ordered"],
+        lanes,
+    )
+    return np.stack(columns, -1, dtype=np.float64, casting="unsafe")

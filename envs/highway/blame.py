@@ -15,7 +15,7 @@ from cavbench.envs.highway.clairvoyant import HELD_S, ClairvoyantPlanner
 from cavbench.envs.highway.config import HighwayConfig
 from cavbench.envs.highway.dynamics import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH
 from cavbench.envs.highway.engine import HighwayEngine
-from cavbench.envs.highway.orders import SAME_PLACE, SIDE_MARGIN
+from cavbench.envs.highway.ordered import SAME_PLACE, SIDE_MARGIN
 from cavbench.envs.highway.state import Integers
 
 CRUISE = 25.0

@@ -16,7 +16,7 @@ from cavbench.envs.highway.config import ACTIONS, HighwayConfig
 from cavbench.envs.highway.dynamics import move
 from cavbench.envs.highway.ego import apply_action, score, time_to_collision
 from cavbench.envs.highway.observation import observe
-from cavbench.envs.highway.orders import COUNTS, order_batch
+from cavbench.envs.highway.ordered import COUNTS, order_batch
 from cavbench.envs.highway.search import sort_by_position
 from cavbench.envs.highway.sensor import noise_sigma, sensor_range_m
 from cavbench.envs.highway.spawn import draw_words, lane_spacing, spawn_batch
@@ -171,7 +171,7 @@ class HighwayEngine:
         flags: bool [5, B]; rows as in `Flag`.
         vehicles: [B, vehicles + 1] records `VEHICLE`, in highway-env's order.
         episodes: [B] records `EPISODE`.
-        orders: int64 [B, 4] what came of the orders to cars that are driven; columns as in `cavbench.envs.highway.orders`.
+        orders: int64 [B, 4] what came of the orders to cars that are driven; columns as in `cavbench.envs.highway.ordered`.
     """
 
     def __init__(self, config: HighwayConfig) -> None:

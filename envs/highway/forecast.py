@@ -16,7 +16,7 @@ from cavbench.envs.highway.config import ACTIONS, HighwayConfig
 from cavbench.envs.highway.dynamics import is_on_lane, move
 from cavbench.envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED, apply_action, lane_share, speed_share
 from cavbench.envs.highway.engine import physical_controls
-from cavbench.envs.highway.orders import COUNTS, take_orders
+from cavbench.envs.highway.ordered import COUNTS, take_orders
 from cavbench.envs.highway.rehearsal import HighwayRehearsal
 from cavbench.envs.highway.search import sort_by_position
 from cavbench.envs.highway.sensor import sensor_range_m

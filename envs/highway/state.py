@@ -39,7 +39,7 @@ class Vehicle:
     target_lane: int
     crashed: bool
     held: int  # frames until it decides again
-    ordered: bool  # driven by orders (`cavbench.envs.highway.orders`), not by IDM and MOBIL
+    ordered: bool  # driven by orders (`cavbench.envs.highway.ordered`), not by IDM and MOBIL
     braking: bool  # in a braking manoeuvre
     ordered_acceleration: float  # m/s2
     ordered_y: float  # m, where it steers to

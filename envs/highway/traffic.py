@@ -17,7 +17,7 @@ from cavbench.envs.highway.dynamics import (
     steering_control,
     weigh,
 )
-from cavbench.envs.highway.orders import follow_orders
+from cavbench.envs.highway.ordered import follow_orders
 from cavbench.envs.highway.search import front_vehicle, rear_vehicle
 from cavbench.envs.highway.state import Integers, Manners, Parameters, Vehicle, Vehicles
 

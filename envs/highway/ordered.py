@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,6 @@ from cavbench.envs.highway.dynamics import (
     steer_to,
 )
 from cavbench.envs.highway.state import Bounds, Floats, Integers, Vehicle, Vehicles
-
-if TYPE_CHECKING:
-    from cavbench.envs.highway.engine import HighwayEngine
 
 GENTLE = 2.0
 """Braking up to this, in m/s2, is no manoeuvre: every car may do it at any time."""
@@ -176,19 +172,3 @@ def order_batch(
         if paused[number] or episode.terminated or episode.truncated:
             continue
         take_orders(vehicles[number], orders[number], episode.lanes, bounds, counts[number])
-
-
-def view_of(engine: HighwayEngine) -> NDArray[np.float64]:
-    """[B, N, 7] the cars as `cavbench.driving.traffic.View` has them."""
-    cars = engine.vehicles
-    lanes = np.broadcast_to(engine.episodes["lanes"][:, None], cars.shape)
-    columns = (
-        cars["x"] - cars["x"][:, :1],
-        cars["y"],
-        cars["speed"],
-        cars["heading"],
-        cars["crashed"],
-        cars["ordered"],
-        lanes,
-    )
-    return np.stack(columns, -1, dtype=np.float64, casting="unsafe")

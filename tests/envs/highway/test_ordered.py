@@ -13,7 +13,7 @@ from cavbench.driving.surroundings import Surroundings
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.config import HighwayConfig
 from cavbench.envs.highway.engine import HighwayEngine
-from cavbench.envs.highway.orders import BRAKED, GENTLE, MOVED, REFUSED, TAKEN
+from cavbench.envs.highway.ordered import BRAKED, GENTLE, MOVED, REFUSED, TAKEN
 
 CELLS = tuple(AXES.cell(lanes=lanes, density=density) for lanes in (3, 4) for density in (1.0, 2.0)) * 6
 BATCH = len(CELLS)
