@@ -178,6 +178,8 @@ class Track(ABC):
     """The columns of its records, in addition to those of all tracks (`cavbench.records.schema`)."""
     probes: ClassVar[tuple[pa.Field, ...]] = ()
     """Further columns, which may be null, for the flags of a leaderboard."""
+    later: ClassVar[tuple[str, ...]] = ()
+    """Those of `probes` that older records do not have."""
     norms: ClassVar[tuple[str, ...]] = ()
     """The norms of its threat models; records with another one are refused. Empty: any name."""
     facts: ClassVar[Mapping[str, object]] = {}

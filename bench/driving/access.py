@@ -25,6 +25,7 @@ from cavbench.driving.gradients import Gradients, Tangent
 from cavbench.driving.parts import Part, parts_of
 from cavbench.driving.policy import State, repeated, rows_of
 from cavbench.driving.threat import ObservationThreat, PerturbationSet, bounds, within
+from cavbench.driving.traffic import ORDERED, Orders, View
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
 from cavbench.isolation.watch import TamperError
@@ -71,6 +72,7 @@ class Oracle:
     """Whether the victim decides discretely or continuously."""
     draws: int
     """How often the victim is asked about each point: 1 unless it is random."""
+    _view: View | None = None
 
     def __reduce__(self) -> NoReturn:
         # `copy.copy`, `copy.deepcopy` and `pickle` ask here. A deep copy would ask a copy of the victim, uncounted.
@@ -93,7 +95,28 @@ class Oracle:
             observation=self.observation[rows],
             radius=self.radius[rows],
             parts=parts_of(self.parts, rows),
+            _view=None if self._view is None else self._view.of(rows),
         )
+
+    @property
+    def traffic(self) -> View:
+        """The cars of the B episodes, for an attack that drives some of them.
+
+        Raises:
+            UserError: if the attack does not declare that it `drives`.
+        """
+        if self._view is None:
+            raise UserError("the attack asks for the traffic: it must declare drives = True")
+        return self._view
+
+    def order(self, orders: Orders) -> None:
+        """What the driven cars of the B episodes are to do in the next decision. The world keeps the bounds (`threat.traffic`).
+
+        Raises:
+            UserError: if the attack does not declare that it `drives`, or the orders have another shape.
+            TamperError: if the step is over.
+        """
+        self._enforcer.order(self._step, orders.stacked(), self.traffic.x.shape, self._rows)
 
     @property
     def spent(self) -> Tensor:
@@ -265,6 +288,7 @@ class Enforcer:
         self.forging: Forging | None = None
         self.asked: list[tuple[Tensor | None, Tensor]] | None = None
         self.rehearsed: tuple[int, Tensor | None] | None = None
+        self.orders: Tensor | None = None
         self._step = 0
 
     def begin(
@@ -274,6 +298,7 @@ class Enforcer:
         scale: float = 1.0,
         parts: Sequence[Part] = (),
         rows: Tensor | None = None,
+        view: View | None = None,
     ) -> Oracle:
         """The oracle of a step, with counters at 0; the oracle of the step before answers no more.
 
@@ -283,6 +308,7 @@ class Enforcer:
             scale: multiplies the budget.
             parts: the units of these episodes; by default they are one unit, with the generator of the enforcer.
             rows: int64 [B], their places among the episodes that `forging` goes on with; by default each step is the first one.
+            view: the traffic of these episodes, for an attack that drives some of it.
         """
         if rows is None:
             self.forging = Forging(self.threat, self.features, 1 / 15, STEPS, [(len(observation), 0)])
@@ -295,6 +321,7 @@ class Enforcer:
         self._evaluations, self._step = self.subject.evaluations, self._step + 1
         self.spent = torch.zeros(len(observation), dtype=torch.int64)
         self.gradients = Gradients(self._set.radius)
+        self.orders = None if view is None else torch.zeros(*view.x.shape, ORDERED, dtype=torch.float64)
         threat, features = self._shown
         parts = parts or (Part(slice(0, len(observation)), self.generator),)
         return Oracle(
@@ -310,7 +337,17 @@ class Enforcer:
             generator=parts[0].generator,
             action_type=self.subject.action_type,
             draws=DRAWS if self.subject.draws and self.threat.queries >= DRAWS else 1,
+            _view=None if view is None else View(*(values.clone() for values in view)),
         )
+
+    def order(self, step: int, orders: Tensor, shape: torch.Size, rows: Tensor | None) -> None:
+        """Take orders [R, N, 3] for the next decision, of all episodes or of `rows`; see `Oracle.order`."""
+        if step != self._step:
+            raise TamperError("the attack used the oracle of another step", "attack")
+        if type(orders) is not Tensor or orders.shape != (*shape, ORDERED):
+            raise UserError(f"the attack gave orders of shape {list(orders.shape)[:-1]}, its oracle has {list(shape)}")
+        assert self.orders is not None
+        self.orders[slice(None) if rows is None else rows] = orders.detach()
 
     def spend(self, access: Access, step: int, observation: Tensor, rows: Tensor | None) -> None:
         """Count queries [..., B, V, F], of all episodes or of `rows`, before they are answered.

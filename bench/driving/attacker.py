@@ -19,6 +19,7 @@ from cavbench.driving.forging import Forging, Used
 from cavbench.driving.parts import Part, parts_of
 from cavbench.driving.policy import State, rows_of
 from cavbench.driving.threat import ObservationThreat
+from cavbench.driving.traffic import ORDERED, View
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
 
@@ -35,6 +36,7 @@ class Shown:
         excess: [B] L-inf distance from the attack's answer before projection to the set, on the normalised scale.
         milliseconds: the attack's wall time for the whole batch.
         used: what was used of the other sets of the threat model.
+        orders: [B, N, 3] orders to cars of the traffic (`cavbench.driving.traffic.Orders`); None if the attack drives none.
     """
 
     observation: Tensor
@@ -45,6 +47,7 @@ class Shown:
     excess: Tensor
     milliseconds: float = 0.0
     used: Used | None = None
+    orders: Tensor | None = None
 
 
 class Attacker:
@@ -80,6 +83,10 @@ class Attacker:
     ) -> None:
         self.attack, self.subject = attack, subject
         access = attack.access if attack else "oblivious"
+        if attack is not None and attack.drives and not threat.traffic.cars:
+            raise UserError(
+                "the attack drives cars of the traffic, the threat model allows none: threat.traffic.cars=1"
+            )
         seeds = [seed] if isinstance(seed, int) else list(seed)
         starts = [place for place, one in enumerate(seeds) if place == 0 or one != seeds[place - 1]]
         self.parts = [
@@ -94,7 +101,7 @@ class Attacker:
         self.state: State = None
         self.begun = False
 
-    def show(self, observation: Tensor, running: Tensor, policy_state: State) -> Shown:
+    def show(self, observation: Tensor, running: Tensor, policy_state: State, view: View | None = None) -> Shown:
         """Attack the running episodes and return the observations for the victim.
 
         A frame is attacked if any value shown differs from the truth. Once an episode has no frame left, the truth is shown and
@@ -104,6 +111,7 @@ class Attacker:
             observation: the true observation, [B, V, F].
             running: bool [B]; the other episodes are neither attacked nor counted.
             policy_state: the victim's state for the B episodes.
+            view: the traffic, if the attack drives some of it.
         """
         counts = torch.zeros(4, observation.shape[0], dtype=torch.int64)
         excess = observation.new_zeros(observation.shape[0])
@@ -118,17 +126,25 @@ class Attacker:
             running = running & (self.changed < self.frames)
         rows = running.nonzero().squeeze(-1)
         perturbed = observation.clone()
+        orders = None if view is None else torch.zeros(*view.x.shape, ORDERED, dtype=torch.float64)
         start = time.perf_counter()
         if rows.numel():
             perturbed[rows], excess[rows] = self._answer(
-                self.attack, observation[rows], rows, rows_of(policy_state, rows)
+                self.attack,
+                observation[rows],
+                rows,
+                rows_of(policy_state, rows),
+                None if view is None else view.of(rows),
             )
+            if orders is not None and self.enforcer.orders is not None:
+                orders[rows] = self.enforcer.orders
             counts[:, rows] = torch.stack(self.enforcer.counts)
         self.differs = (perturbed != observation).flatten(1).any(1)
         self.changed += self.differs
         forging.close(observation, rows)
         milliseconds = (time.perf_counter() - start) * 1000
-        return Shown(perturbed, counts[0], counts[1], counts[2], counts[3], excess, milliseconds, forging.used)
+        used = forging.used
+        return Shown(perturbed, counts[0], counts[1], counts[2], counts[3], excess, milliseconds, used, orders)
 
     def execute(self, action: Tensor) -> Tensor:
         """What the cars execute of the victim's decisions [B] or [B, 2]. A command that is executed otherwise attacks a frame."""
@@ -165,10 +181,10 @@ class Attacker:
         return self.enforcer.forging
 
     def _answer(
-        self, attack: DrivingAttack, observation: Tensor, rows: Tensor, policy_state: State
+        self, attack: DrivingAttack, observation: Tensor, rows: Tensor, policy_state: State, view: View | None
     ) -> tuple[Tensor, Tensor]:
         """The attack's answer for the running episodes, projected, and its distance to the perturbation set."""
-        oracle = self.enforcer.begin(observation, policy_state, parts=parts_of(self.parts, rows), rows=rows)
+        oracle = self.enforcer.begin(observation, policy_state, parts=parts_of(self.parts, rows), rows=rows, view=view)
         name = type(attack).__name__
         with self.subject.turn():
             answer, state = attack.step(observation, oracle, rows_of(self.state, rows))

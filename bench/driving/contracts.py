@@ -10,15 +10,20 @@ from torch import Tensor
 
 from cavbench.core.contracts import Attack, Defense, Progress, ThreatModel, Trained, Victim, World
 from cavbench.driving.access import Oracle
+from cavbench.driving.blame import Deeds
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.features import ActionType, Control, Driver, DrivingFacts, Features
 from cavbench.driving.forgery import Forgery
 from cavbench.driving.kinematics import Kinematics
 from cavbench.driving.policy import Policy, State
+from cavbench.driving.sets import Traffic
+from cavbench.driving.surroundings import USUAL, Surroundings
 from cavbench.driving.threat import ObservationThreat
 from cavbench.scenarios import Cell
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
@@ -44,7 +49,8 @@ class DrivingWorld(World):
     drivers: ClassVar[tuple[Driver, ...]] = ("agent",)
     """The values of `driver` that `make` supports."""
     offers: ClassVar[tuple[str, ...]] = ("presence", "latency", "held", "actuator")
-    """Names of the sets of a threat model that it can carry out."""
+    """Names of the sets of a threat model that it can carry out. With `traffic` its environments give what an attacker that
+    drives cars sees, `traffic` float64 [B, N, 7] (`cavbench.driving.traffic.View`), and take `orders` float64 [B, N, 3]."""
     brakes_by: ClassVar[str] = "give world.target_speeds a lower first speed"
     """What a user does so that SLOWER ends at a lower speed."""
 
@@ -99,9 +105,41 @@ class DrivingWorld(World):
         action_type: ActionType = "discrete",
         driver: Driver = "agent",
         action_repeat: int = 1,
+        traffic: Traffic | None = None,
+        surroundings: Surroundings = USUAL,
     ) -> EnvBase:
         """The environment of `build`; the other arguments are those of `cavbench.driving.Control`."""
-        return self.build(cells, Control(action_type=action_type, driver=driver, action_repeat=action_repeat))
+        return self.build(
+            cells,
+            Control(
+                action_type=action_type,
+                driver=driver,
+                action_repeat=action_repeat,
+                traffic=traffic,
+                surroundings=surroundings,
+            ),
+        )
+
+    def blame(
+        self,
+        cells: Sequence[Cell],
+        control: Control,
+        deeds: Deeds,
+        decisions: NDArray[np.int64],
+        crashed: NDArray[np.bool_],
+    ) -> Mapping[str, NDArray[np.float64]]:
+        """Who is to blame for the crashes of episodes in which an attacker drove cars of the traffic.
+
+        Args:
+            cells, control: of the B episodes, as in `build`.
+            deeds: what was done in them.
+            decisions: decisions of each episode [B].
+            crashed: whether it ended in a crash [B].
+
+        Returns:
+            The measurements of `cavbench.driving.blame`, [B] each; nothing from a world that cannot say.
+        """
+        return {}
 
     def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics | None:
         """The rules of motion, for attacks with access `dynamics`; None if the world does not offer them.
@@ -223,8 +261,12 @@ class DrivingAttack(Attack):
     for itself."""
     needs: ClassVar[tuple[str, ...]] = ()
     """Names of the features without which it can do nothing."""
+    drives: ClassVar[bool] = False
+    """Whether it drives cars of the traffic (`Oracle.order`); the threat model must allow it some (`threat.traffic.cars`)."""
 
     def lacks(self, world: DrivingWorld) -> str:
+        if self.drives and "traffic" not in world.offers:
+            return "it drives cars of the traffic, which this world does not allow"
         if self.access == "dynamics" and type(world).dynamics is DrivingWorld.dynamics:
             return "it needs the dynamics of the world (how its cars move), which this world does not offer"
         return missing_features(self.needs, world)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
+from functools import partial
 from itertools import accumulate, pairwise
 
 from cavbench.core.pair import Pair
@@ -25,6 +26,7 @@ from cavbench.driving import (
 )
 from cavbench.driving import rollout as rollouts
 from cavbench.driving.contracts import DrivingAttack, DrivingVictim, DrivingWorld
+from cavbench.driving.features import Control
 from cavbench.driving.meter import Columns
 from cavbench.driving.placed import placed
 from cavbench.driving.policy import Policy
@@ -99,7 +101,14 @@ def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
         cells = [job.cell for job in jobs for _ in job.seeds]
         # Before any code of the attack or the defence runs, which could change what these are made from.
         facts, threat, declared = deepcopy(world.facts_at(first.cell)), deepcopy(pair.threat), _declared(pair)
-        env = world.make(cells, action_type=declared.action_type, driver=declared.driver)
+        attack = pair.attack.component
+        control = Control(
+            action_type=declared.action_type,
+            driver=declared.driver,
+            traffic=threat.traffic if getattr(attack, "drives", False) else None,
+            surroundings=threat.dynamics,
+        )
+        env = world.build(cells, control)
         try:
             dynamics = world.dynamics(cells, declared.action_type)
             policy, attack = _checked(pair.load(first.training_seed, first.cell), pair), pair.armed(first.training_seed)
@@ -115,6 +124,7 @@ def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
                 dynamics=dynamics,
                 entropy=first.entropy,
                 trace=trace,
+                judge=partial(world.blame, cells, control),
             )
         finally:
             env.close(raise_if_closed=False)

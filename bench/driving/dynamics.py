@@ -9,6 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cavbench.driving.features import ActionType
+from cavbench.driving.sets import Traffic
+from cavbench.driving.traffic import View
 from cavbench.errors import UserError
 
 
@@ -43,6 +45,21 @@ class Rehearsal(ABC):
     @abstractmethod
     def step(self, action: Tensor) -> None:
         """Simulate one decision: int64 [K, B], or float [K, B, 2] for continuous actions."""
+
+    def order(self, orders: Tensor, view: View, bounds: Traffic) -> None:
+        """Give orders to cars of the traffic for the next decision.
+
+        Args:
+            orders: [K, B, N, 3] (`cavbench.driving.traffic.Orders`). A car that the belief does not have takes none.
+            view: the traffic at the moment of the belief, which numbers the N cars; the same in every call.
+            bounds: what the cars may do.
+
+        Raises:
+            UserError: if the world has no cars to give orders to.
+        """
+        raise UserError(
+            "the attack needs cars of the traffic to drive, which the simulation of this world does not offer"
+        )
 
 
 class Dynamics(ABC):

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from cavbench.core.contracts import Facts
 from cavbench.driving.kinematics import Kinematics
+from cavbench.driving.sets import Traffic
+from cavbench.driving.surroundings import USUAL, Surroundings
 
 ActionType = Literal["discrete", "continuous"]
 Driver = Literal["agent", "idm", "clairvoyant"]
@@ -25,11 +27,15 @@ class Control:
             planner that knows its hidden state.
         action_repeat: number of frames for which a decision is held (training only). A lane change is sent once, other actions
             are repeated. Reward and progress are summed over the frames; an episode may end between them.
+        traffic: bounds of the cars of the traffic that an attacker drives; None if it drives none.
+        surroundings: how the traffic drives, and what the ego's body and the road do.
     """
 
     action_type: ActionType = "discrete"
     driver: Driver = "agent"
     action_repeat: int = 1
+    traffic: Traffic | None = None
+    surroundings: Surroundings = USUAL
 
 
 CONSTANT_CONTROLS = {"throttle": (1.0, 0.0), "coast": (0.0, 0.0), "brake": (-1.0, 0.0)}

@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from cavbench.core import sets
 from cavbench.core.progress import share_done
 from cavbench.driving.attacker import Attacker, Shown
+from cavbench.driving.blame import Deeds, Judge, unknown
 from cavbench.driving.contracts import DrivingAttack
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.features import DrivingFacts
@@ -24,6 +25,7 @@ from cavbench.driving.meter import Columns, Meter
 from cavbench.driving.policy import Policy, State, rows_of
 from cavbench.driving.probes import Probe
 from cavbench.driving.threat import ObservationThreat
+from cavbench.driving.traffic import View
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
 from cavbench.isolation.identifiers import opaque
@@ -72,6 +74,7 @@ def rollout(
     dynamics: Dynamics | None = None,
     entropy: int = 0,
     trace: Trace | None = None,
+    judge: Judge | None = None,
 ) -> Columns:
     """Drive every episode of `env` once, to its end, and measure it.
 
@@ -87,6 +90,7 @@ def rollout(
         dynamics: the world's rules of motion, for attacks with that access; None if the world does not offer them.
         entropy: seed of the steps that are probed, which a victim must not be able to foresee; no measurement depends on it.
         trace: collects every step of its episodes.
+        judge: says who is to blame for crashes among cars that the attack drives.
 
     Returns:
         One column [B] for each measurement; `cavbench.driving.track` has the names and units.
@@ -125,6 +129,7 @@ def rollout(
         )
         td = env.reset(TensorDict({"seed": episodes}, batch_size=env.batch_size))
         state = subject.initial(torch.cat([opaque([seed], salt) for seed, salt in zip(seeds, salts, strict=True)]))
+        deeds = Deeds(episodes.numpy())
         meter = Meter(subject, facts, td["info", "x"].squeeze(-1), forges=bool(sets.present(threat)))
         probe = Probe(len(seeds), subject, entropy, rehearsed=attack is not None and attack.access == "dynamics")
         _check_actions(subject, td["observation"], state, facts)
@@ -136,13 +141,16 @@ def rollout(
             truth, running = td["observation"], ~td["done"].squeeze(-1)
             probing = probe.due()
             asked = attacker.enforcer.asked = [] if probing else None
-            shown = attacker.show(truth, running, state)
+            shown = attacker.show(truth, running, state, _view(attack, td))
             if probing or probe.shadow:
                 rehearsal = attacker.enforcer.rehearsed
                 scores, action = probe.driven(shown.observation, truth, running, state, asked, rehearsal)
             else:
                 scores, action = subject.driven(shown.observation, state)
             executed = attacker.execute(action)
+            if shown.orders is not None:
+                td["orders"] = shown.orders
+                deeds.append(executed, shown.orders)
             td = env.step(td.set("action", executed))["next"]
             meter.step(truth, shown, action, running, state, td)
             meter.forged(shown.used, executed, action, running)
@@ -154,9 +162,18 @@ def rollout(
         probe.end()
     if several and (victims_draws.used() or attacks_draws.used()):
         raise NotJointError
+    measured = meter.columns()
+    judged = unknown(len(seeds))
+    if judge is not None and deeds.orders:
+        judged |= judge(deeds, measured["steps"].astype(np.int64), measured["crashed"].astype(np.bool_))
     reach = threat.reach(td["observation"].shape[-2], facts.features, facts.max_steps)
     shift = np.full(len(seeds), reach / policy.noise if policy.noise else np.nan)
-    return {"seed": episodes.numpy(), **meter.columns(), **probe.columns(), "shift": shift}
+    return {"seed": episodes.numpy(), **measured, **judged, **probe.columns(), "shift": shift}
+
+
+def _view(attack: DrivingAttack | None, td: TensorDictBase) -> View | None:
+    """The traffic, for an attack that drives some of it."""
+    return View.parsed(td["traffic"]) if attack is not None and attack.drives else None
 
 
 def _check_actions(subject: CountedPolicy, observation: Tensor, state: State, facts: DrivingFacts) -> None:

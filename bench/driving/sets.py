@@ -96,21 +96,28 @@ class Actuator:
 
 @dataclass(frozen=True, kw_only=True)
 class Traffic:
-    """Cars of the traffic that the attacker drives, within bounds that a careless driver keeps.
+    """Cars of the traffic that the attacker drives, within bounds that a careless driver keeps; the world enforces them.
+
+    A manoeuvre is a change of place across the road, or braking harder than 2 m/s2. It may begin only with room to every car that
+    it concerns: the cars beside the new place, or those behind a car that brakes. Bumper to bumper they are at least `gap` and
+    `headway` times the speed of the rear one away, and the rear one closes by at most `closing`. A driven car never runs into
+    the car ahead by itself: it brakes as hard as it may where that is needed. It stays on the road and does not reverse.
 
     Args:
-        cars: number of cars that the attacker may drive.
+        cars: number of cars that the attacker may drive at once. A car that gets no order is released: IDM and MOBIL drive on.
         acceleration: their largest acceleration in m/s2.
         braking: their hardest braking in m/s2.
         lateral_speed: their largest speed across the road in m/s.
-        gap: smallest distance to the ego along the road, between bumpers, at which a manoeuvre may begin, in m.
+        gap, headway, closing: room at the beginning of a manoeuvre, in m, s and m/s.
     """
 
     cars: Cars = 0
     acceleration: Annotated[float, Interval(ge=0, le=6)] = 3.0
-    braking: Annotated[float, Interval(ge=0, le=9)] = 6.0
+    braking: Annotated[float, Interval(ge=1, le=9)] = 6.0
     lateral_speed: Annotated[float, Interval(ge=0, le=4)] = 1.5
-    gap: Annotated[float, Interval(ge=0, le=100)] = 5.0
+    gap: Annotated[float, Interval(ge=0, le=100)] = 3.0
+    headway: Annotated[float, Interval(ge=0, le=10)] = 0.1
+    closing: Annotated[float, Interval(ge=0, le=80)] = 8.0
 
     def __post_init__(self) -> None:
         ranges.check(self)

@@ -147,6 +147,32 @@ FORGED = (
 )
 """What was used of the sets beside changed values."""
 
+BLAME: tuple[pa.Field, ...] = (
+    field(
+        "avoidable",
+        FLOAT,
+        "whether the planner with perfect information, at the wheel from 5 s before the crash, avoids it among the same driven "
+        "cars; null without a crash among driven cars",
+        "share, 0 to 1",
+        nullable=True,
+    ),
+    field(
+        "avoidable_idm",
+        FLOAT,
+        "the same of the IDM driver, which does not know what the driven cars will do",
+        "share, 0 to 1",
+        nullable=True,
+    ),
+    field(
+        "room",
+        FLOAT,
+        "distance to the driven car at its last manoeuvre before the crash, over the safe distance of RSS; null without one",
+        "safe distances",
+        nullable=True,
+        low=0,
+    ),
+)
+
 
 class DrivingTrack(Track):
     """Driving policies on a road, attacked through their observations, ranked by `safe_progress`."""
@@ -157,7 +183,8 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS, *ALARMS, *FORGED)
+    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS, *ALARMS, *FORGED, *BLAME)
+    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*ALARMS, *FORGED, *BLAME))
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"

@@ -109,6 +109,12 @@ def schema(track: Track) -> pa.Schema:
     return pa.schema(columns, metadata={"cavbench": VERSION, "track": track.name})
 
 
+def earlier(track: Track) -> pa.Schema:
+    """The schema of records that were written before a track had its `later` columns, which are null in them."""
+    whole = schema(track)
+    return pa.schema([one for one in whole if one.name not in track.later], metadata=whole.metadata)
+
+
 def encoded(track: Track, names: Sequence[str] | None = None) -> pa.Schema:
     """The schema of a track's records as they are read: text is dictionary-encoded.
 

@@ -17,6 +17,7 @@ FIGURES = {
     "attack_rehearse.svg": "attacks:rehearse",
     "attack_zo.svg": "attacks:zo",
     "attack_pgd.svg": "attacks:pgd",
+    "traffic_cut_in.svg": "traffic:cut_in",
     "attack_two_stage.svg": "attacks:two_stage",
     "attack_paad.svg": "attacks:paad",
     "attack_sarsa.svg": "attacks:sarsa",

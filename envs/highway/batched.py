@@ -29,5 +29,27 @@ class BatchedHighway(HighwayEnv):
     def _drive(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None) -> None:
         self.engine.step(action if self.clairvoyant is None else self.clairvoyant.actions(), paused)
 
+    def _order(self, orders: NDArray[np.float64], paused: NDArray[np.bool_] | None) -> None:
+        self.engine.order_cars(orders, paused)
+
+    def _view(self) -> NDArray[np.float64]:
+        return view_of(self.engine)
+
     def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         return self.engine.observation, self.engine.numbers, self.engine.flags
+
+
+def view_of(engine: HighwayEngine) -> NDArray[np.float64]:
+    """[B, N, 7] the cars as `cavbench.driving.traffic.View` has them."""
+    cars = engine.vehicles
+    lanes = np.broadcast_to(engine.episodes["lanes"][:, None], cars.shape)
+    columns = (
+        cars["x"] - cars["x"][:, :1],
+        cars["y"],
+        cars["speed"],
+        cars["heading"],
+        cars["crashed"],
+        cars["ordered"],
+        lanes,
+    )
+    return np.stack(columns, -1, dtype=np.float64, casting="unsafe")

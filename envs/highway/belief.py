@@ -22,9 +22,9 @@ from cavbench.envs.highway.dynamics import (
 )
 from cavbench.envs.highway.ego import IDLE, apply_meta_action, nearest_target_speed
 from cavbench.envs.highway.engine import advance
+from cavbench.envs.highway.search import sort_by_position
 from cavbench.envs.highway.spawn import DEFAULT_DELTA, TRAFFIC_SPEED_HIGH, TRAFFIC_SPEED_LOW
 from cavbench.envs.highway.state import Floats, Integers, Parameters, Vehicle, Vehicles
-from cavbench.envs.highway.traffic import sort_by_position
 
 EGO_X = 1000.0
 """Assumed position of the ego along the road in m; its true position is outside of the sensor's range."""
@@ -51,6 +51,8 @@ def copy_vehicle(source: Vehicle, target: Vehicle) -> None:
     target.steering, target.acceleration = source.steering, source.acceleration
     target.impact_x, target.impact_y, target.impact_pair = source.impact_x, source.impact_y, source.impact_pair
     target.lane, target.target_lane, target.crashed = source.lane, source.target_lane, source.crashed
+    target.held, target.ordered, target.braking = source.held, source.ordered, source.braking
+    target.ordered_acceleration, target.ordered_y = source.ordered_acceleration, source.ordered_y
 
 
 @inner

@@ -27,11 +27,13 @@ class ClairvoyantPlanner:
 
     Args:
         engine: the engine, with discrete actions.
+        orders: [B, T, N, 3] the orders to cars that an attacker drives, of each decision of the episode, if they are known;
+            otherwise the cars are taken to go on as they were ordered last.
     """
 
-    def __init__(self, engine: HighwayEngine) -> None:
+    def __init__(self, engine: HighwayEngine, orders: NDArray[np.float64] | None = None) -> None:
         hz = engine.config.policy_frequency
-        self.engine = engine
+        self.engine, self.orders = engine, orders
         self.length, self.held = round(HORIZON_S * hz), max(1, round(HELD_S * hz))
         self.library = _library(self.length, max(1, round(SEGMENT_S * hz)))
         self.plan = np.full((engine.config.batch, self.length), IDLE, dtype=np.int64)
@@ -66,8 +68,18 @@ class ClairvoyantPlanner:
         counts = np.full(len(rows), cars.shape[1], np.int64)
         controls = np.zeros((*tried.shape, 2))
         lanes = self.engine.episodes["lanes"][rows].astype(np.int64)
-        roll_batch(cars, counts, tried, controls, lanes, self.engine.parameters, failed, crashed, progress)
+        orders = self._known(rows)
+        roll_batch(cars, counts, tried, controls, orders, lanes, self.engine.parameters, failed, crashed, progress)
         return progress - np.where(failed < self.length, FAILURE - failed, 0.0)
+
+    def _known(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """[R, length, N, 3] the orders of the next decisions, none after their end; [R, 0, 0, 3] if they are not known."""
+        if self.orders is None:
+            return np.zeros((len(rows), 0, 0, 3))
+        places = self.engine.episodes["steps"][rows][:, None] + np.arange(self.length)
+        last = self.orders.shape[1] - 1
+        found = self.orders[rows[:, None], np.minimum(places, last)]
+        return np.ascontiguousarray(np.where((places <= last)[..., None, None], found, 0.0))
 
 
 def _library(length: int, segment: int) -> NDArray[np.int64]:

@@ -10,6 +10,8 @@ from typing import Any, Literal, get_args
 
 from cavbench.driving.features import ActionType, Driver, Features
 from cavbench.driving.kinematics import CarFollowing
+from cavbench.driving.sets import Traffic
+from cavbench.driving.surroundings import USUAL, Surroundings
 from cavbench.envs.highway.axes import AXES
 from cavbench.scenarios import Cell
 
@@ -86,6 +88,8 @@ class HighwayConfig:
         offroad_terminal: whether leaving the road ends the episode.
         others_collide: whether the traffic crashes into itself; in `highway-fast-v0` only the ego collides.
         start_lane: number of the lane in which the ego starts; None to draw it.
+        surroundings: how the traffic drives, and what the ego's body and the road do.
+        traffic: bounds of the cars that are driven by orders; None if there are none.
 
     Raises:
         ValueError: if a value is not allowed; the message is one line with the allowed values.
@@ -112,6 +116,8 @@ class HighwayConfig:
     offroad_terminal: bool = True
     others_collide: bool = True
     start_lane: int | None = None
+    surroundings: Surroundings = USUAL
+    traffic: Traffic | None = None
 
     def __post_init__(self) -> None:
         _check_counts(self)

@@ -99,11 +99,17 @@ def update_direction(vehicle: Vehicle) -> None:
 @inner
 def steering_control(vehicle: Vehicle, lane: int) -> float:
     """ControlledVehicle.steering_control: the steering angle in rad that leads to the centre of `lane`."""
-    lateral = vehicle.y - LANE_WIDTH * lane
+    return steer_to(vehicle, LANE_WIDTH * lane, math.inf)
+
+
+@inner
+def steer_to(vehicle: Vehicle, y: float, lateral_speed: float) -> float:
+    """The steering angle in rad that leads to the place `y` across the road, at most at `lateral_speed` in m/s."""
+    lateral = vehicle.y - y
     if lateral == 0.0 and vehicle.heading == 0.0:
         return 0.0
     speed = not_zero(vehicle.speed)
-    heading_command = math.asin(clip(-GAIN_LATERAL * lateral / speed, -1.0, 1.0))
+    heading_command = math.asin(clip(clip(-GAIN_LATERAL * lateral, -lateral_speed, lateral_speed) / speed, -1.0, 1.0))
     heading_reference = clip(heading_command, -MAX_LANE_CHANGE_HEADING, MAX_LANE_CHANGE_HEADING)
     heading_rate = GAIN_HEADING * wrap_to_pi(heading_reference - vehicle.heading)
     slip_angle = math.asin(clip(VEHICLE_LENGTH / 2 / speed * heading_rate, -1.0, 1.0))
@@ -114,6 +120,21 @@ def steering_control(vehicle: Vehicle, lane: int) -> float:
 def speed_control(vehicle: Vehicle) -> float:
     """ControlledVehicle.speed_control: the acceleration in m/s2 towards the target speed."""
     return GAIN_SPEED * (vehicle.target_speed - vehicle.speed)
+
+
+@inner
+def weigh(ego: Vehicle, mass: float, grip: float) -> None:
+    """What the ego's mass (over the nominal one) and the grip of the road (m/s2) leave of its commands."""
+    if mass != 1.0:
+        ego.acceleration /= mass
+    if abs(ego.acceleration) > grip:
+        ego.acceleration = clip(ego.acceleration, -grip, grip)
+    # Turning costs v^2 sin(slip) / (L / 2), which is 0 when driving straight on.
+    if ego.steering != 0.0 and grip < math.inf:
+        steepest = VEHICLE_LENGTH / 2 * grip / max(ego.speed * ego.speed, 1.0)
+        if steepest < 1.0:
+            limit = math.atan(2 * math.tan(math.asin(steepest)))
+            ego.steering = clip(ego.steering, -limit, limit)
 
 
 @inner

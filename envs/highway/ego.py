@@ -5,9 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from cavbench.compiled import inner
-from cavbench.envs.highway.dynamics import DISCRETE, IDM, VEHICLE_LENGTH, clip, is_on_lane, is_reachable, linear_map
+from cavbench.envs.highway.dynamics import (
+    DISCRETE,
+    IDM,
+    VEHICLE_LENGTH,
+    clip,
+    is_on_lane,
+    is_reachable,
+    linear_map,
+    weigh,
+)
+from cavbench.envs.highway.search import front_vehicle
 from cavbench.envs.highway.state import Episode, Floats, Integers, Parameters, Vehicle, Vehicles
-from cavbench.envs.highway.traffic import front_vehicle
 
 LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
 PROGRESS_LANE, PROGRESS_SPEED = 0.1, 0.4
@@ -52,6 +61,7 @@ def apply_action(ego: Vehicle, action: int, control: Floats, first: bool, lanes:
     else:
         ego.acceleration = control[0]
         ego.steering = control[1]
+        weigh(ego, parameters.mass, parameters.grip)
 
 
 @inner

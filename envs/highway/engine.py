@@ -16,6 +16,8 @@ from cavbench.envs.highway.config import ACTIONS, HighwayConfig
 from cavbench.envs.highway.dynamics import move
 from cavbench.envs.highway.ego import apply_action, score, time_to_collision
 from cavbench.envs.highway.observation import observe
+from cavbench.envs.highway.ordered import COUNTS, order_batch
+from cavbench.envs.highway.search import sort_by_position
 from cavbench.envs.highway.sensor import noise_sigma, sensor_range_m
 from cavbench.envs.highway.spawn import draw_words, lane_spacing, spawn_batch
 from cavbench.envs.highway.state import (
@@ -30,7 +32,7 @@ from cavbench.envs.highway.state import (
     Vehicles,
     parameters,
 )
-from cavbench.envs.highway.traffic import act, sort_by_position
+from cavbench.envs.highway.traffic import act
 from cavbench.envs.weather import WEATHERS
 
 
@@ -64,7 +66,7 @@ def advance(
 ) -> None:
     """AbstractEnv._simulate: the physics frames of one decision."""
     for _ in range(parameters.substeps):
-        act(vehicles, order, places, lanes, parameters.ego)
+        act(vehicles, order, places, lanes, parameters)
         for number in range(vehicles.size):
             move(vehicles[number], lanes, parameters.dt)
         sort_by_position(vehicles, order)
@@ -169,6 +171,7 @@ class HighwayEngine:
         flags: bool [5, B]; rows as in `Flag`.
         vehicles: [B, vehicles + 1] records `VEHICLE`, in highway-env's order.
         episodes: [B] records `EPISODE`.
+        orders: int64 [B, 4] what came of the orders to cars that are driven; columns as in `cavbench.envs.highway.ordered`.
     """
 
     def __init__(self, config: HighwayConfig) -> None:
@@ -192,6 +195,7 @@ class HighwayEngine:
         self._no_actions = np.ones(batch, dtype=np.int64)
         self._no_controls = np.zeros((batch, 2))
         self._no_pause = np.zeros(batch, dtype=np.bool_)
+        self.orders = np.zeros((batch, COUNTS), dtype=np.int64)
 
     def reset(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
         """Start the episodes `chosen` [R] (row numbers) from the scenario seeds [R].
@@ -203,6 +207,7 @@ class HighwayEngine:
         for name in ("steps", "reward", "progress", "crashed", "offroad", "terminated", "truncated"):
             self.episodes[name][chosen] = 0
         self.episodes["seed"][chosen] = seeds
+        self.orders[chosen] = 0
         spawn_batch(
             self.vehicles,
             self.order,
@@ -223,6 +228,26 @@ class HighwayEngine:
             self.observation,
             self.numbers,
             self.flags,
+        )
+
+    def order_cars(self, orders: NDArray[np.float64], paused: NDArray[np.bool_] | None = None) -> None:
+        """Give orders to cars of the traffic for the next decision, within `config.traffic`.
+
+        Args:
+            orders: float64 [B, vehicles + 1, 3]: above 0 for a car to drive, its acceleration in m/s2, and where it steers to, in
+                m across the road. Numbers that are not finite are no order.
+            paused: as in `step`.
+        """
+        given = np.ascontiguousarray(orders, dtype=np.float64)
+        if not np.isfinite(given).all():
+            given = np.where(np.isfinite(given).all(-1, keepdims=True), given, 0.0)
+        order_batch(
+            self.vehicles,
+            self.episodes,
+            given,
+            self._no_pause if paused is None else paused,
+            self.parameters.bounds,
+            self.orders,
         )
 
     def step(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None = None) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from cavbench.driving.traffic import View
 from cavbench.envs.highway.config import ACTIONS, HighwayConfig
 from cavbench.envs.highway.engine import Flag, Number
 from cavbench.scenarios import SeedBlock
@@ -59,6 +60,14 @@ class HighwayEnv(EnvBase):
     def _drive(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None) -> None:
         """Execute one action [B] or [B, 2] in every unfinished episode that is not `paused` [B]."""
 
+    def _order(self, orders: NDArray[np.float64], paused: NDArray[np.bool_] | None) -> None:
+        """Give orders [B, N, 3] to cars of the traffic (`cavbench.driving.traffic.Orders`)."""
+        raise NotImplementedError(f"{type(self).__name__} takes no orders for the traffic")
+
+    def _view(self) -> NDArray[np.float64]:
+        """[B, N, 7] the cars as an attacker that drives some of them sees them (`cavbench.driving.traffic.View`)."""
+        raise NotImplementedError(f"{type(self).__name__} shows no traffic")
+
     @abstractmethod
     def _outputs(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         """The current observation [B, V, 5], numbers [5, B] (rows `Number`) and flags [5, B] (rows `Flag`)."""
@@ -71,6 +80,9 @@ class HighwayEnv(EnvBase):
         )
         observation = Bounded(-1, 1, shape=(batch, self.config.observed_vehicles, 5), dtype=torch.float32)
         self.observation_spec = Composite(observation=observation, info=info, shape=(batch,))
+        if self.config.traffic is not None:
+            seen = Unbounded(shape=(batch, self.config.vehicles + 1, len(View._fields)), dtype=torch.float64)
+            self.observation_spec["traffic"] = seen
         if self.config.action_type == "discrete":
             self.action_spec = Categorical(len(ACTIONS), shape=(batch,), dtype=torch.int64)
         else:
@@ -103,6 +115,8 @@ class HighwayEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         running = tensordict.get("_step", None)
         paused = None if running is None else ~running.reshape(-1).numpy()
+        if (orders := tensordict.get("orders", None)) is not None:
+            self._order(orders.numpy(), paused)
         self._drive(tensordict.get("action").numpy(), paused)
         return self._tensordict(with_reward=True)
 
@@ -132,4 +146,6 @@ class HighwayEnv(EnvBase):
         }
         if with_reward:
             content["reward"] = number[Number.REWARD]
+        if self.config.traffic is not None:
+            content["traffic"] = torch.from_numpy(self._view())
         return TensorDict(content, batch_size=self.batch_size, device=self.device)

@@ -16,10 +16,12 @@ from cavbench.envs.highway.config import ACTIONS, HighwayConfig
 from cavbench.envs.highway.dynamics import is_on_lane, move
 from cavbench.envs.highway.ego import PROGRESS_LANE, PROGRESS_SPEED, apply_action, lane_share, speed_share
 from cavbench.envs.highway.engine import physical_controls
+from cavbench.envs.highway.ordered import COUNTS, take_orders
 from cavbench.envs.highway.rehearsal import HighwayRehearsal
+from cavbench.envs.highway.search import sort_by_position
 from cavbench.envs.highway.sensor import sensor_range_m
 from cavbench.envs.highway.state import VEHICLE, EgoKind, Floats, Integers, Parameters, parameters
-from cavbench.envs.highway.traffic import act, sort_by_position
+from cavbench.envs.highway.traffic import act
 from cavbench.envs.weather import WEATHERS
 
 FIELDS = ("x", "y", "heading", "speed", "target_speed", "timer", "delta", "lane", "target_lane")
@@ -35,6 +37,7 @@ def roll_batch(
     counts: Integers,
     actions: Integers,
     controls: Floats,
+    orders: Floats,
     lanes: Integers,
     parameters: Parameters,
     failed: Integers,
@@ -46,13 +49,15 @@ def roll_batch(
     Args:
         cars: beliefs [B, N], of which the first `counts` [B] are known.
         actions: [B, P, T]; controls: [B, P, T, 2].
+        orders: [B, T, N, 3] orders to cars that are driven; with T = 0 they go on as they were ordered last.
         lanes: of each episode [B].
         failed, crashed, progress: outputs [B, P].
     """
     size = cars.shape[1]
     near, copy = np.empty_like(cars[0]), np.empty_like(cars[0])
     order, ordered, places = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
-    corners = np.empty((2, 5, 2))
+    corners, counted = np.empty((2, 5, 2)), np.zeros(COUNTS, np.int64)
+    numbers, given = np.empty(size, np.int64), np.empty((size, 3))
     for episode in range(cars.shape[0]):
         count = 0
         for number in range(counts[episode]):
@@ -60,6 +65,7 @@ def roll_batch(
             if -NEAR_BEHIND < ahead < NEAR_AHEAD:
                 near[count : count + 1] = cars[episode, number : number + 1]
                 ordered[count] = count
+                numbers[count] = number
                 count += 1
         sort_by_position(near, ordered[:count])
         for plan in range(actions.shape[1]):
@@ -68,9 +74,13 @@ def roll_batch(
             vehicles, sequence, ego = copy[:count], order[:count], copy[0]
             total, step, road = 0.0, 0, lanes[episode]
             while step < actions.shape[2]:
+                if step < orders.shape[1]:
+                    for place in range(count):
+                        given[place] = orders[episode, step, numbers[place]]
+                    take_orders(vehicles, given[:count], road, parameters.bounds, counted)
                 apply_action(ego, actions[episode, plan, step], controls[episode, plan, step], True, road, parameters)
                 for _ in range(parameters.substeps):
-                    act(vehicles, sequence, places[:count], road, parameters.ego)
+                    act(vehicles, sequence, places[:count], road, parameters)
                     for number in range(count):
                         move(vehicles[number], road, parameters.dt)
                     sort_by_position(vehicles, sequence)
@@ -140,7 +150,8 @@ class HighwayDynamics(Dynamics):
             controls = np.ascontiguousarray(physical_controls(given.reshape(-1, 2)).reshape(*shape, 2))
         failed, progress = np.zeros(shape[:2], np.int64), np.zeros(shape[:2], np.float32)
         crashed = np.zeros(shape[:2], np.bool_)
-        roll_batch(cars, counts, actions, controls, belief["lanes"].numpy(), self.parameters, failed, crashed, progress)
+        lanes, nothing = belief["lanes"].numpy(), np.zeros((len(cars), 0, 0, 3))
+        roll_batch(cars, counts, actions, controls, nothing, lanes, self.parameters, failed, crashed, progress)
         return Forecast(torch.from_numpy(failed), torch.from_numpy(crashed), torch.from_numpy(progress))
 
     def rehearsal(self, belief: TensorDictBase, copies: int) -> HighwayRehearsal:

@@ -11,12 +11,17 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cavbench.driving.dynamics import Rehearsal
+from cavbench.driving.sets import Traffic
+from cavbench.driving.traffic import View
 from cavbench.envs.highway.config import HighwayConfig
 from cavbench.envs.highway.engine import Flag, HighwayEngine, Number, observe_batch
 from cavbench.envs.highway.state import Integers
+from cavbench.envs.highway.state import bounds as bounds_of
 
 FAR_BEHIND, APART = 5000.0, 60.0
 """Cars that were never seen stand so far behind, in m, and so far from each other."""
+SAME_CAR = 2.5
+"""A car of the belief is the one of the traffic that is so near, in m."""
 UNSEEN_SPEED = 20.0
 """Their speed in m/s."""
 
@@ -60,11 +65,32 @@ class HighwayRehearsal(Rehearsal):
             self.engine.numbers,
             self.engine.flags,
         )
+        self._numbers: Integers | None = None
         self._read()
 
     def step(self, action: Tensor) -> None:
         self.engine.step(action.flatten(0, 1).numpy())
         self._read()
+
+    def order(self, orders: Tensor, view: View, bounds: Traffic) -> None:
+        if self._numbers is None:
+            self._numbers = self._matched(view)
+            self.engine.parameters = self.engine.parameters._replace(bounds=bounds_of(bounds))
+        copies, batch = self.shape
+        given = orders.flatten(0, 1).numpy()
+        mine = np.zeros((copies * batch, *self.engine.vehicles.shape[1:], given.shape[-1]))
+        number = np.tile(self._numbers, (copies, 1))
+        row, car = np.nonzero(number > 0)
+        mine[row, number[row, car]] = given[row, car]
+        self.engine.order_cars(mine)
+
+    def _matched(self, view: View) -> Integers:
+        """[B, N] the number here of each car of the view, 0 where the belief does not have it."""
+        cars = self.engine.vehicles[: self.shape[1]]
+        along, across = cars["x"] - cars["x"][:, :1], cars["y"]
+        off = np.abs(view.x.numpy()[:, :, None] - along[:, None]) + np.abs(view.y.numpy()[:, :, None] - across[:, None])
+        nearest = off.argmin(2)
+        return np.where(off.min(2) < SAME_CAR, nearest, 0)
 
     def _read(self) -> None:
         engine = self.engine

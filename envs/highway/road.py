@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
@@ -15,7 +15,11 @@ from cavbench.envs.highway.config import ACTIONS, KINEMATICS, HighwayConfig
 from cavbench.scenarios import Axes, Cell
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from torchrl.envs import EnvBase
+
+    from cavbench.driving.blame import Deeds
 
 Backend = Literal["batched", "reference"]
 BUSY = 2.0
@@ -39,6 +43,7 @@ class StraightRoad(DrivingWorld):
     """Its name on the command line."""
     home: ClassVar[Cell] = AXES.cell(lanes=3, density=1.0)
     """The cell that stands for the world where none is chosen."""
+    offers: ClassVar[tuple[str, ...]] = (*DrivingWorld.offers, "traffic", "dynamics")
     backend: Backend
 
     def __post_init__(self) -> None:
@@ -51,6 +56,7 @@ class StraightRoad(DrivingWorld):
             object.__setattr__(self, "libraries", (REFERENCE,))
             # The planner copies the state of our engine.
             object.__setattr__(self, "drivers", ("agent", "idm"))
+            object.__setattr__(self, "offers", DrivingWorld.offers)
         self.configuration((self.home,))
 
     @abstractmethod
@@ -98,6 +104,19 @@ class StraightRoad(DrivingWorld):
         from cavbench.envs.highway.forecast import HighwayDynamics
 
         return HighwayDynamics(self.configuration(cells, Control(action_type=action_type)))
+
+    def blame(
+        self,
+        cells: Sequence[Cell],
+        control: Control,
+        deeds: Deeds,
+        decisions: NDArray[np.int64],
+        crashed: NDArray[np.bool_],
+    ) -> Mapping[str, NDArray[np.float64]]:
+        """See `cavbench.driving.DrivingWorld.blame`."""
+        from cavbench.envs.highway.blame import blame
+
+        return blame(self.configuration(cells, control), deeds, decisions, crashed)
 
     def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
         """See `cavbench.driving.DrivingWorld.build`.

@@ -96,7 +96,9 @@ def place_vehicle(vehicle: Vehicle, x: float, lane: int | np.int64, lanes: int, 
     vehicle.impact_pair = -1
     vehicle.lane = closest_lane(vehicle.x, vehicle.y, vehicle.heading, lanes)
     vehicle.target_lane = vehicle.lane
-    vehicle.crashed = False
+    vehicle.crashed = vehicle.ordered = vehicle.braking = False
+    vehicle.held = 0
+    vehicle.ordered_acceleration = vehicle.ordered_y = 0.0
     update_direction(vehicle)
 
 

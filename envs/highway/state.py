@@ -5,12 +5,15 @@ Vehicles are in highway-env's order (the ego is 0), because several of its rules
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavbench.driving.sets import Traffic
+from cavbench.driving.surroundings import USUAL, Surroundings
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.config import HighwayConfig
 
@@ -35,6 +38,11 @@ class Vehicle:
     lane: int
     target_lane: int
     crashed: bool
+    held: int  # frames until it decides again
+    ordered: bool  # driven by orders (`cavbench.envs.highway.ordered`), not by IDM and MOBIL
+    braking: bool  # in a braking manoeuvre
+    ordered_acceleration: float  # m/s2
+    ordered_y: float  # m, where it steers to
 
 
 class Episode:
@@ -80,6 +88,30 @@ class EgoKind(IntEnum):
     IDM = 2
 
 
+class Manners(NamedTuple):
+    """Parameters of IDM and MOBIL; documented in `cavbench.driving.Surroundings`."""
+
+    acceleration: float
+    jam_distance: float
+    time_gap: float
+    gap_scale: float  # 2 sqrt(a b)
+    lane_gain: float
+    imposed_braking: float
+    hold: int  # frames for which a decision is held; 0 and 1 decide in every frame
+
+
+class Bounds(NamedTuple):
+    """What cars that are driven by orders may do; documented in `cavbench.driving.sets.Traffic`."""
+
+    cars: int
+    acceleration: float
+    braking: float
+    lateral_speed: float
+    gap: float
+    headway: float
+    closing: float
+
+
 class Parameters(NamedTuple):
     """The parameters shared by all episodes of a batch; documented in `HighwayConfig`."""
 
@@ -100,10 +132,36 @@ class Parameters(NamedTuple):
     offroad_terminal: bool
     others_collide: bool
     start_lane: int  # -1 if it is drawn
+    usual: Manners  # of an ego that is an IDM car
+    manners: Manners  # of the traffic
+    mass: float
+    grip: float  # m/s2, the largest acceleration of the ego in any direction
+    bounds: Bounds
 
 
+GRAVITY = 9.81
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
+
+
+def manners(surroundings: Surroundings, frequency: int) -> Manners:
+    """The manners of the traffic, at so many physics frames a second."""
+    return Manners(
+        acceleration=float(surroundings.acceleration),
+        jam_distance=float(surroundings.jam_distance),
+        time_gap=float(surroundings.time_gap),
+        gap_scale=2 * math.sqrt(surroundings.acceleration * surroundings.braking),
+        lane_gain=float(surroundings.lane_gain),
+        imposed_braking=float(surroundings.imposed_braking),
+        hold=round(surroundings.reaction * frequency),
+    )
+
+
+def bounds(traffic: Traffic | None) -> Bounds:
+    """The bounds of cars that are driven by orders; none is, if they are None."""
+    traffic = traffic or Traffic(cars=0)
+    values = [float(getattr(traffic, name)) for name in Bounds._fields if name != "cars"]
+    return Bounds(int(traffic.cars), *values)
 
 
 def ego_kind(config: HighwayConfig) -> EgoKind:
@@ -134,4 +192,9 @@ def parameters(config: HighwayConfig) -> Parameters:
         offroad_terminal=bool(config.offroad_terminal),
         others_collide=bool(config.others_collide),
         start_lane=-1 if config.start_lane is None else config.start_lane,
+        usual=manners(USUAL, config.simulation_frequency),
+        manners=manners(config.surroundings, config.simulation_frequency),
+        mass=float(config.surroundings.mass),
+        grip=GRAVITY * config.surroundings.friction if config.surroundings.friction < 1 else math.inf,
+        bounds=bounds(config.traffic),
     )

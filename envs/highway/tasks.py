@@ -99,6 +99,8 @@ class HighwayTask(StraightRoad):
             action_type=control.action_type,
             driver=control.driver,
             action_repeat=control.action_repeat,
+            traffic=control.traffic,
+            surroundings=control.surroundings,
             **self._fields,
         )
 

@@ -1,7 +1,4 @@
-"""Traffic: highway-env's IDM and MOBIL (vehicle/behavior.py) and its search for neighbours (road/road.py).
-
-`order` lists the vehicles by position (ties: by number), so that neighbours are found by searching outwards.
-"""
+"""Traffic: highway-env's IDM and MOBIL (vehicle/behavior.py)."""
 
 from __future__ import annotations
 
@@ -14,112 +11,55 @@ from cavbench.envs.highway.dynamics import (
     IDM,
     SPEED_LIMIT,
     clip,
-    is_on_lane,
     is_reachable,
     not_zero,
     speed_control,
     steering_control,
+    weigh,
 )
-from cavbench.envs.highway.state import Integers, Vehicle, Vehicles
+from cavbench.envs.highway.ordered import follow_orders
+from cavbench.envs.highway.search import front_vehicle, rear_vehicle
+from cavbench.envs.highway.state import Integers, Manners, Parameters, Vehicle, Vehicles
 
 MAX_ACCELERATION = 6.0
-COMFORT_ACCELERATION = 3.0
-COMFORT_BRAKING = -5.0
-JAM_DISTANCE = 10.0
-TIME_GAP = 1.5
-GAP_SCALE = 2 * math.sqrt(-COMFORT_ACCELERATION * COMFORT_BRAKING)
 LANE_CHANGE_DELAY = 1.0
-LANE_CHANGE_MIN_GAIN = 0.2
-LANE_CHANGE_MAX_BRAKING_IMPOSED = 2.0
-NEIGHBOUR_MARGIN = 1.0
-NO_ONE = -1
 
 
 @inner
-def sort_by_position(vehicles: Vehicles, order: Integers) -> None:
-    """Sort `order` [N] in place, by insertion sort, because it is nearly sorted from the previous frame."""
-    for place in range(1, order.size):
-        moved = order[place]
-        x = vehicles[moved].x
-        slot = place - 1
-        while slot >= 0 and (vehicles[order[slot]].x > x or (vehicles[order[slot]].x == x and order[slot] > moved)):
-            order[slot + 1] = order[slot]
-            slot -= 1
-        order[slot + 1] = moved
-
-
-@inner
-def front_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> int:
-    """Road.neighbour_vehicles: the nearest vehicle on `lane`, level with or ahead of the vehicle at `place` of `order`.
-
-    Returns its number, or NO_ONE. Among vehicles at the same position the last in highway-env's order is taken.
-    """
-    x = vehicles[order[place]].x
-    first = place
-    while first > 0 and vehicles[order[first - 1]].x == x:
-        first -= 1
-    found = NO_ONE
-    for candidate in range(first, order.size):
-        other = order[candidate]
-        if found >= 0 and vehicles[other].x > vehicles[found].x:
-            break
-        if candidate != place and is_on_lane(vehicles[other], lane, NEIGHBOUR_MARGIN):
-            found = other
-    return found
-
-
-@inner
-def rear_vehicle(vehicles: Vehicles, order: Integers, place: int, lane: int) -> int:
-    """Road.neighbour_vehicles: the nearest vehicle on `lane` behind the vehicle at `place` of `order`.
-
-    Returns its number, or NO_ONE. Among vehicles at the same position the first in highway-env's order is taken.
-    """
-    x = vehicles[order[place]].x
-    found = NO_ONE
-    for candidate in range(place - 1, -1, -1):
-        other = order[candidate]
-        if found >= 0 and vehicles[other].x < vehicles[found].x:
-            break
-        if vehicles[other].x < x and is_on_lane(vehicles[other], lane, NEIGHBOUR_MARGIN):
-            found = other
-    return found
-
-
-@inner
-def desired_gap(vehicle: Vehicle, leader: Vehicle) -> float:
+def desired_gap(vehicle: Vehicle, leader: Vehicle, manners: Manners) -> float:
     """IDMVehicle.desired_gap in m; the difference of velocities is projected onto the vehicle's direction."""
     cos, sin = vehicle.cos_heading, vehicle.sin_heading
     along = vehicle.speed * cos - leader.speed * leader.cos_heading
     across = vehicle.speed * sin - leader.speed * leader.sin_heading
     closing = along * cos + across * sin
-    return JAM_DISTANCE + vehicle.speed * TIME_GAP + vehicle.speed * closing / GAP_SCALE
+    return manners.jam_distance + vehicle.speed * manners.time_gap + vehicle.speed * closing / manners.gap_scale
 
 
 @inner
-def free_acceleration(vehicle: Vehicle, target_speed: float, delta: float) -> float:
+def free_acceleration(vehicle: Vehicle, target_speed: float, delta: float, manners: Manners) -> float:
     """IDMVehicle.acceleration on an empty road, in m/s2."""
     wanted = abs(not_zero(clip(target_speed, 0.0, SPEED_LIMIT)))
-    return COMFORT_ACCELERATION * (1 - math.pow(max(vehicle.speed, 0.0) / wanted, delta))
+    return manners.acceleration * (1 - math.pow(max(vehicle.speed, 0.0) / wanted, delta))
 
 
 @inner
-def interaction(vehicle: Vehicle, leader: Vehicle) -> float:
+def interaction(vehicle: Vehicle, leader: Vehicle, manners: Manners) -> float:
     """The term that IDMVehicle.acceleration subtracts for the vehicle ahead, in m/s2."""
-    ratio = desired_gap(vehicle, leader) / not_zero(leader.x - vehicle.x)
-    return COMFORT_ACCELERATION * (ratio * ratio)
+    ratio = desired_gap(vehicle, leader, manners) / not_zero(leader.x - vehicle.x)
+    return manners.acceleration * (ratio * ratio)
 
 
 @inner
-def following_acceleration(vehicles: Vehicles, number: int, leader: int, free: float) -> float:
+def following_acceleration(vehicles: Vehicles, number: int, leader: int, free: float, manners: Manners) -> float:
     """IDMVehicle.acceleration behind `leader` (or NO_ONE), in m/s2, given its value `free` on an empty road."""
     if leader < 0:
         return free
-    return free - interaction(vehicles[number], vehicles[leader])
+    return free - interaction(vehicles[number], vehicles[leader], manners)
 
 
 @inner
 def wants_lane(
-    vehicles: Vehicles, order: Integers, place: int, lane: int, free: float, own_leader: int, ego: int
+    vehicles: Vehicles, order: Integers, place: int, lane: int, free: float, own_leader: int, ego: int, manners: Manners
 ) -> bool:
     """IDMVehicle.mobil: whether changing to `lane` has a gain and imposes no hard braking on the new follower.
 
@@ -128,21 +68,21 @@ def wants_lane(
     """
     number = order[place]
     new_leader = front_vehicle(vehicles, order, place, lane)
-    gain = following_acceleration(vehicles, number, new_leader, free) - following_acceleration(
-        vehicles, number, own_leader, free
+    gain = following_acceleration(vehicles, number, new_leader, free, manners) - following_acceleration(
+        vehicles, number, own_leader, free, manners
     )
-    if gain < LANE_CHANGE_MIN_GAIN:
+    if gain < manners.lane_gain:
         return False
     follower = rear_vehicle(vehicles, order, place, lane)
     if follower < 0:
         return True
     target_speed = 0.0 if follower == 0 and ego == CONTINUOUS else vehicles[follower].target_speed
-    imposed = free_acceleration(vehicles[follower], target_speed, vehicles[number].delta)
-    return not imposed - interaction(vehicles[follower], vehicles[number]) < -LANE_CHANGE_MAX_BRAKING_IMPOSED
+    imposed = free_acceleration(vehicles[follower], target_speed, vehicles[number].delta, manners)
+    return not imposed - interaction(vehicles[follower], vehicles[number], manners) < -manners.imposed_braking
 
 
 @inner
-def must_abort(vehicles: Vehicles, number: int, ego: int) -> bool:
+def must_abort(vehicles: Vehicles, number: int, ego: int, manners: Manners) -> bool:
     """Whether a vehicle just ahead is already changing to the same lane (IDMVehicle.change_lane_policy)."""
     vehicle = vehicles[number]
     for other in range(1 if ego == CONTINUOUS else 0, vehicles.size):
@@ -150,14 +90,21 @@ def must_abort(vehicles: Vehicles, number: int, ego: int) -> bool:
         if rival.target_lane != vehicle.target_lane or rival.lane == vehicle.target_lane or other == number:
             continue
         distance = rival.x - vehicle.x
-        if 0 < distance < desired_gap(vehicle, rival):
+        if 0 < distance < desired_gap(vehicle, rival, manners):
             return True
     return False
 
 
 @inner
 def choose_lane(
-    vehicles: Vehicles, order: Integers, place: int, lanes: int, free: float, leader: int, ego: int
+    vehicles: Vehicles,
+    order: Integers,
+    place: int,
+    lanes: int,
+    free: float,
+    leader: int,
+    ego: int,
+    manners: Manners,
 ) -> None:
     """The second half of IDMVehicle.change_lane_policy: test left, then right; right overwrites left."""
     vehicle = vehicles[order[place]]
@@ -168,45 +115,57 @@ def choose_lane(
         if (
             0 <= lane < lanes
             and is_reachable(vehicle, lane)
-            and wants_lane(vehicles, order, place, lane, free, leader, ego)
+            and wants_lane(vehicles, order, place, lane, free, leader, ego, manners)
         ):
             vehicle.target_lane = lane
 
 
 @inner
-def drive_idm(vehicles: Vehicles, order: Integers, place: int, lanes: int, ego: int) -> None:
+def drive_idm(vehicles: Vehicles, order: Integers, place: int, lanes: int, ego: int, manners: Manners) -> None:
     """IDMVehicle.act: MOBIL for the lane, IDM for the acceleration (over both lanes during a change)."""
     number = order[place]
     vehicle = vehicles[number]
     if vehicle.crashed:
         return
-    free = free_acceleration(vehicle, vehicle.target_speed, vehicle.delta)
+    if manners.hold > 1:
+        vehicle.held -= 1
+        if vehicle.held > 0:
+            vehicle.steering = steering_control(vehicle, vehicle.target_lane)
+            return
+        vehicle.held = manners.hold
+    free = free_acceleration(vehicle, vehicle.target_speed, vehicle.delta, manners)
     leader = front_vehicle(vehicles, order, place, vehicle.lane)
     if vehicle.lane != vehicle.target_lane:
-        if must_abort(vehicles, number, ego):
+        if must_abort(vehicles, number, ego, manners):
             vehicle.target_lane = vehicle.lane
     elif vehicle.timer > LANE_CHANGE_DELAY:
-        choose_lane(vehicles, order, place, lanes, free, leader, ego)
+        choose_lane(vehicles, order, place, lanes, free, leader, ego, manners)
     vehicle.steering = steering_control(vehicle, vehicle.target_lane)
-    acceleration = following_acceleration(vehicles, number, leader, free)
+    acceleration = following_acceleration(vehicles, number, leader, free, manners)
     if vehicle.lane != vehicle.target_lane:
         leader = front_vehicle(vehicles, order, place, vehicle.target_lane)
-        acceleration = min(acceleration, following_acceleration(vehicles, number, leader, free))
+        acceleration = min(acceleration, following_acceleration(vehicles, number, leader, free, manners))
     vehicle.acceleration = clip(acceleration, -MAX_ACCELERATION, MAX_ACCELERATION)
 
 
 @inner
-def act(vehicles: Vehicles, order: Integers, places: Integers, lanes: int, ego: int) -> None:
+def act(vehicles: Vehicles, order: Integers, places: Integers, lanes: int, parameters: Parameters) -> None:
     """Road.act: every vehicle decides, in highway-env's order, because each uses the target lanes chosen before it.
 
     `places` [N] is a work array for the position of each vehicle in `order`.
     """
+    ego = parameters.ego
     for place in range(order.size):
         places[order[place]] = place
     if ego == DISCRETE:
         vehicles[0].steering = steering_control(vehicles[0], vehicles[0].target_lane)
         vehicles[0].acceleration = speed_control(vehicles[0])
+        weigh(vehicles[0], parameters.mass, parameters.grip)
     elif ego == IDM:
-        drive_idm(vehicles, order, places[0], lanes, ego)
+        drive_idm(vehicles, order, places[0], lanes, ego, parameters.usual)
+        weigh(vehicles[0], parameters.mass, parameters.grip)
     for number in range(1, vehicles.size):
-        drive_idm(vehicles, order, places[number], lanes, ego)
+        if vehicles[number].ordered:
+            follow_orders(vehicles, order, places[number], parameters.bounds)
+        else:
+            drive_idm(vehicles, order, places[number], lanes, ego, parameters.manners)

@@ -90,6 +90,8 @@ class HighwayWorld(StraightRoad):
             action_type=control.action_type,
             driver=control.driver,
             action_repeat=control.action_repeat,
+            traffic=control.traffic,
+            surroundings=control.surroundings,
             target_speeds=self.target_speeds if self.target_speeds is not None else preset_speeds,
             features=self.features,
             observed_vehicles=self.observed_rows,

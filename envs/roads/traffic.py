@@ -8,20 +8,19 @@ import numpy as np
 
 from cavbench.compiled import inner
 from cavbench.envs.highway.dynamics import MAX_STEERING, clip, not_zero
+from cavbench.envs.highway.search import NEIGHBOUR_MARGIN, NO_ONE
 from cavbench.envs.highway.traffic import (
     LANE_CHANGE_DELAY,
-    LANE_CHANGE_MAX_BRAKING_IMPOSED,
-    LANE_CHANGE_MIN_GAIN,
     MAX_ACCELERATION,
-    NEIGHBOUR_MARGIN,
-    NO_ONE,
-    TIME_GAP,
 )
 from cavbench.envs.roads.lanes import CAR_LENGTH, CIRCULAR, STRAIGHT, is_on, is_reachable, local_coordinates
 from cavbench.envs.roads.motion import coordinates_on, follow_road, speed_control, steering_control
 from cavbench.envs.roads.network import LaneRecord
 from cavbench.envs.roads.state import Bodies, Body, Kind, Parameters, Road
 
+TIME_GAP = 1.5
+LANE_CHANGE_MIN_GAIN = 0.2
+LANE_CHANGE_MAX_BRAKING_IMPOSED = 2.0
 DISCRETE, CONTINUOUS, IDM, OBSTACLE = int(Kind.DISCRETE), int(Kind.CONTINUOUS), int(Kind.IDM), int(Kind.OBSTACLE)
 
 

@@ -16,14 +16,15 @@ from cavbench.core import registry
 from cavbench.core.contracts import QueryBudgetError
 from cavbench.driving import ActionType, DrivingAttack, DrivingWorld, ObservationThreat, Policy
 from cavbench.driving.access import Enforcer
-from cavbench.driving.checks.traffic import action_types, observations, victim
+from cavbench.driving.checks.traffic import action_types, observations, victim, viewed
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.forgery import Forgery
+from cavbench.driving.sets import Traffic
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
 from cavbench.identity.fingerprint import state_digest
 
-EPISODES = 6
+EPISODES, CARS = 6, 3
 BUDGETS = (0, 1, 2, 7, 50, 1000)
 """Query budgets per step that an attack must work with."""
 WITHIN = 1e-5
@@ -88,7 +89,13 @@ class AttackSuite(Suite):
             among, others = self._observations(0).double(), self._observations(1).double()
             others[0] = among[0]
             for threat in (self._threat(), self._threat(queries=30)):
-                first, second = (self._answer(policy, batch, threat)[0] for batch in (among, others))
+                answers = [self._answer(policy, batch, threat) for batch in (among, others)]
+                first, second = (answer for answer, _ in answers)
+                mine, again = (enforcer.orders for _, enforcer in answers)
+                require(
+                    mine is None or again is None or torch.equal(mine[0], again[0]),
+                    "the orders to the cars of an episode depend on the other episodes of its batch",
+                )
                 require(
                     torch.allclose(first[0], second[0], atol=1e-9),
                     "the answer for an episode depends on the others of its batch: compute means, norms, best points and "
@@ -184,7 +191,7 @@ class AttackSuite(Suite):
             generator,
             dynamics(self.component, self.subject.world, policy.action_type, len(observation)),
         )
-        oracle = enforcer.begin(observation)
+        oracle = enforcer.begin(observation, view=viewed(self.component, observation, self.subject.world.features))
         try:
             with torch.no_grad():
                 state = self.component.initial(observation, oracle)
@@ -199,6 +206,8 @@ class AttackSuite(Suite):
 def allowing(attack: DrivingAttack, **values: Any) -> ObservationThreat:
     """A threat model that allows the attack's access."""
     threat = ObservationThreat(**values)
+    if attack.drives:
+        threat = replace(threat, traffic=Traffic(cars=CARS))
     return threat if threat.allows(attack.access) else replace(threat, access=attack.access)
 
 

@@ -13,7 +13,7 @@ from cavbench.driving import ActionType, DrivingAttack
 from cavbench.driving.attacker import Attacker
 from cavbench.driving.checks.attack import allowing, dynamics
 from cavbench.driving.checks.state import check_state, named
-from cavbench.driving.checks.traffic import action_types, observations, victim
+from cavbench.driving.checks.traffic import action_types, observations, victim, viewed
 from cavbench.driving.victim import CountedPolicy
 
 EPISODES, STEPS = 6, 4
@@ -37,7 +37,9 @@ class AttackMemorySuite(Suite):
         """The state is a TensorDict with one row per episode, from the first step on; creating it costs no query."""
         for action_type in action_types(self.subject):
             observation = self._observations()[0]
-            oracle = self._attacker(action_type).enforcer.begin(observation)
+            oracle = self._attacker(action_type).enforcer.begin(
+                observation, view=viewed(self.component, observation, self.subject.world.features)
+            )
             with torch.no_grad(), refusals_are_broken_rules():
                 first = self.component.initial(observation, oracle)
                 require(
@@ -88,7 +90,8 @@ class AttackMemorySuite(Suite):
             for run, seen in zip(runs, (batch, beside), strict=False):
                 assert seen is not None
                 with torch.no_grad(), refusals_are_broken_rules():
-                    answer = run.show(seen[step], running, None)
+                    view = viewed(self.component, seen[step], self.subject.world.features)
+                    answer = run.show(seen[step], running, None, view)
                 if run is runs[0]:
                     shown.append(answer.observation)
         return shown

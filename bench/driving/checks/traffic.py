@@ -9,9 +9,12 @@ from torch import Tensor
 
 from cavbench.checks.check import Subject
 from cavbench.checks.scenarios import first_cell
-from cavbench.driving import ActionType, DrivingFacts, DrivingWorld, Features, Policy
+from cavbench.driving import ActionType, DrivingAttack, DrivingFacts, DrivingWorld, Features, Policy
+from cavbench.driving.traffic import View
 
 HIDDEN = 16
+FAR, ROAD = 1000.0, 3.0
+"""Where absent cars are, in m behind, and the lanes of the road."""
 
 
 def observations(count: int, *, features: Features, rows: int = 10, seed: int = 0) -> Tensor:
@@ -21,6 +24,20 @@ def observations(count: int, *, features: Features, rows: int = 10, seed: int = 
     present = (torch.rand(count, rows, 1, generator=generator) > 0.3).float()
     present[:, 0] = 1.0
     return torch.cat((present, measured * present), -1)
+
+
+def viewed(attack: DrivingAttack, observation: Tensor, features: Features) -> View | None:
+    """The traffic of observations [B, V, F] for an attack that drives some of it; None for other attacks."""
+    if not attack.drives:
+        return None
+    place = {name: number for number, name in enumerate(features.names)}
+    cars = features.physical(observation).double()
+    x, y, vx = (cars[..., place[name]] for name in ("x", "y", "vx"))
+    absent = (observation[..., 0] <= 0).double()
+    ones = torch.ones_like(x)
+    # An absent car is far away; the first row is the victim's own, in absolute values.
+    along = (x * (1 - absent) - FAR * absent).index_fill(1, torch.tensor([0]), 0.0)
+    return View(along, y, vx.abs(), 0 * ones, 0 * ones, 0 * ones, ROAD * ones)
 
 
 def victim(action_type: ActionType, facts: DrivingFacts) -> Policy:
