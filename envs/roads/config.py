@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import get_args
+from typing import ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +103,9 @@ class RoadsConfig:
     Raises:
         ValueError: if a value is not allowed; the message is one line with the allowed values.
     """
+
+    traffic: ClassVar[None] = None
+    """No car is driven by orders."""
 
     task: TaskKind
     scenes: tuple[Scene, ...]

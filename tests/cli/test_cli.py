@@ -71,7 +71,7 @@ def test_an_unknown_component_has_no_page(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (("shwo",), "unknown command 'shwo'; did you mean 'show'? known: audit, check"),
+        (("shwo",), "unknown command 'shwo'; did you mean 'show'? known: audit, certify, check"),
         (("list", "--jsn"), "unknown option '--jsn'; known: --json"),
         (("list", "a", "b"), "cannot read b: `bench list --help` says what it takes"),
         (("verify",), "FOLDER is missing; `bench verify --help` says what it is"),
@@ -92,7 +92,7 @@ def test_what_is_typed_wrong_is_said_in_our_own_words(bench: Bench, words: tuple
         (("attack=nugde",), "unknown attack 'nugde'; did you mean 'nudge'?"),
         (("attack=nudge", "attack.pause=long"), "attack.pause must be a number, got long"),
         (("threat.budget=-1",), "threat.budget must be between 0 and 2, got -1"),
-        (("attack=steer", "victim=toy"), "attack 'steer' does not fit victim 'toy'"),
+        (("attack=veer", "victim=toy"), "attack 'veer' does not fit victim 'toy'"),
         (("--fast",), "unknown option '--fast'; known: "),
     ],
 )

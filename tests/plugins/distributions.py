@@ -12,7 +12,7 @@ TOY_CAMERA = TOY.with_name("toy_camera.py")
 TOY_POINTS = {
     "cavbench.attacks": {
         "nudge": "toy_plugin:Nudge",
-        "steer": "toy_plugin:Steer",
+        "veer": "toy_plugin:Veer",
         "paint": "toy_camera_plugin:Paint",
         "blank": "toy_camera_plugin:Blank",
     },

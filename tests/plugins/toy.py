@@ -239,7 +239,7 @@ class Nudge(DrivingAttack):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steer(DrivingAttack):
+class Veer(DrivingAttack):
     """An attack for continuous actions that needs gradients."""
 
     access: ClassVar[Access] = "gradients"

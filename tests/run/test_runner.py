@@ -127,7 +127,7 @@ def test_baselines_can_be_switched_off(tmp_path: Path) -> None:
 
 
 def test_continuous_victims_have_continuous_baselines() -> None:
-    config = plan_of(["attack=steer", "victim=toy", "victim.actions=continuous", "world=toy"])
+    config = plan_of(["attack=veer", "victim=toy", "victim.actions=continuous", "world=toy"])
     kinds = {(unit.pair.victim.name, unit.pair.victim.component.action_type) for unit in config.units()}
     assert kinds == {("toy", "continuous"), ("blind", "continuous"), ("random", "continuous")}
 

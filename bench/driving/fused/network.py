@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -56,8 +57,6 @@ class Fused:
         self.features = car.in_features if car else 0
         self.size, self.kept = self.features or int(self.widths[0]), int(self.widths.sum())
         self.width, self.pooled = (car.out_features, pair.out_features) if car and pair else (0, 0)
-        self._views: list[Tensor] = []
-        self._places: list[int] = []
         self.last = kernels.DUELING if dueling else kernels.PLAIN if scale is None else kernels.SCALED
 
     def fits(self, observation: Tensor) -> bool:
@@ -76,10 +75,10 @@ class Fused:
             return False
         # Views see whatever is written to a weight, but not that it was replaced by another tensor.
         places = [weight.data_ptr() for weight in weights]
-        if places != self._places or places != [view.data_ptr() for view in self._views]:
+        if places != [view.data_ptr() for view in _VIEWS.get(self, ())]:
             if any(weight.dtype != torch.float32 or weight.device.type != "cpu" for weight in weights):
                 return False
-            self._views, self._places = [weight.detach().reshape(-1) for weight in weights], places
+            _VIEWS[self] = [weight.detach().reshape(-1) for weight in weights]
         return True
 
     def __call__(self, observation: Tensor) -> Tensor:
@@ -94,7 +93,7 @@ class Fused:
         leading = observation.shape[: -2 if self.width else -1]
         count = leading.numel()
         points = observation.detach().reshape(count, observation.shape[len(leading) :].numel()).contiguous().numpy()
-        weights = torch.cat(self._views).numpy()
+        weights = torch.cat(_VIEWS[self]).numpy()
         blocks = -(-count // kernels.LANES) if keeps else 1
         out = np.empty((count, self.outputs), np.float32)
         kept = np.empty((blocks, self.kept, kernels.LANES), np.float32)
@@ -108,15 +107,15 @@ class Fused:
         rows = size // self.features if self.features else 1
         return kernels.Form(rows, self.features, self.width, self.pooled, self.last)
 
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy has weights of its own.
-        return {**self.__dict__, "_views": [], "_places": []}
-
     def _weights(self) -> list[Tensor]:
         """All weights in the order of `kernels.forward`."""
         own = (weight for module in self.modules for weight in module._parameters.values())
         found: list[Tensor] = [weight for weight in own if weight is not None]
         return found if self.scale is None else [*found, self.scale]
+
+
+_VIEWS: WeakKeyDictionary[Fused, list[Tensor]] = WeakKeyDictionary()
+"""The weights as flat vectors. They are kept apart, so that where they lie in memory is no part of what a network is."""
 
 
 def chain(network: object) -> Fused | None:
