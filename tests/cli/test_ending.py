@@ -28,7 +28,7 @@ ending.END_S, ending.BACKSTOP_S = 1.0, 0.5
 
 def command():
     print("all is said")
-    registry.resolve("cavbench.attacks", "late", "attack")()
+    registry.resolve("cavbench.attacks", "slow_end", "attack")()
     sys.exit(3)
 
 ending.ended(command)
@@ -78,7 +78,7 @@ class Kept:
 @pytest.mark.parametrize("what", LATE)
 def test_a_command_ends_whatever_a_plugin_left(what: str, tmp_path: Path) -> None:
     code, said = LATE[what]
-    install(tmp_path, "cavbench-late", {"cavbench.attacks": {"late": "late:main"}}, {"late": HEAD + code}, "2.0")
+    install(tmp_path, "cavbench-late", {"cavbench.attacks": {"slow_end": "late:main"}}, {"late": HEAD + code}, "2.0")
     start = time.monotonic()
     found = subprocess.run(
         [sys.executable, "-c", COMMAND],

@@ -55,7 +55,7 @@ def test_a_record_gives_the_same_sets_back(names: list[str]) -> None:
         ({"latency": {"frames": -1}}, "threat.latency.frames must be between 0 and 450, got -1"),
         ({"held": {"share": 0.1}}, "threat.held.longest is 0, so nothing may be held: give both share and longest"),
         ({"actuator": {"replaced": 2.0}}, "threat.actuator.replaced must be between 0 and 1, got 2.0"),
-        ({"traffic": {"gap": 3.0}}, "threat.traffic.cars is 0, so the attacker drives nobody: give cars, too"),
+        ({"traffic": {"gap": 4.0}}, "threat.traffic.cars is 0, so the attacker drives nobody: give cars, too"),
         ({"held": 3}, "threat.held takes held.share, held.longest, got 3"),
     ],
 )

@@ -25,6 +25,7 @@ from cavbench.detection.drive import drive as score_patch
 from cavbench.detection.patch import Patch
 from cavbench.detection.threat import PatchThreat
 from cavbench.driving.drive import drive
+from cavbench.driving.fused.network import Fused
 from cavbench.driving.threat import ObservationThreat
 from cavbench.envs.highway.axes import AXES
 
@@ -109,6 +110,8 @@ def driver(victim: str, defense: str, attack: str) -> None:
     )
     cell = AXES.cell(lanes=3, density=2.0, weather="rain")
     job = Job(pair=pair, training_seed=0, attack_seed=7, cell=cell, seeds=range(1_000_000, 1_000_004), entropy=5)
+    # On the processor a small network is compiled, and adds in another order than torch.
+    Fused.fits = lambda *_: False  # type: ignore[method-assign]
     here, there = (drive(replace(job, device=device), ()).columns for device in ("cpu", NAME))
     for name in here.keys() - {"attack_ms"}:
         np.testing.assert_array_equal(here[name], there[name], name)
