@@ -16,6 +16,7 @@ from cavbench.envs.highway.engine import Flag
 from cavbench.envs.roads.axes import MERGE_V1
 from cavbench.envs.roads.engine import RoadsEngine
 from cavbench.envs.roads.merge_world import MergeWorld
+from cavbench.envs.roads.network import LaneKind
 from cavbench.envs.roads.shape import points
 from docs.figures import style
 
@@ -106,7 +107,8 @@ def u_turn() -> Figure:
 def network(axes: Axes, road: np.void) -> None:
     """Draw every lane of a network at its width."""
     for lane in road["lanes"][: road["lane_count"]]:
-        edges = [points(lane, side * float(lane["width"]) / 2, 60) for side in (-1, 1)]
+        count = 60 if lane["kind"] == LaneKind.CIRCULAR or lane["amplitude"] else 2
+        edges = [points(lane, side * float(lane["width"]) / 2, count) for side in (-1, 1)]
         axes.add_patch(Polygon(np.concatenate([edges[0], edges[1][::-1]]), color=GREY, lw=0))
         for edge in edges:
             axes.plot(*edge.T, color="white", lw=0.8)

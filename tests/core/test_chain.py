@@ -132,7 +132,7 @@ def test_a_driver_is_trained_behind_a_chain_and_drives_behind_it(
     plain, world = trained(), "victim.trained_in=max_steps=20"
     behind = trained("defense=tracker+shield", *parameters)
     hardened = trained("defense=advtrain+tracker+shield", "defense.advtrain.decisions=48", world, *parameters)
-    units = [plan_of([*WORDS[1:], "world.max_steps=20", *used]).units()[0] for used in (plain, behind, hardened)]
+    units = [plan_of([*WORDS[1:], *used]).units()[0] for used in (plain, behind, hardened)]
     assert len({unit.weights_sha256 for unit in units}) == 3
     assert 'victim.behind="tracker+shield tracker.assumed_budget=0.08 shield.band=3.0"' in behind
     assert {"defense=advtrain+tracker+shield", "defense.shield.band=3.0"} <= set(hardened)
