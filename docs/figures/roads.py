@@ -107,7 +107,7 @@ def u_turn() -> Figure:
 def network(axes: Axes, road: np.void) -> None:
     """Draw every lane of a network at its width."""
     for lane in road["lanes"][: road["lane_count"]]:
-        count = 60 if lane["kind"] == LaneKind.CIRCULAR or lane["amplitude"] else 2
+        count = 30 if lane["kind"] == LaneKind.CIRCULAR or lane["amplitude"] else 2
         edges = [points(lane, side * float(lane["width"]) / 2, count) for side in (-1, 1)]
         axes.add_patch(Polygon(np.concatenate([edges[0], edges[1][::-1]]), color=GREY, lw=0))
         for edge in edges:
