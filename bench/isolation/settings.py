@@ -263,6 +263,11 @@ SETTINGS = (
         write=vars(sys).update,
         kept=_same_objects,
     ),
+    # Closed, a standard stream keeps its descriptor, and the next line that is printed is an error.
+    Setting(
+        name="whether standard input or output is closed",
+        read=lambda: [stream is not None and stream.closed for stream in (sys.stdin, sys.stdout, sys.stderr)],
+    ),
     Setting(
         name="the filters of warnings",
         read=lambda: list(warnings.filters),

@@ -48,6 +48,7 @@ PUT_BACK = {
     "import torch; torch.set_num_threads(7)": "the threads of torch",
 }  # fmt: skip
 STAYS = {
+    "import sys; sys.stdout.close()": "changes whether standard input or output is closed",
     "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))": "changes limits of the process",
     "import os; os.nice(3)": "changes the priority of the process",
     "import os; os.closerange(3, 4096)": "closes files of the process",

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from cavbench.driving import Policy
-from cavbench.driving.fused.network import Fused, chain
+from cavbench.driving.fused.network import _VIEWS, Fused, chain
 from cavbench.driving.victims.from_file import FilePolicy
 from cavbench.driving.victims.logits import SoftPolicy
 from cavbench.driving.victims.networks import ActorPolicy, QPolicy
@@ -150,7 +150,7 @@ def test_the_watch_sees_that_its_layers_were_exchanged() -> None:
     assert marks(policy) == before
     fused = policy.network.fused
     # A copy of the weights in the place of a view of them changes nothing: it is not the weights.
-    fused._views[0] = fused._views[0] * 2
+    _VIEWS[fused][0] = _VIEWS[fused][0] * 2
     assert torch.equal(policy.scores(x), scores)
     fused.modules = tuple(copy.deepcopy(fused.modules))
     assert marks(policy)["methods"] != before["methods"]
