@@ -11,7 +11,9 @@ from cavbench.core.pair import Pair
 from cavbench.core.track import Driven, Job
 from cavbench.driving import (
     access,
+    alarms,
     attacker,
+    blame,
     forgery,
     forging,
     gradients,
@@ -19,9 +21,12 @@ from cavbench.driving import (
     meter,
     parts,
     probes,
+    rss,
     sets,
     shadows,
+    surroundings,
     threat,
+    traffic,
     victim,
 )
 from cavbench.driving import rollout as rollouts
@@ -38,7 +43,9 @@ from cavbench.isolation.streams import Stream
 
 SEAL = Seal(
     access,
+    alarms,
     attacker,
+    blame,
     forgery,
     forging,
     gradients,
@@ -47,9 +54,12 @@ SEAL = Seal(
     parts,
     probes,
     rollouts,
+    rss,
     sets,
     shadows,
+    surroundings,
     threat,
+    traffic,
     victim,
 )
 

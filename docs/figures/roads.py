@@ -39,6 +39,8 @@ def merge() -> Figure:
             network(axes, engine.roads[0])
             cars(axes, engine.bodies[0][: engine.episodes["bodies"][0]])
             axes.set(xlim=(0, 420), ylim=(20, -6), yticks=[], aspect=2.5)
+            if step < max(moments):
+                axes.set(xticks=[])
             axes.set_title(f"{step / 15:.0f} s", fontsize=10)
         engine.step(np.array([1]))
     return made
@@ -107,11 +109,13 @@ def u_turn() -> Figure:
 def network(axes: Axes, road: np.void) -> None:
     """Draw every lane of a network at its width."""
     for lane in road["lanes"][: road["lane_count"]]:
-        count = 30 if lane["kind"] == LaneKind.CIRCULAR or lane["amplitude"] else 2
+        # A point for every 6 degrees of a bend looks round.
+        turned = lane["length"] / lane["radius"] if lane["kind"] == LaneKind.CIRCULAR else 0.0
+        count = 16 if lane["amplitude"] else 2 + int(turned / np.radians(6))
         edges = [points(lane, side * float(lane["width"]) / 2, count) for side in (-1, 1)]
         axes.add_patch(Polygon(np.concatenate([edges[0], edges[1][::-1]]), color=GREY, lw=0))
-        for edge in edges:
-            axes.plot(*edge.T, color="white", lw=0.8)
+        # One line with a gap for both edges.
+        axes.plot(*np.concatenate([edges[0], [[np.nan, np.nan]], edges[1]]).T, color="white", lw=0.8)
 
 
 def cars(axes: Axes, bodies: NDArray[np.void], ego: int = 0) -> None:

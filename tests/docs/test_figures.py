@@ -11,7 +11,7 @@ pytest.importorskip("matplotlib")
 
 from docs.figures.__main__ import FIGURES, FOLDER, make
 
-LARGEST, ALL = 150_000, 4_000_000
+LARGEST, ALL = 150_000, 3_500_000
 """Bytes of one figure, and of all."""
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from cavbench.core.contracts import Access, QueryBudgetError
 from cavbench.core.pair import choose
-from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, access
+from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, access, alarms, blame, forging, rss, traffic
 from cavbench.driving.access import Enforcer
 from cavbench.driving.drive import SEAL
 from cavbench.driving.rollout import rollout
@@ -365,8 +365,21 @@ def test_changing_the_settings_of_torch_reaches_nobody() -> None:
     assert {kind for kind, _ in Sees.kinds} == {torch.float32}
 
 
-def test_replacing_a_function_that_enforces_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [
+        (access.Enforcer, "project"),
+        (forging.Forging, "show"),
+        (traffic.Orders, "stacked"),
+        (blame.Deeds, "append"),
+        (rss, "safe_distance"),
+        (alarms.Alarms, "step"),
+    ],
+)
+def test_replacing_a_function_that_enforces_or_measures_is_noticed(
+    owner: Any, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     SEAL.check()
-    monkeypatch.setattr(access.Enforcer, "project", lambda self, answer: (answer, torch.zeros(len(answer))))
-    with pytest.raises(TamperError, match=r"bench\.driving\.access\.Enforcer\.project was replaced"):
+    monkeypatch.setattr(owner, name, lambda self, answer: (answer, torch.zeros(len(answer))))
+    with pytest.raises(TamperError, match=rf"bench\.driving\..*{name} was replaced"):
         SEAL.check()

@@ -56,12 +56,9 @@ def save(victim: DQN, world: DrivingWorld, *, seed: int, card: dict[str, object]
 
 def test_a_policy_loads_as_it_was_saved(saved: Path) -> None:
     torch.manual_seed(3)
-    before, after = QPolicy(5, 5, 8), zoo.load(RECIPE, 3, QPolicy)
+    before, after = QPolicy(5, 5, 8).requires_grad_(False).eval(), zoo.load(RECIPE, 3, QPolicy)
     x = torch.rand(4, 10, 5)
-    for saved_weight, loaded in zip(before.parameters(), after.parameters(), strict=True):
-        assert torch.equal(saved_weight, loaded)
-    # Loaded, it is compiled.
-    torch.testing.assert_close(after.scores(x), before.scores(x), rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(after.scores(x), before.scores(x), rtol=0, atol=0)
     assert not any(weight.requires_grad for weight in after.parameters())
     assert after.weights_sha256 == zoo.card(RECIPE, 3)["sha256"]
     assert zoo.seeds(RECIPE) == [3]

@@ -1,10 +1,9 @@
-"""The world `merge`: its axes, its drivers, and that its episodes do not depend on the batch."""
+"""The world `merge`: its axes and its drivers."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from cavbench.driving import Control
 from cavbench.envs.highway.engine import Flag, Number
@@ -43,32 +42,6 @@ def test_a_short_drive_with_perfect_information_does_not_fail() -> None:
     drive = env.rollout(120, break_when_all_done=True)
     assert not drive["next", "info", "crashed"].any()
     assert not drive["next", "info", "offroad"].any()
-
-
-def test_an_episode_does_not_depend_on_the_batch() -> None:
-    world = MergeWorld()
-    env = world.make([SPARSE, DENSE, MERGE.cell(density=2.0, ramp=80.0, weather="rain")])
-    alone = world.make([DENSE])
-    seeds = torch.tensor([3, 4, 5])
-    together, single = env.reset(env.reset().set("seed", seeds)), alone.reset(alone.reset().set("seed", seeds[1:2]))
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(60):
-        action = torch.randint(5, (3,), generator=generator)
-        together = env.step(together.set("action", action))["next"]
-        single = alone.step(single.set("action", action[1:2]))["next"]
-        assert (together["observation"][1] == single["observation"][0]).all()
-        if together["done"].any():
-            break
-
-
-def test_weather_changes_what_is_seen_and_nothing_else() -> None:
-    cells = [MERGE.cell(density=2.0, ramp=80.0, weather=weather) for weather in ("clear", "fog")]
-    engine = RoadsEngine(MergeWorld().config(cells))
-    engine.reset(np.arange(2), np.array([9, 9]))
-    for _ in range(30):
-        engine.step(np.array([1, 1]))
-    assert (engine.bodies["x"][0] == engine.bodies["x"][1]).all()
-    assert (engine.observation[0] != engine.observation[1]).any()
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def test_an_episode_does_not_depend_on_the_batch(kind: type[RoadsWorld]) -> None
     seeds = torch.tensor([3, 4, 5])
     together, single = env.reset(env.reset().set("seed", seeds)), alone.reset(alone.reset().set("seed", seeds[1:2]))
     generator = torch.Generator().manual_seed(0)
-    for _ in range(40):
+    for _ in range(60):
         action = torch.randint(5, (3,), generator=generator)
         together = env.step(together.set("action", action))["next"]
         single = alone.step(single.set("action", action[1:2]))["next"]
@@ -126,7 +126,7 @@ def test_weather_changes_what_is_seen_and_nothing_else(kind: type[RoadsWorld]) -
     cells = [Cell(**{**kind.home, "weather": weather}) for weather in ("clear", "fog")]
     engine = RoadsEngine(kind().config(cells))
     engine.reset(np.arange(2), np.array([9, 9]))
-    for _ in range(15):
+    for _ in range(30):
         engine.step(np.array([IDLE, IDLE]))
     assert (engine.bodies["x"][0] == engine.bodies["x"][1]).all()
     assert (engine.observation[0] != engine.observation[1]).any()
