@@ -1,4 +1,4 @@
-"""The end of a command: no thread and no hook that a plug-in left holds it, and a line says whose it was."""
+"""The end of a command: nothing that a plug-in left holds or outlives it, and a line says whose it was."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from os import write
 from time import sleep
 
 from cavbench.errors import bounded
+from cavbench.isolation import tree
 
 END_S = 6.0
 """Seconds that threads and hooks may take after the command has said all."""
@@ -28,10 +29,11 @@ BACKSTOP_S = 2.0
 def ended(command: Callable[[], None]) -> None:
     """Carry out a command, and end the process with its exit code.
 
-    A process that imported a plug-in waits for threads and hooks of its end `END_S` seconds. Objects that are left are not
-    deleted one by one: their code could hang, too.
+    A process that imported a plug-in waits for threads and hooks of its end `END_S` seconds, and ends the processes that are left
+    then. Objects that are left are not deleted one by one: their code could hang, too.
     """
     code: object = 0
+    tree.adopt()
     try:
         command()
     except SystemExit as error:
@@ -68,16 +70,26 @@ def _end(code: int) -> None:
         phase[0] = "hooks"
         atexit._run_exitfuncs()
         _flush()
+    phase[0] = "processes"
+    with suppress(BaseException):
+        if names := tree.end_what_is_left():
+            whose = ", ".join(sorted(set(_foreign().values())))
+            line = f"the command ended processes that one of {whose} left: {', '.join(names)}"
+            write(2, f"warning: {bounded(line)}\n".encode())
     end_now(code)
 
 
 def _watch(code: int, phase: list[str]) -> None:
     sleep(END_S)
+    if phase[0] == "processes":
+        return
     line = "the command is ended, although something that a plug-in left does not end"
     with suppress(BaseException):
         line = f"the command is ended, although {_held(phase[0])}"
     with suppress(BaseException):
         write(2, f"warning: {bounded(line)}\n".encode())
+    with suppress(BaseException):
+        tree.end_what_is_left()
     end_now(code)
 
 

@@ -23,6 +23,7 @@ from cavbench.cli.as_json import recordings
 from cavbench.cli.show import located, pair_named, records_of
 from cavbench.errors import UserError
 from cavbench.files import check_folder
+from cavbench.isolation import tree
 from cavbench.scenarios.axes import written
 from cavbench.terminal import Console
 
@@ -78,7 +79,8 @@ def open_recording(run: str, where: Sequence[str], out: Path, console: Console, 
             soft_wrap=True,
         )
         return
-    subprocess.Popen([sys.executable, "-m", "rerun", str(path)], start_new_session=True)
+    with tree.ours():
+        subprocess.Popen([sys.executable, "-m", "rerun", str(path)], start_new_session=True)
     console.print(Text(f"opened {path} in the rerun viewer"), soft_wrap=True)
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import FrameType
 
 from cavbench.errors import EscapeError, Notice, reason
+from cavbench.isolation import tree
 from cavbench.isolation.framework import Snapshot
 from cavbench.isolation.settings import RECURSION, Settings
 
@@ -107,10 +108,11 @@ def harm(act: Callable[[], object], seconds: float = HARM_S, *, stays: bool = Fa
         act: imports a module, or reads a file.
         seconds: how long it may take.
         stays: whether what it does stays in a process, as a module does: then the settings of the process must be as before,
-            and its hooks for the end of the process must end.
+            its hooks for the end of the process must end, and no process that it started may be left after them.
 
     Returns:
-        That it ends the process, does not end, replaces functions of the framework, or changes settings; empty without `os.fork`.
+        That it ends the process, does not end, replaces functions of the framework, changes settings, or leaves something; empty
+        without `os.fork`.
     """
     if sys.platform != "linux":
         return ""
@@ -131,14 +133,17 @@ def _tried(act: Callable[[], object], seconds: float, stays: bool, stuck: float)
         said = _reported(pipe, child, deadline, stuck)
         late = time.monotonic() >= deadline
         reported = bool(said and said.startswith(SURVIVED))
-        last = reported and (not stays or said.endswith(ENDED) or _said(pipe, END_S) is not None)  # type: ignore[union-attr]
+        left = _left(said, pipe) if said and reported and stays else ""
+    started = tree.identities(child)
     if said == b"":
         # It ends by itself, and its exit code says why.
         _wait(child, END_S)
     # What it started ends, too.
+    for process in started:
+        process.kill()
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)
-    if said is None:
+    if said is None or left:
         os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     if said is None:
@@ -146,8 +151,16 @@ def _tried(act: Callable[[], object], seconds: float, stays: bool, stuck: float)
     if not reported:
         code = os.waitstatus_to_exitcode(status)
         return "closes files of the process" if code == CLOSED else f"ends the process ({ended(code)})"
-    found = said.removeprefix(SURVIVED).partition(b"\n")[0].decode(errors="replace")
-    return found or ("" if last else f"leaves a hook for the end of the process that does not end within {END_S:g} s")
+    return said.removeprefix(SURVIVED).partition(b"\n")[0].decode(errors="replace") or left
+
+
+def _left(said: bytes, pipe: FileIO) -> str:
+    """What a copy that has reported leaves at its end; empty if nothing."""
+    after = said.partition(b"\n")[2] or _said(pipe, END_S + tree.LEFT_S)
+    if after is None:
+        return f"leaves a hook for the end of the process that does not end within {END_S:g} s"
+    names = after.removeprefix(ENDED).decode(errors="replace")
+    return f"leaves a process that outlives the command ({names})" if names else ""
 
 
 def _copied() -> int:
@@ -198,9 +211,10 @@ def _wait(child: int, seconds: float) -> None:
 
 def _act_and_end(act: Callable[[], object], write: int, stays: bool) -> None:
     """In the copy: do it without a word on the terminal, report, and end."""
-    code = 0
+    code, own = 0, os.getpid()
     try:
         os.setsid()
+        tree.adopt()
         silence = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(silence, stream)
@@ -217,6 +231,8 @@ def _act_and_end(act: Callable[[], object], write: int, stays: bool) -> None:
         framework, settings, limit = Snapshot(), Settings(alone=True), sys.getrecursionlimit()
         with suppress(BaseException):
             act()
+        if os.getpid() != own:
+            return
         lowered = sys.getrecursionlimit()
         sys.setrecursionlimit(limit)
         found = ""
@@ -230,7 +246,7 @@ def _act_and_end(act: Callable[[], object], write: int, stays: bool) -> None:
         if stays:
             with suppress(BaseException):
                 atexit._run_exitfuncs()
-            os.write(write, ENDED)
+            os.write(write, ENDED + ", ".join(tree.end_what_is_left(write)).encode())
     finally:
         os._exit(code)
 

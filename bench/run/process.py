@@ -12,6 +12,8 @@ import threading
 from multiprocessing.context import BaseContext
 from pathlib import Path
 
+from cavbench.isolation import tree
+
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 """Parameters of glibc's mallopt(3)."""
 PR_SET_PDEATHSIG = 1
@@ -87,7 +89,8 @@ def context(*modules: str) -> BaseContext:
     before = dict(os.environ)
     os.environ |= {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     try:
-        forkserver.ensure_running()
+        with tree.ours():
+            forkserver.ensure_running()
     finally:
         os.environ.clear()
         os.environ.update(before)

@@ -9,9 +9,9 @@ from multiprocessing.connection import wait
 from cavbench.core import registry
 from cavbench.errors import UserError
 from cavbench.isolation.threads import holders
+from cavbench.isolation.tree import resident_bytes
 from cavbench.run.executor import NEWS_S, Finished, Retries, Watcher
 from cavbench.run.task import Limits, Outcome, Task
-from cavbench.run.tree import resident_bytes
 from cavbench.run.worker import GB, Worker, packed
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cavbench.errors import UserError, short
+from cavbench.isolation import tree
 from cavbench.run.executor import NEWS_S, Finished, Retries, Watcher
 from cavbench.run.process import cores
 from cavbench.run.task import Limits, Outcome, Task
@@ -118,7 +119,8 @@ class RayExecutor:
         if self.started:
             _check_answers(address)
             try:
-                ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **own)
+                with tree.ours():
+                    ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **own)
             # Ray has many ways of saying that nothing answers.
             except Exception as error:
                 line = str(error).strip().splitlines()[0]
@@ -228,4 +230,6 @@ class RayExecutor:
         for actor in list(self.actors):
             self._kill(actor)
         if self.started:
+            # Ray's agents end by themselves, a minute later.
+            tree.OURS.update(tree.identities(os.getpid()))
             self.ray.shutdown()

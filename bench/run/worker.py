@@ -20,10 +20,10 @@ from typing import Any
 
 from cavbench import files
 from cavbench.errors import reason
+from cavbench.isolation import tree
 from cavbench.isolation.foreign import contained, ended
 from cavbench.isolation.framework import Snapshot
 from cavbench.isolation.settings import Settings
-from cavbench.run import tree
 from cavbench.run.attempt import attempt
 from cavbench.run.blame import blamed
 from cavbench.run.process import children, follow_parent, settle

@@ -14,8 +14,8 @@ import pytest
 
 from cavbench.core import registry
 from cavbench.errors import UserError
+from cavbench.isolation.tree import resident_bytes
 from cavbench.run.process_executor import ProcessExecutor
-from cavbench.run.tree import resident_bytes
 from cavbench.run.worker import Limits
 from tests.command import import_path
 from tests.plugins.distributions import install
@@ -98,6 +98,25 @@ def test_a_command_ends_whatever_a_plugin_left(what: str, tmp_path: Path) -> Non
         assert found.stderr == ""
     if what == "nothing":
         assert found.stdout.endswith("and the hooks are heard\n")
+
+
+def test_a_command_ends_the_processes_that_a_plugin_left(tmp_path: Path) -> None:
+    started = (
+        "subprocess.Popen(['sleep', '96'])",
+        "subprocess.Popen(['sleep', '96'], start_new_session=True)",
+        "os.fork() or (os.setsid(), os.execlp('sleep', 'sleep', '96'))",
+    )
+    code = HEAD + "import os, subprocess\ndef main():\n" + "".join(f"    {one}\n" for one in started)
+    install(tmp_path, "cavbench-late", {"cavbench.attacks": {"slow_end": "late:main"}}, {"late": code}, "2.0")
+    found = subprocess.run(
+        [sys.executable, "-c", COMMAND],
+        env={"PYTHONPATH": import_path(tmp_path), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert found.returncode == 3
+    assert found.stderr == "warning: the command ended processes that one of cavbench-late 2.0 left: sleep\n"
 
 
 def test_a_thread_that_fills_the_runs_own_process_stops_the_run_by_name(monkeypatch: pytest.MonkeyPatch) -> None:

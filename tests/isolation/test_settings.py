@@ -58,6 +58,9 @@ STAYS = {
     "import torch; torch.nn.modules.module.register_module_forward_hook(print)": "changes the hooks of all modules of torch",
     "import torch; torch.overrides.TorchFunctionMode().__enter__()": "changes the default device of torch, the modes of torch",
     "import atexit, time; atexit.register(time.sleep, 99)": "leaves a hook for the end of the process that does not end within",
+    "import subprocess; subprocess.Popen(['sleep', '99'])": "leaves a process that outlives the command (sleep)",
+    "import subprocess; subprocess.Popen(['sleep', '98'], start_new_session=True)": "leaves a process that outlives the command",
+    "import os, time; os.fork() or os.fork() or (os.setsid(), time.sleep(99))": "leaves a process that outlives the command",
     "import os; os._exit(0)": "ends the process (exit code 0)",
 }  # fmt: skip
 HONEST = (
@@ -68,8 +71,16 @@ HONEST = (
     "import torch, numpy, random; torch.manual_seed(1); numpy.random.seed(1); random.seed(1)",
     "import threading, time; threading.Thread(target=time.sleep, args=(99,), daemon=True).start()",
     "import highway_env, cv2, ray, art, stable_baselines3, onnxruntime, mitsuba, matplotlib.pyplot, sklearn",
+    "import subprocess; subprocess.run(['true'])",
+    "import atexit, subprocess; atexit.register(subprocess.Popen(['sleep', '97']).kill)",
     "1 / 0",
 )
+
+
+def sleepers() -> list[str]:
+    """The processes that sleep for as long as those of these tests, whoever is their parent."""
+    commands = [one.read_bytes().split(b"\0") for one in Path("/proc").glob("[0-9]*/cmdline") if one.exists()]
+    return [repr(one) for one in commands if one[:1] == [b"sleep"] and one[1:2] in ([b"97"], [b"98"], [b"99"])]
 
 
 def executed(code: str) -> None:
@@ -97,6 +108,7 @@ def test_what_an_import_would_change_is_noticed_in_a_copy_of_the_process(
     assert found.startswith(wanted)
     assert bool(found) == bool(wanted)
     assert before.changed() == ""
+    assert not sleepers()
 
 
 @LINUX

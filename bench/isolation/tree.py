@@ -10,13 +10,18 @@ import os
 import signal
 import stat
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+# By name: a plug-in could replace or delete what a module has.
+from time import monotonic, sleep
+
 PR_SET_CHILD_SUBREAPER = 36
 """Parameter of Linux' prctl(2)."""
+LEFT_S = 1.0
+"""Seconds that processes may take to end after what held them is closed."""
 ROUNDS = 20
 """How often what is left of a tree is killed: a process may start another one meanwhile."""
 MEMORY = ("/dev/shm/", "/memfd:", "/SYSV")
@@ -35,6 +40,20 @@ class Identity:
         if _start(self.number) == self.start:
             with suppress(ProcessLookupError, PermissionError):
                 os.kill(self.number, signal.SIGKILL)
+
+
+OURS: set[Identity] = set()
+"""What the framework itself started. It ends by itself, or is meant to stay, as a viewer is."""
+
+
+@contextmanager
+def ours() -> Iterator[None]:
+    """What this process starts in this context is the framework's own: `end_what_is_left` leaves it alone."""
+    before = identities(os.getpid())
+    try:
+        yield
+    finally:
+        OURS.update(identities(os.getpid()) - before)
 
 
 def identities(process: int) -> set[Identity]:
@@ -111,15 +130,55 @@ def folder_bytes(folder: Path) -> int:
 
 def kill(process: int) -> None:
     """End the descendants of a process that is its own reaper, wherever they are; then the process itself."""
+    _kill_descendants(process)
+    with suppress(ProcessLookupError, PermissionError):
+        os.kill(process, signal.SIGKILL)
+
+
+def end_what_is_left(*used: int) -> list[str]:
+    """End the descendants of this process that would outlive it, but not the framework's own (`ours`).
+
+    Call it last: files are closed, because some programs end as soon as nobody has the other end of a pipe.
+
+    Args:
+        used: descriptors of this process that stay open, beside its standard streams.
+
+    Returns:
+        The programs that had to be killed, in alphabetical order.
+    """
+    own, deadline = os.getpid(), monotonic() + LEFT_S
+    if not _living(own, but=OURS):
+        return []
+    for number in [int(name) for name in os.listdir("/proc/self/fd")]:
+        if number > 2 and number not in used:
+            with suppress(OSError):
+                os.close(number)
+    while (living := _living(own, but=OURS)) and monotonic() < deadline:
+        sleep(0.01)
+    names = sorted({name for one in living if (name := _program(one.number))})
+    _kill_descendants(own, but=OURS)
+    return names
+
+
+def _kill_descendants(process: int, but: Collection[Identity] = ()) -> None:
     for _ in range(ROUNDS):
-        living = [one for one in descendants(process) if not _is_zombie(one)]
+        living = _living(process, but)
         if not living:
             break
         for one in living:
-            with suppress(ProcessLookupError, PermissionError):
-                os.kill(one, signal.SIGKILL)
-    with suppress(ProcessLookupError, PermissionError):
-        os.kill(process, signal.SIGKILL)
+            one.kill()
+
+
+def _living(process: int, but: Collection[Identity] = ()) -> list[Identity]:
+    return [one for one in identities(process) - set(but) if not _is_zombie(one.number)]
+
+
+def _program(process: int) -> str:
+    """What a process runs; empty if it is not there."""
+    try:
+        return Path(f"/proc/{process}/comm").read_text().strip()
+    except OSError:
+        return ""
 
 
 def _is_zombie(process: int) -> bool:
