@@ -14,7 +14,7 @@ from cavbench.core import budgets, registry, suites
 from cavbench.core.contracts import Access, Attack, Component, Defense, ThreatModel, Victim, World
 from cavbench.core.pair import Chosen, Pair, choose
 from cavbench.core.registry import GROUPS, Kind
-from cavbench.core.suites import Suite, combined
+from cavbench.core.suites import Suite, combined, racing
 from cavbench.core.track import track
 from cavbench.detection import CameraWorld, Detector
 from cavbench.detection.victims.in_process import DetectorObject, detector
@@ -209,8 +209,8 @@ def _refuse_twice(victim: InProcess) -> None:
 
 def pairs_of(
     attack: Any, defense: Any, victim: Chosen[Any], world: Chosen[Any], threat: ThreatModel | Mapping[str, Any] | None
-) -> tuple[list[Pair], list[str]]:
-    """Every combination of attacks and defences, as `cavbench.core.suites.combined`."""
+) -> tuple[list[Pair], list[str], frozenset[str]]:
+    """Every combination of attacks and defences, as `cavbench.core.suites.combined`, and the pairs that race."""
     own_track = victim.component.tracks()[0]
     names = suites.names()
     chosen_suites = [suites.suite(one, own_track) for one in several(attack) if isinstance(one, str) and one in names]
@@ -225,7 +225,8 @@ def pairs_of(
     allowed = threat_of(threat, victim, chosen_suites)
     defenses = [chosen("defense", one, own_track) for one in several(defense)]
     others = [{"defense": one, "victim": victim, "world": world, "threat": allowed} for one in defenses]
-    return combined(attacks, chosen_suites, others)
+    pairs, skipped = combined(attacks, chosen_suites, others)
+    return pairs, skipped, racing(pairs, attacks, chosen_suites)
 
 
 def threat_of(

@@ -43,6 +43,7 @@ def score(
     seeds: Sequence[int] | None = None,
     by: By = "pair",
     baselines: bool = True,
+    race: bool = True,
     record: int = 0,
     out: str | Path = "results",
     workers: int = 1,
@@ -73,6 +74,7 @@ def score(
         seeds: training seeds; by default those of the grid, or one for each object of `victim`.
         by: `pair` for one row for each pair, `cell` for one row for each pair and cell.
         baselines: whether to drive the baselines, too.
+        race: whether only the strongest two attacks of a suite drive all scenarios; the others drive a pilot.
         record: episodes to record in each cell.
         out: results folder. What is there is not driven again.
         workers: worker processes. 1 drives in this process. More need a script with `if __name__ == "__main__":`, and objects
@@ -96,7 +98,7 @@ def score(
     in_world = world_of(world, victim)
     asked = grid_with(in_world, grid, episodes, axes)
     attacked = victim_of(victim, in_world, asked, name=name, actions=actions, trained_in=trained_in)
-    pairs, skipped = pairs_of(attack, defense, attacked, in_world, threat)
+    pairs, skipped, racing = pairs_of(attack, defense, attacked, in_world, threat)
     checked_for_workers(pairs, workers)
     policies = getattr(attacked.component, "policies", ())
     count = len(policies) if len(policies) > 1 else asked.training_seeds
@@ -111,6 +113,7 @@ def score(
             out=Path(out).expanduser(),
             record=record,
             reference=baselines,
+            racing=racing if race else frozenset(),
             skipped=tuple(skipped),
         )
     except ValueError as error:

@@ -106,5 +106,5 @@ def show_plan(plan: Plan, console: Console) -> None:
 def _print(plan: Plan, records: pa.Table | None, console: Console, report: Callable[[Track, pa.Table], None]) -> None:
     if records is not None:
         report(plan.track, records)
-    for stop in stops.read(plan.out, [pair.id for pair in plan.pairs]) if plan.until else ():
+    for stop in stops.read(plan.out, [pair.id for pair in plan.pairs]) if plan.until or plan.racing else ():
         console.print(Text(str(stop)), soft_wrap=True)

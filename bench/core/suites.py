@@ -67,6 +67,7 @@ class Suite:
         access: the access that its members need, allowed by default in a run of the suite.
         members: the attacks.
         threat: what else of the threat model is allowed by default, such as {"presence.hidden": 9}.
+        races: whether its strongest member counts alone, so that the others need not drive all scenarios.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Suite:
     access: Access
     members: tuple[Member, ...]
     threat: Mapping[str, Any] = field(default_factory=dict)
+    races: bool = False
 
     @classmethod
     def read(cls, path: Path) -> Suite:
@@ -173,6 +175,13 @@ def combined(
     if not pairs:
         raise UserError(skipped[0] if skipped else f"no member of {suites[0].name} is meant for the victim")
     return list({pair.id: pair for pair in pairs}.values()), list(dict.fromkeys(skipped))
+
+
+def racing(pairs: Sequence[Pair], attacks: Sequence[Chosen[Any]], suites: Sequence[Suite]) -> frozenset[str]:
+    """The pairs that race, by their `id`: members of suites that race, but no attack that was chosen by its name."""
+    members = {str(member.chosen) for suite in suites if suite.races for member in suite.members}
+    members -= {str(attack) for attack in attacks}
+    return frozenset(pair.id for pair in pairs if str(pair.attack) in members)
 
 
 def _family(name: str) -> str:

@@ -14,7 +14,7 @@ from cavbench.core import registry
 from cavbench.core.options import Options, configured
 from cavbench.core.pair import Chosen, Pair, check_track
 from cavbench.core.registry import KINDS, Kind
-from cavbench.core.suites import combined
+from cavbench.core.suites import combined, racing
 from cavbench.errors import UserError, short
 from cavbench.run import config_file, logs
 from cavbench.run.gates import Gates
@@ -97,11 +97,19 @@ def plan_of(words: Sequence[str], start: Callable[[str], None] = lambda executor
             unit_timeout=settings["unit_timeout"],
             unit_memory=settings["unit_memory"],
             until=settings["until"],
+            racing=_racing(settings, pairs, given),
             device=settings["device"],
             gates=_gates(settings),
             log=_log(settings["log"]),
             words=_repeating(words, given, standard, settings["seeds"]),
         )
+
+
+def _racing(settings: Mapping[str, Any], pairs: Sequence[Pair], given: Options) -> frozenset[str]:
+    """The pairs that race: by default those of suites, where all their units are in one run."""
+    alone = settings["until"] is None and settings["shard"] == "1/1"
+    wanted = alone if settings["race"] is None else settings["race"]
+    return racing(pairs, given.chosen("attack"), given.suites) if wanted else frozenset()
 
 
 def _gates(settings: Mapping[str, Any]) -> Gates:

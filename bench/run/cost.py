@@ -22,6 +22,7 @@ from cavbench.core.parameters import parameters
 from cavbench.records.packing import UNITS
 from cavbench.run.batches import batches
 from cavbench.run.process import cores
+from cavbench.run.racing import dearest
 from cavbench.run.task import Task
 from cavbench.run.unit import Unit
 
@@ -55,7 +56,7 @@ class Cost:
         workers: worker processes that have something to do.
         disk_bytes: what the results folder will have.
         unknown: components whose cost nobody measured.
-        at_most: whether it may stop earlier (`until`).
+        at_most: whether it may drive less (`until`, or a race).
         by_pair: episodes and CPU seconds of each pair that is driven, by its `id`.
     """
 
@@ -260,10 +261,11 @@ def cost_of(plan: Any) -> Cost:
     """What a `cavbench.run.plan.Plan` costs, all of it; of a run with `until` the most. No network is loaded for it."""
     asked = {pair.id for pair in plan.pairs}
     baselines = {pair.id for pair in plan.baselines} - asked
+    every = {pair.id: rates(pair) for pair in plan.driven}
     weights = {task.unit.networks: ("", "") for task in plan.loadings}
     units = [unit for part in plan.rounds for unit in part.units(weights)]
+    units = dearest(plan, units, lambda pair: every[pair.id].episode)
     workers = 1 if plan.executor == "serial" else plan.workers or cores()
-    every = {pair.id: rates(pair) for pair in plan.driven}
     seeds = {(unit.pair.id, unit.training_seed) for unit in units if every[unit.pair.id].artefact}
     by_pair = dict.fromkeys(every, (0, 0.0))
     for name, _ in seeds:
@@ -281,7 +283,7 @@ def cost_of(plan: Any) -> Cost:
         workers=min(workers, max(1, len(units))),
         disk_bytes=_disk(plan, units, episodes) + len(seeds) * ARTEFACT_BYTES,
         unknown=tuple(dict.fromkeys(name for one in every.values() for name in one.unknown)),
-        at_most=plan.until is not None,
+        at_most=plan.until is not None or bool(plan.racing),
         by_pair=by_pair,
     )
 

@@ -79,15 +79,19 @@ class Forecast:
         recorded: Collection[str] = (),
     ) -> None:
         self.workers, self.now = workers, now
-        units = [task.unit for task in tasks if task.step == "drive"]
-        costs = iter(shares(units, workers, recorded))
         self.parts: dict[str, Part] = {}
-        for task in tasks:
-            cost = next(costs) if task.step == "drive" else rates(task.pair).artefact
-            self.parts[_key(task)] = Part(task.pair, cost)
+        self.expect(tasks, recorded)
         self.running: dict[str, Batch] = {}
         self.ended: dict[str, Part] = {}
         self.spent: dict[Hashable, list[float]] = {}
+
+    def expect(self, tasks: Sequence[Task], recorded: Collection[str] = ()) -> None:
+        """These tasks are still to be done, and no others; arguments as of the class."""
+        costs = iter(shares([task.unit for task in tasks if task.step == "drive"], self.workers, recorded))
+        self.parts = {
+            _key(task): Part(task.pair, next(costs) if task.step == "drive" else rates(task.pair).artefact)
+            for task in tasks
+        }
 
     def working(self, tasks: Sequence[Task]) -> None:
         """These are under way, each with all its units, and no others."""

@@ -60,6 +60,9 @@ class RunOptions:
     until: float | None = field(
         default=None, metadata=_meaning("Drive in rounds until each score is known to +- this.", "off")
     )
+    race: bool | None = field(
+        default=None, metadata=_meaning("Only the strongest two of a suite drive all scenarios.", "true")
+    )
     config: str | None = field(
         default=None, metadata=_meaning("YAML file with these options, or the folder of a run.", "none", "FILE.yaml")
     )

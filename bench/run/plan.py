@@ -48,6 +48,7 @@ class Plan:
         shard: (3, 10) drives the third of ten equal parts of the units.
         unit_timeout: seconds that a task may take; 0 for no limit.
         unit_memory: GB of memory that a worker process may use; 0 for no limit.
+        racing: the pairs that race (`cavbench.run.racing`), by their `id`.
         device: where victims compute: `auto` is a GPU if there is one, and becomes `cpu` or `cuda` here.
         until: half the width of the interval at which a row has enough scenarios (`cavbench.run.rounds`); None drives them all.
         gates: what it must reach to pass.
@@ -73,6 +74,7 @@ class Plan:
     unit_timeout: float = 3600.0
     unit_memory: float = field(default_factory=half_of_memory)
     until: float | None = None
+    racing: frozenset[str] = frozenset()
     device: str = CPU
     gates: Gates = field(default_factory=Gates)
     log: str | None = None
@@ -92,6 +94,8 @@ class Plan:
             raise ValueError(f"record must be between 0 and the {self.grid.episodes} episodes, got {self.record}")
         if self.until is not None:
             self._check_until(self.until)
+        if self.racing and (self.until is not None or self.shard != (1, 1)):
+            raise ValueError("a race looks at all units of its pilot: with until or shard, race=true cannot be")
 
     def _check_until(self, until: float) -> None:
         if not 0.001 <= until < 0.5:

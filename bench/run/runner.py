@@ -12,12 +12,14 @@ from typing import Protocol
 
 from cavbench.run import config_file
 from cavbench.run.batches import batches
+from cavbench.run.cost import rates
 from cavbench.run.executor import Executor, Finished
 from cavbench.run.executors import EXECUTORS
 from cavbench.run.failures import Failures
 from cavbench.run.forecast import Forecast
 from cavbench.run.loading import LoadWatcher, load
 from cavbench.run.plan import Plan
+from cavbench.run.racing import dearest, race
 from cavbench.run.results import Results
 from cavbench.run.rounds import drive_until
 from cavbench.run.task import Outcome, Task
@@ -68,15 +70,17 @@ def run(plan: Plan, watcher: RunWatcher, choose: Choice | None = None) -> list[s
             units = {key: unit for key, unit in units.items() if key in chosen}
         driving = _Driving(results, plan.recorded(units.values()), back_end, watcher, failures)
         driving.finished |= results.finished(units)
-        episodes = {key: len(unit.seeds) for key, unit in units.items()}
-        done = sum(episodes[key] for key in driving.finished)
-        forecast = driving.forecast(list(units.values()))
-        watcher.begin(episodes=sum(episodes.values()), finished=done, forecast=forecast)
-        if plan.until is None:
-            driving.carry_out(list(units.values()))
-            wanted = list(units)
-        else:
+        expected = dearest(plan, list(units.values()), lambda pair: rates(pair).episode)
+        done = sum(len(unit.seeds) for unit in expected if unit.fingerprint in driving.finished)
+        forecast = driving.forecast(expected)
+        watcher.begin(episodes=sum(len(unit.seeds) for unit in expected), finished=done, forecast=forecast)
+        if plan.until is not None:
             wanted = drive_until(plan, weights, driving.carry_out, results)
+        elif plan.racing:
+            wanted = race(plan, list(units.values()), driving.carry_out, driving.rest, results)
+        else:
+            driving.carry_out(expected)
+            wanted = list(units)
     if line := _hopeless(plan, {key: unit for key, unit in units.items() if key in driving.finished}, results):
         watcher.warn(line)
     if failures:
@@ -117,15 +121,24 @@ class _Driving:
         self.results, self.recorded, self.back_end = results, recorded, back_end
         self.watcher, self.failures = watcher, failures
         self.finished: set[str] = set()
+        self._forecast: Forecast | None = None
         self._warned: set[str] = set()
 
     def forecast(self, units: Sequence[Unit]) -> Forecast:
         """What the units that are not finished take, with what is prepared for them."""
+        self._forecast = Forecast(self._tasks(units), self.back_end.size, recorded=self.recorded)
+        return self._forecast
+
+    def rest(self, units: Sequence[Unit]) -> set[str]:
+        """As `carry_out`, of units that are all that is left of the run."""
+        if self._forecast:
+            self._forecast.expect(self._tasks(units), self.recorded)
+        return self.carry_out(units)
+
+    def _tasks(self, units: Sequence[Unit]) -> list[Task]:
         waiting = [unit for unit in units if unit.fingerprint not in self.finished]
         absent = {unit.artefact: Task(unit=unit, step="prepare") for unit in waiting if self.results.lacks(unit)}
-        return Forecast(
-            [*absent.values(), *(Task(unit=unit) for unit in waiting)], self.back_end.size, recorded=self.recorded
-        )
+        return [*absent.values(), *(Task(unit=unit) for unit in waiting)]
 
     def carry_out(self, units: Sequence[Unit]) -> set[str]:
         """Prepare what is missing, drive the units that are not finished, and return the fingerprints of those that are now."""

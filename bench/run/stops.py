@@ -1,4 +1,4 @@
-"""Where the rows of a run with `until=` stopped: a file each in the results folder."""
+"""Where the rows of a run with `until=` stopped, and which were dropped from a race: a file each in the results folder."""
 
 from __future__ import annotations
 
@@ -19,19 +19,21 @@ class Stop:
 
     Args:
         pair: name of the pair.
-        why: `narrow`, `ruled out`, `grid done` or `failed`.
-        by: for a pair that was ruled out, the pairs that were stronger in its cells.
-        until: half the width of the interval that was asked for.
+        why: `narrow`, `ruled out`, `grid done`, `failed` or `raced out`.
+        by: for a pair that was ruled out, the pairs that were stronger in its cells; for one that was raced out, those that
+            went on.
+        until: half the width of the interval that was asked for; None in a race.
         scenarios: scenarios driven in each cell.
         most: scenarios of the grid in each cell.
         estimate: mean of the ranking metric over training seeds, cells and scenarios.
-        low, high: bounds of the mean over all scenarios, for these trained victims; valid at every look together with 95 %.
+        low, high: bounds of the mean over all scenarios, for these trained victims; valid at every look together with 95 %. Of
+            a pair that was raced out, the 95 % interval of the pilot, for other trainings, too.
     """
 
     pair: str
     why: str
     by: tuple[str, ...]
-    until: float
+    until: float | None
     scenarios: int
     most: int
     estimate: float
@@ -39,7 +41,12 @@ class Stop:
     high: float
 
     def __str__(self) -> str:
-        said = {"narrow": "known closely enough", "ruled out": f"ruled out by {' and '.join(self.by)}"}
+        by = " and ".join(self.by)
+        said = {
+            "narrow": "known closely enough",
+            "ruled out": f"ruled out by {by}",
+            "raced out": f"dropped: {by} lowered the score more in all cells together",
+        }
         return (
             f"{self.pair}: {self.estimate:.3f} ({self.low:.3f} to {self.high:.3f}) after {self.scenarios} of {self.most} "
             f"scenarios a cell, {said.get(self.why, self.why)}"

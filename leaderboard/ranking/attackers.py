@@ -86,14 +86,16 @@ def _attacker(name: str, rows: Sequence[Row]) -> Attacker:
 
 def _added(row: Row, family: Sequence[Comparison]) -> float:
     """Never negative: an attack that is nowhere the strongest adds nothing, and below that is what the choice missed."""
-    rest = row.worst.panel.strongest([one for one in row.attacks if one not in family])
-    change = margin(rest, row.worst) if rest else None
+    whole = row.worst.panel.whole
+    every = row.worst if whole is row.worst.panel else whole.strongest()
+    rest = whole.strongest([one for one in row.attacks if one not in family])
+    change = margin(rest, every) if rest and every else None
     found = _alone(row, family) if change is None else change.estimate
     return found if math.isnan(found) else max(found, 0.0)
 
 
 def _alone(row: Row, family: Sequence[Comparison]) -> float:
-    found = row.worst.panel.strongest(family)
+    found = row.worst.panel.whole.strongest(family)
     return found.clean.estimate - found.score.estimate if found and found.clean else math.nan
 
 

@@ -149,7 +149,8 @@ def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
         panel = Panel.of([one for one in allowed if one.ranked_as == defended])
         found = panel.strongest()
         assert found is not None, "the attack whose seeds the panel has has a cell"
-        own = found.order
+        # Those that were dropped from a race, too.
+        own = (*found.order, *(one for one in panel.whole.attacks if one not in found.order))
         same = [one for one in attacked if one.ranked_as == defended and one.identity["grid"] == grid]
         others = [one for one in same if one.identity["threat_norm"] == threat[0]]
         raised = tuple(flags(Subject(track, own, others, found)))

@@ -70,7 +70,7 @@ class Subject:
 
     def strongest(self, *knowledge: str) -> Worst | None:
         """The score under the attacks that asked so much, the strongest in each cell."""
-        return self.worst.panel.strongest([one for one in self.attacks if one.knowledge in knowledge])
+        return self.worst.panel.whole.strongest([one for one in self.attacks if one.knowledge in knowledge])
 
     @property
     def attacked(self) -> list[pa.Table]:

@@ -69,10 +69,23 @@ def row_remarks(worst: Worst) -> list[Remark]:
     one = worst.most
     found = [
         *above(worst, ""),
+        *_raced(worst.panel),
         *doubts.of_victim(one.own.table, one.clean.table if one.clean else None, one.track),
         *doubts.of_runs(len(worst.runs), one.track, trained=worst.trained),
     ]
     return list(dict.fromkeys(found))
+
+
+def _raced(panel: Panel) -> Iterator[Remark]:
+    """A remark where attacks were dropped from a race."""
+    if panel.pilot:
+        dropped, every = len(panel.pilot.attacks) - len(panel.attacks), len(panel.pilot.attacks)
+        yield Remark(
+            "raced",
+            "",
+            f"{dropped} of {every} attacks were dropped from a race after {len(panel.pilot.seeds)} scenarios a cell; the score "
+            f"may be too high by up to {panel.hidden:.3f} for it, which its lower bound allows for",
+        )
 
 
 def _attack(episodes: Episodes) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,7 @@ from cavbench.statistics.doubts import mean
 from cavbench.statistics.episodes import Episodes
 from cavbench.statistics.estimates import Array, Interval, interval, share_interval, task_intervals
 from cavbench.statistics.independent import independent
+from cavbench.statistics.racing import PILOT_RUNS, PILOT_SCENARIOS, by_the_rule, hidden
 from cavbench.statistics.strongest import strongest_of, under
 
 
@@ -32,6 +33,7 @@ class Panel:
         scores: [A, R, C, E] of the metric, NaN in the cells that an attack does not have.
         failed: [A, R, C, E], whether the episode has the failure of the track; NaN likewise.
         left_out: attacks without a whole cell: those that were driven on other seeds, or on a part of them.
+        pilot: in a race (`cavbench.statistics.racing`), all attacks on the seeds after which those of this panel went on alone.
     """
 
     attacks: tuple[Comparison, ...]
@@ -41,17 +43,39 @@ class Panel:
     scores: Array
     failed: Array
     left_out: tuple[Comparison, ...]
+    pilot: Panel | None = None
 
     @classmethod
     def of(cls, attacks: Sequence[Comparison]) -> Panel:
         """The attacks on the training and scenario seeds of one of them: those that keep the most episodes of all attacks.
 
         An attack counts in the cells in which it has all of these seeds. So a partial run changes nothing, and neither does one
-        attack on more training seeds than the others have.
+        attack on more training seeds than the others have. Of a race, those that went on count on all their seeds.
         """
         designs = [(one.own.runs, one.own.seeds) for one in attacks if not one.stands_for_all]
         designs = designs or [(one.own.runs, one.own.seeds) for one in attacks]
-        runs, seeds = min(designs, key=lambda design: (-_episodes(attacks, *design), len(design[0]), design))
+        ordered = sorted(set(designs), key=lambda design: (-_episodes(attacks, *design), len(design[0]), design))
+        found = cls._on(attacks, *ordered[0])
+        if not found.left_out and len(ordered) == 1:
+            return found
+        return next((race for design in ordered if (race := cls._race(attacks, *design))), found)
+
+    @classmethod
+    def _race(cls, attacks: Sequence[Comparison], runs: Sequence[int], seeds: Sequence[int]) -> Panel | None:
+        """The attacks that have these seeds, if they won a race against those that have the pilot's seeds; else None."""
+        first = tuple(runs[:PILOT_RUNS]), tuple(seeds[:PILOT_SCENARIOS])
+        on = [one for one in attacks if _covers(one, runs, seeds)]
+        if first == (tuple(runs), tuple(seeds)) or sum(_covers(one, *first) for one in attacks) <= len(on):
+            return None
+        pilot = cls._on(attacks, *first)
+        whole = not np.isnan(pilot.scores).any()
+        if not whole or not by_the_rule(pilot.scores, [n for n, one in enumerate(pilot.attacks) if one in on]):
+            return None
+        return replace(cls._on(on, runs, seeds), left_out=pilot.left_out, pilot=pilot)
+
+    @classmethod
+    def _on(cls, attacks: Sequence[Comparison], runs: Sequence[int], seeds: Sequence[int]) -> Panel:
+        """The attacks on these seeds."""
         whole = sorted((one for one in attacks if _covers(one, runs, seeds)), key=lambda one: one.content)
         cells = sorted({cell for one in whole for cell in one.cells}, key=whole[0].axes.place)
         shape = (len(whole), len(runs), len(cells), len(seeds))
@@ -63,7 +87,17 @@ class Panel:
             if one.track.failure:
                 failed[number][:, there] = one.own.column(one.track.failure)[places]
         left_out = tuple(sorted((one for one in attacks if one not in whole), key=lambda one: one.content))
-        return cls(tuple(whole), runs, tuple(cells), seeds, scores, failed, left_out)
+        return cls(tuple(whole), tuple(runs), tuple(cells), tuple(seeds), scores, failed, left_out)
+
+    @property
+    def whole(self) -> Panel:
+        """The panel on which all attacks can be compared: in a race, the pilot's."""
+        return self.pilot or self
+
+    @cached_property
+    def hidden(self) -> float:
+        """By how much the score may be too high because attacks were dropped from a race: a bound of 97.5 %; 0 without a race."""
+        return hidden(self.pilot.scores) if self.pilot else 0.0
 
     def strongest(self, attacks: Collection[Comparison] | None = None) -> Worst | None:
         """The score where in each cell the strongest of `attacks` counts; None where none of them has a cell.
@@ -83,7 +117,13 @@ class Panel:
         return Worst(self, tuple(cells.tolist()), weights, under(own, scores), under(own, failed), tuple(some))
 
     def marginal(self, worst: Worst) -> dict[Comparison, Interval]:
-        """By how much each attack lowers the score further than all the others do together; `worst` is that of all."""
+        """By how much each attack lowers the score further than all the others do together; `worst` is that of all.
+
+        In a race, in its pilot.
+        """
+        if self.pilot:
+            every = self.pilot.strongest()
+            return self.pilot.marginal(every) if every else {}
         found: dict[Comparison, Interval] = {}
         for attack in self.attacks:
             rest = self.strongest([one for one in self.attacks if one is not attack])
@@ -180,8 +220,8 @@ class Worst:
 
     @cached_property
     def score(self) -> Interval:
-        """The headline: over all runs, cells and scenarios."""
-        return share_interval(self.scores)
+        """The headline: over all runs, cells and scenarios. After a race, lower by what that may hide (`Panel.hidden`)."""
+        return _lowered(share_interval(self.scores), self.panel.hidden)
 
     @cached_property
     def failure(self) -> Interval | None:
@@ -256,7 +296,10 @@ class Worst:
     def lead(self) -> Interval | None:
         """Minus that baseline, paired scenario by scenario, in the cells where that was driven."""
         known = np.isfinite(self.rival).all(1)
-        return interval((self.scores - self.rival)[:, known]) if known.any() else None
+        if not known.any():
+            return None
+        found = interval((self.scores - self.rival)[:, known])
+        return Interval(found.estimate, found.low - self.panel.hidden, found.high)
 
     def beside(self, baseline: str, column: str) -> Array:
         """[C', E] a measurement of a baseline on the same scenarios, NaN where it was not driven."""
@@ -290,8 +333,23 @@ class Worst:
         return found
 
 
+def _lowered(score: Interval, by: float) -> Interval:
+    return Interval(score.estimate, max(score.low - by, 0.0), score.high)
+
+
 def margin(first: Worst, second: Worst) -> Interval | None:
     """`first` minus `second`, in the cells and scenarios that both have; None where they have none.
+
+    What a race may hide of either (`Panel.hidden`) makes it wider.
+    """
+    found = _margin(first, second)
+    if found is None or first.panel is second.panel:
+        return found
+    return Interval(found.estimate, found.low - first.panel.hidden, found.high + second.panel.hidden)
+
+
+def _margin(first: Worst, second: Worst) -> Interval | None:
+    """`margin`, as if nothing had been dropped.
 
     Of the same defended victim, and of two with the same training seeds, runs are paired. All others were trained apart
     (`independent`); if their numbers of trainings differ, the attacks are chosen for each training alone.
