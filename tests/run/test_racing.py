@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 
 from cavbench.core.suites import suite
 from cavbench.core.track import track
+from cavbench.documents import schema
 from cavbench.errors import UserError
 from cavbench.leaderboard.comparisons.reading import read_tracks
 from cavbench.leaderboard.ranking.boards import read_boards
@@ -63,6 +65,7 @@ def test_what_was_dropped_is_written_with_its_reason(driven: tuple[Plan, list[st
         assert set(stop.by) == on
         assert (stop.scenarios, stop.most) == (10, 30)
         assert stop.low <= stop.estimate <= stop.high
+        jsonschema.validate(asdict(stop) | {"by": list(stop.by)}, schema()["$defs"]["stop"])
         assert "lowered the score more in all cells together" in str(stop)
 
 
