@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, replace
+from io import StringIO
 from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
+from rich.console import Console
 
+from cavbench import documents
 from cavbench.core.suites import suite
 from cavbench.core.track import track
 from cavbench.documents import schema
 from cavbench.errors import UserError
 from cavbench.leaderboard.comparisons.reading import read_tracks
+from cavbench.leaderboard.page.document import document
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.ranking.worst import Panel
+from cavbench.leaderboard.terminal.ranking import print_boards
 from cavbench.records import reading
 from cavbench.run import runner, stops
 from cavbench.run.config import plan_of
@@ -85,8 +91,8 @@ def test_the_same_command_drives_nothing_again_and_without_a_race_it_drives_what
 def test_the_report_knows_a_race_from_its_records_and_makes_the_interval_wider(tmp_path: Path) -> None:
     plan = raced(tmp_path)
     records = reading.read(tmp_path, runner.run(plan, Silent()), track=track("driving"))
-    (board,) = read_boards({"driving": records})[0]
-    (row,) = board.rows
+    boards, comparisons = read_boards({"driving": records})
+    ((row,),) = (board.rows for board in boards)
     panel = row.worst.panel
     assert panel.pilot is not None
     assert (len(panel.attacks), len(panel.seeds)) == (2, 30)
@@ -103,6 +109,12 @@ def test_the_report_knows_a_race_from_its_records_and_makes_the_interval_wider(t
     assert alone.score.low > doubtful.score.low == pytest.approx(max(alone.score.low - hidden(close.scores), 0))
     assert len(row.attacks) == 4
     assert set(row.marginal) == set(panel.pilot.attacks)
+    made = documents.document("leaderboard", document(boards, comparisons, tmp_path, ""))
+    jsonschema.validate(json.loads(documents.written(made)), schema())
+    console = Console(file=StringIO(), width=200)
+    print_boards(boards, console)
+    assert isinstance(console.file, StringIO)
+    assert "toy" in console.file.getvalue()
     assert [remark.name for remark in row.remarks if remark.name == "raced"] == ["raced"]
 
 
