@@ -135,7 +135,7 @@ def look(rows: Sequence[Row]) -> None:
         _rule_out(rows, going)
         going = [row for row in rows if row.stop is None]
     found = [row.stopped("narrow") for row in going]
-    if all(stop.high - stop.low <= 2 * stop.until for stop in found):
+    if all(stop.high - stop.low <= 2 * row.until for stop, row in zip(found, going, strict=True)):
         for row, stop in zip(going, found, strict=True):
             row.stop = stop
 
