@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 import re
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pyarrow as pa
@@ -144,10 +145,24 @@ def sweep(place: Path, count: int, seed: int) -> str:
     wrong += [] if same else ["the records of the honest attacks differ"]
     wrong += ["a traceback"] if re.search("^Traceback", said.err, re.MULTILINE) else []
     wrong += [] if alone.code == 0 else [alone.err]
+    left = _left(place)
+    wrong += [f"{len(left)} processes outlived the command: {', '.join(left)}"] if left else []
     return (
         f"{count} plug-ins in {seconds:.0f} s: {len(finished & set(names))} driven, {len(named)} named; "
         f"{'nothing wrong' if not wrong else '; '.join(wrong)}"
     )
+
+
+def _left(place: Path) -> list[str]:
+    """The programs that still run of what plug-ins started, or as copies of the command."""
+    found = []
+    for listed in Path("/proc").glob("[0-9]*/cmdline"):
+        # It may have ended meanwhile.
+        with suppress(OSError):
+            words = listed.read_text(errors="replace").split("\0")
+            if words[:2] == ["sleep", "600"] or any(word.endswith(str(place / "all")) for word in words):
+                found.append(words[0])
+    return found
 
 
 def _honest(records: pa.Table) -> pa.Table:
