@@ -1,0 +1,52 @@
+"""`make publish`: what the leaderboard lacks is named with its cost, driven, and published when it is whole."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from cavbench.core.suites import suite
+from cavbench.leaderboard.job import Wanted, main, wanted_rows
+from cavbench.leaderboard.published import HOME
+
+SMALL = ("victim=dqn", "lanes=3", "density=1", "weather=clear", "episodes=2", "seeds=0", "reference=false", "workers=1")
+
+
+def test_a_row_is_driven_and_published_once(tmp_path: Path) -> None:
+    (tmp_path / "board.toml").write_text(f"[[row]]\nwords = {list(SMALL)}\n")
+    (row,) = wanted_rows(tmp_path, tmp_path / "results")
+    assert row.missing == "all"
+    assert row.drive()
+    (again,) = wanted_rows(tmp_path, tmp_path / "results")
+    assert again.missing == ""
+    assert again.face["scenarios"] == 2
+    assert len(again.face["attacks"]) == len(suite("standard", "driving").members)
+    longer = Wanted((*SMALL[:-4], "episodes=3", "seeds=0,1"), tmp_path, tmp_path / "results")
+    assert longer.missing == "1 of 2 trainings, 2 of 3 scenarios"
+
+
+def test_a_row_that_cannot_be_driven_is_not_published(tmp_path: Path) -> None:
+    row = Wanted((*SMALL, "unit_timeout=0.000001"), tmp_path, tmp_path / "results")
+    assert not row.drive()
+    assert not (tmp_path / "rows").exists()
+
+
+def test_what_is_missing_is_said_with_its_cost(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--list"]) == 0
+    said = capsys.readouterr().out
+    home = Path(str(files(HOME)))
+    rows = wanted_rows(home, Path("results/board"))
+    for row in rows:
+        assert (f" {row.name} " in said) == bool(row.missing)
+    assert said.splitlines()[-1].startswith(" all ")
+
+
+def test_every_row_of_driving_that_is_published_is_in_the_list_or_has_too_few_trainings() -> None:
+    home = Path(str(files(HOME)))
+    listed = {row.name for row in wanted_rows(home, Path("results/board"))}
+    published = {path.stem for path in (home / "rows" / "standard-v2").glob("*.json")}
+    # Of these, one training is in the zoo.
+    assert published - listed == {"dqn+car", "dqn+sa", "dqn+atla"}
+    assert listed <= published
