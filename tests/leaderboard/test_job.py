@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from cavbench.core.suites import suite
 from cavbench.leaderboard.job import Wanted, main, wanted_rows
 from cavbench.leaderboard.published import HOME
 
@@ -22,7 +21,7 @@ def test_a_row_is_driven_and_published_once(tmp_path: Path) -> None:
     (again,) = wanted_rows(tmp_path, tmp_path / "results")
     assert again.missing == ""
     assert again.face["scenarios"] == 2
-    assert len(again.face["attacks"]) == len(suite("standard", "driving").members)
+    assert len(again.face["attacks"]) == len(row.plan.pairs) > 10
     longer = Wanted((*SMALL[:-4], "episodes=3", "seeds=0,1"), tmp_path, tmp_path / "results")
     assert longer.missing == "1 of 2 trainings, 2 of 3 scenarios"
 
