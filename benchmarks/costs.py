@@ -170,7 +170,7 @@ def row_of(name: str, framework: Snapshot) -> dict[str, dict[str, float]]:
 
 
 def world_of(name: str, framework: Snapshot) -> dict[str, float]:
-    """What a victim that computes nothing costs in a world; and how long the episodes of `dqn` are there, where it was trained."""
+    """What a victim that computes nothing costs in a world; and how long episodes of `dqn` are, where it was trained there."""
     cells = ("lanes=4", "density=1", "weather=clear") if name.startswith("highway") else ()
     found = measured((f"world={name}", "victim=idm", "attack=none"), framework, cells)
     del found["length"]

@@ -70,7 +70,7 @@ class Worker:
         end.close()
 
     def give(self, content: bytes, task: Task | None = None) -> None:
-        """Start a task, from `packed`; of a `task` that was planned on this machine, the worker is told the digest of its code."""
+        """Start a task, from `packed`; the worker is told the code digest of a `task` that was planned on this machine."""
         self.busy, self.started, self.printed = True, time.monotonic(), b""
         modules = task.unit.modules if task and task.step == "drive" else ()
         digests = {modules: code_digest(modules)} if modules and modules not in self.told else {}
