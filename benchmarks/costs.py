@@ -56,7 +56,10 @@ ROWS = {
     **{f"yolov5+{name}": PATCHES for name in ("jpeg", "median", "temporal", "advtrain_detection")},
     **{f"yolov3_tiny+{name}": PATCHES for name in ("masking", "segmenter")},
 }
-WORLDS = ("highway", "merge", "highway-v0", "highway-fast-v0")
+WORLDS = (
+    *("highway", "merge", "highway-v0", "highway-fast-v0"),
+    *("roundabout", "intersection", "exit", "two_way", "racetrack", "u_turn"),
+)
 DETECTORS = ("yolov5", "yolov3_tiny", "fcos", "rcnn")
 DRIVEN, DETECTED, SLOW, SLOW_S = (2, 40), (1, 3), 6, 8.0
 """Episodes of the two batches on each track; and of the second one if the first took longer than so many seconds."""
@@ -167,10 +170,19 @@ def row_of(name: str, framework: Snapshot) -> dict[str, dict[str, float]]:
 
 
 def world_of(name: str, framework: Snapshot) -> dict[str, float]:
-    """What a victim that computes nothing costs in a world."""
-    cells = ("lanes=4", "density=1", "weather=clear") if name != "merge" else ("density=1", "weather=clear")
+    """What a victim that computes nothing costs in a world; and how long episodes of `dqn` are, where it was trained there."""
+    cells = ("lanes=4", "density=1", "weather=clear") if name.startswith("highway") else ()
     found = measured((f"world={name}", "victim=idm", "attack=none"), framework, cells)
     del found["length"]
+    for attack, column in (("none", "length"), ("pgd", "attacked")):
+        try:
+            plan = plan_of((f"world={name}", "victim=dqn", f"attack={attack}", *cells, "seeds=0", "reference=false"))
+            unit = next(one for one in plan.units() if one.pair.id == plan.pairs[0].id)
+        except UserError as error:
+            print(f"{name} {attack}: {error}", flush=True)
+            break
+        steps = _steps(_timed(_task(unit, DRIVEN[0] * 3, {}), framework)[0])
+        found[column] = float(f"{steps.mean() / unit.pair.world.component.max_steps:.3g}")
     print(name, found, flush=True)
     return found
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from cavbench.cli.progress import show_downloads
 from cavbench.core.pair import Pair
 from cavbench.core.track import Certified
 from cavbench.errors import UserError, short
-from cavbench.run.config import plan_of
+from cavbench.run.config import Start, plan_of
 from cavbench.run.plan import Plan
 from cavbench.statistics.estimates import share_interval
 from cavbench.terminal import Console
@@ -26,7 +26,7 @@ FOR_ATTACK = "pgd"
 """The attack that is compared with the bounds where none is chosen."""
 
 
-def asked(words: Sequence[str], start: Callable[[str], None] = lambda executor: None) -> tuple[Plan, int]:
+def asked(words: Sequence[str], start: Start = lambda executor, modules: None) -> tuple[Plan, int]:
     """What these words ask for: those of `bench run`, and `leaves=NUMBER`.
 
     Raises:

@@ -30,7 +30,7 @@ def ended(command: Callable[[], None]) -> None:
     """Carry out a command, and end the process with its exit code.
 
     A process that imported a plug-in waits for threads and hooks of its end `END_S` seconds, and ends the processes that are left
-    then. Objects that are left are not deleted one by one: their code could hang, too.
+    then. Objects that are left are not deleted one by one: their code could hang, too, and those of torch take a second.
     """
     code: object = 0
     tree.adopt()
@@ -42,13 +42,14 @@ def ended(command: Callable[[], None]) -> None:
         sys.excepthook(*sys.exc_info())
         code = 1
     # Most commands import no plug-in, some not even what finds them.
-    if "cavbench.core.registry" not in sys.modules or not _foreign():
+    foreign = "cavbench.core.registry" in sys.modules and bool(_foreign())
+    if not foreign and "torch" not in sys.modules:
         raise SystemExit(code)
     if isinstance(code, str):
         sys.stderr.write(f"{code}\n")
     number = code if isinstance(code, int) else int(code is not None)
     _flush()
-    _end(number)
+    _end(number, watched=foreign)
 
 
 def _flush() -> None:
@@ -58,14 +59,16 @@ def _flush() -> None:
             stream.flush()
 
 
-def _end(code: int) -> None:
-    """Wait for threads and hooks as Python does, but not for ever."""
+def _end(code: int, *, watched: bool) -> None:
+    """Wait for threads and hooks as Python does, but not for ever if it is `watched`."""
     phase = ["threads"]
     with suppress(BaseException):
-        dump_traceback_later(END_S + BACKSTOP_S, exit=True, file=open_descriptor(os.devnull, os.O_WRONLY))
+        if watched:
+            dump_traceback_later(END_S + BACKSTOP_S, exit=True, file=open_descriptor(os.devnull, os.O_WRONLY))
     with suppress(BaseException):
-        # `threading.Thread.start` would wait for ever where a plug-in took away what a new thread calls first.
-        start_new_thread(_watch, (code, phase))
+        if watched:
+            # `threading.Thread.start` would wait for ever where a plug-in took away what a new thread calls first.
+            start_new_thread(_watch, (code, phase))
         threading._shutdown()  # type: ignore[attr-defined]
         phase[0] = "hooks"
         atexit._run_exitfuncs()

@@ -212,6 +212,18 @@ class Options:
         if self.axes and victims[0] is not None and isinstance(victims[0].threat, type):
             self._threats(victims[0].threat, next(iter(on)))
 
+    def modules(self) -> list[str]:
+        """The modules of the built-in components that are named, or chosen by default; nothing is imported to know them."""
+        outlines = [outline("victim", name) for name in self.values.get("victim", (DEFAULTS["victim"],))]
+        on = [victim.tracks()[0] for victim in outlines if victim is not None][:1]
+        found: dict[str, None] = {}
+        for kind in self.kinds if on else ():
+            for name in self.values.get(kind, (DEFAULTS[kind],) if kind in DEFAULTS else ()):
+                for link in registry.split(name) if kind == "defense" else (name,):
+                    claims = registry.entries(registry.GROUPS[kind]).get(registry.on_track(kind, link, on[0]), ())
+                    found |= {one.target.partition(":")[0]: None for one in claims if one.distribution == registry.OWN}
+        return list(found)
+
     def _check_outlines(self, kind: Kind, found: Mapping[str, type[Any]]) -> None:
         known = {name: parameters(one) for name, one in found.items()}
         self._refuse_unknown(kind, list(found), known)

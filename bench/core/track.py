@@ -223,6 +223,8 @@ class Track(ABC):
 
     work: ClassVar[str]
     """The module that computes its records; a change of its source, or of what it imports, outdates them."""
+    tries_beside: ClassVar[bool] = False
+    """Whether worker processes may load its networks, several at once: none is downloaded."""
     preparation: ClassVar[str] = ""
     """The module that computes its artefacts; empty if it has none."""
 

@@ -228,6 +228,7 @@ class DrivingTrack(Track):
     }
 
     work: ClassVar[str] = "cavbench.driving.drive"
+    tries_beside: ClassVar[bool] = True
 
     def baselines(self, pair: Pair) -> Iterator[Pair]:
         """Input-independent policies with the pair's action type, and the IDM driver if the world has one."""

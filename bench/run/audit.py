@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from cavbench.errors import UserError
 from cavbench.records.schema import AUDIT
-from cavbench.run.config import plan_of
+from cavbench.run.config import Start, plan_of
 from cavbench.run.plan import Plan
 from cavbench.scenarios import SeedBlock
 from cavbench.statistics.unpaired import ENOUGH_SCENARIOS
@@ -31,7 +31,7 @@ class Audit:
     salt: int
 
 
-def audit_of(words: Sequence[str], start: Callable[[str], None] = lambda executor: None) -> Audit:
+def audit_of(words: Sequence[str], start: Start = lambda executor, modules: None) -> Audit:
     """The audit with these words: those of `bench run`, and `salt=NUMBER` to repeat or continue an audit.
 
     Args:

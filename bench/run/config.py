@@ -58,12 +58,17 @@ class TrainConfig:
         return next((part for part in (self.attack, self.defense) if part.name != "none"), self.victim)
 
 
-def plan_of(words: Sequence[str], start: Callable[[str], None] = lambda executor: None) -> Plan:
+Start = Callable[[str, Sequence[str]], None]
+"""Is told that the options are understood: the executor, and the modules of the built-in components."""
+
+
+def plan_of(words: Sequence[str], start: Start = lambda executor, modules: None) -> Plan:
     """The plan of `bench run` with these words.
 
     Args:
         words: options, each `key=value`.
-        start: called with the executor when all names are known, before the first component is imported, which takes seconds.
+        start: called with the executor and the modules of the built-in components when all names are known, before the first
+            component is imported, which takes seconds.
 
     Raises:
         UserError: if an option cannot be parsed or is not allowed.
@@ -74,7 +79,7 @@ def plan_of(words: Sequence[str], start: Callable[[str], None] = lambda executor
     given.check_names()
     given.check_outlines()
     settings = given.settings()
-    start(settings["executor"])
+    start(settings["executor"], given.modules())
     if settings["executor"] != "ray" and any(key.startswith("ray.") for key in given.values):
         raise UserError("ray.address is of executor=ray: add executor=ray, or leave it out")
     with _one_line():
@@ -186,7 +191,7 @@ def grid_of(chosen: Chosen[Any], name: str | None) -> Grid:
     return registry.grid(name)
 
 
-def training_of(words: Sequence[str], start: Callable[[str], None] = lambda executor: None) -> TrainConfig:
+def training_of(words: Sequence[str], start: Start = lambda executor, modules: None) -> TrainConfig:
     """What `bench train` trains with these words; arguments as in `plan_of`.
 
     Raises:
@@ -195,7 +200,7 @@ def training_of(words: Sequence[str], start: Callable[[str], None] = lambda exec
     given = Options(words, kinds=KINDS, settings=TrainOptions)
     given.check_names()
     given.check_outlines()
-    start("")
+    start("", ())
     settings = given.settings()
     one: dict[Kind, Chosen[Any]] = {}
     for kind in given.kinds:

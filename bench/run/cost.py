@@ -193,7 +193,19 @@ def rates(pair: Pair) -> Rates:
     times *= getattr(pair.world.component, "max_steps", STEPS) / STEPS
     batch = here["batch"] + max(batch - usual["batch"], 0.0) * times
     episode = here["episode"] + max(episode - usual["episode"], 0.0) * times
-    return Rates(0.0, batch, episode, tuple(unknown), _of_row(rows, own, attack, "length") or 1.0)
+    length = _of_row(rows, own, attack, "length") or 1.0
+    return Rates(0.0, batch, episode, tuple(unknown), _there(length, usual, here))
+
+
+def _there(length: float, usual: Mapping[str, float], here: Mapping[str, float]) -> float:
+    """The length of episodes in another world, from that in the usual one.
+
+    Between a clean drive and one under `pgd`, which are known of both worlds, it is as far on.
+    """
+    if not all(name in world for name in ("length", "attacked") for world in (usual, here)):
+        return length
+    on = (usual["length"] - length) / (usual["length"] - usual["attacked"] or 1.0)
+    return min(max(here["length"] + on * (here["attacked"] - here["length"]), 0.02), 1.0)
 
 
 HOME, STEPS = "highway", 450

@@ -29,9 +29,13 @@ class Watcher(Protocol):
 
 
 class Executor(Protocol):
-    """A back end that carries out tasks. `size` is the number of tasks that it carries out at once."""
+    """A back end that carries out tasks.
+
+    `size` is the number of tasks that it carries out at once, `beside` whether in processes of this machine beside this one.
+    """
 
     size: int
+    beside: bool
 
     def map(self, tasks: Iterable[Task], watcher: Watcher) -> Generator[list[Finished], None, None]:
         """Carry out all tasks, and yield each with its outcome, or why it failed, as soon as it is finished.

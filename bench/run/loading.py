@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from itertools import chain
+from threading import Thread
 from typing import Protocol
 
 from cavbench.errors import RefusedNetworkError, UserError, message
@@ -12,6 +14,7 @@ from cavbench.run.executor import Executor, Watcher
 from cavbench.run.failures import Failures
 from cavbench.run.networks import Weights
 from cavbench.run.plan import Plan
+from cavbench.run.task import Task
 from cavbench.run.unit import is_foreign
 
 
@@ -26,7 +29,7 @@ class LoadWatcher(Watcher, Protocol):
 
 
 def load(plan: Plan, back_end: Executor, watcher: LoadWatcher, failures: Failures) -> Weights:
-    """The hashes of the networks. Built-in components are loaded here, plug-ins where they are driven.
+    """The hashes of the networks. Plug-ins are loaded where they are driven, and built-in components if that is this machine.
 
     Args:
         plan: the run.
@@ -40,17 +43,17 @@ def load(plan: Plan, back_end: Executor, watcher: LoadWatcher, failures: Failure
     """
     weights: dict[str, tuple[str, str]] = {}
     doubts: dict[str, None] = {}
-    foreign = []
+    elsewhere = []
     for task in plan.loadings:
-        if any(is_foreign(part) for part in task.pair.parts):
-            foreign.append(task)
+        if (back_end.beside and task.unit.track.tries_beside) or any(is_foreign(part) for part in task.pair.parts):
+            elsewhere.append(task)
             continue
         try:
             weights[task.unit.networks], found = networks.tried(task)
         except RefusedNetworkError as error:
             raise UserError(f"{task} is refused: {message(error)}") from error
         doubts |= dict.fromkeys(found)
-    with closing(back_end.map(foreign, watcher)) as finished:
+    with _digesting(plan, elsewhere), closing(back_end.map(elsewhere, watcher)) as finished:
         for task, outcome in chain.from_iterable(finished):
             if outcome.weights is not None:
                 weights[task.unit.networks] = outcome.weights
@@ -64,3 +67,23 @@ def load(plan: Plan, back_end: Executor, watcher: LoadWatcher, failures: Failure
     if not plan.can_drive(weights):
         raise failures.error((), 0)
     return weights
+
+
+@contextmanager
+def _digesting(plan: Plan, elsewhere: Sequence[Task]) -> Iterator[None]:
+    """Hash the code of the units, which the next step needs, while this process waits for networks that load elsewhere."""
+
+    def digest() -> None:
+        # What is wrong with a source is said when its units are made.
+        with suppress(Exception):
+            for unit in plan.first_units():
+                _ = unit.code_digest
+
+    hashing = Thread(target=digest)
+    if elsewhere:
+        hashing.start()
+    try:
+        yield
+    finally:
+        if elsewhere:
+            hashing.join()

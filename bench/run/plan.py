@@ -186,6 +186,10 @@ class Plan:
                     units += [replace(first, cell=cell, seeds=block) for block, cell in mine]
         return units
 
+    def first_units(self) -> list[Unit]:
+        """A unit of each pair, whose networks are not loaded: it says which code the pair is driven by."""
+        return [self._unit(pair, self._training_seeds(pair)[0]) for pair in self.driven]
+
     def _unit(self, pair: Pair, training_seed: int) -> Unit:
         """A unit of a pair, on the whole first cell, whose networks are not loaded."""
         return Unit(

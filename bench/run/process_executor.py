@@ -23,6 +23,8 @@ class ProcessExecutor:
         limits: of each task.
     """
 
+    beside = True
+
     def __init__(self, workers: int, limits: Limits) -> None:
         self.size, self.limits = workers, limits
         self.idle: list[Worker] = []
@@ -41,7 +43,7 @@ class ProcessExecutor:
                         ended.append((task, content))
                         continue
                     worker = self.idle.pop() if self.idle else Worker(self.limits)
-                    worker.give(content)
+                    worker.give(content, task)
                     busy[worker] = task
                 if ended:
                     yield ended

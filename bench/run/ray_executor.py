@@ -105,6 +105,8 @@ class RayExecutor:
         UserError: if Ray is not installed, or there is no cluster at that address.
     """
 
+    beside = False
+
     def __init__(self, workers: int | None, limits: Limits, address: str) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:

@@ -31,6 +31,7 @@ class SerialExecutor:
     """
 
     size = 1
+    beside = False
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits

@@ -9,7 +9,7 @@ from cavbench.core import registry
 from cavbench.core.track import track
 from cavbench.run.process import context
 
-WORKER = "cavbench.run.worker"
+FIRST, WORKER = "cavbench.run.quick_server", "cavbench.run.worker"
 RANGES = "cavbench.envs.highway.world"
 
 
@@ -26,6 +26,10 @@ def work_modules() -> tuple[str, ...]:
     return (*work, RANGES)
 
 
-def server() -> BaseContext:
-    """How worker processes are made; the first call starts the server, and does not wait for its imports."""
-    return context(WORKER, *work_modules())
+def server(*modules: str) -> BaseContext:
+    """How worker processes are made; the first call starts the server, and does not wait for its imports.
+
+    Args:
+        modules: built-in modules that the server imports, too, so that not every worker does.
+    """
+    return context(FIRST, WORKER, *work_modules(), *modules)

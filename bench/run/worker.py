@@ -6,6 +6,7 @@ What components print is kept apart from the terminal and from the tables: it co
 from __future__ import annotations
 
 import _thread
+import gc
 import importlib
 import multiprocessing
 import os
@@ -20,6 +21,7 @@ from typing import Any
 
 from cavbench import files
 from cavbench.errors import reason
+from cavbench.identity.fingerprint import code_digest, told
 from cavbench.isolation import tree
 from cavbench.isolation.foreign import contained, ended
 from cavbench.isolation.framework import Snapshot
@@ -52,6 +54,7 @@ class Worker:
         self.limits = limits
         self.busy = self.ready = self.spent = False
         self.heard, self.printed = True, b""
+        self.told: dict[tuple[str, ...], str] = {}
         self.known: set[tree.Identity] = set()
         self.connection, far = multiprocessing.Pipe()
         self.output, end = multiprocessing.Pipe(duplex=False)
@@ -66,11 +69,15 @@ class Worker:
         far.close()
         end.close()
 
-    def give(self, content: bytes) -> None:
-        """Start a task, from `packed`."""
+    def give(self, content: bytes, task: Task | None = None) -> None:
+        """Start a task, from `packed`; the worker is told the code digest of a `task` that was planned on this machine."""
         self.busy, self.started, self.printed = True, time.monotonic(), b""
+        modules = task.unit.modules if task and task.step == "drive" else ()
+        digests = {modules: code_digest(modules)} if modules and modules not in self.told else {}
+        self.told |= digests
         # A worker that died meanwhile is noticed when it is asked for news.
         with suppress(OSError):
+            self.connection.send_bytes(pickle.dumps(digests))
             self.connection.send_bytes(content)
 
     @property
@@ -204,6 +211,9 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
     settle()
     for module in work_modules():
         importlib.import_module(module)
+    # The server did without, and what it imported is no garbage.
+    gc.freeze()
+    gc.enable()
     # Before any plug-in is imported.
     before = Snapshot()
     settings, started = Settings(alone=True), _running()
@@ -217,6 +227,7 @@ def _serve(connection: Connection, output: Connection, environment: dict[str, st
 
     while True:
         try:
+            told().update(pickle.loads(connection.recv_bytes()))
             content = connection.recv_bytes()
         except (EOFError, OSError):
             if os.getpgrp() == own:

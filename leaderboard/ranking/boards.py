@@ -16,6 +16,7 @@ from cavbench.errors import UserError
 from cavbench.leaderboard.comparisons.beside import beside
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.reading import read_tracks
+from cavbench.leaderboard.ranking.faults import FaultRow, is_fault, under_faults
 from cavbench.leaderboard.ranking.flags import Flag, Subject, flags
 from cavbench.leaderboard.ranking.remarks import row_remarks
 from cavbench.leaderboard.ranking.worst import Panel, Worst, margin
@@ -37,6 +38,7 @@ class Row:
         flags: each with its measurement, fired or not.
         group: rank group, from 1; rows of a group cannot be told from its first. Flagged rows follow the others. 0 for a row
             without a rank, whose victim sees nothing without an attack.
+        faults: its scores under faults, which rank nothing; None where they were not driven.
     """
 
     attacks: tuple[Comparison, ...]
@@ -45,6 +47,7 @@ class Row:
     left_out: tuple[Comparison, ...]
     flags: tuple[Flag, ...]
     group: int = 0
+    faults: FaultRow | None = None
 
     @property
     def identity(self) -> Mapping[str, object]:
@@ -106,6 +109,9 @@ def boards(comparisons: Sequence[Comparison]) -> list[Board]:
     episodes, the largest budget, the most access.
     """
     attacked = sorted((one for one in comparisons if one.is_attacked), key=lambda one: one.content)
+    faults = under_faults(attacked)
+    # Faults rank nothing beside attacks. Alone they are all that is known.
+    attacked = [one for one in attacked if not is_fault(one)] or attacked
     episodes: Counter[tuple[str, ...]] = Counter()
     for one in attacked:
         for key in ((one.track.name,), (one.track.name, str(one.identity["threat_norm"]))):
@@ -129,7 +135,7 @@ def boards(comparisons: Sequence[Comparison]) -> list[Board]:
             -share,
         )
 
-    return [_board(key, tracks[key], attacked) for key in sorted(tracks, key=rank)]
+    return [_board(key, tracks[key], attacked, faults) for key in sorted(tracks, key=rank)]
 
 
 def _key(one: Comparison) -> Key:
@@ -141,7 +147,9 @@ def _access(name: str) -> int:
     return known.index(name) if name in known else len(known)
 
 
-def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
+def _board(
+    key: Key, track: Track, attacked: Sequence[Comparison], faults: Mapping[tuple[object, ...], FaultRow]
+) -> Board:
     _, world, world_params, grid, *threat = key
     allowed = [one for one in attacked if _within(one, key)]
     rows = []
@@ -154,7 +162,7 @@ def _board(key: Key, track: Track, attacked: Sequence[Comparison]) -> Board:
         same = [one for one in attacked if one.ranked_as == defended and one.identity["grid"] == grid]
         others = [one for one in same if one.identity["threat_norm"] == threat[0]]
         raised = tuple(flags(Subject(track, own, others, found)))
-        rows.append(Row(own, found, panel.marginal(found), panel.left_out, raised))
+        rows.append(Row(own, found, panel.marginal(found), panel.left_out, raised, faults=faults.get(defended)))
     return Board(track, (world, world_params), grid, tuple(threat), tuple(ranked(rows)), _baselines(allowed))
 
 

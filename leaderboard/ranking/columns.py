@@ -66,7 +66,7 @@ def columns(board: Board) -> list[Column]:
 
 def all_columns(track: Track) -> list[Column]:
     """Every column that a leaderboard of a track can have, from left to right."""
-    return [*_names(), *_scores(track), *_rest(track)]
+    return [*_names(), *_scores(track), *_faults(), *_rest(track)]
 
 
 def _says(column: Column, row: Row) -> bool:
@@ -177,6 +177,31 @@ def _scores(track: Track) -> Iterator[Column]:
             by_cell=lambda worst: (worst.scores - worst.rival).mean((0, 2)),
             interval=True,
             spare=2,
+        )
+
+
+def _faults() -> Iterator[Column]:
+    """What faults without an adversary do to a row; empty where they were not driven."""
+    for name, title, short, meaning, kind, digits, spare, value in (
+        ("mean", "Faults", "faults\nmean", "mean score under faults without an adversary", "number", 2, 2, "mean"),
+        ("worst", "Worst fault", "faults\nworst", "score under the worst of these faults", "number", 2, 4, "worst"),
+        (
+            *("failed", "Crashed, faults", "faults\ncrashed", "share of episodes that crash, over all faults"),
+            *("share", 0, 3, "crashed"),
+        ),
+        ("of_idm", "Faults, of IDM", "of\nIDM", "that mean as a share of IDM's score there", "share", 0, 5, "of_idm"),
+    ):
+        yield Column(
+            name=f"faults_{name}",
+            title=title,
+            short=short,
+            meaning=f"{meaning}; empty: not measured",
+            value=lambda row, called, value=value: getattr(row.faults, value) if row.faults else None,  # type: ignore[misc]
+            kind=kind,  # type: ignore[arg-type]
+            digits=digits,
+            optional=True,
+            shown=name != "of_idm",
+            spare=spare,
         )
 
 

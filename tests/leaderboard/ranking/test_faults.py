@@ -1,0 +1,69 @@
+"""Tests for the columns of a leaderboard that say what faults do: real episodes of the highway."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from cavbench.api import score
+from cavbench.attacks.driving.fault import Fault
+from cavbench.core import registry
+from cavbench.core.pair import choose
+from cavbench.leaderboard.ranking.boards import read_boards
+from cavbench.leaderboard.ranking.columns import columns
+from cavbench.records import reading
+
+ALLOWED = {"presence": {"hidden": 9, "share": 1.0}, "actuator": {"delay": 4, "replaced": 0.5}}
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `noise` and two faults on `dqn`, and `noise` alone on `random`'s neighbour `ppo`."""
+    folder = tmp_path_factory.mktemp("faults")
+    world = choose("world", "highway", max_steps=10).component
+    cell = {"world": world, "lanes": 3, "density": 1.0, "weather": "clear", "episodes": 2, "seeds": [0], "out": folder}
+    for victim in ("dqn", "ppo"):
+        score(victim, "noise", **cell)
+    score("dqn", [Fault(mode="dropout", severity=3), Fault(mode="lost", severity=3)], threat=ALLOWED, **cell)
+    return folder
+
+
+def test_faults_are_columns_beside_the_attacks_and_rank_nothing(out: Path) -> None:
+    (board,), _ = read_boards(reading.read_all(out))
+    by_victim = {str(row.identity["victim"]): row for row in board.rows}
+    assert [str(one.identity["attack"]) for row in board.rows for one in row.attacks] == ["noise", "noise"]
+    faults = by_victim["dqn"].faults
+    assert faults is not None
+    assert faults.faults == 2
+    assert by_victim["ppo"].faults is None
+    listed = {one.name: one for one in columns(board)}
+    values = {name: listed[name].value(by_victim["dqn"], lambda one, kind: "") for name in listed if "faults" in name}
+    assert values == {
+        "faults_mean": faults.mean,
+        "faults_worst": faults.worst,
+        "faults_failed": faults.crashed,
+        "faults_of_idm": faults.mean / faults.idm,
+    }
+    assert listed["faults_mean"].value(by_victim["ppo"], lambda one, kind: "") is None
+
+
+def test_a_leaderboard_without_faults_has_no_column_of_them(out: Path) -> None:
+    records = {name: table.filter(_is_no_fault(table)) for name, table in reading.read_all(out).items()}
+    (board,), _ = read_boards(records)
+    assert not [one.name for one in columns(board) if "faults" in one.name]
+
+
+def test_the_terminal_shows_them(out: Path) -> None:
+    said = io.StringIO()
+    report = registry.resolve(registry.REPORTS, "leaderboard", "report")
+    report(reading.read_all(out), Console(file=said, width=160))
+    assert "faults" in said.getvalue()
+
+
+def _is_no_fault(table: object) -> object:
+    import pyarrow.compute as pc
+
+    return pc.not_equal(table["attack"].cast("string"), "fault")  # type: ignore[index]
