@@ -71,10 +71,7 @@ def measured(pair: str, cells: list[str], scenarios: int, bounds: dict[str, floa
         judge=partial(world.blame, places, control),
     )
     crashed = found["crashed"]
-    shares = [
-        f"{name} {np.nanmean(found[name][crashed]) if crashed.any() else np.nan:.2f}"
-        for name in COLUMNS
-    ]
+    shares = [f"{name} {np.nanmean(found[name][crashed]) if crashed.any() else np.nan:.2f}" for name in COLUMNS]
     row = (
         f"{attack:12} {victim + ' ' + defense:22} score {found['safe_progress'].mean():.2f} crashed {crashed.sum()}/"
         f"{len(crashed)} {' '.join(shares)} CPU {time.process_time() - start:.0f} s"
@@ -85,9 +82,15 @@ def measured(pair: str, cells: list[str], scenarios: int, bounds: dict[str, floa
 def both_ways(crashes: Blame) -> str:
     """How often RSS and the replays agree about who could have avoided a crash; of the crashes that both judge."""
     avoidable, by_idm, room = crashes[:, np.isfinite(crashes).all(0)]
-    rows = {"avoidable": avoidable == 1, "unavoidable": avoidable == 0, "IDM avoids": by_idm == 1, "IDM does not": by_idm == 0}
+    rows = {
+        "avoidable": avoidable == 1,
+        "unavoidable": avoidable == 0,
+        "IDM avoids": by_idm == 1,
+        "IDM does not": by_idm == 0,
+    }
     return "\n".join(
-        f"{name}: {chosen.sum()} crashes, {(room[chosen] < 1).sum()} with room below 1, room {np.sort(room[chosen]).round(2).tolist()}"
+        f"{name}: {chosen.sum()} crashes, {(room[chosen] < 1).sum()} with room below 1; room "
+        f"{np.sort(room[chosen]).round(2).tolist()}"
         for name, chosen in rows.items()
     )
 
