@@ -122,7 +122,7 @@ def train(task: str, algorithm: str, steps: int, path: str) -> str:
         model: Any = DQN("MlpPolicy", env, policy_kwargs=wide, buffer_size=15_000, **rhythm, **common)
     else:
         two = {"net_arch": {"pi": [256, 256], "vf": [256, 256]}}
-        model = PPO("MlpPolicy", env, policy_kwargs=two, n_steps=768, batch_size=64, n_epochs=10, **common)
+        model = PPO("MlpPolicy", env, policy_kwargs=two, n_steps=min(768, steps), batch_size=64, n_epochs=10, **common)
     model.learn(steps).save(path)
     return path
 
