@@ -10,7 +10,7 @@ from rich.text import Text
 
 from cavbench.cli.progress import show_downloads
 from cavbench.zoo import fetch
-from cavbench.zoo.tarballs import Tarball
+from cavbench.zoo.wheels import Wheel
 
 
 def print_downloads(console: Console) -> None:
@@ -21,7 +21,7 @@ def print_downloads(console: Console) -> None:
     for name, download in fetch.DOWNLOADS.items():
         cached = "yes" if fetch.cached(name) else "no"
         size = f"{download.size / 1e6:.1f} MB"
-        if isinstance(download.package, Tarball):
+        if not isinstance(download.package, Wheel):
             size += f" of {download.package.size / 1e6:.1f} MB"
         table.add_row(Text(name, style="bold"), size, download.licence, cached, Text(download.source))
     console.print(table)

@@ -1,7 +1,8 @@
 """Downloads published files that cavbench cannot ship (size or licence), checks them, and keeps them in the user's cache.
 
-A file is taken from a package of a registry that users can reach, also behind a mirror: a wheel on the Python package index
-(`cavbench.zoo.wheels`) or a package of npm (`cavbench.zoo.tarballs`). Both are read as archives: nothing is installed or run.
+A file is taken from a package of a registry that users can reach, also behind a mirror: a wheel or a source distribution of the
+Python package index (`cavbench.zoo.wheels`, `cavbench.zoo.sources`), or a package of npm (`cavbench.zoo.tarballs`). All are read
+as archives: nothing is built, installed or run.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from cavbench import bounded
 from cavbench.core.registry import unknown
 from cavbench.errors import UserError
 from cavbench.files import scratch, whole
+from cavbench.zoo.sources import Source
 from cavbench.zoo.tarballs import Tarball
 from cavbench.zoo.wheels import NotDownloadedError, Report, Wheel
 
@@ -64,7 +66,7 @@ class Download:
         source: authors, and address of the first publication.
     """
 
-    package: Wheel | Tarball
+    package: Wheel | Source | Tarball
     parts: tuple[Part, ...]
     licence: str
     source: str
@@ -80,6 +82,7 @@ class Download:
         return sum(part.size for part in self.parts)
 
 
+_CHECKER = "commonroad_drivability_checker-2025.4.0"
 DOWNLOADS = {
     "yolov3_tiny": Download(
         package=Wheel(
@@ -117,6 +120,37 @@ DOWNLOADS = {
         ),
         licence="Apache-2.0",
         source="RangiLyu, https://github.com/RangiLyu/nanodet; as a graph of TensorFlow.js by V. Mandic",
+    ),
+    "ngsim": Download(
+        package=Source(
+            requirement="commonroad-drivability-checker==2025.4.0",
+            sha256="77ccc5ffb36becc2a528e09b01526997742a3f946fe77506cc1732fe325147d0",
+            size=3_781_042,
+        ),
+        parts=(
+            Part(
+                member=f"{_CHECKER}/tests/not_for_public_repo/costs/ressources/scenarios/USA_US101-23_1_T-1.xml",
+                sha256="bf980d8e10b2158ec9948230ddf598326225414fd1af5a1a191da7015e2a7fdf",
+                size=2_511_856,
+            ),
+            Part(
+                member=f"{_CHECKER}/tests/not_for_public_repo/costs/ressources/scenarios/USA_Lanker-2_23_T-1.xml",
+                sha256="96c02d9d71a1878e744f51f164a58f75a1f92b3731966f630f3f5d01d9b37659",
+                size=1_927_755,
+            ),
+            Part(
+                member=f"{_CHECKER}/tutorials/USA_US101-3_1_T-1.xml",
+                sha256="49ddfe8b16df29daf3e4a7e8f137e33a0108bc3e1b3726391433f3fa2e957ff4",
+                size=1_161_779,
+            ),
+            Part(
+                member=f"{_CHECKER}/tutorials/USA_US101-3_3_T-1.xml",
+                sha256="7abafaf94e3ffd4a32d4fbcff9ee778ec1515e0db20b7d90c52376872243b7ab",
+                size=219_898,
+            ),
+        ),
+        licence="package BSD-3-Clause, recordings not stated",
+        source="NGSIM recordings as CommonRoad scenes, Technical University of Munich, https://commonroad.in.tum.de",
     ),
 }
 

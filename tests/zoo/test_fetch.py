@@ -149,5 +149,7 @@ def test_an_unknown_name_is_refused_before_anything_is_fetched(
     wheel: Path, cache: Path, bench: Callable[..., Said]
 ) -> None:
     said = bench("fetch", "small", "smal")
-    assert said.err == "error: unknown download 'smal'; did you mean 'small'? known: yolov3_tiny, nanodet, small\n"
+    assert (
+        said.err == "error: unknown download 'smal'; did you mean 'small'? known: yolov3_tiny, nanodet, ngsim, small\n"
+    )
     assert not cache.exists()

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavbench.driving.victims.spaces import Expected
+from cavbench.driving.victims.spaces import FEATURES_THERE, Expected, configured, task_of
 from cavbench.errors import UserError
 
 EXACT = 1e-6
 BEYOND = 0.01
 """An observation of the world's own environment may leave a declared range by this share of it."""
 ON_POLICY = ("PPO", "A2C")
+FARTHEST_M, BEHIND_M = 200.0, 10.0
+"""How far ahead highway-env shows a car, and how far behind unless `see_behind`."""
 
 
 def check_traces(
@@ -53,12 +55,20 @@ def check_traces(
     if algorithm in ON_POLICY:
         normalised = kept and not (_equal(last, raw) or (plain and not what))
     else:
-        normalised = kept and bool(what or (native and _beyond(last, raw, expected)))
+        # Without VecNormalize the one before the last is as strange as the last.
+        strange = what and raw is not None and not _strange(raw, expected)
+        normalised = kept and bool(strange or (native and _beyond(last, raw, expected)))
     if normalised:
         raise UserError(
             f"{name} was trained behind VecNormalize, whose statistics are not in it: add the file of VecNormalize.save, "
             f"victim.normalize=statistics.pkl, or give the model with its environment, cavbench.score({whole}), or train it "
             "without norm_obs"
+        )
+    if plain and task_of(expected.facts) and (what := what or _other_view(last, expected)):
+        raise UserError(
+            f"the last observation of {name} in its training is none of this world: {what}. "
+            f"{configured(expected.facts, FEATURES_THERE)}. If a wrapper changed them, give cavbench.score a torch.nn.Module "
+            "that does the same"
         )
     if what:
         raise UserError(
@@ -97,4 +107,18 @@ def _strange(last: NDArray[np.float32] | None, expected: Expected) -> str:
         return "a row without a car is not 0"
     if float(np.abs(rows).max()) > 1 + EXACT:
         return f"it has the value {float(np.abs(rows).max()):g}, beyond [-1, 1]"
+    return ""
+
+
+def _other_view(last: NDArray[np.float32] | None, expected: Expected) -> str:
+    """What highway-env shows with other keys of `observation` only: cars too far ahead or behind."""
+    assert last is not None
+    features = expected.facts.features
+    column, reach = 1 + features.names.index("x"), features.high[features.names.index("x")]
+    rows = last.reshape(len(last), -1, expected.shape[1])[:, 1:]
+    ahead = reach * rows[..., column][rows[..., 0] == 1]
+    if ahead.size and float(ahead.min()) < -BEHIND_M * (1 + EXACT):
+        return f"it has a car {-float(ahead.min()):.0f} m behind (see_behind: true shows such cars)"
+    if ahead.size and reach >= FARTHEST_M and float(ahead.max()) >= FARTHEST_M * (1 - EXACT):
+        return f"it has a car {float(ahead.max()):.0f} m ahead (absolute: true, or a smaller features_range, shows such values)"
     return ""

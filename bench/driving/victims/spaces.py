@@ -21,6 +21,9 @@ TASKS = ("highway-fast-v0", "highway-v0")
 """The worlds that are highway-env's own tasks."""
 OTHER_TASK = "world=gym world.id=TASK, for instance world.id=merge-v0"
 """Where policies of any other environment are scored."""
+FEATURES_THERE = "{observation: {features: [presence, x, y, vx, vy, cos_h, sin_h]}}"
+ACTION_THERE = "{action: {type: ContinuousAction, lateral: false}}"
+"""Examples of what only highway-env's own environments can be told."""
 ROWS = 5
 """Rows of their observations, unless `vehicles_count` says otherwise."""
 SPARE = 0.01
@@ -180,6 +183,9 @@ class Expected:
             whose = ". A policy of highway-env's own tasks is scored in its task:"
             whose = "; if its environment had another number of rows, write" if facts.unbounded else whose
             return f"{name} {takes}, this world shows {wanted}{whose} {home}; of another task, {OTHER_TASK}"
+        there = bounds is not None and task_of(facts) and (bounds.unbounded or shape[-1] != features)
+        if there and not self._frames(shape):
+            return f"{name} {takes}, this world shows {wanted}. {configured(facts, FEATURES_THERE)}"
         if elsewhere and not facts.unbounded:
             return f"{name} {takes}, this world shows {wanted}. A policy of another task is scored in that task: {OTHER_TASK}"
         if frames := self._frames(shape):
@@ -203,7 +209,21 @@ def check_actions(name: str, found: ActionType, width: int, facts: DrivingFacts)
     wanted = len(facts.actions) if found == "discrete" else len(facts.controls)
     if width == wanted and wanted:
         return
-    raise UserError(f"{name} was trained for {width} {found} actions, this world takes {facts.takes()}")
+    there = f". {configured(facts, ACTION_THERE)}" if task_of(facts) else ""
+    raise UserError(f"{name} was trained for {width} {found} actions, this world takes {facts.takes()}{there}")
+
+
+def task_of(facts: DrivingFacts) -> str:
+    """The id of highway-env's own task that a world is; empty if it is none."""
+    return facts.environment.split('"')[1] if facts.unbounded and '"' in facts.environment else ""
+
+
+def configured(facts: DrivingFacts, example: str) -> str:
+    """What to type for a policy of highway-env's task with a configuration that only highway-env itself knows."""
+    return (
+        "If its environment had another configuration, it is scored in highway-env itself with the same keys, for instance "
+        f"world=gym world.id={task_of(facts)} 'world.config={example}'"
+    )
 
 
 def check_range(name: str, bounds: Bounds, facts: DrivingFacts) -> None:
