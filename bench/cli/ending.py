@@ -75,7 +75,7 @@ def _end(code: int, *, watched: bool) -> None:
         _flush()
     phase[0] = "processes"
     with suppress(BaseException):
-        if names := tree.end_what_is_left():
+        if watched and (names := tree.end_what_is_left()):
             whose = ", ".join(sorted(set(_foreign().values())))
             line = f"the command ended processes that one of {whose} left: {', '.join(names)}"
             write(2, f"warning: {bounded(line)}\n".encode())
