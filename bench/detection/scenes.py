@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -19,10 +20,12 @@ class Decoy:
     Args:
         name: of the face.
         octagonal: whether it has the outline of the stop sign.
+        family: the kind of face, for the false stops of each kind; empty for none.
     """
 
     name: str
     octagonal: bool
+    family: str = ""
 
 
 class Scenes(ABC):
@@ -78,9 +81,18 @@ class Scenes(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} has no decoys")
 
-    def redrawn(self, number: int) -> Scenes:
-        """The same frames for training with other decoys, those of a number; the same decoys unless a world overrides it."""
+    def redrawn(self, number: int, like_signs: bool = False) -> Scenes:
+        """The same frames for training with other decoys, those of a number; the same decoys unless a world overrides it.
+
+        Args:
+            number: of the decoys.
+            like_signs: with other words on the octagon, real signs, and foreign stop signs among them (`Decoy.family`).
+        """
         return self
+
+    def with_decoys(self, decoys: Sequence[Decoy]) -> Scenes:
+        """The same frames with these decoys, one for each frame."""
+        raise NotImplementedError(f"{type(self).__name__} has no other decoys")
 
     def windows(
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]

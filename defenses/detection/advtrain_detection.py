@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import asdict, dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from annotated_types import Interval
@@ -66,6 +66,8 @@ class DetectorAdversarialTraining(DetectorDefense):
     Args:
         skip: probability that a sign or a decoy has no patch, in [0, 1].
         decoys: share of the windows that have a decoy in the place of the sign, in [0, 1].
+        faces: what decoys show: faces drawn at random, or, of `signs`, also other words on the octagon, real signs, and foreign
+            stop signs, which are found like the sign (`Decoy.family`).
         attack: any registered patch attack.
         attack_params: its parameters, as on the command line but separated by spaces.
         budget: side of the patches as a share of the sign's side, in (0, 1].
@@ -86,6 +88,7 @@ class DetectorAdversarialTraining(DetectorDefense):
 
     skip: Share = 0.3
     decoys: Share = 0.4
+    faces: Literal["drawn", "signs"] = "drawn"
     attack: str = "eot"
     attack_params: str = IN_THE_LOOP
     budget: Annotated[float, Interval(gt=0, le=1)] = 0.5
@@ -164,6 +167,7 @@ class _Hardening:
         self.generator = torch.Generator().manual_seed(seed)
         self.windows = Windows(scenes, recipe.window, away=AWAY, generator=self.generator)
         self.decoys: Tensor | None = None
+        self.families: list[str] = []
         self.patches: list[Tensor] = []
 
     def loss(self, update: int) -> Tensor:
@@ -178,23 +182,25 @@ class _Hardening:
         current = self.detector(shown)
         boxes = views.boxes(self.scenes.boxes[views.frames], self.recipe.window)
         inside = ((boxes >= 0) & (boxes <= self.recipe.window)).all(1)
-        visible = signs & inside & (self.scenes.visible[views.frames] >= SEEN)
+        stops = signs | self.of_family(views, "stops")
+        visible = stops & inside & (self.scenes.visible[views.frames] >= SEEN)
         found = (missed(current, self.label, boxes) * visible).mean()
-        cautious = mistaken(current, self.label, boxes, signs).mean()
+        cautious = mistaken(current, self.label, boxes, stops).mean()
         if self.learner:
-            faithful = self.learner.loss(self.detector, self._taught(shown, original, signs))
+            faithful = self.learner.loss(self.detector, self._taught(shown, original, signs, visible & ~signs, boxes))
         else:
             # What the teacher says of decoys is no example.
             faithful = (unlike(current, original) * signs).mean()
         return found + self.caution * cautious + self.recipe.fidelity * faithful
 
-    def _taught(self, shown: Tensor, original: Predictions, signs: Tensor) -> Example:
-        """The windows with the teacher's detections, but no stop signs where decoys are."""
+    def _taught(self, shown: Tensor, original: Predictions, signs: Tensor, foreign: Tensor, places: Tensor) -> Example:
+        """The windows with the teacher's detections; where decoys are, a stop sign is one of `foreign` alone, at its place."""
         boxes, labels = [], []
-        for found, real in zip(detections(original, threshold=SURE, iou=NMS_IOU), signs.tolist(), strict=True):
+        taught = detections(original, threshold=SURE, iou=NMS_IOU)
+        for found, real, other, place in zip(taught, signs.tolist(), foreign.tolist(), places, strict=True):
             kept_ones = found.labels != (-1 if real else self.label)
-            boxes.append(found.boxes[kept_ones])
-            labels.append(found.labels[kept_ones])
+            boxes.append(torch.cat((found.boxes[kept_ones], place[None][: int(other)])))
+            labels.append(torch.cat((found.labels[kept_ones], torch.full((int(other),), self.label))))
         return Example(shown, boxes, labels)
 
     def _begin(self, number: int) -> None:
@@ -202,8 +208,13 @@ class _Hardening:
         if self.recipe.skip < 1:
             self.patches = [*self.patches, self._crafted(number)][-self.recipe.shown :]
         if self.scenes.decoys and self.recipe.decoys:
-            redrawn = self.scenes.redrawn(number)
+            redrawn = self.scenes.redrawn(number, True) if self.recipe.faces == "signs" else self.scenes.redrawn(number)
             self.decoys = kept(redrawn, redrawn.render_decoys)
+            self.families = [one.family for one in redrawn.decoys]
+
+    def of_family(self, views: Views, family: str) -> Tensor:
+        """The windows whose decoy, if they have one, is of a family, bool [N]."""
+        return torch.tensor([bool(self.families) and self.families[frame] == family for frame in views.frames.tolist()])
 
     def _train_weights(self) -> None:
         """Let all tensors learn but those that are too large."""
@@ -238,6 +249,8 @@ class _Hardening:
     def _patched(self, views: Views, plain: Tensor, signs: Tensor) -> Tensor:
         """The windows, with patches on the signs and the decoys except where skipped."""
         attacked = torch.rand(len(plain), generator=self.generator) >= self.recipe.skip
+        # A patch may hide the word: then nobody can tell the sign from an octagon with another one.
+        attacked &= signs | ~self.of_family(views, "words")
         if not attacked.any():
             return plain
         which = torch.randint(len(self.patches), (len(plain),), generator=self.generator)

@@ -18,7 +18,7 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from cavbench.detection import Decoy, Objects, Scenes
-from cavbench.envs.camera import faces, sign, training_faces
+from cavbench.envs.camera import faces, sheet, sign, training_faces, training_signs
 from cavbench.envs.camera.frame import Frame, noise_level
 from cavbench.envs.camera.objects import objects
 from cavbench.envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
@@ -136,8 +136,13 @@ class BankScenes(Scenes):
         self.decoys = tuple(faces.DECOYS[(first + n) % len(faces.DECOYS)] for n in range(len(self.poses)))
         self._plates: dict[int, Plate] = {}
 
-    def redrawn(self, number: int) -> BankScenes:
+    def redrawn(self, number: int, like_signs: bool = False) -> BankScenes:
         return self
+
+    def with_decoys(self, decoys: Sequence[Decoy]) -> BankScenes:
+        other = copy(self)
+        other.decoys = tuple(decoys)
+        return other
 
     def apart(self) -> Scenes:
         other = super().apart()
@@ -228,10 +233,9 @@ class TrainingScenes(BankScenes):
         super().__init__(frames, weathers)
         self.decoys = training_faces.decoys(0, len(self))
 
-    def redrawn(self, number: int) -> TrainingScenes:
-        other = copy(self)
-        other.decoys = training_faces.decoys(number * len(self), len(self))
-        return other
+    def redrawn(self, number: int, like_signs: bool = False) -> BankScenes:
+        source = training_signs if like_signs else training_faces
+        return self.with_decoys(source.decoys(number * len(self), len(self)))
 
 
 def _kind(plate: Plate) -> tuple[int, sign.Colour]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cavbench.detection import Decoy
 from cavbench.detection.colour import linear
-from cavbench.envs.camera import sign, training_faces
+from cavbench.envs.camera import sheet, sign, training_faces, training_signs
 
 DECOYS = (
     Decoy("fifty", octagonal=True),
@@ -53,13 +53,22 @@ class Face:
 
 @lru_cache(maxsize=16)
 def face(name: str) -> Face:
-    """The face of a decoy, of `DECOYS` or for training. Cached: do not modify it."""
-    picture, cover = _DRAWN[name]() if name in _DRAWN else training_faces.drawn(name)
+    """The face of a decoy, of `DECOYS`, of the sheet or for training. Cached: do not modify it."""
+    picture, cover = _drawn(name)
     colour, shape = (
         torch.from_numpy(cv2.resize(part, (sign.TEXELS, sign.TEXELS), interpolation=cv2.INTER_AREA)) / 255
         for part in (picture, cover)
     )
     return Face(linear(colour.permute(2, 0, 1)), shape[None])
+
+
+def _drawn(name: str) -> tuple[Image, Image]:
+    if name in _DRAWN:
+        return _DRAWN[name]()
+    for source in (training_faces, training_signs):
+        if name.startswith(source.NAME):
+            return source.drawn(name)
+    return sheet.drawn(name)
 
 
 def _plain(colour: Colour) -> Image:
