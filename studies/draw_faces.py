@@ -82,7 +82,14 @@ REAL = (
     *("weight-limit--g1", "weight-limit--g4", "maximum-speed-limit-30--g1", "maximum-speed-limit-50--g1"),
     *("maximum-speed-limit-50--g3", "maximum-speed-limit-80--g1", "roundabout--g1", "bicycles-only--g1"),
 )
-WARNINGS = ("stop-ahead--g1", "stop-ahead--g3", "stop-ahead--g5", "traffic-signals--g1", "children--g1", "other-danger--g1")
+WARNINGS = (
+    "stop-ahead--g1",
+    "stop-ahead--g3",
+    "stop-ahead--g5",
+    "traffic-signals--g1",
+    "children--g1",
+    "other-danger--g1",
+)
 STOPS = tuple(f"stop--g{number}" for number in range(1, 11))
 """English, Japanese, ringed (two), Chinese, Chinese and English, a hand, Arabic, Korean, Korean and English."""
 
@@ -127,7 +134,9 @@ class Pen:
     def disc(self, mark: Callable[[ImageDraw.ImageDraw], None] | str, slanted: bool = False) -> Picture:
         return self.marked(64, 0.0, mark, slanted, 1 / 4, 0.7, 0.5)
 
-    def triangle(self, first: float, mark: Callable[[ImageDraw.ImageDraw], None] | str, slanted: bool = False) -> Picture:
+    def triangle(
+        self, first: float, mark: Callable[[ImageDraw.ImageDraw], None] | str, slanted: bool = False
+    ) -> Picture:
         return self.marked(3, first, mark, slanted, 1 / 6, 0.42, 0.57 if first < 0 else 0.42)
 
     def marked(
@@ -235,7 +244,9 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--picture", type=Path, help="PNG of the sheet on grey, kept back ones first")
     asked = parser.parse_args()
-    chosen = {f"regulatory--{name}": name for name in (*STOPS, *REAL)} | {f"warning--{n}": f"warning {n}" for n in WARNINGS}
+    chosen = {f"regulatory--{name}": name for name in (*STOPS, *REAL)} | {
+        f"warning--{n}": f"warning {n}" for n in WARNINGS
+    }
     with tempfile.TemporaryDirectory() as folder:
         members = [f"package/package_signs/{name}.svg" for name in chosen]
         parts = SIGNS.take(members, Path(folder), lambda done, total: None)

@@ -12,6 +12,12 @@ from torch import Tensor
 
 from cavbench.detection.detector import STOP_SIGN, Objects
 
+FAMILIES = ("words", "colours", "signs")
+"""Faces that are not to be stopped for: other words on the red octagon; octagons of other colours and red plates of other shapes
+with white marks; real signs."""
+FOREIGN = "stops"
+"""The family of the stop signs of other countries, which are to be stopped for."""
+
 
 @dataclass(frozen=True)
 class Decoy:
@@ -20,7 +26,7 @@ class Decoy:
     Args:
         name: of the face.
         octagonal: whether it has the outline of the stop sign.
-        family: the kind of face, for the false stops of each kind; empty for none.
+        family: one of `FAMILIES`, or `FOREIGN`; empty for neither.
     """
 
     name: str
@@ -45,6 +51,8 @@ class Scenes(ABC):
     """[M] distance from the camera to the sign along the road, in m."""
     decoys: tuple[Decoy, ...] = ()
     """[M] the decoy of each frame (`render_decoys`); empty if the world has none."""
+    faces: tuple[Decoy, ...] = ()
+    """[M] a face of each frame that no training sees, of one of `FAMILIES` or `FOREIGN`; empty if the world has none."""
 
     def __len__(self) -> int:
         return len(self.boxes)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Annotated, ClassVar, Literal
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from annotated_types import Interval
@@ -27,7 +29,9 @@ from cavbench.detection import (
 )
 from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.boxes import detections
+from cavbench.detection.scenes import FOREIGN
 from cavbench.detection.sight import NMS_IOU
+from cavbench.detection.victims.checkpoint import Checkpoint
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.learner import Learner
 from cavbench.detection.victims.loss import missed, mistaken, unlike
@@ -68,6 +72,7 @@ class DetectorAdversarialTraining(DetectorDefense):
         decoys: share of the windows that have a decoy in the place of the sign, in [0, 1].
         faces: what decoys show: faces drawn at random, or, of `signs`, also other words on the octagon, real signs, and foreign
             stop signs, which are found like the sign (`Decoy.family`).
+        again: start from the detector that was trained with the default parameters, which knows patches, so few rounds are enough.
         attack: any registered patch attack.
         attack_params: its parameters, as on the command line but separated by spaces.
         budget: side of the patches as a share of the sign's side, in (0, 1].
@@ -89,6 +94,7 @@ class DetectorAdversarialTraining(DetectorDefense):
     skip: Share = 0.3
     decoys: Share = 0.4
     faces: Literal["drawn", "signs"] = "drawn"
+    again: bool = False
     attack: str = "eot"
     attack_params: str = IN_THE_LOOP
     budget: Annotated[float, Interval(gt=0, le=1)] = 0.5
@@ -130,7 +136,8 @@ class DetectorAdversarialTraining(DetectorDefense):
             start = victim.load(seed, world.facts)
             if not start.aligned and not isinstance(victim, Learner):
                 raise UserError(f"{type(victim).__name__} has no loss for adversarial training, and is not aligned")
-            hardening = _Hardening(self, attack, victim, start, world.training_scenes(), seed, progress)
+            first = DetectorAdversarialTraining().load(victim, seed, world.facts) if self.again else start
+            hardening = _Hardening(self, attack, victim, (start, first), world.training_scenes(), seed, progress)
             detector, seconds = descend(
                 hardening.detector,
                 hardening.loss,
@@ -138,6 +145,7 @@ class DetectorAdversarialTraining(DetectorDefense):
                 learning_rate=self.learning_rate,
                 decay=DECAY,
                 progress=progress,
+                checkpoint=hardening.kept_at(zoo.unfinished(zoo.Recipe.of(victim, self), seed)),
             )
         card = {"attack": asdict(attack), "cpu_seconds": round(seconds)}  # type: ignore[call-overload]
         return Trained(detector.requires_grad_(False), card, start)
@@ -151,7 +159,7 @@ class _Hardening:
         recipe: DetectorAdversarialTraining,
         attack: PatchAttack,
         victim: DetectorVictim,
-        detector: Detector,
+        detectors: tuple[Detector, Detector],
         scenes: Scenes,
         seed: int,
         progress: Progress,
@@ -159,11 +167,12 @@ class _Hardening:
         self.recipe, self.attack, self.scenes, self.progress = recipe, attack, scenes, progress
         self.learner = victim if isinstance(victim, Learner) else None
         self.caution = recipe.caution * (self.learner.care if self.learner else 1.0)
-        self.teacher, self.detector = detector, copy.deepcopy(detector)
+        # The undefended detector, whose other predictions are kept, and the one that the training starts from.
+        self.teacher, self.detector = detectors[0], copy.deepcopy(detectors[1])
         self._train_weights()
         if not any(weight.requires_grad for weight in self.detector.parameters()):
             raise UserError(f"largest={recipe.largest} leaves no tensor of the detector to train: allow larger ones")
-        self.label = detector.index(STOP_SIGN)
+        self.label = self.detector.index(STOP_SIGN)
         self.generator = torch.Generator().manual_seed(seed)
         self.windows = Windows(scenes, recipe.window, away=AWAY, generator=self.generator)
         self.decoys: Tensor | None = None
@@ -182,7 +191,7 @@ class _Hardening:
         current = self.detector(shown)
         boxes = views.boxes(self.scenes.boxes[views.frames], self.recipe.window)
         inside = ((boxes >= 0) & (boxes <= self.recipe.window)).all(1)
-        stops = signs | self.of_family(views, "stops")
+        stops = signs | self.of_family(views, FOREIGN)
         visible = stops & inside & (self.scenes.visible[views.frames] >= SEEN)
         found = (missed(current, self.label, boxes) * visible).mean()
         cautious = mistaken(current, self.label, boxes, stops).mean()
@@ -202,6 +211,17 @@ class _Hardening:
             boxes.append(torch.cat((found.boxes[kept_ones], place[None][: int(other)])))
             labels.append(torch.cat((found.labels[kept_ones], torch.full((int(other),), self.label))))
         return Example(shown, boxes, labels)
+
+    def kept_at(self, path: Path) -> Checkpoint:
+        """Where the training is kept after each round."""
+        return Checkpoint(path, self.recipe.updates, self._held, self._restore)
+
+    def _held(self) -> dict[str, Any]:
+        return {"patches": self.patches, "generator": self.generator.get_state()}
+
+    def _restore(self, held: Mapping[str, Any]) -> None:
+        self.patches = list(held["patches"])
+        self.generator.set_state(held["generator"])
 
     def _begin(self, number: int) -> None:
         """Begin a round: craft a patch, and draw decoys."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from cavbench.detection import Decoy
 from cavbench.detection.colour import linear
+from cavbench.detection.scenes import FAMILIES, FOREIGN
 from cavbench.envs.camera import sheet, sign, training_faces, training_signs
 
 DECOYS = (
@@ -27,6 +28,8 @@ DECOYS = (
 )
 """A speed limit on the octagon, a yield sign, a word on a yellow octagon, a round speed limit, a plain octagon, a post without
 a sign, and an advert on the octagon; every second face has the outline of the stop sign."""
+
+KINDS = (*FAMILIES, FOREIGN)
 
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -51,7 +54,17 @@ class Face:
     cover: Tensor
 
 
-@lru_cache(maxsize=16)
+def of_sheet(seed: int, count: int, *, scored: bool = True) -> tuple[Decoy, ...]:
+    """Faces of a half of the sheet for the frames of an approach: the families take turns, in an order of the seed."""
+    chance = np.random.default_rng(seed)
+    half = sheet.half(scored=scored)
+    own = {kind: chance.permutation([n for n, one in enumerate(half) if one.family == kind]) for kind in KINDS}
+    order = chance.permutation(KINDS)
+    turns = [(str(order[number % len(KINDS)]), number // len(KINDS)) for number in range(count)]
+    return tuple(half[own[kind][turn % len(own[kind])]] for kind, turn in turns)
+
+
+@lru_cache(maxsize=64)
 def face(name: str) -> Face:
     """The face of a decoy, of `DECOYS`, of the sheet or for training. Cached: do not modify it."""
     picture, cover = _drawn(name)

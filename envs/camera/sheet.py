@@ -22,10 +22,6 @@ Image = NDArray[np.uint8]
 
 SIDE = 128
 """Side of a face in texels; the largest sign that is scored is seen with fewer pixels."""
-FAMILIES = ("words", "colours", "signs")
-"""Other words on the red octagon; octagons of other colours and red plates of other shapes; real signs. None is a stop sign."""
-STOPS = "stops"
-"""The family of foreign stop signs, which must be stopped for."""
 _PICTURE, _NAMES = (Path(__file__).parent / "data" / f"faces.{ending}" for ending in ("png", "json"))
 _WIDE = 10
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.detection import Decoy
+from cavbench.detection.scenes import FAMILIES, FOREIGN
 from cavbench.envs.camera import sheet, sign, training_faces
 
 Image = NDArray[np.uint8]
@@ -62,7 +63,7 @@ def _begun(name: str) -> tuple[np.random.Generator, str, Decoy | None]:
     kind = str(chance.choice(list(KINDS), p=list(KINDS.values())))
     if kind not in ("sheet", "stop"):
         return chance, kind, None
-    family = sheet.STOPS if kind == "stop" else str(chance.choice(sheet.FAMILIES))
+    family = FOREIGN if kind == "stop" else str(chance.choice(FAMILIES))
     own = [one for one in sheet.half(scored=False) if one.family == family]
     return chance, kind, own[int(chance.integers(len(own)))]
 

@@ -31,7 +31,7 @@ class WindscreenScenes(Scenes):
 
     def __init__(self, street: BankScenes, lenses: Sequence[str]) -> None:
         self.street, self.lenses = street, tuple(lenses)
-        self.size, self.decoys = street.size, street.decoys
+        self.size, self.decoys, self.faces = street.size, street.decoys, street.faces
         self.boxes, self.visible, self.distance = street.boxes, street.visible, street.distance
 
     def objects(self, frame: int) -> Objects:
