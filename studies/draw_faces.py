@@ -218,12 +218,12 @@ def drawn(svg: Path) -> Picture:
     Raises:
         UserError: if the file is too large, or names anything outside itself.
     """
-    import resvg_py
-
     text = svg.read_text("utf-8") if svg.stat().st_size <= MOST_BYTES else ""
     outside = r"<!ENTITY|<image|<script|<foreignObject|<style|href\s*=\s*[\"'](?!#)|url\((?!#)"
     if not text or re.search(outside, text, re.IGNORECASE):
         raise UserError(f"{svg.name} is larger than {MOST_BYTES} bytes, or refers to something outside itself")
+    import resvg_py
+
     picture = Image.open(io.BytesIO(bytes(resvg_py.svg_to_bytes(svg_string=text, width=SIDE)))).convert("RGBA")
     picture = picture.crop(picture.getchannel("A").point(lambda one: 255 * (one > 127)).getbbox())
     step = np.linspace(0, 1, SIDE)

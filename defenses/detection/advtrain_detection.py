@@ -72,7 +72,7 @@ class DetectorAdversarialTraining(DetectorDefense):
         decoys: share of the windows that have a decoy in the place of the sign, in [0, 1].
         faces: what decoys show: faces drawn at random, or, of `signs`, also other words on the octagon, real signs, and foreign
             stop signs, which are found like the sign (`Decoy.family`).
-        again: start from the detector that was trained with the default parameters, which knows patches, so few rounds are enough.
+        again: start from the detector that was trained with the default parameters. It knows patches, so few rounds are enough.
         attack: any registered patch attack.
         attack_params: its parameters, as on the command line but separated by spaces.
         budget: side of the patches as a share of the sign's side, in (0, 1].
@@ -137,7 +137,7 @@ class DetectorAdversarialTraining(DetectorDefense):
             if not start.aligned and not isinstance(victim, Learner):
                 raise UserError(f"{type(victim).__name__} has no loss for adversarial training, and is not aligned")
             first = DetectorAdversarialTraining().load(victim, seed, world.facts) if self.again else start
-            hardening = _Hardening(self, attack, victim, (start, first), world.training_scenes(), seed, progress)
+            hardening = _Hardening(self, attack, victim, start, world.training_scenes(), seed, progress, first)
             detector, seconds = descend(
                 hardening.detector,
                 hardening.loss,
@@ -159,20 +159,21 @@ class _Hardening:
         recipe: DetectorAdversarialTraining,
         attack: PatchAttack,
         victim: DetectorVictim,
-        detectors: tuple[Detector, Detector],
+        detector: Detector,
         scenes: Scenes,
         seed: int,
         progress: Progress,
+        first: Detector | None = None,
     ) -> None:
         self.recipe, self.attack, self.scenes, self.progress = recipe, attack, scenes, progress
         self.learner = victim if isinstance(victim, Learner) else None
         self.caution = recipe.caution * (self.learner.care if self.learner else 1.0)
         # The undefended detector, whose other predictions are kept, and the one that the training starts from.
-        self.teacher, self.detector = detectors[0], copy.deepcopy(detectors[1])
+        self.teacher, self.detector = detector, copy.deepcopy(first or detector)
         self._train_weights()
         if not any(weight.requires_grad for weight in self.detector.parameters()):
             raise UserError(f"largest={recipe.largest} leaves no tensor of the detector to train: allow larger ones")
-        self.label = self.detector.index(STOP_SIGN)
+        self.label = detector.index(STOP_SIGN)
         self.generator = torch.Generator().manual_seed(seed)
         self.windows = Windows(scenes, recipe.window, away=AWAY, generator=self.generator)
         self.decoys: Tensor | None = None
