@@ -15,11 +15,11 @@ from cavbench.detection import stopping
 from cavbench.detection.boxes import confidence, overlap
 from cavbench.detection.closed_loop import Drives
 from cavbench.detection.detector import STOP_SIGN, Detections, Detector
-from cavbench.detection.discrimination import certified, discrimination, if_visible
+from cavbench.detection.discrimination import certified, discrimination, if_visible, stops_by_family
 from cavbench.detection.patch import Patch
 from cavbench.detection.printing import non_printability
 from cavbench.detection.scenes import Approach, Scenes
-from cavbench.detection.sight import SAME_IOU, Sight, certain, look, look_at_decoys
+from cavbench.detection.sight import SAME_IOU, Sight, certain, look, look_at_decoys, look_at_faces
 from cavbench.isolation.streams import Stream
 
 Columns = dict[str, NDArray[np.generic]]
@@ -71,12 +71,14 @@ class Unpatched:
         of_approach: [A] the number of each approach's scenes.
         decoys: [S] the output on the decoys; None for a world without decoys.
         least: [S] what is certain under every patch; None without a certificate or a patch.
+        faces: [S] the output on faces that no training sees; None for a world without them.
     """
 
     scenes: Sequence[Scenes]
     of_approach: NDArray[np.int64]
     decoys: Sequence[Sight | None]
     least: Sequence[NDArray[np.float32] | None]
+    faces: Sequence[Sight | None]
 
     @classmethod
     def of(cls, detector: Detector, approaches: Sequence[Approach], share: float) -> Unpatched:
@@ -86,7 +88,9 @@ class Unpatched:
             decoys = [look_at_decoys(detector, one) for one in scenes]
             # Without an attack there is no patch that something is certain under.
             least = [certain(detector, one, share) if share else None for one in scenes]
-        return cls(scenes, of_approach, decoys, least)
+            # Last, so that a random detector draws the same as before for the others.
+            faces = [look_at_faces(detector, one) for one in scenes]
+        return cls(scenes, of_approach, decoys, least, faces)
 
 
 @dataclass(frozen=True)
@@ -148,6 +152,7 @@ def score(
         **measured(looks, scenes),
         **discrimination(looks, known.decoys, scenes),
         **certified(known.least, looks, known.decoys),
+        **stops_by_family(known.faces, scenes),
         **if_visible(looks, scenes),
     }
     return {

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavbench.detection import stopping
 from cavbench.detection.precision import VISIBLE, precision_of_approach
-from cavbench.detection.scenes import Scenes
+from cavbench.detection.scenes import FAMILIES, FOREIGN, Scenes
 from cavbench.detection.sight import Sight
 from cavbench.errors import UserError
 
@@ -48,6 +48,31 @@ def _of_approach(seen: Sight, decoys: Sight | None, scenes: Scenes) -> dict[str,
         "decoy_confidence": of_decoys,
         "false_stops": float(np.mean([len(one.scores) for one in decoys.found])),
         "octagons": float(taken.mean()) if len(taken) else np.nan,
+    }
+
+
+def stops_by_family(faces: Sequence[Sight | None], scenes: Sequence[Scenes]) -> dict[str, NDArray[np.generic]]:
+    """What is detected on faces that no training sees, [A] each; NaN where an approach shows none of a family.
+
+    Args:
+        faces: the output with these faces; None where the world has none.
+        scenes: the frames.
+    """
+    rows = [_of_faces(*each) for each in zip(faces, scenes, strict=True)]
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def _of_faces(sight: Sight | None, scenes: Scenes) -> dict[str, float]:
+    families = np.array([one.family for one in scenes.faces] if sight else [])
+    stops = np.array([len(one.scores) for one in sight.found] if sight else [])
+    seen = sight.confidence > stopping.THRESHOLD if sight else np.array([])
+    foreign = families == FOREIGN
+    if sight:
+        foreign &= (scenes.visible >= VISIBLE).numpy()
+    return {
+        "false_stops_faces": _mean(stops[np.isin(families, FAMILIES)]),
+        **{f"false_stops_{family}": _mean(stops[families == family]) for family in FAMILIES},
+        "foreign_stops": _mean(seen[foreign]),
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -10,6 +11,12 @@ import torch
 from torch import Tensor
 
 from cavbench.detection.detector import STOP_SIGN, Objects
+
+FAMILIES = ("words", "colours", "signs")
+"""Faces that are not to be stopped for: other words on the red octagon; octagons of other colours and red plates of other shapes
+with white marks; real signs."""
+FOREIGN = "stops"
+"""The family of the stop signs of other countries, which are to be stopped for."""
 
 
 @dataclass(frozen=True)
@@ -19,10 +26,12 @@ class Decoy:
     Args:
         name: of the face.
         octagonal: whether it has the outline of the stop sign.
+        family: one of `FAMILIES`, or `FOREIGN`; empty for neither.
     """
 
     name: str
     octagonal: bool
+    family: str = ""
 
 
 class Scenes(ABC):
@@ -42,6 +51,8 @@ class Scenes(ABC):
     """[M] distance from the camera to the sign along the road, in m."""
     decoys: tuple[Decoy, ...] = ()
     """[M] the decoy of each frame (`render_decoys`); empty if the world has none."""
+    faces: tuple[Decoy, ...] = ()
+    """[M] a face of each frame that no training sees, of one of `FAMILIES` or `FOREIGN`; empty if the world has none."""
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -78,9 +89,18 @@ class Scenes(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} has no decoys")
 
-    def redrawn(self, number: int) -> Scenes:
-        """The same frames for training with other decoys, those of a number; the same decoys unless a world overrides it."""
+    def redrawn(self, number: int, like_signs: bool = False) -> Scenes:
+        """The same frames for training with other decoys, those of a number; the same decoys unless a world overrides it.
+
+        Args:
+            number: of the decoys.
+            like_signs: with other words on the octagon, real signs, and foreign stop signs among them (`Decoy.family`).
+        """
         return self
+
+    def with_decoys(self, decoys: Sequence[Decoy]) -> Scenes:
+        """The same frames with these decoys, one for each frame."""
+        raise NotImplementedError(f"{type(self).__name__} has no other decoys")
 
     def windows(
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]

@@ -84,6 +84,15 @@ def look_at_decoys(detector: Detector, scenes: Scenes) -> Sight | None:
     return _sight(detector, scenes, scenes.render_decoys) if scenes.decoys else None
 
 
+def look_at_faces(detector: Detector, scenes: Scenes) -> Sight | None:
+    """Run the detector on each frame with a face that no training sees in the place of the sign; None if the world has none.
+
+    Raises:
+        UserError: if a prediction is NaN, infinite or complex.
+    """
+    return look_at_decoys(detector, scenes.with_decoys(scenes.faces)) if scenes.faces else None
+
+
 def certain(detector: Detector, scenes: Scenes, share: float) -> NDArray[np.float32] | None:
     """[F] what the detector reports at least of the sign in each frame, whatever is on the patch; None without a certificate.
 

@@ -3,6 +3,18 @@
 from __future__ import annotations
 
 from cavbench.zoo.recipe import Recipe, trained_in, written
-from cavbench.zoo.store import card, load, missing, own, own_files, save, seeds
+from cavbench.zoo.store import card, load, missing, own, own_files, save, seeds, unfinished
 
-__all__ = ["Recipe", "card", "load", "missing", "own", "own_files", "save", "seeds", "trained_in", "written"]
+__all__ = [
+    "Recipe",
+    "card",
+    "load",
+    "missing",
+    "own",
+    "own_files",
+    "save",
+    "seeds",
+    "trained_in",
+    "unfinished",
+    "written",
+]

@@ -196,6 +196,11 @@ def own_files(recipe: Recipe, seed: int) -> tuple[Path, ...]:
     return (path, path.with_suffix(".json")) if path.exists() else ()
 
 
+def unfinished(recipe: Recipe, seed: int) -> Path:
+    """The file of a training that is not finished, in the user's zoo."""
+    return own() / recipe.key / f"seed{seed}.unfinished"
+
+
 def seeds(recipe: Recipe) -> list[int]:
     """The training seeds of a recipe in the user's zoo and the shipped one."""
     return _seeds(recipe.key)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Annotated, ClassVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from annotated_types import Interval
@@ -27,7 +29,9 @@ from cavbench.detection import (
 )
 from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.boxes import detections
+from cavbench.detection.scenes import FOREIGN
 from cavbench.detection.sight import NMS_IOU
+from cavbench.detection.victims.checkpoint import Checkpoint
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.learner import Learner
 from cavbench.detection.victims.loss import missed, mistaken, unlike
@@ -66,6 +70,9 @@ class DetectorAdversarialTraining(DetectorDefense):
     Args:
         skip: probability that a sign or a decoy has no patch, in [0, 1].
         decoys: share of the windows that have a decoy in the place of the sign, in [0, 1].
+        faces: what decoys show: faces drawn at random, or, of `signs`, also other words on the octagon, real signs, and foreign
+            stop signs, which are found like the sign (`Decoy.family`).
+        again: start from the detector that was trained with the default parameters. It knows patches, so few rounds are enough.
         attack: any registered patch attack.
         attack_params: its parameters, as on the command line but separated by spaces.
         budget: side of the patches as a share of the sign's side, in (0, 1].
@@ -86,6 +93,8 @@ class DetectorAdversarialTraining(DetectorDefense):
 
     skip: Share = 0.3
     decoys: Share = 0.4
+    faces: Literal["drawn", "signs"] = "drawn"
+    again: bool = False
     attack: str = "eot"
     attack_params: str = IN_THE_LOOP
     budget: Annotated[float, Interval(gt=0, le=1)] = 0.5
@@ -127,7 +136,8 @@ class DetectorAdversarialTraining(DetectorDefense):
             start = victim.load(seed, world.facts)
             if not start.aligned and not isinstance(victim, Learner):
                 raise UserError(f"{type(victim).__name__} has no loss for adversarial training, and is not aligned")
-            hardening = _Hardening(self, attack, victim, start, world.training_scenes(), seed, progress)
+            first = DetectorAdversarialTraining().load(victim, seed, world.facts) if self.again else start
+            hardening = _Hardening(self, attack, victim, start, world.training_scenes(), seed, progress, first)
             detector, seconds = descend(
                 hardening.detector,
                 hardening.loss,
@@ -135,6 +145,7 @@ class DetectorAdversarialTraining(DetectorDefense):
                 learning_rate=self.learning_rate,
                 decay=DECAY,
                 progress=progress,
+                checkpoint=hardening.kept_at(zoo.unfinished(zoo.Recipe.of(victim, self), seed)),
             )
         card = {"attack": asdict(attack), "cpu_seconds": round(seconds)}  # type: ignore[call-overload]
         return Trained(detector.requires_grad_(False), card, start)
@@ -152,11 +163,13 @@ class _Hardening:
         scenes: Scenes,
         seed: int,
         progress: Progress,
+        first: Detector | None = None,
     ) -> None:
         self.recipe, self.attack, self.scenes, self.progress = recipe, attack, scenes, progress
         self.learner = victim if isinstance(victim, Learner) else None
         self.caution = recipe.caution * (self.learner.care if self.learner else 1.0)
-        self.teacher, self.detector = detector, copy.deepcopy(detector)
+        # The undefended detector, whose other predictions are kept, and the one that the training starts from.
+        self.teacher, self.detector = detector, copy.deepcopy(first or detector)
         self._train_weights()
         if not any(weight.requires_grad for weight in self.detector.parameters()):
             raise UserError(f"largest={recipe.largest} leaves no tensor of the detector to train: allow larger ones")
@@ -164,6 +177,7 @@ class _Hardening:
         self.generator = torch.Generator().manual_seed(seed)
         self.windows = Windows(scenes, recipe.window, away=AWAY, generator=self.generator)
         self.decoys: Tensor | None = None
+        self.families: list[str] = []
         self.patches: list[Tensor] = []
 
     def loss(self, update: int) -> Tensor:
@@ -178,32 +192,50 @@ class _Hardening:
         current = self.detector(shown)
         boxes = views.boxes(self.scenes.boxes[views.frames], self.recipe.window)
         inside = ((boxes >= 0) & (boxes <= self.recipe.window)).all(1)
-        visible = signs & inside & (self.scenes.visible[views.frames] >= SEEN)
+        stops = signs | self.of_family(views, FOREIGN)
+        visible = stops & inside & (self.scenes.visible[views.frames] >= SEEN)
         found = (missed(current, self.label, boxes) * visible).mean()
-        cautious = mistaken(current, self.label, boxes, signs).mean()
+        cautious = mistaken(current, self.label, boxes, stops).mean()
         if self.learner:
-            faithful = self.learner.loss(self.detector, self._taught(shown, original, signs))
+            faithful = self.learner.loss(self.detector, self._taught(shown, original, signs, visible & ~signs, boxes))
         else:
             # What the teacher says of decoys is no example.
             faithful = (unlike(current, original) * signs).mean()
         return found + self.caution * cautious + self.recipe.fidelity * faithful
 
-    def _taught(self, shown: Tensor, original: Predictions, signs: Tensor) -> Example:
-        """The windows with the teacher's detections, but no stop signs where decoys are."""
+    def _taught(self, shown: Tensor, original: Predictions, signs: Tensor, foreign: Tensor, places: Tensor) -> Example:
+        """The windows with the teacher's detections; where decoys are, a stop sign is one of `foreign` alone, at its place."""
         boxes, labels = [], []
-        for found, real in zip(detections(original, threshold=SURE, iou=NMS_IOU), signs.tolist(), strict=True):
+        taught = detections(original, threshold=SURE, iou=NMS_IOU)
+        for found, real, other, place in zip(taught, signs.tolist(), foreign.tolist(), places, strict=True):
             kept_ones = found.labels != (-1 if real else self.label)
-            boxes.append(found.boxes[kept_ones])
-            labels.append(found.labels[kept_ones])
+            boxes.append(torch.cat((found.boxes[kept_ones], place[None][: int(other)])))
+            labels.append(torch.cat((found.labels[kept_ones], torch.full((int(other),), self.label))))
         return Example(shown, boxes, labels)
+
+    def kept_at(self, path: Path) -> Checkpoint:
+        """Where the training is kept after each round."""
+        return Checkpoint(path, self.recipe.updates, self._held, self._restore)
+
+    def _held(self) -> dict[str, Any]:
+        return {"patches": self.patches, "generator": self.generator.get_state()}
+
+    def _restore(self, held: Mapping[str, Any]) -> None:
+        self.patches = list(held["patches"])
+        self.generator.set_state(held["generator"])
 
     def _begin(self, number: int) -> None:
         """Begin a round: craft a patch, and draw decoys."""
         if self.recipe.skip < 1:
             self.patches = [*self.patches, self._crafted(number)][-self.recipe.shown :]
         if self.scenes.decoys and self.recipe.decoys:
-            redrawn = self.scenes.redrawn(number)
+            redrawn = self.scenes.redrawn(number, True) if self.recipe.faces == "signs" else self.scenes.redrawn(number)
             self.decoys = kept(redrawn, redrawn.render_decoys)
+            self.families = [one.family for one in redrawn.decoys]
+
+    def of_family(self, views: Views, family: str) -> Tensor:
+        """The windows whose decoy, if they have one, is of a family, bool [N]."""
+        return torch.tensor([bool(self.families) and self.families[frame] == family for frame in views.frames.tolist()])
 
     def _train_weights(self) -> None:
         """Let all tensors learn but those that are too large."""
@@ -238,6 +270,8 @@ class _Hardening:
     def _patched(self, views: Views, plain: Tensor, signs: Tensor) -> Tensor:
         """The windows, with patches on the signs and the decoys except where skipped."""
         attacked = torch.rand(len(plain), generator=self.generator) >= self.recipe.skip
+        # A patch may hide the word: then nobody can tell the sign from an octagon with another one.
+        attacked &= signs | ~self.of_family(views, "words")
         if not attacked.any():
             return plain
         which = torch.randint(len(self.patches), (len(plain),), generator=self.generator)

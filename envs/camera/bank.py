@@ -18,7 +18,7 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from cavbench.detection import Decoy, Objects, Scenes
-from cavbench.envs.camera import faces, sign, training_faces
+from cavbench.envs.camera import faces, sign, training_faces, training_signs
 from cavbench.envs.camera.frame import Frame, noise_level
 from cavbench.envs.camera.objects import objects
 from cavbench.envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
@@ -134,10 +134,16 @@ class BankScenes(Scenes):
         # So that over the places and roads each decoy is seen at every distance.
         first = self.poses[0].seed
         self.decoys = tuple(faces.DECOYS[(first + n) % len(faces.DECOYS)] for n in range(len(self.poses)))
+        self.faces = faces.of_sheet(first, len(self.poses))
         self._plates: dict[int, Plate] = {}
 
-    def redrawn(self, number: int) -> BankScenes:
+    def redrawn(self, number: int, like_signs: bool = False) -> BankScenes:
         return self
+
+    def with_decoys(self, decoys: Sequence[Decoy]) -> BankScenes:
+        other = copy(self)
+        other.decoys = tuple(decoys)
+        return other
 
     def apart(self) -> Scenes:
         other = super().apart()
@@ -226,12 +232,11 @@ class TrainingScenes(BankScenes):
 
     def __init__(self, frames: Sequence[tuple[Pose, Frame]], weathers: Sequence[str]) -> None:
         super().__init__(frames, weathers)
-        self.decoys = training_faces.decoys(0, len(self))
+        self.decoys, self.faces = training_faces.decoys(0, len(self)), ()
 
-    def redrawn(self, number: int) -> TrainingScenes:
-        other = copy(self)
-        other.decoys = training_faces.decoys(number * len(self), len(self))
-        return other
+    def redrawn(self, number: int, like_signs: bool = False) -> BankScenes:
+        source = training_signs if like_signs else training_faces
+        return self.with_decoys(source.decoys(number * len(self), len(self)))
 
 
 def _kind(plate: Plate) -> tuple[int, sign.Colour]:

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from cavbench.detection import Decoy
 from cavbench.detection.colour import linear
-from cavbench.envs.camera import sign, training_faces
+from cavbench.detection.scenes import FAMILIES, FOREIGN
+from cavbench.envs.camera import sheet, sign, training_faces, training_signs
 
 DECOYS = (
     Decoy("fifty", octagonal=True),
@@ -27,6 +28,8 @@ DECOYS = (
 )
 """A speed limit on the octagon, a yield sign, a word on a yellow octagon, a round speed limit, a plain octagon, a post without
 a sign, and an advert on the octagon; every second face has the outline of the stop sign."""
+
+KINDS = (*FAMILIES, FOREIGN)
 
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -51,15 +54,34 @@ class Face:
     cover: Tensor
 
 
-@lru_cache(maxsize=16)
+def of_sheet(seed: int, count: int, *, scored: bool = True) -> tuple[Decoy, ...]:
+    """Faces of a half of the sheet for the frames of an approach: the families take turns, in an order of the seed."""
+    chance = np.random.default_rng(seed)
+    half = sheet.half(scored=scored)
+    own = {kind: chance.permutation([n for n, one in enumerate(half) if one.family == kind]) for kind in KINDS}
+    order = chance.permutation(KINDS)
+    turns = [(str(order[number % len(KINDS)]), number // len(KINDS)) for number in range(count)]
+    return tuple(half[own[kind][turn % len(own[kind])]] for kind, turn in turns)
+
+
+@lru_cache(maxsize=64)
 def face(name: str) -> Face:
-    """The face of a decoy, of `DECOYS` or for training. Cached: do not modify it."""
-    picture, cover = _DRAWN[name]() if name in _DRAWN else training_faces.drawn(name)
+    """The face of a decoy, of `DECOYS`, of the sheet or for training. Cached: do not modify it."""
+    picture, cover = _drawn(name)
     colour, shape = (
         torch.from_numpy(cv2.resize(part, (sign.TEXELS, sign.TEXELS), interpolation=cv2.INTER_AREA)) / 255
         for part in (picture, cover)
     )
     return Face(linear(colour.permute(2, 0, 1)), shape[None])
+
+
+def _drawn(name: str) -> tuple[Image, Image]:
+    if name in _DRAWN:
+        return _DRAWN[name]()
+    for source in (training_faces, training_signs):
+        if name.startswith(source.NAME):
+            return source.drawn(name)
+    return sheet.drawn(name)
 
 
 def _plain(colour: Colour) -> Image:

@@ -22,40 +22,45 @@ WHITE_MARKS = 0.6
 RED_RIMS = 0.35
 """Share of the plates with a red rim, as many signs have. A stop sign with a patch has one, too, but a wider one."""
 WHITE: Colour = (235, 235, 230)
-_NAME = "training "
+NAME = "training "
 _SIDE = sign.TEXELS
 _FULL = 255
 
 
 def decoys(first: int, count: int) -> tuple[Decoy, ...]:
     """The training decoys with the numbers from `first` on."""
-    names = (f"{_NAME}{number}" for number in range(first, first + count))
-    return tuple(Decoy(name, octagonal=_begun(name)[1] == "octagon") for name in names)
+    names = (name(number) for number in range(first, first + count))
+    return tuple(Decoy(one, octagonal=_begun(one)[1] == "octagon") for one in names)
 
 
-def drawn(name: str) -> tuple[Image, Image]:
+def name(number: int) -> str:
+    """The name of the training decoy of a number."""
+    return f"{NAME}{number}"
+
+
+def drawn(face: str) -> tuple[Image, Image]:
     """The face of a training decoy: colours sRGB [S, S, 3], and where its plate is [S, S], 0 to 255."""
-    chance, outline = _begun(name)
-    cover = np.zeros((_SIDE, _SIDE), np.uint8) if outline == "nothing" else _polygon(outline, 1.0)
-    rim = _red(chance) if chance.random() < RED_RIMS else _colour(chance)
+    chance, outline = _begun(face)
+    cover = np.zeros((_SIDE, _SIDE), np.uint8) if outline == "nothing" else polygon(outline, 1.0)
+    rim = red(chance) if chance.random() < RED_RIMS else colour(chance)
     picture = np.full((_SIDE, _SIDE, 3), rim, np.uint8)
-    inner = _polygon(outline, chance.uniform(0.75, 0.97)) if outline != "nothing" else cover
-    red = outline != "octagon" and chance.random() < RED_GROUNDS
-    picture[inner > 0] = _red(chance) if red else _ground(chance)
+    inner = polygon(outline, chance.uniform(0.75, 0.97)) if outline != "nothing" else cover
+    is_red = outline != "octagon" and chance.random() < RED_GROUNDS
+    picture[inner > 0] = red(chance) if is_red else ground(chance)
     for _ in range(int(chance.integers(1, 4))):
-        colour = WHITE if red and chance.random() < WHITE_MARKS else _colour(chance)
+        ink = WHITE if is_red and chance.random() < WHITE_MARKS else colour(chance)
         painting = (_word, _word, _shape, _bars, _blocks)
-        painting[int(chance.integers(len(painting)))](picture, chance, colour)
+        painting[int(chance.integers(len(painting)))](picture, chance, ink)
     return picture, cover
 
 
-def _begun(name: str) -> tuple[np.random.Generator, str]:
+def _begun(face: str) -> tuple[np.random.Generator, str]:
     """The random generator of a face, and its outline, which is drawn first."""
-    chance = np.random.default_rng(int(name.removeprefix(_NAME)))
+    chance = np.random.default_rng(int(face.removeprefix(NAME)))
     return chance, str(chance.choice(OUTLINES))
 
 
-def _polygon(outline: str, size: float) -> Image:
+def polygon(outline: str, size: float) -> Image:
     """Where a centred plate of an outline is, its size as a share of the face's."""
     mask, middle, radius = np.zeros((_SIDE, _SIDE), np.uint8), _SIDE / 2, size * _SIDE / 2
     first, corners = {
@@ -73,7 +78,7 @@ def _polygon(outline: str, size: float) -> Image:
     return mask
 
 
-def _colour(chance: np.random.Generator) -> Colour:
+def colour(chance: np.random.Generator) -> Colour:
     """White, black, or any hue."""
     match chance.choice(["white", "black", "hue"], p=[0.2, 0.1, 0.7]):
         case "white":
@@ -83,7 +88,7 @@ def _colour(chance: np.random.Generator) -> Colour:
     return _rgb(int(chance.integers(180)), int(chance.integers(90, 256)), int(chance.integers(70, 250)))
 
 
-def _red(chance: np.random.Generator) -> Colour:
+def red(chance: np.random.Generator) -> Colour:
     """A red of traffic signs, new or faded."""
     return _rgb(int(chance.integers(-6, 7)) % 180, int(chance.integers(170, 256)), int(chance.integers(110, 240)))
 
@@ -94,12 +99,12 @@ def _rgb(hue: int, saturation: int, value: int) -> Colour:
     return red, green, blue
 
 
-def _ground(chance: np.random.Generator) -> Colour:
+def ground(chance: np.random.Generator) -> Colour:
     """A colour that is not the red of a stop sign."""
     while True:
-        red, green, blue = colour = _colour(chance)
-        if red < 1.8 * max(green, blue):
-            return colour
+        found = colour(chance)
+        if found[0] < 1.8 * max(found[1:]):
+            return found
 
 
 def _word(picture: Image, chance: np.random.Generator, colour: Colour) -> None:
@@ -118,9 +123,9 @@ def _shape(picture: Image, chance: np.random.Generator, colour: Colour) -> None:
     """A disc, a ring, a triangle, a diamond or a rectangle."""
     name = str(chance.choice(["octagon", "disc", "triangle", "diamond", "rectangle"]))
     size = chance.uniform(0.3, 0.9)
-    mask = _polygon(name, size) > 0
+    mask = polygon(name, size) > 0
     if chance.random() < 0.5:
-        mask &= _polygon(name, size * chance.uniform(0.5, 0.85)) == 0
+        mask &= polygon(name, size * chance.uniform(0.5, 0.85)) == 0
     picture[mask] = colour
 
 

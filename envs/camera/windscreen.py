@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from cavbench.detection import Approach, Objects, Scenes
+from cavbench.detection import Approach, Decoy, Objects, Scenes
 from cavbench.envs.camera import develop
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.bank_world import BankWorld
@@ -31,14 +31,17 @@ class WindscreenScenes(Scenes):
 
     def __init__(self, street: BankScenes, lenses: Sequence[str]) -> None:
         self.street, self.lenses = street, tuple(lenses)
-        self.size, self.decoys = street.size, street.decoys
+        self.size, self.decoys, self.faces = street.size, street.decoys, street.faces
         self.boxes, self.visible, self.distance = street.boxes, street.visible, street.distance
 
     def objects(self, frame: int) -> Objects:
         return self.street.objects(frame)
 
-    def redrawn(self, number: int) -> Scenes:
-        return WindscreenScenes(self.street.redrawn(number), self.lenses)
+    def redrawn(self, number: int, like_signs: bool = False) -> Scenes:
+        return WindscreenScenes(self.street.redrawn(number, like_signs), self.lenses)
+
+    def with_decoys(self, decoys: Sequence[Decoy]) -> Scenes:
+        return WindscreenScenes(self.street.with_decoys(decoys), self.lenses)
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
         return self._seen(self.street.developed(frames, patches, share), frames)

@@ -34,7 +34,7 @@ TOO_MANY_CRASHES = 0.2
 STILL_FALLING = 0.02
 """A curve that falls by more than this with its last increase has not flattened."""
 FOOLED = 0.5
-"""Share of decoys with the outline of the stop sign from which on a detector that takes them for it does not know the sign."""
+"""False stops a frame on faces like the stop sign from which on a detector does not know the sign."""
 
 
 @dataclass(frozen=True)
@@ -218,14 +218,17 @@ def too_little(of: Subject) -> Finding:
 
 
 def octagon(of: Subject) -> Finding:
-    """Fires where at least half of the decoys on an octagon are taken for a stop sign: it knows the outline, not the sign."""
-    share = doubts.share(of.tables, "octagons")
-    if math.isnan(share):
-        return None, "Not measured: the records have no decoys on an octagon."
-    return (
-        share >= FOOLED,
-        f"It detects a stop sign in {100 * share:.0f} % of the frames with another face on the octagon.",
-    )
+    """Fires where half of the other faces on an octagon or more are taken for a stop sign: it does not know the sign."""
+    told = {
+        "another face on the octagon": doubts.share(of.tables, "octagons"),
+        "another word on the red octagon": doubts.share(of.tables, "false_stops_words"),
+        "another colour or a red plate of another shape": doubts.share(of.tables, "false_stops_colours"),
+    }
+    known = {face: share for face, share in told.items() if not math.isnan(share)}
+    if not known:
+        return None, "Not measured: the records have no other faces on an octagon."
+    said = ", ".join(f"{share:.2f} with {face}" for face, share in known.items())
+    return max(known.values()) >= FOOLED, f"Stop signs detected a frame: {said}."
 
 
 def public_only(of: Subject) -> Finding:

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import average_precision_score
 
-from cavbench.detection import Detections, Predictions
+from cavbench.detection import Decoy, Detections, Predictions
 from cavbench.detection.boxes import best_other
-from cavbench.detection.discrimination import discrimination, if_visible
+from cavbench.detection.discrimination import discrimination, if_visible, stops_by_family
 from cavbench.detection.precision import average_precision, precision_of_approach
 from cavbench.detection.sight import Sight, look, look_at_decoys
 from tests.plugins.toy_camera import RedDetector, RedScenes, StopEverywhere
@@ -123,3 +123,22 @@ def test_the_best_other_class_is_the_one_at_the_place_of_the_sign() -> None:
     predictions = Predictions(places, torch.full((2, 2), 0.5), classes)
     found = best_other(predictions, 1, torch.tensor([SIGN, SIGN]))
     assert found == [(pytest.approx(0.3), 2), (0.0, 1)]
+
+
+def test_false_stops_by_family_by_hand() -> None:
+    scenes = RedScenes(torch.linspace(30, 8, 6))
+    kinds = ("words", "words", "colours", "stops", "stops", "stops")
+    scenes.faces = tuple(Decoy(str(n), octagonal=True, family=kind) for n, kind in enumerate(kinds))
+    scenes.visible = torch.tensor([1.0, 1.0, 1.0, 1.0, 0.9, 0.1])
+    stop = boxes((SIGN, 0.9))
+    sight = Sight(
+        np.array([0.9, 0, 0.1, 0.9, 0.2, 0], np.float32), [stop, boxes(), boxes((SIGN, 0.1)), *[stop] * 3], [""] * 6
+    )
+    found = {name: float(values[0]) for name, values in stops_by_family([sight], [scenes]).items()}
+    assert found["false_stops_words"] == 0.5
+    assert found["false_stops_colours"] == 0
+    assert np.isnan(found["false_stops_signs"])
+    assert found["false_stops_faces"] == pytest.approx(1 / 3)
+    # The third foreign stop sign is hidden, the second is not detected.
+    assert found["foreign_stops"] == 0.5
+    assert all(np.isnan(values[0]) for values in stops_by_family([None], [RedScenes(torch.ones(1))]).values())

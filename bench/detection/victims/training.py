@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cavbench.core.contracts import Progress
+from cavbench.detection.victims.checkpoint import Checkpoint
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -28,6 +29,7 @@ def descend(
     warm_up: float = 0.05,
     decay: float = 0.998,
     progress: Progress,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Network, float]:
     """Train a network with AdamW and a one-cycle learning rate, and return the exponential moving average of its weights.
 
@@ -39,9 +41,10 @@ def descend(
         warm_up: share of the updates in which the learning rate rises; it then falls by a cosine.
         decay: decay of the average of the weights, per update.
         progress: called with the finished share and the loss.
+        checkpoint: where the unfinished training is kept; a training that was stopped goes on from there.
 
     Returns:
-        The averaged network, and the CPU time in seconds.
+        The averaged network, and the CPU time in seconds, without that before a stop.
 
     Raises:
         FloatingPointError: if the loss is NaN or infinite.
@@ -51,7 +54,11 @@ def descend(
     weights = [weight for weight in network.parameters() if weight.requires_grad]
     adam = torch.optim.AdamW(weights, lr=learning_rate, weight_decay=5e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(adam, learning_rate, total_steps=updates, pct_start=warm_up)
-    for update in range(updates):
+    parts = {"network": network, "mean": mean, "adam": adam, "schedule": schedule}
+    first = checkpoint.resume(parts) if checkpoint else 0
+    for update in range(first, updates):
+        if checkpoint and update > first:
+            checkpoint.keep(update, parts)
         now = loss(update)
         if not math.isfinite(float(now.detach())):
             raise FloatingPointError(f"the loss is {float(now.detach())} after {update} updates")
@@ -63,5 +70,7 @@ def descend(
         mean.update_parameters(network)
         if update % REPORT_EVERY == 0:
             progress(update / updates, f"loss {float(now.detach()):.2f}")
+    if checkpoint:
+        checkpoint.done()
     averaged: Network = mean.module  # type: ignore[assignment]
     return averaged, time.process_time() - start

@@ -137,6 +137,54 @@ def test_decoys_carry_the_patches_that_signs_carry(decoys: float, victim: YOLOv5
     assert seen > 1000
 
 
+def test_a_patch_never_hides_another_word_and_foreign_stop_signs_are_to_be_found(victim: YOLOv5) -> None:
+    recipe = DetectorAdversarialTraining(skip=0.0, decoys=1.0, window=64, faces="signs")
+    scenes = FewScenes().training_scenes()
+    hardening = _Hardening(
+        recipe, NoisePatch(), victim, victim.load(0, FACTS), scenes, seed=0, progress=lambda share, text: None
+    )
+    hardening._begin(0)
+    views = hardening.windows.draw(64)
+    signs, plain = hardening._plain(views)
+    changed = (hardening._patched(views, plain, signs) != plain).flatten(1).any(1)
+    words = hardening.of_family(views, "words")
+    assert not changed[words].any()
+    assert changed[~words].any()
+    assert words.any()
+    places, foreign = torch.rand(4, 4), torch.tensor([True, False, True, False])
+    taught = hardening._taught(plain[:4], hardening.teacher(plain[:4]), signs[:4], foreign, places)
+    stops = [int((label == hardening.label).sum()) for label in taught.labels]
+    assert stops == foreign.int().tolist()
+    torch.testing.assert_close(taught.boxes[0][-1], places[0])
+
+
+def test_a_training_that_was_stopped_ends_as_one_that_was_not(
+    victim: YOLOv5, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
+    whole, _ = trained(victim)
+
+    class StoppedError(Exception):
+        """As if the machine went down."""
+
+    def stopping(share: float, text: str) -> None:
+        if text.startswith("patch 2"):
+            raise StoppedError
+
+    defense = DetectorAdversarialTraining(**QUICK)
+    with pytest.raises(StoppedError):
+        defense.train(victim, DrawnStreet(), seed=0, progress=stopping)
+    path = zoo.unfinished(zoo.Recipe.of(victim, defense), 0)
+    assert path.exists()
+    again, told = trained(victim)
+    assert not any(text.startswith("patch 1") for text in told)
+    assert not path.exists()
+    assert all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), again.state_dict().values(), strict=True))
+    path.write_bytes(b"cut short")
+    with pytest.raises(UserError, match=r"cannot be continued.*delete it"):
+        trained(victim)
+
+
 @pytest.mark.parametrize("of_victim", [0.0, 3.0])
 def test_an_aligned_detector_that_was_trained_here_keeps_its_own_loss_too(
     of_victim: float, victim: YOLOv5, monkeypatch: pytest.MonkeyPatch

@@ -124,6 +124,15 @@ def test_every_flag_is_tested_both_ways() -> None:
     assert set(FIRES) == set(FIRES_NOT) == set(FLAGS)
 
 
+def test_a_detector_that_reads_no_words_is_flagged_though_it_passes_all_decoys() -> None:
+    for column in ("false_stops_words", "false_stops_colours"):
+        found = flag(
+            "octagon", *(probed(approach(0.9, attack=name), octagons=0.0, **{column: 0.9}) for name in ("none", "eot"))
+        )
+        assert found.fired
+        assert "0.90 with another" in found.reason
+
+
 @pytest.mark.parametrize("name", FLAGS)
 def test_a_flag_fires_where_it_should_and_only_there(name: str) -> None:
     assert flag(name, *FIRES[name]).fired is True
