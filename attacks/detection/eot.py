@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import torch
 from annotated_types import Interval
@@ -17,7 +17,10 @@ from cavbench.core.ranges import Count, NotNegative, Positive, Share
 from cavbench.detection import PatchAttack, PatchOracle, Predictions, Scenes
 from cavbench.detection.evidence import log_odds
 from cavbench.detection.printing import non_printability
-from cavbench.detection.threat import Texels
+from cavbench.detection.threat import HIDING, Texels
+
+if TYPE_CHECKING:
+    from cavbench.attacks.detection.transformations import Transformations
 
 Loss = Literal["probability", "log_odds"]
 
@@ -75,6 +78,8 @@ class EOT(PatchAttack):
     """
 
     access: ClassVar[Access] = "gradients"
+    towards: ClassVar[float] = 1.0
+    """1 where the score of the sign shall be low, -1 where it shall be high."""
 
     target: str = ""
     texels: Texels = 100
@@ -131,10 +136,10 @@ class EOT(PatchAttack):
             views.draw(self.batch)
             shown = cut_out(patch, self.batch, self.cutout, oracle.generator) if self.cutout else patch
             predictions = oracle.differentiable(transform(views.shown(shown), views.reach))
-            scores = views.reported(views.highest(predictions))
+            scores = views.reported(self._scores(oracle, views, transform, predictions))
             found, variation = scores.mean(), total_variation(patch)
             oracle.report(patch[0], found=found, total_variation=variation)
-            loss = self._loss(scores) + self.tv * variation
+            loss = self.towards * self._loss(scores) + self.tv * variation
             if self.target:
                 places = transform.carried(views.boxes)
                 loss = loss - self._loss(seen_at(places, predictions, oracle.index(self.target)))
@@ -153,6 +158,16 @@ class EOT(PatchAttack):
         mean = sum(last) / len(last) if len(losses) == self.steps else torch.inf
         # A start whose loss is not a number is never the best one.
         return patch.detach()[0], torch.inf if mean != mean else mean
+
+    @property
+    def forges(self) -> tuple[str, ...]:
+        return HIDING
+
+    def _scores(
+        self, oracle: PatchOracle, views: Views, transform: Transformations, predictions: Predictions
+    ) -> Tensor:
+        """[N] what is attacked in each view: the highest score of a stop sign."""
+        return views.highest(predictions)
 
     def _loss(self, scores: Tensor) -> Tensor:
         """The loss of scores [N] in [0, 1]."""

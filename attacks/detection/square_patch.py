@@ -15,7 +15,7 @@ from cavbench.core.contracts import Access, Progress
 from cavbench.core.ranges import Count
 from cavbench.detection import PatchAttack, PatchOracle, Scenes
 from cavbench.detection.evidence import log_odds
-from cavbench.detection.threat import Texels
+from cavbench.detection.threat import HIDING, Texels
 
 REPORT_EVERY = 10
 """Steps between two progress reports."""
@@ -57,6 +57,10 @@ class SquarePatch(PatchAttack):
     area: Annotated[float, Interval(gt=0, le=1)] = 0.3
     window: Count = 160
     translation: Annotated[float, Interval(ge=0, lt=1)] = 0.15
+
+    @property
+    def forges(self) -> tuple[str, ...]:
+        return HIDING
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         views = Views(oracle, scenes, window=self.window, translation=self.translation)

@@ -255,6 +255,28 @@ def render(
 
 
 @app.command()
+def patch(
+    action: Annotated[str, typer.Argument(metavar="print|scan", help="print: a PDF. scan: back from a picture.")],
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="FILE [mm=…] [texels=…] [original=…] [site=…] [out=…]",
+            help="print: a file of patches/ in a results folder, mm=SIDE. scan: a picture, texels=SIDE or original=FILE.",
+        ),
+    ] = None,
+) -> None:
+    """Print a patch at its true size, and read it back from a scan or a photograph of the page."""
+    from cavbench.cli import patch as cli_patch
+    from cavbench.cli.words import split
+
+    keys = {"print": ("mm", "site", "out"), "scan": ("texels", "original", "site", "out")}
+    if action not in keys:
+        raise UserError(f"bench patch does print or scan, not {action[:40]!r}")
+    names, values = split(words or [], keys[action], names=1)
+    cli_patch.run(action, names, values, Console())
+
+
+@app.command()
 def show(
     words: Annotated[
         list[str] | None, typer.Argument(metavar="[RUN] [out=…]", help="A results folder, or the name of a pair.")

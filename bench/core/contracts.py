@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 from cavbench.core import ranges, sets
 from cavbench.errors import UserError
-from cavbench.scenarios import Axes, Grid
+from cavbench.scenarios import Axes, Cell, Grid
 
 if TYPE_CHECKING:
     # Reports read records and need no torch, which takes seconds to import.
@@ -314,6 +314,9 @@ class ThreatModel:
     access: Access = "gradients"
     queries: ranges.Natural
 
+    marks: ClassVar[tuple[str, ...]] = ()
+    """Names of its further text fields; where one is off its default, records have it in `threat_norm`: `patch+knows=site`."""
+
     def __post_init__(self) -> None:
         try:
             ranges.check(self)
@@ -341,14 +344,15 @@ class ThreatModel:
 
         Sets that are not empty are named in `threat_norm` (`cavbench.core.sets`).
         """
-        found = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in sets.of(type(self))}
+        found = {name: getattr(self, name) for name in self._plain()}
         found["norm"] = "+".join([self.norm, *sets.words(self)])
         return {"threat_share": 1.0} | {f"threat_{name}": value for name, value in found.items()}
 
     @property
     def written(self) -> dict[str, Any]:
         """Its fields without the sets that are empty: the hash of a pair is that of records from before a set."""
-        empty = sets.of(type(self)).keys() - sets.present(self).keys()
+        given = sets.present(self).keys() | sets.marked(self).keys()
+        empty = {*sets.of(type(self)), *self.marks} - given
         return {item.name: getattr(self, item.name) for item in fields(self) if item.name not in empty}
 
     @classmethod
@@ -359,8 +363,20 @@ class ThreatModel:
             ValueError: if it has no such set, or a value is not allowed.
         """
         norm, words = sets.split(record["threat_norm"])
-        own = {item.name: record[f"threat_{item.name}"] for item in fields(cls) if item.name not in sets.of(cls)}
+        own = {name: record[f"threat_{name}"] for name in cls._plain()}
         return cls(**own | {"norm": norm} | sets.read(cls, words))
+
+    @classmethod
+    def _plain(cls) -> list[str]:
+        """The fields with a column of their own."""
+        return [item.name for item in fields(cls) if item.name not in {*sets.of(cls), *cls.marks}]
+
+    def known(self, cell: Cell, axes: Axes) -> Cell | None:
+        """What an attack knows of the scored scenarios' cell when it prepares; None if it knows none of them.
+
+        What is prepared is then made for each such cell and its scenarios.
+        """
+        return None
 
     def allows(self, access: Access) -> bool:
         """Whether this threat model allows an attack that needs `access`."""

@@ -1,6 +1,7 @@
 """The sets of a threat model beside the perturbation of values, as text: `relative+presence.hidden=1+latency.frames=2`.
 
 A set is a frozen dataclass with a default for every field. The defaults are the empty set: the attacker may do nothing of it.
+A threat model may also have *marks*, text fields such as `knows`: where one is off its default, `patch+knows=site`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Annotated, Any, get_args, get_origin
 
-WRITTEN = re.compile(r"[a-z0-9_]+(\+[a-z_]+\.[a-z_]+=-?[0-9][0-9.e+-]*)*")
+WRITTEN = re.compile(r"[a-z0-9_]+(\+[a-z_]+=[a-z_]+|\+[a-z_]+\.[a-z_]+=-?[0-9][0-9.e+-]*)*")
 """A perturbation set with the others, as records have it in `threat_norm`."""
 
 
@@ -50,16 +51,29 @@ def made(name: str, kind: type[Any], given: Any) -> Any:
 
 
 def allows(threat: Any, word: str) -> bool:
-    """Whether a threat model allows something in a field of a set: a `word` such as `presence.hidden=1`, whatever its number."""
+    """Whether a threat model allows something in a field of a set: a `word` such as `presence.hidden=1`, whatever its number.
+
+    A mark, such as `shape=plate`, must have this value.
+    """
+    key, _, value = word.partition("=")
+    if key in threat.marks:
+        return bool(getattr(threat, key) == value)
     name, _, field = word.partition("=")[0].partition(".")
     return field in changed(getattr(threat, name, None)) if name in of(type(threat)) else False
 
 
 def words(threat: Any) -> list[str]:
     """What a threat model allows beside its perturbation set: `presence.hidden=1`, one text for each field off its default."""
-    return [
+    marks = [f"{name}={value}" for name, value in marked(threat).items()]
+    return marks + [
         f"{name}.{key}={_number(value)}" for name, one in present(threat).items() for key, value in changed(one).items()
     ]
+
+
+def marked(threat: Any) -> dict[str, str]:
+    """The marks of a threat model that are off their defaults, by name."""
+    defaults = {item.name: item.default for item in fields(threat)}
+    return {name: getattr(threat, name) for name in threat.marks if getattr(threat, name) != defaults[name]}
 
 
 def split(text: str) -> tuple[str, list[str]]:
@@ -71,20 +85,23 @@ def split(text: str) -> tuple[str, list[str]]:
     if not WRITTEN.fullmatch(text):
         raise ValueError(f"{text[:80]!r} is no perturbation set with other sets")
     # A number may have a plus sign in its exponent.
-    norm, *rest = re.split(r"\+(?=[a-z_]+\.)", text)
+    norm, *rest = re.split(r"\+(?=[a-z_]+[.=])", text)
     return norm, rest
 
 
-def read(model: type[Any], given: list[str]) -> dict[str, dict[str, Any]]:
-    """The sets in `words`, as arguments of the threat model.
+def read(model: type[Any], given: list[str]) -> dict[str, Any]:
+    """The sets and marks in `words`, as arguments of the threat model.
 
     Raises:
         ValueError: if the threat model has no such set or field.
     """
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, Any] = {}
     for word in given:
         key, _, text = word.partition("=")
         name, _, field = key.partition(".")
+        if key in model.marks:
+            found[key] = text
+            continue
         if name not in of(model) or field not in _types(of(model)[name]):
             raise ValueError(f"threat.{key} is unknown")
         whole = _types(of(model)[name])[field] is int

@@ -275,7 +275,8 @@ class Track(ABC):
         """Make the `artefact` of a pair and training seed: the content of a safetensors file.
 
         Args:
-            job: the job that needs it; its cell and scenario seeds do not matter.
+            job: the job that needs it; its cell and scenario seeds matter only where the attacker knows them
+                (`ThreatModel.known`).
             made_by: canonical JSON of everything that determines it, to be stored in the file.
             progress: called with the progress.
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from cavbench.detection.boxes import confidence, overlap
 from cavbench.detection.closed_loop import Drives
 from cavbench.detection.detector import STOP_SIGN, Detections, Detector
 from cavbench.detection.discrimination import certified, discrimination, if_visible, stops_by_family
+from cavbench.detection.mount import Mount
 from cavbench.detection.patch import Patch
 from cavbench.detection.printing import non_printability
 from cavbench.detection.scenes import Approach, Scenes
@@ -80,16 +82,24 @@ class Unpatched:
     least: Sequence[NDArray[np.float32] | None]
     faces: Sequence[Sight | None]
 
+    def at(self, approach: int) -> Unpatched:
+        """That of one approach."""
+        number = self.of_approach[approach]
+        own = [self.scenes[number]], np.zeros(1, np.int64)
+        return Unpatched(*own, [self.decoys[number]], [self.least[number]], [self.faces[number]])
+
     @classmethod
     def of(cls, detector: Detector, approaches: Sequence[Approach], share: float) -> Unpatched:
         """Run the detector; `share` is the side of patches as a share of the sign's side."""
         scenes, of_approach = _distinct([approach.scenes for approach in approaches])
         with torch.no_grad():
-            decoys = [look_at_decoys(detector, one) for one in scenes]
-            # Without an attack there is no patch that something is certain under.
-            least = [certain(detector, one, share) if share else None for one in scenes]
+            # Where a plate appears, it is what stands in the sign's place.
+            decoys = [None if one.mount.appears else look_at_decoys(detector, one) for one in scenes]
+            # Without an attack, or with light or a plate, there is no patch that something is certain under.
+            covered = [share and one.mount.shape in ("square", "stickers") for one in scenes]
+            least = [certain(detector, one, share) if some else None for one, some in zip(scenes, covered, strict=True)]
             # Last, so that a random detector draws the same as before for the others.
-            faces = [look_at_faces(detector, one) for one in scenes]
+            faces = [None if one.mount.appears else look_at_faces(detector, one) for one in scenes]
         return cls(scenes, of_approach, decoys, least, faces)
 
 
@@ -125,6 +135,8 @@ def score(
     texels = patch.texels if patch else None
     known = unpatched or Unpatched.of(detector, approaches, share)
     scenes, of_approach = known.scenes, known.of_approach
+    appears = scenes[0].mount.appears
+    decoys = known.decoys
     with torch.no_grad():
         looks = [look(detector, one, texels, share) for one in scenes]
         seen = [looks[number] for number in of_approach]
@@ -132,6 +144,11 @@ def score(
             for place in trace.episodes:
                 clean = look(detector, approaches[place].scenes, None, share) if texels is not None else None
                 trace.sightings.append(Sighting(approaches[place], patch, share, seen[place], clean))
+        if appears:
+            # The plate is scored as a decoy, beside the sign as it is.
+            decoys = [look(detector, at_plates(one, share), texels, share) for one in scenes]
+            looks = [look(detector, one, None, share) for one in scenes]
+            seen, texels = [looks[number] for number in of_approach], None
     crafted = patch or Patch(texels=None)
     constant = {
         "patch_sha256": crafted.sha256,
@@ -145,13 +162,13 @@ def score(
             for name in OF_GRADIENTS
         },
         "draws": np.nan,
-        "non_printability": np.nan if texels is None else float(non_printability(texels)),
+        "non_printability": np.nan if crafted.texels is None else float(non_printability(crafted.texels)),
         **probed(detector, approaches, seen, texels, share, entropy),
     }
     of_scenes = {
         **measured(looks, scenes),
-        **discrimination(looks, known.decoys, scenes),
-        **certified(known.least, looks, known.decoys),
+        **discrimination(looks, decoys, scenes),
+        **certified(known.least, looks, decoys),
         **stops_by_family(known.faces, scenes),
         **if_visible(looks, scenes),
     }
@@ -161,6 +178,20 @@ def score(
         **{name: np.array([value] * len(approaches)) for name, value in constant.items()},
         **{name: values[of_approach] for name, values in of_scenes.items()},
     }
+
+
+def mounted(approaches: Sequence[Approach], mount: Mount) -> list[Approach]:
+    """The approaches with patches shown in another way; those with the same scenes still have the same."""
+    scenes = {id(one.scenes): one.scenes.mounted(mount) for one in approaches}
+    return [replace(one, scenes=scenes[id(one.scenes)]) for one in approaches]
+
+
+def at_plates(scenes: Scenes, share: float) -> Scenes:
+    """The same frames with the boxes of plates that appear, instead of the sign's."""
+    other = copy(scenes)
+    height, width = scenes.size
+    other.boxes = scenes.reach(share).minimum(torch.tensor([width, height] * 2)).clamp(min=0)
+    return other
 
 
 def _distinct(scenes: Sequence[Scenes]) -> tuple[list[Scenes], NDArray[np.int64]]:

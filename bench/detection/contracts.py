@@ -27,6 +27,8 @@ class CameraWorld(World):
     locations: ClassVar[tuple[str, ...]]
     """Names of the places; scenario seed s is driven at `locations[s % len(locations)]`."""
     redraws: ClassVar[bool] = False
+    mounts: ClassVar[bool] = False
+    """Whether its scenes show patches of other shapes and places, too (`Scenes.mounted`)."""
     classes: ClassVar[tuple[str, ...]] = (STOP_SIGN,)
     """Names of the object classes in its scenes (`Scenes.objects`)."""
 

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from cavbench.core.contracts import Progress
 from cavbench.core.track import Job
+from cavbench.detection import joined
 from cavbench.detection.access import PatchEnforcer
 from cavbench.detection.contracts import CameraWorld, PatchAttack
 from cavbench.detection.detector import Detector
-from cavbench.detection.patch import Patch
+from cavbench.detection.patch import Patch, written_together
 from cavbench.detection.placed import placed
 from cavbench.detection.scenes import Scenes
 from cavbench.detection.threat import PatchThreat
@@ -74,14 +75,29 @@ def craft(
 
 
 def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
-    """Craft the patch of a job's pair and training seed; return the content of its file (`cavbench.detection.patch`)."""
+    """Craft the patch of a job's pair and training seed; return the content of its file (`cavbench.detection.patch`).
+
+    For an attacker who knows the site there is a patch for each of the job's approaches, crafted on its own frames.
+    """
     pair = job.pair
     attack, world, threat = pair.armed(job.training_seed), pair.world.component, pair.threat
     assert isinstance(attack, PatchAttack)
     assert isinstance(world, CameraWorld)
     assert isinstance(threat, PatchThreat)
     with Stream("load", job.attack_seed).in_use():
-        scenes = world.training_scenes()
+        sites = joined.sites(world, threat, job.cell, job.seeds) or [world.training_scenes()]
         detector = placed(pair.load(job.training_seed), job.device)
-        patch = craft(attack, detector, scenes, threat, attack_seed=job.attack_seed, progress=progress)
-    return patch.written(made_by)
+
+        def one(number: int) -> Patch:
+            def tell(share: float, text: str) -> None:
+                progress((number + share) / len(sites), text)
+
+            scenes = sites[number].mounted(threat.mount)
+            return craft(attack, detector, scenes, threat, attack_seed=job.attack_seed, progress=tell)
+
+        made = {id(scenes): number for number, scenes in reversed([*enumerate(sites)])}
+        made_of = {number: one(number) for number in sorted(made.values())}
+        patches = [made_of[made[id(scenes)]] for scenes in sites]
+    if threat.knows == "universal":
+        return patches[0].written(made_by)
+    return written_together(patches, made_by)

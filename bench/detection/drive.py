@@ -18,6 +18,7 @@ from cavbench.detection import (
     crafting,
     discrimination,
     driver,
+    mount,
     precision,
     printing,
     reports,
@@ -25,11 +26,11 @@ from cavbench.detection import (
     stopping,
     threat,
 )
-from cavbench.detection.approach import Sighting, Trace, Unpatched, check_approaches, score
+from cavbench.detection.approach import Sighting, Trace, Unpatched, check_approaches, mounted, score
 from cavbench.detection.closed_loop import Drive, Drives
 from cavbench.detection.contracts import CameraWorld
 from cavbench.detection.detector import Detector
-from cavbench.detection.patch import Patch
+from cavbench.detection.patch import Patch, read_all
 from cavbench.detection.placed import placed
 from cavbench.detection.scenes import Approach
 from cavbench.errors import UserError
@@ -45,6 +46,7 @@ SEAL = Seal(
     crafting,
     discrimination,
     driver,
+    mount,
     precision,
     printing,
     reports,
@@ -89,21 +91,26 @@ def _carried_out(jobs: Sequence[Job], artefacts: Mapping[str, bytes], traced: Se
     found: list[Driven] = []
     pair, world = first.pair, first.pair.world.component
     assert isinstance(world, CameraWorld)
-    patches = [_patch(artefacts[job.artefact], job.artefact) if job.artefact in artefacts else None for job in jobs]
+    patches = [_patches(artefacts[job.artefact], job) if job.artefact in artefacts else [None] for job in jobs]
     SEAL.check()
     with Stream("load", first.attack_seed).in_use():
         # Before any code of the defence runs, which could change what these are made from.
         approaches = world.approaches(first.cell, first.seeds)
         check_approaches(approaches, first.seeds, type(world).__name__)
+        assert isinstance(pair.threat, threat.PatchThreat)
+        approaches = mounted(approaches, pair.threat.mount)
         detector = placed(pair.load(first.training_seed), first.device)
     with Watch(detector, "detector", "defense", listens=False):
         with Stream("unpatched", first.attack_seed).in_use():
             unpatched = Unpatched.of(detector, approaches, pair.threat.budget)
-        for job, patch in zip(jobs, patches, strict=True):
+        for job, own in zip(jobs, patches, strict=True):
             share_done(len(found) / len(jobs))
             # A random detector draws the same whatever patches it saw before.
             with Stream("look", job.attack_seed).in_use():
-                found.append(_scored(job, detector, approaches, patch, unpatched, traced))
+                if len(own) == 1:
+                    found.append(_scored(job, detector, approaches, own[0], unpatched, traced))
+                else:
+                    found.append(_at_sites(job, detector, approaches, own, unpatched, traced))
     SEAL.check()
     return found
 
@@ -134,6 +141,24 @@ def _scored(
     return Driven(columns, dict(zip(traced, sightings, strict=True)))
 
 
+def _at_sites(
+    job: Job,
+    detector: Detector,
+    approaches: Sequence[Approach],
+    patches: Sequence[Patch | None],
+    unpatched: Unpatched,
+    traced: Sequence[int],
+) -> Driven:
+    """The measurements of a job with a patch of its own on each approach."""
+    parts = []
+    for number, (seen, patch) in enumerate(zip(approaches, patches, strict=True)):
+        one = replace(job, seeds=job.seeds[number : number + 1])
+        own = [seed for seed in traced if seed == seen.seed]
+        parts.append(_scored(one, detector, [seen], patch, unpatched.at(number), own))
+    columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns}
+    return Driven(columns, {seed: trace for part in parts for seed, trace in part.traces.items()})
+
+
 def _driven(
     job: Job, detector: Detector, texels: Tensor | None, sightings: list[Sighting]
 ) -> tuple[Drive | None, list[Sighting]]:
@@ -152,10 +177,15 @@ def _driven(
     ]
 
 
-def _patch(artefact: bytes, fingerprint: str) -> Patch:
+def _patches(artefact: bytes, job: Job) -> list[Patch]:
+    """The patch of a job; for an attacker who knows the sites, one for each approach."""
     try:
-        return Patch.read(artefact)
+        found = read_all(artefact)
+        known = job.pair.threat.known(job.cell, job.pair.world.component.facts.axes) is not None
+        if len(found) != (len(job.seeds) if known else 1):
+            raise UserError("of other approaches")
+        return found
     except UserError as error:
         raise UserError(
-            f"the patch {fingerprint}.safetensors is {error}; delete it and run again to craft a new one"
+            f"the patch {job.artefact}.safetensors is {error}; delete it and run again to craft a new one"
         ) from error

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
@@ -17,6 +18,7 @@ MOMENTS = 20
 """Largest number of crafting steps kept in an `Evolution`."""
 MEASURED = ("queries", "gradients", "zero_gradients", "nan_gradients", "seconds", "excess")
 LOSS = "loss."
+SITE = "site."
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,34 @@ class Patch:
         if patch.sha256 != header.get("sha256"):
             raise UserError("changed since it was written")
         return patch
+
+
+def written_together(patches: Sequence[Patch], made_by: str) -> bytes:
+    """The content of the file of several patches, one for each site: the file of each, as bytes.
+
+    Args:
+        patches: in the order of their sites.
+        made_by: as in `Patch.written`.
+    """
+    files = {f"{SITE}{number}": patch.written(made_by) for number, patch in enumerate(patches)}
+    tensors = {name: torch.frombuffer(bytearray(content), dtype=torch.uint8) for name, content in files.items()}
+    return save(tensors, {"made_by": made_by})
+
+
+def read_all(content: bytes) -> list[Patch]:
+    """The patches of a file: one, or one for each site.
+
+    Raises:
+        UserError: if it cannot be read, or a hash does not match.
+    """
+    try:
+        tensors = load(content)
+        files = [
+            tensors[f"{SITE}{number}"].numpy().tobytes() for number in range(len(tensors)) if f"{SITE}0" in tensors
+        ]
+    except (SafetensorError, KeyError, ValueError):
+        raise UserError("truncated or foreign") from None
+    return [Patch.read(each) for each in files or [content]]
 
 
 def _tensors(evolution: Evolution | None) -> dict[str, Tensor]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cavbench.detection.detector import STOP_SIGN, Objects
+from cavbench.detection.mount import Mount
 
 FAMILIES = ("words", "colours", "signs")
 """Faces that are not to be stopped for: other words on the red octagon; octagons of other colours and red plates of other shapes
@@ -53,6 +54,8 @@ class Scenes(ABC):
     """[M] the decoy of each frame (`render_decoys`); empty if the world has none."""
     faces: tuple[Decoy, ...] = ()
     """[M] a face of each frame that no training sees, of one of `FAMILIES` or `FOREIGN`; empty if the world has none."""
+    mount: Mount = Mount()
+    """How patches are shown; the square in the middle of the sign unless the scenes come from `mounted`."""
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -66,6 +69,12 @@ class Scenes(ABC):
             elif isinstance(value, dict | list):
                 setattr(other, name, copy(value))
         return other
+
+    def mounted(self, mount: Mount) -> Scenes:
+        """The same frames, with patches shown in this way. A world whose `mounts` is true overrides it."""
+        if mount != self.mount:
+            raise NotImplementedError(f"{type(self).__name__} shows patches as squares in the middle of the sign alone")
+        return self
 
     def objects(self, frame: int) -> Objects:
         """The objects in a frame, as training targets: the sign, unless a world overrides it."""

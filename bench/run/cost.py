@@ -269,6 +269,11 @@ def shares(units: Sequence[Unit], workers: int, recorded: Collection[str] = ()) 
     return [found[id(unit)] for unit in units]
 
 
+def preparing_s(unit: Unit) -> float:
+    """The CPU seconds of what is prepared for a unit; an attacker who knows the scenarios prepares something for each."""
+    return rates(unit.pair).artefact * (1 if unit.known is None else len(unit.seeds))
+
+
 def cost_of(plan: Any) -> Cost:
     """What a `cavbench.run.plan.Plan` costs, all of it; of a run with `until` the most. No network is loaded for it."""
     asked = {pair.id for pair in plan.pairs}
@@ -278,10 +283,14 @@ def cost_of(plan: Any) -> Cost:
     units = [unit for part in plan.rounds for unit in part.units(weights)]
     units = dearest(plan, units, lambda pair: every[pair.id].episode)
     workers = 1 if plan.executor == "serial" else plan.workers or cores()
-    seeds = {(unit.pair.id, unit.training_seed) for unit in units if every[unit.pair.id].artefact}
+    made = {
+        (unit.pair.id, unit.training_seed, unit.known): preparing_s(unit)
+        for unit in units
+        if every[unit.pair.id].artefact
+    }
     by_pair = dict.fromkeys(every, (0, 0.0))
-    for name, _ in seeds:
-        by_pair[name] = (0, by_pair[name][1] + every[name].artefact)
+    for (name, *_), seconds in made.items():
+        by_pair[name] = (0, by_pair[name][1] + seconds)
     for unit, seconds in zip(units, shares(units, workers), strict=True):
         before = by_pair[unit.pair.id]
         by_pair[unit.pair.id] = (before[0] + len(unit.seeds), before[1] + seconds)
@@ -293,7 +302,7 @@ def cost_of(plan: Any) -> Cost:
         baselines=sum(count for name, (count, _) in by_pair.items() if name in baselines),
         cpu_s=sum(seconds for _, seconds in by_pair.values()),
         workers=min(workers, max(1, len(units))),
-        disk_bytes=_disk(plan, units, episodes) + len(seeds) * ARTEFACT_BYTES,
+        disk_bytes=_disk(plan, units, episodes) + len(made) * ARTEFACT_BYTES,
         unknown=tuple(dict.fromkeys(name for one in every.values() for name in one.unknown)),
         at_most=plan.until is not None or bool(plan.racing),
         by_pair=by_pair,

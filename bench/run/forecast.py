@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Hashable, Sequence
 from dataclasses import dataclass
 
 from cavbench.core.pair import Pair
-from cavbench.run.cost import longest, rates, shares
+from cavbench.run.cost import longest, preparing_s, rates, shares
 from cavbench.run.task import Task
 
 EARLY = 0.02
@@ -89,7 +89,7 @@ class Forecast:
         """These tasks are still to be done, and no others; arguments as of the class."""
         costs = iter(shares([task.unit for task in tasks if task.step == "drive"], self.workers, recorded))
         self.parts = {
-            _key(task): Part(task.pair, next(costs) if task.step == "drive" else rates(task.pair).artefact)
+            _key(task): Part(task.pair, next(costs) if task.step == "drive" else preparing_s(task.unit))
             for task in tasks
         }
 
@@ -105,7 +105,7 @@ class Forecast:
 
     def _begun(self, task: Task, keys: tuple[str, ...]) -> Batch:
         known, drives, episodes = rates(task.pair), task.step == "drive", [len(unit.seeds) for unit in task.units]
-        cost = known.of(sum(episodes)) if drives else known.artefact
+        cost = known.of(sum(episodes)) if drives else preparing_s(task.unit)
         for key, count in zip(keys, episodes, strict=True):
             self.parts[key] = Part(task.pair, cost * count / sum(episodes))
         return Batch(

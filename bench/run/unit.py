@@ -90,7 +90,7 @@ class Unit:
     def artefact(self) -> str:
         """Fingerprint of its artefact: what the attack prepares once for a defended victim, such as a patch; empty for none.
 
-        Units of a pair that differ in cell and scenarios have the same.
+        Units of a pair that differ in cell and scenarios have the same, unless the attacker knows them (`ThreatModel.known`).
         """
         return digest(self.artefact_origin) if self.track.artefact and not self.pair.is_clean else ""
 
@@ -102,7 +102,15 @@ class Unit:
     @property
     def artefact_origin(self) -> dict[str, object]:
         """Everything that determines its artefact."""
-        return self._origin(self._artefact_seed, self.artefact_modules)
+        origin = self._origin(self._artefact_seed, self.artefact_modules)
+        if self.known is None:
+            return origin
+        return origin | {"cell": canonical(self.known), "seeds": [self.seeds.start, self.seeds.stop]}
+
+    @property
+    def known(self) -> Cell | None:
+        """What the attack knows of the cell when it prepares; None if it knows none of the scenarios."""
+        return self.pair.threat.known(self.cell, self.pair.world.component.facts.axes)
 
     @property
     def preparing_job(self) -> Job:

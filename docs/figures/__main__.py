@@ -27,6 +27,7 @@ FIGURES = {
     "attack_transfer.png": "sign_patches:transfer",
     "attack_noise_patch.png": "sign_patches:noise_patch",
     "attack_grey_patch.png": "sign_patches:grey_patch",
+    "mounts.png": "mounts:mounts",
     "defense_none.svg": "hardening:none",
     "defense_frame_stack.svg": "memory:frame_stack",
     "defense_smoothing.svg": "smoothing:smoothing",

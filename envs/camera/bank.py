@@ -18,6 +18,7 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from cavbench.detection import Decoy, Objects, Scenes
+from cavbench.detection.mount import Mount
 from cavbench.envs.camera import faces, sign, training_faces, training_signs
 from cavbench.envs.camera.frame import Frame, noise_level
 from cavbench.envs.camera.objects import objects
@@ -152,6 +153,15 @@ class BankScenes(Scenes):
         other._plates = {}
         return other
 
+    def mounted(self, mount: Mount) -> BankScenes:
+        if mount == self.mount:
+            return self
+        other = copy(self)
+        other.mount = mount
+        if mount.appears:
+            other.decoys = (Decoy("plate", octagonal=False),) * len(self)
+        return other
+
     def objects(self, frame: int) -> Objects:
         found = objects(self.poses[frame])
         boxes = np.array([box for _, box in found]).reshape(-1, 4)
@@ -192,24 +202,38 @@ class BankScenes(Scenes):
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
     ) -> list[Tensor]:
         """Windows of the images without sensor noise, [3, h, w] each."""
+        if patches is not None and self.mount.appears:
+            return self._plates_alone(frames, patches, share, corners, size)
         numbers = frames.tolist()
         faces: dict[tuple[int, sign.Colour], tuple[Tensor, ...]] = {}
         if patches is not None:
             kinds = {_kind(self._plate(number)) for number in numbers}
-            painted = {printed: sign.painted(patches, share, printed) for _, printed in kinds}
+            painted = {printed: sign.painted(patches, share, printed, self.mount) for _, printed in kinds}
             faces = {(side, printed): filtered(painted[printed], side).unbind() for side, printed in kinds}
         shown = []
         for place, (number, (x, y)) in enumerate(zip(numbers, corners.tolist(), strict=True)):
             plate, window = self._plate(number), (x, y, x + size[1], y + size[0])
             picture = plate.cut(window)
-            patched = common(window, plate.crop, _reach(self.poses[number], share))
+            patched = common(window, plate.crop, _reach(self.poses[number], share, self.mount))
             if patches is not None and patched:
                 picture[within(patched, window)] = plate.signed(faces[_kind(plate)][place % len(patches)], patched)
             shown.append(picture)
         return shown
 
+    def _plates_alone(
+        self, frames: Tensor, patches: Tensor, share: float, corners: Tensor, size: tuple[int, int]
+    ) -> list[Tensor]:
+        """As `_developed`, with each patch on a plate of its own, on the post without the sign."""
+        cover, shown = self.mount.cover(share, sign.TEXELS), []
+        light = sign.painted(patches, share, mount=self.mount)
+        for place, (number, (x, y)) in enumerate(zip(frames.tolist(), corners.tolist(), strict=True)):
+            plate, window = self._plate(number), (x, y, x + size[1], y + size[0])
+            face = faces.Face(light[place % len(light)] * torch.tensor(plate.printed).view(3, 1, 1), cover)
+            shown.append(plate.carrying(face)[within(window, (0, 0, 0, 0))])
+        return shown
+
     def reach(self, share: float) -> Tensor:
-        return torch.tensor([_reach(pose, share) for pose in self.poses], dtype=torch.float32)
+        return torch.tensor([_reach(pose, share, self.mount) for pose in self.poses], dtype=torch.float32)
 
     def _plate(self, number: int) -> Plate:
         """The opened plate of a frame, cached in these scenes: about 1.6 MB."""
@@ -245,7 +269,7 @@ def _kind(plate: Plate) -> tuple[int, sign.Colour]:
 
 
 @cache
-def _reach(pose: Pose, share: float) -> Box:
+def _reach(pose: Pose, share: float, mount: Mount) -> Box:
     """The box of the pixels that a patch can change: those it covers, plus one on each side for texture filtering."""
-    x0, y0, x1, y1 = sign.patch_box(share, sign_x(pose.lanes), pose.camera)
+    x0, y0, x1, y1 = sign.patch_box(share, sign_x(pose.lanes), pose.camera, mount)
     return floor(x0) - 1, floor(y0) - 1, ceil(x1) + 1, ceil(y1) + 1

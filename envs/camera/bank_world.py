@@ -30,6 +30,7 @@ class BankWorld(CameraWorld):
     title: ClassVar[str]
     """Name of the component, for messages."""
     classes: ClassVar[tuple[str, ...]] = NAMES
+    mounts: ClassVar[bool] = True
 
     bank: str = ""
 

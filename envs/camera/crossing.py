@@ -42,6 +42,7 @@ class StopSignCrossing(BankWorld):
     axes: ClassVar[Axes] = AXES
     grid: ClassVar[str] = CROSSING_V1.name
     locations: ClassVar[tuple[str, ...]] = (PLACE.name,)
+    mounts: ClassVar[bool] = False
 
     def training_scenes(self) -> Scenes:
         """Those of the world `camera`."""

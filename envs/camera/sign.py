@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cavbench.detection.colour import linear
+from cavbench.detection.mount import Mount
 from cavbench.envs.camera.camera import Array, Camera
 
 Colour = tuple[float, float, float]
 """A number for each of red, green and blue."""
 
+SQUARE = Mount()
 SIZE_M = 1.2
 """Width across flats: 48 inches, the oversized R1-1 of the MUTCD (2009, table 2B-1)."""
 HEIGHT_M = 2.7
@@ -41,9 +43,12 @@ def box(x: float, camera: Camera) -> Array:
     return _bounds(camera.project(corners(x)))
 
 
-def patch_box(share: float, x: float, camera: Camera) -> Array:
-    """x0, y0, x1, y1 in pixels, [4], of a patch whose side is `share` of the sign's side, not clipped to the image."""
-    return _bounds(camera.project(_square(share, x)))
+def patch_box(share: float, x: float, camera: Camera, mount: Mount = SQUARE) -> Array:
+    """x0, y0, x1, y1 in pixels, [4], of a patch of the budget `share`, not clipped to the image."""
+    left, top, right, bottom = mount.bounds(share)
+    edges = ((left, top), (right, top), (right, bottom), (left, bottom))
+    where = [(x + (across - 0.5) * SIZE_M, 0, HEIGHT_M + (0.5 - down) * SIZE_M) for across, down in edges]
+    return _bounds(camera.project(np.array(where)))
 
 
 def _bounds(seen: Array) -> Array:
@@ -108,30 +113,19 @@ def face() -> NDArray[np.float32]:
     return np.ascontiguousarray(small.transpose(2, 0, 1))
 
 
-def painted(patches: Tensor | None, share: float, printed: Colour = (1.0, 1.0, 1.0)) -> Tensor:
+def painted(patches: Tensor | None, share: float, printed: Colour = (1.0, 1.0, 1.0), mount: Mount = SQUARE) -> Tensor:
     """Linear reflectances of the face with patches, [N, 3, TEXELS, TEXELS]; each texel of a patch is a square.
 
     Args:
         patches: sRGB in [0, 1], [N, 3, P, P]; None for the plain face, N = 1.
         share: side of the patch as a share of the sign's side, in (0, 1].
         printed: what a print reflects as a share of what the sheeting reflects, for each colour; less than 1 in headlights.
+        mount: how the patches are shown.
     """
     plain = _reflectance().unsqueeze(0)
     if patches is None:
         return plain
-    middle = patch_texels(share)
-    side = middle.stop - middle.start
-    light = linear(patches) * torch.tensor(printed).view(3, 1, 1)
-    faces = plain.repeat(len(patches), 1, 1, 1)
-    faces[:, :, middle, middle] = torch.nn.functional.interpolate(light, size=(side, side), mode="nearest-exact")
-    return faces
-
-
-def patch_texels(share: float) -> slice:
-    """Rows (and columns) of the face that a patch covers; its side is `share` of the sign's side."""
-    side = max(1, round(share * TEXELS))
-    first = (TEXELS - side) // 2
-    return slice(first, first + side)
+    return mount.painted(plain, patches, share, torch.tensor(printed).view(3, 1, 1))
 
 
 @cache

@@ -78,6 +78,7 @@ class Windscreen(BankWorld):
 
     title: ClassVar[str] = "windscreen"
     axes: ClassVar[Axes] = AXES
+    mounts: ClassVar[bool] = False
     grid: ClassVar[str] = WINDSCREEN_V1.name
     locations: ClassVar[tuple[str, ...]] = StopSignApproach.locations
 

@@ -48,6 +48,8 @@ class Row:
     flags: tuple[Flag, ...]
     group: int = 0
     faults: FaultRow | None = None
+    site: Worst | None = None
+    """The score under attackers who know the site (`threat.knows=site`) with the same budget; None where there are none."""
 
     @property
     def identity(self) -> Mapping[str, object]:
@@ -98,6 +100,8 @@ class Board:
     baselines: Mapping[str, Episodes] = field(default_factory=dict)
 
 
+SITE = "knows=site"
+"""In `threat_norm` of attackers who prepare on the scenarios that are scored."""
 Key = tuple[Any, ...]
 """Track, world and its parameters, grid, and the values of `THREAT`."""
 
@@ -162,8 +166,18 @@ def _board(
         same = [one for one in attacked if one.ranked_as == defended and one.identity["grid"] == grid]
         others = [one for one in same if one.identity["threat_norm"] == threat[0]]
         raised = tuple(flags(Subject(track, own, others, found)))
-        rows.append(Row(own, found, panel.marginal(found), panel.left_out, raised, faults=faults.get(defended)))
+        site = _at_site(key, defended, attacked)
+        marginal = panel.marginal(found)
+        rows.append(Row(own, found, marginal, panel.left_out, raised, faults=faults.get(defended), site=site))
     return Board(track, (world, world_params), grid, tuple(threat), tuple(ranked(rows)), _baselines(allowed))
+
+
+def _at_site(key: Key, defended: object, attacked: Sequence[Comparison]) -> Worst | None:
+    """The score of what is defended where the attacker also knows the site; None where that was not driven."""
+    track, world, world_params, grid, norm, *rest = key
+    knowing = (track, world, world_params, grid, f"{norm}+{SITE}", *rest)
+    found = [one for one in attacked if one.ranked_as == defended and _within(one, knowing)]
+    return Panel.of(found).strongest() if found else None
 
 
 def _within(one: Comparison, key: Key) -> bool:

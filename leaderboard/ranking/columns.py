@@ -158,6 +158,16 @@ def _scores(track: Track) -> Iterator[Column]:
         spare=4,
     )
     yield Column(
+        name="site_score",
+        title="Knows the site",
+        short="knows\nsite",
+        meaning="score under the strongest attacker who prepares on the approaches that are scored, with the same budget",
+        value=lambda row, called: row.site.score if row.site else None,
+        interval=True,
+        optional=True,
+        spare=2,
+    )
+    yield Column(
         name="certified",
         title="Certified",
         short="certi-\nfied",

@@ -8,6 +8,7 @@ import pytest
 
 from cavbench.core import sets
 from cavbench.core.options import Options
+from cavbench.detection.threat import PatchThreat
 from cavbench.driving.threat import ObservationThreat
 from cavbench.errors import UserError
 from cavbench.identity.fingerprint import canonical
@@ -79,6 +80,27 @@ def test_the_command_line_refuses_what_no_set_has(word: str) -> None:
     with pytest.raises(UserError) as refused:
         Options([word], kinds=("attack", "defense", "victim", "world"), settings=RunOptions, axes=("lanes",)).threats()
     assert len(str(refused.value).splitlines()) == 1
+
+
+def test_a_mark_is_recorded_where_it_is_off_its_default_and_only_there() -> None:
+    usual, known = PatchThreat(), PatchThreat(knows="site")
+    assert usual.columns["threat_norm"] == "patch"
+    assert canonical(usual.written) == canonical(
+        {"norm": "patch", "budget": 0.5, "access": "gradients", "queries": 20_000}
+    )
+    assert known.columns.keys() == usual.columns.keys()
+    assert known.columns["threat_norm"] == "patch+knows=site"
+    assert sets.split("patch+knows=site")[0] == "patch"
+    for threat in (usual, known):
+        assert PatchThreat.recorded(threat.columns) == threat
+    assert sets.allows(known, "knows=site")
+    assert not sets.allows(usual, "knows=site")
+
+
+@pytest.mark.parametrize("text", ["patch+knows=everything", "patch+nose=long", "patch+knows=site+knows"])
+def test_a_record_with_a_mark_that_is_not_allowed_is_refused(text: str) -> None:
+    with pytest.raises(ValueError):
+        PatchThreat.recorded(PatchThreat().columns | {"threat_norm": text})
 
 
 @pytest.mark.parametrize("text", ["relative+", "relative+presence", "relative+presence.hidden=<b>", "rel ative", ""])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -25,6 +26,7 @@ from cavbench.detection import (
     Predictions,
     Scenes,
 )
+from cavbench.detection.mount import Mount
 from cavbench.envs.weather import WEATHERS
 from cavbench.scenarios import Axes, Axis, Cell, Grid
 
@@ -74,8 +76,18 @@ class RedScenes(Scenes):
         faces = green * torch.tensor([0.0, 1.0, 0.0]) + (1 - green) * 0.5
         return self._shown(frames, faces[:, :, None, None].expand(len(frames), 3, 16, 16))
 
+    def mounted(self, mount: Mount) -> Scenes:
+        other = copy(self)
+        other.mount = mount
+        return other
+
+    def reach(self, share: float) -> Tensor:
+        half = 8 * share
+        return torch.tensor([[16 - half, 16 - half, 16 + half, 16 + half]]).expand(len(self), 4)
+
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
-        face = torch.tensor([1.0, 0.0, 0.0])[:, None, None].expand(len(frames), 3, 16, 16)
+        alone = self.mount.appears and patches is not None
+        face = torch.tensor([0.5, 0.5, 0.5] if alone else [1.0, 0.0, 0.0])[:, None, None].expand(len(frames), 3, 16, 16)
         if patches is not None:
             side = round(16 * share)
             edge = (16 - side) // 2
@@ -101,6 +113,7 @@ class RedStreet(CameraWorld):
     axes: ClassVar[Axes] = RED_AXES
     grid: ClassVar[str] = RED_V1.name
     locations: ClassVar[tuple[str, ...]] = ("front", "side", "back")
+    mounts: ClassVar[bool] = True
     frames: int = 10
 
     def training_scenes(self) -> Scenes:
@@ -178,7 +191,7 @@ class Paint(PatchAttack):
     texels: int = 8
     steps: int = 4
     pause: float = 0.0
-    mood: Literal["calm", "loud", "void", "crooked", "greedy", "tamper", "raise", "kill"] = "calm"
+    mood: Literal["calm", "loud", "void", "crooked", "greedy", "tamper", "raise", "kill", "mindful"] = "calm"
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor | None:
         if self.mood == "raise":
@@ -187,6 +200,11 @@ class Paint(PatchAttack):
             os.kill(os.getpid(), signal.SIGKILL)
         if self.mood == "tamper":
             oracle._enforcer.detector.bias -= 1
+        if self.mood == "mindful":
+            # What it was shown, as texels: the distances of the frames in kilometres.
+            shown = torch.zeros(3 * self.texels**2)
+            shown[: len(scenes)] = scenes.distance / 1000
+            return shown.reshape(3, self.texels, self.texels)
         frames = torch.arange(len(scenes))
         patch = torch.rand(1, 3, self.texels, self.texels, generator=oracle.generator)
         for step in range(10**9 if self.mood == "greedy" else self.steps):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+from cavbench.detection.mount import Mount, Place, Shape
 from cavbench.envs.camera import bank, develop, sign
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.frame import frame
@@ -222,6 +223,23 @@ def test_a_window_is_a_part_of_the_picture(frame: int, x: int, y: int, share: fl
     whole = SCENES.render(frames, patch, share)
     cut = torch.stack([p[:, y : y + 64, x : x + 96] for p, (x, y) in zip(whole, corners.tolist(), strict=True)])
     torch.testing.assert_close(windows, cut, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("shape", ["square", "stickers", "light", "plate"])
+@pytest.mark.parametrize("place", ["middle", "top"])
+def test_a_patch_of_any_shape_changes_the_pixels_that_it_says_and_no_others(shape: Shape, place: Place) -> None:
+    if shape != "square" and place != "middle":
+        return
+    scenes = SCENES.mounted(Mount(shape, place))
+    frames, white, black = torch.arange(2), torch.ones(1, 3, 8, 8), torch.zeros(1, 3, 8, 8)
+    seen = [scenes.developed(frames, patch, 0.5) for patch in (white, black)]
+    for number, (x0, y0, x1, y1) in enumerate(scenes.reach(0.5).int().tolist()):
+        if number < len(frames):
+            rows, columns = (seen[0][number] != seen[1][number]).any(0).nonzero().T
+            assert x0 <= columns.min() <= columns.max() < x1
+            assert y0 <= rows.min() <= rows.max() < y1
+    # Without a patch nothing is mounted.
+    assert torch.equal(scenes.developed(frames, None, 0.5), SCENES.developed(frames, None, 0.5))
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
