@@ -60,8 +60,18 @@ class Source:
         """
         places = Places(configured())
         address = places.find(*self.requirement.split("=="))
-        wanted = {"title": self.title, "kind": "a source distribution", "most_times": MOST_TIMES, "size": self.size}
-        return streams.take(address, members, folder, report, sha256=self.sha256, context=places.context, **wanted)
+        return streams.take(
+            address,
+            members,
+            folder,
+            report,
+            title=self.title,
+            kind="a source distribution",
+            most_times=MOST_TIMES,
+            size=self.size,
+            sha256=self.sha256,
+            context=places.context,
+        )
 
 
 def configured() -> dict[str, str]:

@@ -55,8 +55,17 @@ class Tarball:
         Raises:
             UserError: with the reason alone if it cannot be downloaded; if it has another hash, or no such member.
         """
-        wanted = {"title": self.title, "kind": "a package of npm", "most_times": MOST_TIMES}
-        return streams.take(self.address, members, folder, report, size=self.size, sha256=self.sha256, **wanted)
+        return streams.take(
+            self.address,
+            members,
+            folder,
+            report,
+            title=self.title,
+            kind="a package of npm",
+            most_times=MOST_TIMES,
+            size=self.size,
+            sha256=self.sha256,
+        )
 
 
 def registry(scope: str = "") -> str:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cavbench.core.contracts import Progress
-from cavbench.detection.victims.checkpoint import Checkpoint
+from cavbench.detection.victims.checkpoint import Checkpoint, Stateful
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -54,7 +54,7 @@ def descend(
     weights = [weight for weight in network.parameters() if weight.requires_grad]
     adam = torch.optim.AdamW(weights, lr=learning_rate, weight_decay=5e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(adam, learning_rate, total_steps=updates, pct_start=warm_up)
-    parts = {"network": network, "mean": mean, "adam": adam, "schedule": schedule}
+    parts: dict[str, Stateful] = {"network": network, "mean": mean, "adam": adam, "schedule": schedule}
     first = checkpoint.resume(parts) if checkpoint else 0
     for update in range(first, updates):
         if checkpoint and update > first:
