@@ -2,11 +2,12 @@
 
     python -m cavbench.leaderboard.published RESULTS          # publishes the newest records of a results folder, row by row
     python -m cavbench.leaderboard.published RESULTS --add    # adds them to those that a row has
+    python -m cavbench.leaderboard.published RESULTS --faults # adds what `attack=faults` did to rows
     python -m cavbench.leaderboard.published                  # writes the faces of all rows again
 
 A row is a defended victim on a grid. Its records are `data/GRID/NAME.parquet`, its face is `rows/GRID/NAME.json`
 (`cavbench.leaderboard.faces`). So a new row is two new files, and no other one changes. The records of all baselines of a grid,
-which no leaderboard ranks, are one file, `data/GRID/baselines.parquet`.
+which no leaderboard ranks, are one file, `data/GRID/baselines.parquet`. So are those of faults, `data/faults-1/faults.parquet`.
 """
 
 from __future__ import annotations
@@ -23,12 +24,15 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from rich.console import Console
 
+from cavbench.core import suites
 from cavbench.core.track import Track, track, tracks
+from cavbench.errors import UserError
 from cavbench.files import whole
 from cavbench.identity.fingerprint import canonical
 from cavbench.leaderboard.comparisons.comparison import DEFENDED, IDENTITY, NO_ATTACK
 from cavbench.leaderboard.comparisons.reading import groups
 from cavbench.leaderboard.faces import write_face
+from cavbench.leaderboard.ranking.faults import FAULT
 from cavbench.records import reading
 from cavbench.records.columns import track_of
 from cavbench.records.schema import AUDIT, encoded
@@ -37,6 +41,8 @@ from cavbench.records.table import plain, together
 HOME = "cavbench.leaderboard"
 BASELINES = "baselines"
 """The file of a grid with the victims that others are compared with."""
+FAULTS = "faults"
+"""The file with the records of a suite of faults, which ranks nothing, of all rows with their controls and baselines."""
 SERIES = ("pair", "training_seed", "grid")
 """The columns that records are renewed by."""
 MEASURED = frozenset({"return", "distance_m", "min_ttc_s", "mean_speed", "linf", "l2", "linf_m", "linf_mps"})
@@ -87,6 +93,25 @@ def publish(folder: Path, home: Path, *, add: bool = False) -> dict[str, int]:
             if defended is not None:
                 write_face(file, home)
             found[f"{grid}/{file.stem}"] = int(part.num_rows)
+    return found
+
+
+def publish_faults(folder: Path, home: Path) -> dict[str, int]:
+    """Add the records of a results folder in which `attack=faults` was driven to the published ones; as `publish`.
+
+    Raises:
+        UserError: if the folder has no records, or those of attacks.
+    """
+    found = {}
+    for records in reading.read_all(folder).values():
+        attacks = set(pc.unique(records["attack"]).to_pylist())
+        if not {FAULT} <= attacks <= {FAULT, NO_ATTACK}:
+            raise UserError(
+                f"{folder} must have the records of attack=faults alone, and has {', '.join(sorted(attacks))}"
+            )
+        file = home / "data" / suites.suite("faults").name / f"{FAULTS}.parquet"
+        write_records(added(reading.read_file(file), records) if file.exists() else records, file)
+        found[f"{file.parent.name}/{file.stem}"] = int(reading.read_file(file).num_rows)
     return found
 
 
@@ -165,8 +190,8 @@ def added(old: pa.Table, new: pa.Table) -> pa.Table:
 
 
 def row_files(home: Path) -> list[Path]:
-    """The records of all rows; not those of baselines."""
-    return [path for path in sorted((home / "data").glob("*/*.parquet")) if path.stem != BASELINES]
+    """The records of all rows; not those of baselines and faults."""
+    return [path for path in sorted((home / "data").glob("*/*.parquet")) if path.stem not in (BASELINES, FAULTS)]
 
 
 def main() -> None:
@@ -174,13 +199,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Publish the newest records of a results folder, row by row.")
     parser.add_argument("folder", type=Path, nargs="?", help="results folder; without one the faces are written again")
     parser.add_argument("--add", action="store_true", help="add them to the records of the rows")
+    parser.add_argument("--faults", action="store_true", help="add what attack=faults did to rows")
     words = parser.parse_args()
     with as_file(files(HOME)) as home:
         if words.folder is None:
             for file in row_files(home):
                 write_face(file, home)
             return
-        for name, episodes in publish(words.folder, home, add=words.add).items():
+        made = publish_faults(words.folder, home) if words.faults else publish(words.folder, home, add=words.add)
+        for name, episodes in made.items():
             Console().print(f"{name}: {episodes} episodes")
 
 

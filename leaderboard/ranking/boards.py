@@ -16,7 +16,7 @@ from cavbench.errors import UserError
 from cavbench.leaderboard.comparisons.beside import beside
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.reading import read_tracks
-from cavbench.leaderboard.ranking.faults import FaultRow, is_fault, under_faults
+from cavbench.leaderboard.ranking.faults import FaultRow, Faults, is_fault, of, under_faults
 from cavbench.leaderboard.ranking.flags import Flag, Subject, flags
 from cavbench.leaderboard.ranking.remarks import row_remarks
 from cavbench.leaderboard.ranking.worst import Panel, Worst, margin
@@ -151,9 +151,7 @@ def _access(name: str) -> int:
     return known.index(name) if name in known else len(known)
 
 
-def _board(
-    key: Key, track: Track, attacked: Sequence[Comparison], faults: Mapping[tuple[object, ...], FaultRow]
-) -> Board:
+def _board(key: Key, track: Track, attacked: Sequence[Comparison], faults: Faults) -> Board:
     _, world, world_params, grid, *threat = key
     allowed = [one for one in attacked if _within(one, key)]
     rows = []
@@ -168,7 +166,7 @@ def _board(
         raised = tuple(flags(Subject(track, own, others, found)))
         site = _at_site(key, defended, attacked)
         marginal = panel.marginal(found)
-        rows.append(Row(own, found, marginal, panel.left_out, raised, faults=faults.get(defended), site=site))
+        rows.append(Row(own, found, marginal, panel.left_out, raised, faults=of(own[0], faults), site=site))
     return Board(track, (world, world_params), grid, tuple(threat), tuple(ranked(rows)), _baselines(allowed))
 
 

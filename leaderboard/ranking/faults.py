@@ -8,10 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
-from cavbench.leaderboard.comparisons.comparison import Comparison
+from cavbench.core.outline import outline
+from cavbench.core.parameters import parameters as declared
+from cavbench.core.registry import Kind
+from cavbench.leaderboard.comparisons.comparison import Comparison, parameters
 
 FAULT = "fault"
 
@@ -80,9 +84,42 @@ def fault_rows(comparisons: Sequence[Comparison]) -> list[FaultRow]:
     return sorted(map(FaultRow.of, groups.values()), key=lambda row: -row.mean)
 
 
-def under_faults(comparisons: Sequence[Comparison]) -> dict[tuple[object, ...], FaultRow]:
-    """By what is ranked, its row under faults: on the grid with the most of them."""
+Faults = Sequence[tuple[Comparison, FaultRow]]
+"""The rows under faults, each with one of its comparisons, which says what is defended."""
+
+
+def under_faults(comparisons: Sequence[Comparison]) -> Faults:
+    """Of what is ranked, its row under faults: on the grid with the most of them. A row with fewer than another is unfinished."""
     found: dict[tuple[object, ...], list[Comparison]] = {}
     for one in filter(is_fault, comparisons):
         found.setdefault(one.ranked_as, []).append(one)
-    return {ranked: max(fault_rows(own), key=lambda row: row.faults) for ranked, own in found.items()}
+    rows = [(own[0], max(fault_rows(own), key=lambda row: row.faults)) for own in found.values()]
+    most = max((row.faults for _, row in rows), default=0)
+    return [(one, row) for one, row in rows if row.faults == most]
+
+
+def of(one: Comparison, faults: Faults) -> FaultRow | None:
+    """The row under faults of what a comparison defends; None if they were not driven."""
+    return next((row for other, row in faults if one.mine == other.mine and _alike(one, other)), None)
+
+
+def _alike(one: Comparison, other: Comparison) -> bool:
+    """Whether two comparisons defend the same. A parameter that records lack, because it is newer, has its default."""
+    for kind in ("defense", "victim", "world"):
+        if one.identity[kind] != other.identity[kind]:
+            return False
+        own, others = (parameters(each.identity[f"{kind}_params"]) for each in (one, other))
+        if any(own[name] != others[name] for name in own.keys() & others.keys()):
+            return False
+        added = {**own, **others}
+        lone = own.keys() ^ others.keys()
+        if lone and any(_defaults(kind, str(one.identity[kind])).get(name, ...) != added[name] for name in lone):  # type: ignore[arg-type]
+            return False
+    return True
+
+
+@cache
+def _defaults(kind: Kind, name: str) -> dict[str, object]:
+    """The defaults of a built-in component; nothing is imported to know them."""
+    found = outline(kind, name)
+    return {} if found is None else {key: one.default for key, one in declared(found).items()}

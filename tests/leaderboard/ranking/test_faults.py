@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from cavbench.core import registry
 from cavbench.core.pair import choose
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.ranking.columns import columns
+from cavbench.leaderboard.ranking.faults import is_fault, of, under_faults
 from cavbench.records import reading
 
 ALLOWED = {"presence": {"hidden": 9, "share": 1.0}, "actuator": {"delay": 4, "replaced": 0.5}}
@@ -54,6 +57,26 @@ def test_a_leaderboard_without_faults_has_no_column_of_them(out: Path) -> None:
     records = {name: table.filter(_is_no_fault(table)) for name, table in reading.read_all(out).items()}
     (board,), _ = read_boards(records)
     assert not [one.name for one in columns(board) if "faults" in one.name]
+
+
+def test_a_row_with_fewer_faults_than_another_is_unfinished(out: Path) -> None:
+    comparisons = [one for one in read_boards(reading.read_all(out))[1] if is_fault(one)]
+    (first, second) = comparisons
+    other = replace(second, identity={**second.identity, "victim": "ppo"})
+    assert [row.faults for _, row in under_faults([first, second])] == [2]
+    assert [row.faults for _, row in under_faults([first, second, other])] == [2]
+
+
+def test_records_without_a_newer_parameter_are_of_its_default(out: Path) -> None:
+    one = next(one for one in read_boards(reading.read_all(out))[1] if is_fault(one))
+    params = json.loads(one.identity["victim_params"])
+    older = replace(one, identity={**one.identity, "victim_params": json.dumps(params | {"tau": 0.9})})
+    missing = {key: value for key, value in params.items() if key != "trained_in"}
+    newer = replace(one, identity={**one.identity, "victim_params": json.dumps(missing)})
+    faults = under_faults([one])
+    assert of(newer, faults) is not None
+    assert of(older, faults) is None
+    assert of(replace(one, mine=True), faults) is None
 
 
 def test_the_terminal_shows_them(out: Path) -> None:
