@@ -237,7 +237,7 @@ class DetectionTrack(Track):
     measures: ClassVar[tuple[Measure, ...]] = (
         Measure(column="average_precision", heading="AP of\nstop", digits=2, spare=1, ranked=True),
         Measure(column="false_stops", heading="false\nstops", digits=2, spare=1, ranked=True),
-        Measure(column="false_stops_faces", heading="on kept-\nback faces", digits=2, spare=2, ranked=True),
+        Measure(column="false_stops_faces", heading="on kept-\nback faces", digits=2, spare=2),
         Measure(column="detection_rate", heading="frames\nseen", unit="share"),
         Measure(column="first_seen_m", heading="first\nseen m", digits=1, spare=2),
         Measure(column="ran", heading="runs the\nsign", unit="share", with_interval=True),

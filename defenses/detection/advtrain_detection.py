@@ -72,7 +72,7 @@ class DetectorAdversarialTraining(DetectorDefense):
         decoys: share of the windows that have a decoy in the place of the sign, in [0, 1].
         faces: what decoys show: faces drawn at random, or, of `signs`, also other words on the octagon, real signs, and foreign
             stop signs, which are found like the sign (`Decoy.family`).
-        again: start from the detector that was trained with the default parameters. It knows patches, so few rounds are enough.
+        again: start from the detector that was trained with the default parameters.
         attack: any registered patch attack.
         attack_params: its parameters, as on the command line but separated by spaces.
         budget: side of the patches as a share of the sign's side, in (0, 1].
