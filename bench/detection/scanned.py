@@ -64,7 +64,7 @@ def read(picture: NDArray[np.uint8], texels: int) -> Tensor:
     # Coordinates are 0 in the middle of the first pixel, half a pixel inside the edge of the page.
     onto = np.concatenate([_corners(x, y, printout.MARK) for x, y in printout.places()]) * side - 0.5
     matrix, _ = cv2.findHomography(there, onto, 0)
-    if matrix is None or float(np.abs(_through(matrix, there) - onto).max()) > FLAT * side:
+    if matrix is None or float(np.abs(_through(np.asarray(matrix, np.float64), there) - onto).max()) > FLAT * side:
         raise UserError("the marks in the picture are not those of a flat page: scan it again, flat and whole")
     size = round(printout.WHOLE * side)
     page = cv2.warpPerspective(picture, matrix, (size, size), flags=cv2.INTER_LINEAR)
@@ -104,7 +104,8 @@ def _through(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArra
 
 def _paper_and_black(light: Tensor, side: int) -> tuple[Tensor, Tensor]:
     """[3, 1, 1] the light of paper and of the black of the marks: medians of the white and black squares."""
-    white, black = [], []
+    white: list[Tensor] = []
+    black: list[Tensor] = []
     for number, (x, y) in enumerate(printout.places()):
         bits = cv2.aruco.generateImageMarker(printout.dictionary(), number, printout.MODULES) > 0
         step = printout.MARK * side / printout.MODULES
