@@ -145,6 +145,11 @@ def texture_mean(part: Box, face: Tensor, face_from_pixel: Array) -> Tensor:
     return torch.nn.functional.avg_pool2d(found * torch.from_numpy(weight), SUPERSAMPLING)[0]
 
 
+def wholly_sign(part: Box, face_from_pixel: Array) -> Tensor:
+    """Which pixels show nothing but the sign, bool [h, w]."""
+    return torch.from_numpy(_inside(part, face_from_pixel)[1].all((1, 3)))
+
+
 def _inside(part: Box, face_from_pixel: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where the samples of the pixels are on the face [h * S, w * S, 2], and whether on the octagon [h, S, w, S]."""
     x0, y0, x1, y1 = part
