@@ -93,7 +93,9 @@ def test_a_clean_pair_is_the_same_under_every_threat_model() -> None:
 
 def test_a_set_that_no_attack_would_meet_is_refused() -> None:
     given = ["threat.access=dynamics", "threat.dynamics.friction=0.5"]
-    with pytest.raises(UserError, match=r"attack=none leaves out threat\.dynamics\.friction, as runs without an attack"):
+    with pytest.raises(
+        UserError, match=r"attack=none leaves out threat\.dynamics\.friction, as runs without an attack"
+    ):
         plan_of(["attack=none", *given])
     clean, attacked = plan_of(["attack=none,noise", *given]).pairs
     assert (clean.attack.name, attacked.threat.dynamics.friction) == ("none", 0.5)
