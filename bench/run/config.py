@@ -148,6 +148,12 @@ def _shard(text: str) -> tuple[int, int]:
 def _pairs(given: Options) -> tuple[list[Pair], list[str]]:
     """Every combination of the chosen components and threat models, and the members of suites that are skipped."""
     attacks = given.chosen("attack")
+    sets = [key for key in given.values if re.fullmatch(r"threat\.\w+\.\w+", key)]
+    if sets and all(one.name == "none" for one in attacks):
+        raise UserError(
+            f"attack=none leaves out {sets[0]}, as runs without an attack stay clean: name an attack, or type attack=noise "
+            "threat.budget=0, which changes nothing else"
+        )
     choices: list[Sequence[Any]] = [given.chosen(kind) for kind in KINDS if kind != "attack"]
     names = ("defense", "victim", "world", "threat")
     others = [dict(zip(names, parts, strict=True)) for parts in itertools.product(*choices, given.threats())]

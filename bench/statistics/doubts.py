@@ -113,6 +113,8 @@ def one_draw(tables: Sequence[pa.Table], attacked: Sequence[pa.Table], track: Tr
         return False, "Asked the same twice, it gave the same answer: it is not random."
     if track.many_draws:
         return False, track.many_draws
+    if _largest(attacked, "queries") == 0:
+        return None, "Not measured: no attack asked the victim anything."
     draws = _largest(attacked, "draws")
     draws = 0.0 if math.isnan(draws) else draws
     asked = f"the attack with the most draws asked {draws:.1f} times about each observation"

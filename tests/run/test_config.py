@@ -91,6 +91,16 @@ def test_a_clean_pair_is_the_same_under_every_threat_model() -> None:
     assert len(read("attack=none threat.budget=0.1,0.2").pairs) == 1
 
 
+def test_a_set_that_no_attack_would_meet_is_refused() -> None:
+    given = ["threat.access=dynamics", "threat.dynamics.friction=0.5"]
+    with pytest.raises(
+        UserError, match=r"attack=none leaves out threat\.dynamics\.friction, as runs without an attack"
+    ):
+        plan_of(["attack=none", *given])
+    clean, attacked = plan_of(["attack=none,noise", *given]).pairs
+    assert (clean.attack.name, attacked.threat.dynamics.friction) == ("none", 0.5)
+
+
 def test_a_path_is_not_parsed() -> None:
     assert plan_of(["out=/some/a,b=c {d}/[e]"]).out == Path("/some/a,b=c {d}/[e]")
 

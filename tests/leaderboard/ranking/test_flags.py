@@ -143,6 +143,13 @@ def test_a_flag_fires_where_it_should_and_only_there(name: str) -> None:
         assert unmeasured.reason.startswith("Not measured: ")
 
 
+def test_an_attack_that_asks_nothing_needs_no_draws() -> None:
+    assert flag("one_draw", clean(redrawn=1.0), probed(noise(), redrawn=1.0)).fired is None
+    assert flag(
+        "one_draw", clean(redrawn=1.0), probed(noise(), redrawn=1.0), probed(zo(), redrawn=1.0, draws=1.0)
+    ).fired
+
+
 @pytest.mark.parametrize("name", FLAGS)
 def test_a_reason_is_one_sentence(name: str) -> None:
     for records in (FIRES, FIRES_NOT):
