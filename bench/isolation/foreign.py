@@ -91,6 +91,8 @@ def unchanged() -> Iterator[None]:
         # First of all: with a low limit, nothing else could be called.
         lowered = sys.getrecursionlimit()
         sys.setrecursionlimit(limit)
+        # Nothing says whether it waits to end the process.
+        faulthandler.cancel_dump_traceback_later()
         changed = RECURSION if lowered != limit else before.changed()
         before.restore()
         # A filter of the foreign code stays, but hides no line of ours.
@@ -159,6 +161,9 @@ def _left(said: bytes, pipe: FileIO) -> str:
     after = said.partition(b"\n")[2] or _said(pipe, END_S + tree.LEFT_S)
     if after is None:
         return f"leaves a hook for the end of the process that does not end within {END_S:g} s"
+    if not after:
+        # The exit code of the command would be the hook's.
+        return "leaves a hook for the end of the process that ends it at once"
     names = after.removeprefix(ENDED).decode(errors="replace")
     return f"leaves a process that outlives the command ({names})" if names else ""
 
@@ -229,6 +234,9 @@ def _act_and_end(act: Callable[[], object], write: int, stays: bool) -> None:
         # The hooks of this process are not the module's.
         atexit._clear()
         framework, settings, limit = Snapshot(), Settings(alone=True), sys.getrecursionlimit()
+        hooked: list[str] = []
+        # Nothing lists the audit hooks, but each is told of later ones.
+        sys.addaudithook(lambda event, _: hooked.append(event) if event == "sys.addaudithook" else None)
         with suppress(BaseException):
             act()
         if os.getpid() != own:
@@ -240,6 +248,8 @@ def _act_and_end(act: Callable[[], object], write: int, stays: bool) -> None:
             found = f"changes {changed}"
         elif replaced := framework.changed():
             found = f"replaces {replaced}"
+        elif stays and hooked:
+            found = "adds an audit hook, which cannot be removed"
         code = CLOSED
         os.write(write, SURVIVED + found.encode() + b"\n")
         code = 0

@@ -22,6 +22,8 @@ LIBRARIES = {
     "numpy": ("",),
     "numpy.linalg": ("",),
     "pyarrow": ("",),
+    "pyarrow.compute": ("",),
+    "pyarrow.parquet": ("", "ParquetFile", "ParquetWriter"),
     "math": ("",),
     "time": ("",),
     "random": ("",),
@@ -36,8 +38,19 @@ LIBRARIES = {
     "contextlib": ("",),
     "functools": ("",),
     "pathlib": ("", "Path"),
+    "subprocess": ("", "Popen"),
+    "shutil": ("",),
+    "tempfile": ("",),
+    "secrets": ("",),
+    "re": ("",),
+    "copy": ("",),
+    "importlib": ("",),
+    "importlib.metadata": ("",),
 }
-"""Modules of libraries that scores are computed with, and processes end with; the names are their classes, "" is the module."""
+"""Modules of libraries that scores are computed and kept with, and processes begin and end with.
+
+The names are their classes, "" is the module.
+"""
 SETTINGS = ("manual_seed", "seed", "set_", "load", "save", "compile")
 """Beginnings of the names of library functions that no score depends on, and that other libraries wrap."""
 BUILTINS = (

@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import builtins
+import codecs
+import copyreg
 import gc
 import locale
+import multiprocessing
+import multiprocessing.spawn
 import operator
 import os
-import signal
 import socket
 import stat
 import sys
+import tempfile
 import threading
+import tracemalloc
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from cavbench.isolation.framework import LIBRARIES, OWN
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
+from cavbench.isolation.setting import UNKNOWN, Setting, in_order, same_objects, same_values
+from cavbench.isolation.system import SYSTEM
 
 OURS = (
     *("PYTHON", "LD_PRELOAD", "LD_AUDIT", "DYLD_INSERT", "LC_", "LANG", "TZ", "HOME", "PATH", "TMP", "TEMP", "XDG_"),
@@ -33,40 +33,13 @@ OURS = (
 """Beginnings of the names of environment variables that foreign code may neither add nor change."""
 THEIRS = ("OMP_", "MKL_", "OPENBLAS_", "NUMBA_", "TORCH", "CUDA_")
 """The same for those that it may add: libraries do when they are imported. All others may change, and none may go."""
-UNKNOWN = object()
 RECURSION = "the recursion limit"
+BACKENDS = (
+    *(("cudnn", name) for name in ("enabled", "deterministic", "benchmark", "allow_tf32")),
+    ("mkldnn", "enabled"),
+)
+"""Flags of torch's backends that change numbers, by their modules in `torch.backends`."""
 NUMPY = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Setting:
-    """A setting of the process.
-
-    Args:
-        name: what it is called in errors.
-        read: returns its value, which later changes do not reach.
-        write: sets it; None for what cannot be put back.
-        kept: whether a later value does others no harm, from the value before and the later one.
-        module: a module that must be imported before it can be read; empty for none.
-        usual: its value while that module is not imported.
-    """
-
-    name: str
-    read: Callable[[], Any]
-    write: Callable[[Any], object] | None = None
-    kept: Callable[[Any, Any], bool] = operator.eq
-    module: str = ""
-    usual: Any = UNKNOWN
-
-    def now(self) -> Any:
-        """Its value; `UNKNOWN` if it cannot be read."""
-        if self.module and self.module not in sys.modules:
-            return self.usual
-        try:
-            return self.read()
-        # A plug-in may have broken what reads it.
-        except Exception:
-            return UNKNOWN
 
 
 class Settings:
@@ -97,21 +70,6 @@ def _is_kept(setting: Setting, before: Any) -> bool:
     return before is UNKNOWN or bool(setting.kept(before, setting.now()))
 
 
-def _in_order(before: Sequence[object], after: Sequence[object]) -> bool:
-    """Whether all that was in a list is there, in the same order."""
-    rest = iter(after)
-    return all(any(one is other or one == other for other in rest) for one in before)
-
-
-def _same_objects(before: Mapping[Any, object], after: Mapping[Any, object]) -> bool:
-    """Whether all that was there is there, unchanged."""
-    return all(after.get(key) is value for key, value in before.items())
-
-
-def _same_values(before: Mapping[Any, object], after: Mapping[Any, object]) -> bool:
-    return all(after.get(key) == value for key, value in before.items())
-
-
 def _environment(before: Mapping[str, str], after: Mapping[str, str]) -> bool:
     """Whether no variable is gone, and those that the benchmark depends on are as they were."""
     own = [name for name in after if name.startswith(OURS)] + [name for name in before if name.startswith(THEIRS)]
@@ -131,45 +89,6 @@ def _filters(before: Sequence[object], after: Sequence[Any]) -> bool:
 def _put_filters(before: list[Any]) -> None:
     assert isinstance(warnings.filters, list)
     warnings.filters[:] = before
-
-
-def _folder() -> str:
-    try:
-        return os.getcwd()
-    except OSError:
-        return ""
-
-
-def _mask() -> int:
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("Umask:"):
-                return int(line.split()[1], 8)
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask
-
-
-def _handlers() -> dict[int, object]:
-    return {number: signal.getsignal(number) for number in signal.valid_signals()}
-
-
-def _put_handlers(before: Mapping[int, Any]) -> None:
-    for number, handler in before.items():
-        if handler is not None and signal.getsignal(number) is not handler:
-            with suppress(OSError, ValueError):
-                signal.signal(number, handler)
-
-
-def _limits() -> dict[int, tuple[int, int]]:
-    kinds = {number for name, number in vars(resource).items() if name.startswith("RLIMIT_")} if resource else set()
-    return {kind: resource.getrlimit(kind) for kind in kinds}
-
-
-def _put_limits(before: Mapping[int, tuple[int, int]]) -> None:
-    for kind, limit in before.items():
-        with suppress(OSError, ValueError):
-            resource.setrlimit(kind, limit)
 
 
 def _modules() -> dict[str, object]:
@@ -197,72 +116,152 @@ def _torch() -> Any:
     return sys.modules["torch"]
 
 
-def _modes() -> tuple[int, int]:
-    """How many modes change what torch's functions do: a default device is one."""
+def _modes() -> tuple[int, int, bool]:
+    """How many modes change what torch's functions do: a default device is one. And whether saved tensors are replaced."""
     from torch.overrides import _get_current_function_mode_stack
     from torch.utils._python_dispatch import _get_current_dispatch_mode_stack
 
-    return len(_get_current_function_mode_stack()), len(_get_current_dispatch_mode_stack())
+    hooks = _torch()._C._autograd._top_saved_tensors_default_hooks(True)
+    return len(_get_current_function_mode_stack()), len(_get_current_dispatch_mode_stack()), hooks is not None
+
+
+def _backend(where: str) -> Any:
+    return sys.modules[f"torch.backends.{where}"]
+
+
+def _put_backends(before: Mapping[tuple[str, str], bool]) -> None:
+    for (where, name), value in before.items():
+        setattr(_backend(where), name, value)
+
+
+def _put_collector(before: tuple[bool, tuple[int, int, int], int]) -> None:
+    (gc.enable if before[0] else gc.disable)()
+    gc.set_threshold(*before[1])
+    gc.set_debug(before[2])
+
+
+def _put_temporary(before: str) -> None:
+    tempfile.tempdir = before
+
+
+def _put_program(before: tuple[str, Any]) -> None:
+    sys.executable = before[0]
+    multiprocessing.set_executable(before[1])
+
+
+def _coders() -> dict[str, object]:
+    names = ("strict", "ignore", "replace", "surrogateescape", "backslashreplace")
+    return {name: codecs.lookup_error(name) for name in names}
+
+
+def _put_coders(before: Mapping[str, Any]) -> None:
+    for name, handler in before.items():
+        codecs.register_error(name, handler)
+
+
+def _streams() -> list[dict[str, Any]]:
+    """How each standard stream writes: its encoding, and what an object of it has of its own, as a replaced method."""
+    names = ("encoding", "errors", "line_buffering", "write_through")
+    return [
+        {"own": dict(getattr(stream, "__dict__", {})), **{name: getattr(stream, name, None) for name in names}}
+        for stream in (sys.stdin, sys.stdout, sys.stderr)
+    ]
+
+
+def _put_streams(before: Sequence[Mapping[str, Any]]) -> None:
+    for stream, found in zip((sys.stdin, sys.stdout, sys.stderr), before, strict=True):
+        with suppress(Exception):
+            vars(stream).clear()
+            vars(stream).update(found["own"])
+        with suppress(Exception):
+            stream.reconfigure(**{name: value for name, value in found.items() if name != "own"})  # type: ignore[union-attr]
 
 
 SETTINGS = (
+    *SYSTEM,
     Setting(name=RECURSION, read=sys.getrecursionlimit, write=sys.setrecursionlimit),
     Setting(name="the switch interval of threads", read=sys.getswitchinterval, write=sys.setswitchinterval),
     Setting(name="the trace function", read=sys.gettrace, write=sys.settrace, kept=operator.is_),
     Setting(name="the profile function", read=sys.getprofile, write=sys.setprofile, kept=operator.is_),
     Setting(
+        name="the trace function of new threads", read=threading.gettrace, write=threading.settrace, kept=operator.is_
+    ),
+    Setting(
+        name="the profile function of new threads",
+        read=threading.getprofile,
+        write=threading.setprofile,
+        kept=operator.is_,
+    ),
+    Setting(name="the stack of new threads", read=threading.stack_size, write=threading.stack_size),
+    Setting(name="whether memory is traced", read=tracemalloc.is_tracing, write=lambda _: tracemalloc.stop()),
+    Setting(
         name="the most digits of a number",
         read=lambda: sys.get_int_max_str_digits(),
         write=lambda value: sys.set_int_max_str_digits(value),
     ),
-    Setting(name="the garbage collector", read=gc.isenabled, write=lambda on: gc.enable() if on else gc.disable()),
-    Setting(name="the current folder", read=_folder, write=os.chdir),
-    Setting(name="the umask", read=_mask, write=os.umask),
+    Setting(
+        name="the garbage collector",
+        read=lambda: (gc.isenabled(), gc.get_threshold(), gc.get_debug()),
+        write=_put_collector,
+    ),
     Setting(name="environment variables", read=lambda: dict(os.environ), write=_put_environment, kept=_environment),
+    # What replaces it changes no environment of a process.
+    Setting(
+        name="what holds environment variables",
+        read=lambda: os.environ,
+        write=lambda value: setattr(os, "environ", value),
+        kept=operator.is_,
+    ),
+    Setting(name="the folder for temporary files", read=tempfile.gettempdir, write=_put_temporary),
+    Setting(
+        name="the program of Python",
+        read=lambda: (sys.executable, multiprocessing.spawn.get_executable()),
+        write=_put_program,
+    ),
+    Setting(name="how text is encoded", read=_coders, write=_put_coders, kept=same_objects),
+    Setting(
+        name="how objects are pickled",
+        read=lambda: dict(copyreg.dispatch_table),
+        write=copyreg.dispatch_table.update,
+        kept=same_objects,
+    ),
     Setting(
         name="the locale",
         read=lambda: locale.setlocale(locale.LC_ALL),
         write=lambda value: locale.setlocale(locale.LC_ALL, value),
     ),
-    Setting(name="signal handlers", read=_handlers, write=_put_handlers, kept=_same_objects),
-    Setting(name="limits of the process", read=_limits, write=_put_limits),
-    Setting(
-        name="the cores of the process",
-        read=lambda: os.sched_getaffinity(0),
-        write=lambda value: os.sched_setaffinity(0, value),
-    ),
-    Setting(name="the priority of the process", read=lambda: os.getpriority(os.PRIO_PROCESS, 0)),
     Setting(
         name="the import path",
         read=lambda: list(sys.path),
         write=lambda value: sys.path.__setitem__(slice(None), value),
-        kept=_in_order,
+        kept=in_order,
     ),
     Setting(
         name="how Python imports",
         read=lambda: list(sys.meta_path),
         write=lambda value: sys.meta_path.__setitem__(slice(None), value),
-        kept=_in_order,
+        kept=in_order,
     ),
     Setting(
         name="how Python finds modules",
         read=lambda: list(sys.path_hooks),
         write=lambda value: sys.path_hooks.__setitem__(slice(None), value),
-        kept=_in_order,
+        kept=in_order,
     ),
-    Setting(name="modules of the framework", read=_modules, write=sys.modules.update, kept=_same_objects),
+    Setting(name="modules of the framework", read=_modules, write=sys.modules.update, kept=same_objects),
     Setting(
         name="functions of Python",
         read=lambda: {name: value for name, value in vars(builtins).items() if name != "_"},
         write=vars(builtins).update,
-        kept=_same_objects,
+        kept=same_objects,
     ),
     Setting(
         name="standard input or output",
         read=lambda: {name: getattr(sys, name) for name in ("stdin", "stdout", "stderr")},
         write=vars(sys).update,
-        kept=_same_objects,
+        kept=same_objects,
     ),
+    Setting(name="how standard input or output writes", read=_streams, write=_put_streams),
     # Closed, a standard stream keeps its descriptor, and the next line that is printed is an error.
     Setting(
         name="whether standard input or output is closed",
@@ -273,6 +272,12 @@ SETTINGS = (
         read=lambda: list(warnings.filters),
         write=_put_filters,
         kept=_filters,
+    ),
+    Setting(
+        name="how warnings are shown",
+        read=lambda: {name: vars(warnings).get(name) for name in ("showwarning", "formatwarning")},
+        write=vars(warnings).update,
+        kept=same_objects,
     ),
     Setting(name="the timeout of connections", read=socket.getdefaulttimeout, write=socket.setdefaulttimeout),
     Setting(
@@ -296,7 +301,7 @@ SETTINGS = (
         module="torch",
         usual="cpu",
     ),
-    Setting(name="the modes of torch", read=_modes, module="torch", usual=(0, 0)),
+    Setting(name="the modes of torch", read=_modes, module="torch", usual=(0, 0, False)),
     Setting(
         name="the gradient mode of torch",
         read=lambda: (_torch().is_grad_enabled(), _torch().is_inference_mode_enabled()),
@@ -332,6 +337,12 @@ SETTINGS = (
         usual="highest",
     ),
     Setting(
+        name="the backends of torch",
+        read=lambda: {(where, name): getattr(_backend(where), name) for where, name in BACKENDS},
+        write=_put_backends,
+        module="torch",
+    ),
+    Setting(
         name="the threads of torch",
         read=lambda: _torch().get_num_threads(),
         write=lambda value: _torch().set_num_threads(value),
@@ -340,7 +351,7 @@ SETTINGS = (
 )
 """What is compared before and after the import of a plug-in."""
 ALONE = (
-    Setting(name="open files of the process", read=_files, kept=_same_values),
+    Setting(name="open files of the process", read=_files, kept=same_values),
     Setting(name="the threads that hold the end of the process", read=_threads),
 )
 """What is compared in a copy of the process only, where nothing else runs."""

@@ -104,7 +104,8 @@ def used_bytes(process: int, folder: Path | None = None) -> int:
     own, shared = 0, 0
     for one in (process, *others):
         parts = _shares(one)
-        own += parts.get("Pss", 0)
+        # A process can hide its parts from others of its user, but not how much it has.
+        own += parts.get("Pss") or resident_bytes(one)
         shared += parts.get("Pss_Shmem", 0)
     return max(own, resident_bytes(process)) + max(0, sum(size for size, _ in files.values()) - shared) + temporary
 

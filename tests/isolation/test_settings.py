@@ -13,6 +13,7 @@ from cavbench.isolation.foreign import harm, unchanged
 from cavbench.isolation.settings import Settings
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="there is a copy of the process on Linux only")
+ADOPTS = "import ctypes; adopts = ctypes.c_int(); ctypes.CDLL(None).prctl(37, ctypes.byref(adopts), 0, 0, 0)"
 PUT_BACK = {
     "import sys; sys.setrecursionlimit(len(__import__('inspect').stack()) + 25)": "the recursion limit",
     "import sys; sys.setrecursionlimit(10**6)": "the recursion limit",
@@ -46,6 +47,28 @@ PUT_BACK = {
     "import torch; torch.use_deterministic_algorithms(True)": "the deterministic mode of torch",
     "import torch; torch.set_float32_matmul_precision('medium')": "the precision of torch",
     "import torch; torch.set_num_threads(7)": "the threads of torch",
+    "import torch; torch.backends.cudnn.benchmark = True": "the backends of torch",
+    "import torch; torch.backends.mkldnn.enabled = False": "the backends of torch",
+    "import torch; torch.set_flush_denormal(True)": "how the processor rounds",
+    "import ctypes, platform; ctypes.CDLL(None).fesetround(0x800 if platform.machine() == 'x86_64' else 0x400000)":
+        "how the processor rounds",
+    "import signal; signal.alarm(60)": "timers of the process",
+    "import signal; signal.setitimer(signal.ITIMER_PROF, 60)": "timers of the process",
+    "import signal; signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})": "the blocked signals",
+    f"{ADOPTS}; ctypes.CDLL(None).prctl(36, not adopts.value, 0, 0, 0)": "whether the process adopts others",
+    "import gc; gc.set_threshold(1)": "the garbage collector",
+    "import threading; threading.settrace(print)": "the trace function of new threads",
+    "import threading; threading.setprofile(print)": "the profile function of new threads",
+    "import threading; threading.stack_size(65536)": "the stack of new threads",
+    "import tracemalloc; tracemalloc.start()": "whether memory is traced",
+    "import tempfile; tempfile.tempdir = '/'": "the folder for temporary files",
+    "import sys; sys.executable = '/bin/false'": "the program of Python",
+    "import multiprocessing; multiprocessing.set_executable('/bin/false')": "the program of Python",
+    "import os; os.environ = dict(os.environ)": "what holds environment variables",
+    "import codecs; codecs.register_error('strict', lambda error: ('', error.end))": "how text is encoded",
+    "import copyreg, re; copyreg.pickle(re.Pattern, lambda pattern: (str, ('',)))": "how objects are pickled",
+    "import warnings; warnings.showwarning = print": "how warnings are shown",
+    "import sys; sys.stdout.write = print": "how standard input or output writes",
 }  # fmt: skip
 STAYS = {
     "import sys; sys.stdout.close()": "changes whether standard input or output is closed",
@@ -62,6 +85,14 @@ STAYS = {
     "import subprocess; subprocess.Popen(['sleep', '98'], start_new_session=True)": "leaves a process that outlives the command",
     "import os, time; os.fork() or os.fork() or (os.setsid(), time.sleep(99))": "leaves a process that outlives the command",
     "import os; os._exit(0)": "ends the process (exit code 0)",
+    "import atexit, os; atexit.register(os._exit, 0)": "leaves a hook for the end of the process that ends it at once",
+    "import os; os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))": "changes how the process is scheduled",
+    "import ctypes; ctypes.CDLL(None).prctl(1, 9, 0, 0, 0)": "changes what ends the process with its parent",
+    "import torch; torch.autograd.graph.saved_tensors_hooks(abs, abs).__enter__()": "changes the modes of torch",
+    "import os; os.set_blocking(1, not os.get_blocking(1))": "changes whether standard input or output waits",
+    "import sys; sys.addaudithook(lambda *_: None)": "adds an audit hook, which cannot be removed",
+    "import pyarrow.parquet; pyarrow.parquet.write_table = print": "replaces pyarrow.parquet.write_table",
+    "import subprocess; subprocess.Popen.kill = print": "replaces subprocess.Popen.kill",
 }  # fmt: skip
 HONEST = (
     "import os; os.environ['PYGAME_HIDE_SUPPORT_PROMPT'] = '1'; os.environ.setdefault('OMP_PROC_BIND', 'false')",
