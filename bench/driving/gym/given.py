@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import pickle
+import re
 import secrets
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -118,6 +119,16 @@ def world(given: Any, **parameters: Any) -> RegisteredWorld:
     Raises:
         UserError: if it is none of these, or lacks what the world needs; says what to type.
     """
+    try:
+        return _of_anything(given, parameters)
+    except UserError as error:
+        # Messages name the options of the command line.
+        option = re.search(r"\bworld\.([a-z_]+)\b", str(error))
+        typed = f"; in Python: world=cavbench.gym.world(env, {option[1]}=...)" if option and option[1] != "id" else ""
+        raise UserError(f"{error}{typed}") from None
+
+
+def _of_anything(given: Any, parameters: Mapping[str, Any]) -> RegisteredWorld:
     if isinstance(given, str):
         return _of_id(given, parameters)
     if isinstance(given, gymnasium.Env):

@@ -125,6 +125,27 @@ def test_what_is_wrong_is_one_line(parameters: dict[str, Any], line: str) -> Non
         made(**parameters)
 
 
+class Radar(gymnasium.Env[Any, Any]):
+    """Sees a radar and a speed, apart, and has no limit of time."""
+
+    observation_space = gymnasium.spaces.Dict({name: gymnasium.spaces.Box(-1, 1, (2,)) for name in ("radar", "speed")})
+    action_space = gymnasium.spaces.Discrete(2)
+
+
+def test_of_an_object_the_line_says_what_to_type_in_python() -> None:
+    asked = []
+    given: dict[str, Any] = {}
+    for name, value in {"part": "radar", "max_steps": 9}.items():
+        with pytest.raises(
+            UserError, match=rf"; in Python: world=cavbench\.gym\.world\(env, {name}=\.\.\.\)$"
+        ) as error:
+            cavbench.gym.world(Radar(), **given)
+        asked.append(str(error.value))
+        given[name] = value
+    assert set(cavbench.gym.world(Radar(), **given).features.fixed) == {"speed0", "speed1"}
+    assert len(set(asked)) == 2
+
+
 class Endless(gymnasium.Env[Any, Any]):
     """Sees two numbers without a range."""
 
