@@ -9,7 +9,7 @@ import hashlib
 import os
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -81,16 +81,28 @@ def installed(submission: Submission) -> list[str]:
         names = [kind, f"{kind}_shipped_by"]
         for row in records.select(names).group_by(names).aggregate([]).sort_by(kind).to_pylist():
             name, wanted = row.values()
-            package, _, version = wanted.rpartition(" ")
-            entries = registry.entries(registry.GROUPS[kind]).get(name.partition(":")[0], ())
-            if wanted not in [entry.shipped_by for entry in entries]:
-                has = f"installed is {entries[0].shipped_by}" if entries else "it is not installed"
+            there = _shipped_by(kind, name)
+            if wanted != there:
+                packages = [one.rpartition(" ") for one in wanted.split(", ")]
+                # Somebody may type what a message says.
+                if any(not re.fullmatch(r"[\w.+!-]+", part, re.ASCII) for one in packages for part in (one[0], one[2])):
+                    raise UserError(f"{kind}_shipped_by is {short(wanted)!r}, which is no package with its version")
+                code = " and ".join(short(one[0]) for one in packages)
+                pinned = " ".join(short(f"{one[0]}=={one[2]}") for one in packages)
+                has = f"installed is {there}" if there else "it is not installed"
                 raise UserError(
-                    f"{kind} {short(name)!r} is shipped by {short(wanted)}, {has}: read the code of {short(package)} first, then "
-                    f"`pip install {short(package)}=={short(version)}`; bench verify executes it (column {kind}_shipped_by)"
+                    f"{kind} {short(name)!r} is shipped by {short(wanted)}, {has}: read the code of {code} first, then "
+                    f"`pip install {pinned}`; bench verify executes it (column {kind}_shipped_by)"
                 )
-            found.add(wanted)
+            found.update(wanted.split(", "))
     return sorted(found)
+
+
+def _shipped_by(kind: registry.Kind, name: str) -> str:
+    """The packages that ship a component here, as a record has them, those of a chain together; empty if there is none."""
+    with suppress(UserError):
+        return registry.find(registry.GROUPS[kind], name, kind).shipped_by
+    return ""
 
 
 def check_weights(submission: Submission, expected: Mapping[str, object]) -> None:

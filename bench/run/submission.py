@@ -111,7 +111,8 @@ def described(records: pa.Table, pair: Pair, sums: Mapping[str, str]) -> dict[st
         pair: the pair.
         sums: the sha256 of every file, by its path in the folder.
     """
-    packages = sorted({part.shipped_by for part in pair.parts})
+    # A chain is shipped by several.
+    packages = sorted({package for part in pair.parts for package in part.shipped_by.split(", ")})
     pip = [f"{package.rpartition(' ')[0]}=={package.rpartition(' ')[2]}" for package in packages]
     return {
         "format": FORMAT,

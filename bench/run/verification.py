@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 
 from cavbench import files
 from cavbench.core.track import Track
+from cavbench.errors import UserError
 from cavbench.records import reading, store
 from cavbench.records.finished import finished
 from cavbench.run import artefacts, claims, runner
@@ -150,6 +151,30 @@ def drive(
     return Verified(again=again, units=known, records=records)
 
 
+def _check_same(verified: Verified, there: Collection[str], out: Path) -> None:
+    """Refuse a results folder with units that say otherwise than what was driven: one of the two is wrong.
+
+    Raises:
+        UserError: names the first unit and what differs.
+    """
+    units = [verified.units[key] for key in sorted(there)]
+    if not units:
+        return
+    before = reading.read(out, list(there), track=units[0].track)
+    for unit in units:
+        own = pc.equal(before["unit"], unit.fingerprint), pc.equal(verified.records["unit"], unit.fingerprint)
+        again = Again(
+            unit=unit,
+            submitted=before.filter(own[0]).sort_by("seed"),
+            driven=verified.records.filter(own[1]).sort_by("seed"),
+        )
+        if not again.holds:
+            raise UserError(
+                f"{out} has another record of {unit} than was driven here now ({again.said}): nothing was added; see "
+                "which of the two is wrong, or choose another folder with out="
+            )
+
+
 def _there(out: Path, track: Track) -> pa.Table | None:
     """The records of a results folder; None if it has none of the track."""
     return reading.read_all(out).get(track.name) if any((out / store.FOLDER).glob("[!.]*.parquet")) else None
@@ -173,9 +198,11 @@ def add(verified: Verified, place: Path, out: Path) -> tuple[int, int]:
         How many units were added, and how many were there.
 
     Raises:
-        UserError: if the folder cannot be written.
+        UserError: if a unit that is there differs from what was driven, before anything is added; or if the folder cannot be
+            written.
     """
     there = finished(out, verified.units)
+    _check_same(verified, there, out)
     for key, unit in verified.units.items():
         if key in there:
             continue

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from datetime import timedelta
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -422,6 +423,46 @@ def test_an_existing_unit_is_left_as_it_is(made: Made, tmp_path: Path) -> None:
     )
     assert {path.name: path.read_bytes() for path in out.glob("episodes/*")} == before
     assert not (out / verification.STAGING / made.records["pair"][0].as_py()).exists()
+
+
+def test_an_existing_unit_that_says_otherwise_is_named_and_nothing_is_added(made: Made, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "episodes").mkdir(parents=True)
+    unit = pq.read_table(first(made.submission))
+    path = out / "episodes" / first(made.submission).name
+    score = 1.0 - unit["safe_progress"][0].as_py()
+    pq.write_table(replaced(unit, "safe_progress", score, 4), path)
+    before = path.read_bytes()
+    code, said = verified(made.submission, out)
+    assert (code, "it differs in safe_progress" in said, "nothing was added" in said) == (2, True, True)
+    assert {one.name: one.read_bytes() for one in out.glob("episodes/*")} == {path.name: before}
+
+
+def test_a_package_that_a_message_names_can_be_typed(made: Made, tmp_path: Path) -> None:
+    forge = partial(replaced, name="attack_shipped_by", value="cavbench-toy;reboot 1.0", rows=4)
+    code, said = verified(forged(made, tmp_path / "forged", forge, every=True))
+    assert (code, said) == (2, "attack_shipped_by is 'cavbench-toy;reboot 1.0', which is no package with its version")
+
+
+def test_a_chain_of_defenses_is_verified(bench: Bench, tmp_path: Path) -> None:
+    words = (
+        "attack=nudge",
+        "defense=guard+frame_stack",
+        "defense.guard.digits=2",
+        "victim=toy",
+        "world=toy",
+        "lanes=3",
+        "density=1",
+        "weather=clear",
+    )
+    out, folder = tmp_path / "results", tmp_path / "submission"
+    said = bench("run", *words, "episodes=2", "seeds=0", "record=0", "reference=false", "executor=serial", f"out={out}")
+    assert said.code == 0, said.err
+    assert bench("submit", "nudge-guard", f"results={out}", f"out={folder}").code == 0
+    about = json.loads((folder / "submission.json").read_text())
+    assert about["packages"] == [f"cavbench {metadata.version('cavbench')}", "cavbench-toy 1.0"]
+    said = bench("verify", str(folder), "sample=1", "audit=false")
+    assert (said.code, "The submission holds." in said.out) == (0, True), said.err
 
 
 def test_other_weights_do_not_stand_in_for_those_of_a_row(made: Made, tmp_path: Path) -> None:
