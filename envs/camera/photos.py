@@ -111,7 +111,7 @@ class PhotoScenes(Scenes):
         edges = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
         found = []
         for photo in self.photos:
-            seen = _through(np.linalg.inv(photo.face_from_pixel), edges)
+            seen = _through(np.asarray(np.linalg.inv(photo.face_from_pixel), np.float64), edges)
             # A pixel counts as covered by any part of a texel; textures are filtered over one more.
             found.append([*(np.floor(seen.min(0)) - 2), *(np.ceil(seen.max(0)) + 2)])
         height, width = self.size
@@ -274,8 +274,9 @@ def _lit(picture: NDArray[np.uint8], corners: NDArray[np.float64], path: Path) -
         raise UserError(
             f"{path}: the sign is {min(x1 - x0, y1 - y0)} pixels wide at this side, at least {LEAST_PIXELS:g} are needed"
         )
-    matrix, _ = cv2.findHomography(corners, OCTAGON, 0)
-    if matrix is None or float(np.abs(_through(matrix, corners) - OCTAGON).max()) > OFF:
+    fitted, _ = cv2.findHomography(corners, OCTAGON, 0)
+    matrix = np.asarray(np.eye(3) if fitted is None else fitted, np.float64)
+    if fitted is None or float(np.abs(_through(matrix, corners) - OCTAGON).max()) > OFF:
         raise UserError(f"{path}: the corners are not those of a flat octagon in perspective")
     crop = (int(x0), int(y0), int(x1), int(y1))
     planes = torch.from_numpy(picture).permute(2, 0, 1).contiguous()
