@@ -12,7 +12,7 @@ import sys
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 from rich.text import Text
@@ -266,14 +266,15 @@ def patch(
     ] = None,
 ) -> None:
     """Print a patch at its true size, and read it back from a scan or a photograph of the page."""
-    from cavbench.cli import patch as cli_patch
     from cavbench.cli.words import split
+    from cavbench.core.track import Track, tracks
 
     keys = {"print": ("mm", "site", "out"), "scan": ("texels", "original", "site", "out")}
     if action not in keys:
         raise UserError(f"bench patch does print or scan, not {action[:40]!r}")
     names, values = split(words or [], keys[action], names=1)
-    cli_patch.run(action, names, values, Console())
+    (able,) = [one for one in tracks() if type(one).paper is not Track.paper][:1]
+    able.paper(cast(Literal["print", "scan"], action), names, values, Console())
 
 
 @app.command()

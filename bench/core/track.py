@@ -343,6 +343,20 @@ class Track(ABC):
         """
         return []
 
+    def paper(self, action: Literal["print", "scan"], names: list[str], values: dict[str, str], console: Any) -> None:
+        """Put an artefact on paper, or read it back from a scan.
+
+        Args:
+            action: which of the two.
+            names: the file.
+            values: options by name, as typed.
+            console: to print to.
+
+        Raises:
+            UserError: if it cannot be done; `NotImplementedError` if nothing of this track can be printed.
+        """
+        raise NotImplementedError(f"nothing of the {self.name} track can be printed")
+
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         """Write the recording of an episode.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -330,6 +330,11 @@ class DetectionTrack(Track):
         from cavbench.detection.drive import drive_jointly
 
         return drive_jointly(jobs, artefacts)
+
+    def paper(self, action: Literal["print", "scan"], names: list[str], values: dict[str, str], console: Any) -> None:
+        from cavbench.detection import paper
+
+        paper.run(action, names, values, console)
 
     def record(self, job: Job, trace: Any, meta: Mapping[str, object], path: Path) -> None:
         from cavbench.detection.recording import save

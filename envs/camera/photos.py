@@ -274,9 +274,9 @@ def _lit(picture: NDArray[np.uint8], corners: NDArray[np.float64], path: Path) -
         raise UserError(
             f"{path}: the sign is {min(x1 - x0, y1 - y0)} pixels wide at this side, at least {LEAST_PIXELS:g} are needed"
         )
-    found, _ = cv2.findHomography(corners, OCTAGON, 0)
-    matrix = None if found is None else np.asarray(found, np.float64)
-    if matrix is None or float(np.abs(_through(matrix, corners) - OCTAGON).max()) > OFF:
+    fitted, _ = cv2.findHomography(corners, OCTAGON, 0)
+    matrix = np.asarray(np.eye(3) if fitted is None else fitted, np.float64)
+    if fitted is None or float(np.abs(_through(matrix, corners) - OCTAGON).max()) > OFF:
         raise UserError(f"{path}: the corners are not those of a flat octagon in perspective")
     crop = (int(x0), int(y0), int(x1), int(y1))
     planes = torch.from_numpy(picture).permute(2, 0, 1).contiguous()

@@ -13,8 +13,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from cavbench.cli import patch as cli_patch
-from cavbench.detection import printout, scanned
+from cavbench.detection import paper, printout, scanned
 from cavbench.detection.colour import linear, srgb
 from cavbench.detection.patch import Patch
 from cavbench.detection.printing import LEAST, MOST
@@ -94,11 +93,11 @@ def test_the_pdf_has_the_texels_the_size_and_the_profile(tmp_path: Path) -> None
 def test_from_the_file_of_a_patch_to_paper_and_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, out = tmp_path / "a.safetensors", tmp_path / "a.pdf"
     file.write_bytes(Patch(texels=TEXELS).written("{}"))
-    cli_patch.run("print", [str(file)], {"out": str(out), "mm": "200"}, Console())
+    paper.run("print", [str(file)], {"out": str(out), "mm": "200"}, Console())
     assert out.read_bytes().startswith(b"%PDF-1.7")
     scan, back = tmp_path / "scan.png", tmp_path / "back.png"
     Image.fromarray(seen(printout.raster(TEXELS, 600))).save(scan)
-    cli_patch.run("scan", [str(scan)], {"out": str(back), "original": str(file)}, Console())
+    paper.run("scan", [str(scan)], {"out": str(back), "original": str(file)}, Console())
     assert Image.open(back).size == (24, 24)
     assert "from the original" in capsys.readouterr().out
 
@@ -129,6 +128,6 @@ def test_bad_files_are_one_line(tmp_path: Path) -> None:
     ]:
         out = {"out": str(tmp_path / ("o.pdf" if action == "print" else "o.png"))}
         with pytest.raises(UserError) as refused:
-            cli_patch.run(action, [str(tmp_path / name)], out | values, Console())
+            paper.run(action, [str(tmp_path / name)], out | values, Console())
         assert len(str(refused.value).splitlines()) == 1
     assert not list(tmp_path.glob("o.*"))

@@ -1,4 +1,4 @@
-"""`bench patch`: a patch of a results folder on paper, and back from a scan."""
+"""`bench patch`: a patch of a results folder on paper, and back from a scan (`Track.paper`)."""
 
 from __future__ import annotations
 
