@@ -113,7 +113,7 @@ def _alike(one: Comparison, other: Comparison) -> bool:
             return False
         added = {**own, **others}
         lone = own.keys() ^ others.keys()
-        if lone and any(_defaults(kind, str(one.identity[kind])).get(name, ...) != added[name] for name in lone):  # type: ignore[arg-type]
+        if lone and any(_defaults(kind, str(one.identity[kind])).get(name, ...) != added[name] for name in lone):
             return False
     return True
 
