@@ -444,25 +444,12 @@ def test_a_package_that_a_message_names_can_be_typed(made: Made, tmp_path: Path)
     assert (code, said) == (2, "attack_shipped_by is 'cavbench-toy;reboot 1.0', which is no package with its version")
 
 
-def test_a_chain_of_defenses_is_verified(bench: Bench, tmp_path: Path) -> None:
-    words = (
-        "attack=nudge",
-        "defense=guard+frame_stack",
-        "defense.guard.digits=2",
-        "victim=toy",
-        "world=toy",
-        "lanes=3",
-        "density=1",
-        "weather=clear",
-    )
-    out, folder = tmp_path / "results", tmp_path / "submission"
-    said = bench("run", *words, "episodes=2", "seeds=0", "record=0", "reference=false", "executor=serial", f"out={out}")
-    assert said.code == 0, said.err
-    assert bench("submit", "nudge-guard", f"results={out}", f"out={folder}").code == 0
-    about = json.loads((folder / "submission.json").read_text())
-    assert about["packages"] == [f"cavbench {metadata.version('cavbench')}", "cavbench-toy 1.0"]
-    said = bench("verify", str(folder), "sample=1", "audit=false")
-    assert (said.code, "The submission holds." in said.out) == (0, True), said.err
+@pytest.mark.usefixtures("toy_folder")
+def test_a_chain_of_defenses_is_shipped_by_all_that_ship_a_link() -> None:
+    own = f"cavbench {metadata.version('cavbench')}"
+    assert received._shipped_by("defense", "guard+frame_stack") == f"cavbench-toy 1.0, {own}"
+    assert received._shipped_by("defense", "tracker+shield") == own
+    assert received._shipped_by("defense", "guard+nowhere") == ""
 
 
 def test_other_weights_do_not_stand_in_for_those_of_a_row(made: Made, tmp_path: Path) -> None:
