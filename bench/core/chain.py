@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import field, fields, make_dataclass
+from dataclasses import MISSING, field, fields, make_dataclass
 from functools import cache
 from typing import Any, cast
 
@@ -96,6 +96,9 @@ def chained(links: tuple[tuple[str, type[Defense]], ...]) -> type[Chain]:
         raise UserError(f"defense {MARK.join(names)!r}: a chain takes each defence once, and none as NAME:CHOICE")
     if late := [name for name, link in links[1:] if link.train is not Defense.train]:
         raise UserError(f"defense {MARK.join(names)!r}: {late[0]!r} trains its victim, so it must come first")
+    for name, link in links:
+        if needed := [one.name for one in fields(link) if one.default is MISSING is one.default_factory]:
+            raise UserError(f"defense {MARK.join(names)!r}: {name!r} needs {needed[0]}, but links have defaults")
     parts: list[Any] = [(name, link, field(default_factory=link)) for name, link in links]
     made = cast("type[Chain]", make_dataclass(MARK.join(names), parts, bases=(Chain,), frozen=True, kw_only=True))
     made.__module__ = Chain.__module__

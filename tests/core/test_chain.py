@@ -74,8 +74,10 @@ def test_each_link_has_its_own_parameters() -> None:
         ("shield+advtrain", {}, "must come first"),
         ("tracker+nosuch", {}, "nosuch"),
         ("tracker+jpeg", {}, "different tracks"),
+        ("guard+frame_stack", {}, "'guard' needs digits, but links have defaults"),
     ],
 )
+@pytest.mark.usefixtures("toy_folder")
 def test_bad_chains_are_refused_in_one_line(name: str, values: dict[str, str], said: str) -> None:
     with pytest.raises(UserError, match=said) as refused:
         configured("defense", name, values)

@@ -6,9 +6,9 @@ from tests.checks.rules import broken, built_in, each
 
 WORLDS = built_in("world")
 NEEDS = {"gym": {"id": "merge-v0"}}
-"""Parameters that a world needs."""
+"""Parameters that a world needs. `photos` needs photographs: test_photos.py makes some."""
 
 
-@each(WORLDS)
+@each(sorted(WORLDS.keys() - {"photos"}))
 def test_it_keeps_the_rules(name: str) -> None:
     assert broken("world", name, **NEEDS.get(name, {})) == {}

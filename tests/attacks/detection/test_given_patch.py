@@ -15,6 +15,7 @@ from cavbench.detection import PatchThreat
 from cavbench.detection.access import PatchEnforcer
 from cavbench.errors import UserError
 from tests.attacks.detection.test_eot import SCENES
+from tests.checks.rules import broken
 from tests.plugins.toy_camera import RedDetector
 
 
@@ -31,6 +32,11 @@ def test_the_pixels_are_the_texels(tmp_path: Path) -> None:
     patch = attack.craft(enforcer.oracle, SCENES, lambda share, text: None)
     assert torch.equal((patch * 255).round().to(torch.uint8), torch.from_numpy(pixels).permute(2, 0, 1))
     assert enforcer.spent == 0
+
+
+def test_it_keeps_the_rules(tmp_path: Path) -> None:
+    picture(tmp_path / "a.png")
+    assert broken("attack", "given_patch", path=str(tmp_path / "a.png")) == {}
 
 
 def test_a_file_that_was_changed_is_another_attack_or_refused(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from cavbench.envs.camera.photos_axes import AXES
 from cavbench.envs.camera.street.layout import sign_x
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.errors import UserError
+from tests.checks.rules import broken
 
 FRAMES = (4, 9)
 CELL = AXES.cell(light="as_taken")
@@ -54,6 +55,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # The nearer one first: the world puts them in order.
     given = {f"{n}.png": (taken(scenes, n), corners(scenes, n)) for n in sorted(FRAMES, reverse=True)}
     return write(tmp_path_factory.mktemp("photos"), given)
+
+
+def test_it_keeps_the_rules(folder: Path) -> None:
+    assert broken("world", "photos", path=str(folder), side=1248) == {}
 
 
 def photos(folder: Path) -> Scenes:
