@@ -19,8 +19,8 @@ from tests.attacks.driving.victims import FEATURES, observations, perturb, victi
 from tests.checks.rules import broken, built_in, each
 
 OWN_TESTS = {"art", "given_patch", "none"}
-"""`art` needs a choice: test_art.py checks some. `given_patch` needs a picture: test_given_patch.py has one. `none` answers nothing:
-test_none.py drives with it."""
+"""`art` needs a choice: test_art.py checks some. `given_patch` needs a picture: test_given_patch.py has one. `none` answers
+nothing: test_none.py drives with it."""
 ATTACKS = built_in("attack").keys() - OWN_TESTS
 
 OBJECTIVES = ("collision", "expected", "margin", "target")
