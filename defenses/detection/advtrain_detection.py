@@ -138,6 +138,8 @@ class DetectorAdversarialTraining(DetectorDefense):
                 raise UserError(f"{type(victim).__name__} has no loss for adversarial training, and is not aligned")
             first = DetectorAdversarialTraining().load(victim, seed, world.facts) if self.again else start
             hardening = _Hardening(self, attack, victim, start, world.training_scenes(), seed, progress, first)
+            # What cannot be kept in the zoo when it is done is not kept before.
+            place = zoo.unfinished(zoo.Recipe.of(victim, self), seed) if victim.learns else None
             detector, seconds = descend(
                 hardening.detector,
                 hardening.loss,
@@ -145,7 +147,7 @@ class DetectorAdversarialTraining(DetectorDefense):
                 learning_rate=self.learning_rate,
                 decay=DECAY,
                 progress=progress,
-                checkpoint=hardening.kept_at(zoo.unfinished(zoo.Recipe.of(victim, self), seed)),
+                checkpoint=hardening.kept_at(place) if place else None,
             )
         card = {"attack": asdict(attack), "cpu_seconds": round(seconds)}  # type: ignore[call-overload]
         return Trained(detector.requires_grad_(False), card, start)
