@@ -31,7 +31,7 @@ ACTIONS = {"LANE_LEFT": PURPLE, "IDLE": GREY, "LANE_RIGHT": ORANGE, "FASTER": RE
 
 WIDTH = 6.0
 """Width of a figure in inches."""
-PNG_DPI, PNG_COLOURS = 110, 128
+PNG_DPI, PNG_COLOURS = 110, 96
 
 STYLE = {
     "svg.hashsalt": "cavbench",
