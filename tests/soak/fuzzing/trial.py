@@ -153,6 +153,9 @@ class Trials:
         """In the other process: read what is asked for, and answer."""
         gc.freeze()
         faulthandler.disable()
+        if "torch" in sys.modules:
+            # The threads of the parent are not in this copy: waiting for them would never end.
+            sys.modules["torch"].set_num_threads(1)
         silence = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(silence, stream)
