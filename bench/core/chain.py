@@ -97,7 +97,7 @@ def chained(links: tuple[tuple[str, type[Defense]], ...]) -> type[Chain]:
     if late := [name for name, link in links[1:] if link.train is not Defense.train]:
         raise UserError(f"defense {MARK.join(names)!r}: {late[0]!r} trains its victim, so it must come first")
     for name, link in links:
-        if needed := [one.name for one in fields(link) if one.default is MISSING is one.default_factory]:
+        if needed := [one.name for one in fields(cast("Any", link)) if one.default is MISSING is one.default_factory]:
             raise UserError(f"defense {MARK.join(names)!r}: {name!r} needs {needed[0]}, but links have defaults")
     parts: list[Any] = [(name, link, field(default_factory=link)) for name, link in links]
     made = cast("type[Chain]", make_dataclass(MARK.join(names), parts, bases=(Chain,), frozen=True, kw_only=True))
