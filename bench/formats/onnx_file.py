@@ -7,6 +7,7 @@ and those bytes are run: it does not matter whether another parser would have re
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from cavbench import bounded
 from cavbench.archive import LARGEST
 from cavbench.errors import UserError, short
 
+LONGEST_NAME = 255
+"""Bytes of the longest name that a file can have."""
 KEYS = frozenset(["location", "offset", "length", "checksum"])
 """What a model may say of a tensor in another file. The checksum is not needed: the tensor's bytes are part of the hash."""
 BITS = {"INT4": 4, "UINT4": 4, "FLOAT4E2M1": 4, "INT2": 2, "UINT2": 2}
@@ -89,11 +92,13 @@ def _beside(tensor: Any, path: Path, name: str, most: int) -> bytes:
         raise UserError(f"{what} says where it lies twice, or in words that are not known: {short(', '.join(said))!r}")
     if any(tensor.HasField(one) if one in ("raw_data", "segment") else getattr(tensor, one) for one in CONTENTS):
         raise UserError(f"{what} lies in the model and in {short(place)!r}; it may lie in one of them only")
+    if not place.isprintable() or len(os.fsencode(place)) > LONGEST_NAME:
+        raise UserError(f"{name} is refused: it reads {short(place)!r}, which is no name of a file")
     file = path.parent / place
     if not place or "/" in place or "\\" in place or "\0" in place or place == ".." or file.is_symlink():
         raise UserError(f"{name} is refused: it reads {place!r}; a model may read files in its own folder only")
     if not file.is_file():
-        raise UserError(f"{name} cannot be read: it needs the file {file}")
+        raise UserError(f"{name} cannot be read: it needs the file {place!r} beside it")
     size = _size(tensor)
     offset, length = _whole(said.get("offset", "0")), _whole(said.get("length", str(size)))
     if size is None or offset is None or length != size:

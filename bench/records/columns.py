@@ -31,7 +31,8 @@ def track_of(path: Path) -> Track:
         if _length(path) > LONGEST_FOOTER:
             raise pa.ArrowInvalid("footer")
         found = pq.read_schema(path)
-    except (pa.ArrowException, OSError) as error:
+    # The name of a column may be no text.
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = "missing" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
         raise UserError(f"the record {path} is {reason}; delete it and run again to recreate it") from None
     for track in tracks():

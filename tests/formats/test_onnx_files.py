@@ -137,12 +137,16 @@ def test_a_model_reads_no_file_of_another_folder(where: str, tmp_path: Path) -> 
         ({"offset": "-4"}, "has other sizes in 'weights'"),
         ({"offset": "4"}, "weights ends before the tensor 'w' does"),
         ({"basepath": ".."}, "or in words that are not known: 'location, basepath'"),
-        ({"location": "nothing"}, "it needs the file"),
+        ({"location": "nothing"}, "it needs the file 'nothing' beside it"),
+        ({"location": "a\nb"}, "which is no name of a file"),
+        ({"location": 300 * "a"}, "which is no name of a file"),
     ],
 )
 def test_a_tensor_beside_a_model_is_where_the_model_says(said: dict[str, str], why: str, tmp_path: Path) -> None:
     numbers(tmp_path / "weights", 1)
-    assert why in refusal(written(tmp_path, model(beside(**said))))
+    found = refusal(written(tmp_path, model(beside(**said))))
+    assert why in found
+    assert len(found.splitlines()) == 1
 
 
 def test_parts_of_one_file_are_told_apart(tmp_path: Path) -> None:

@@ -99,6 +99,13 @@ def test_a_truncated_record_is_named(written: Path, units: list[Unit], share: fl
         read(written)
 
 
+def test_a_record_with_a_column_whose_name_is_no_text_is_named(written: Path, units: list[Unit]) -> None:
+    path = results.path_of(written, units[1].fingerprint)
+    path.write_bytes(path.read_bytes().replace(b"machine", b"machin\xd8"))
+    with pytest.raises(UserError, match=f"the record {path} is truncated or not Parquet"):
+        read(written)
+
+
 def test_a_record_whose_data_is_damaged_is_named(written: Path, units: list[Unit]) -> None:
     path = results.path_of(written, units[1].fingerprint)
     blob = bytearray(path.read_bytes())
