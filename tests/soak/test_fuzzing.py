@@ -25,7 +25,8 @@ COUNT = 30
 def test_changed_files_are_read_or_refused_in_one_line(name: str) -> None:
     reader = READERS[name]
     with Trials(reader.read, reader.refusals, guarded=reader.guarded) as trials:
-        assert trials.tried(reader.valid()).kind == "read"
+        first = trials.tried(reader.valid())
+        assert first.kind == "read", first.text
         found = tried(reader, trials, COUNT, 0)
     assert [verdict.text for verdict, _ in found if verdict.kind == "wrong"] == []
     assert len(found) == COUNT

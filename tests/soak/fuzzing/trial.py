@@ -190,6 +190,9 @@ class Trials:
     def _bad(self, event: str, arguments: tuple[Any, ...]) -> bool:
         if event == "pickle.find_class" and _reads_compiled_code():
             return False
+        if event == "ctypes.dlopen" and arguments[0] is None:
+            # The process itself, which libraries open when they are imported.
+            return False
         if event == "open" and isinstance(arguments[0], str) and isinstance(arguments[2], int):
             writes = bool(arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
             return writes and not arguments[0].startswith((self._place.name, "/dev/null"))
