@@ -79,6 +79,10 @@ def _end(code: int, *, watched: bool) -> None:
             whose = ", ".join(sorted(set(_foreign().values())))
             line = f"the command ended processes that one of {whose} left: {', '.join(names)}"
             write(2, f"warning: {bounded(line)}\n".encode())
+    with suppress(BaseException):
+        # Adopted processes that have ended are gone before the command is.
+        while watched and os.waitpid(-1, os.WNOHANG)[0]:
+            pass
     end_now(code)
 
 
