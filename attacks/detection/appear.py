@@ -7,24 +7,24 @@ from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
-from cavbench.attacks.detection.eot import EOT, Loss, seen_at
+from cavbench.attacks.detection.eot import seen_at
+from cavbench.attacks.detection.shaped import ShapedEOT
 from cavbench.attacks.detection.views import Views
-from cavbench.core.ranges import Count, NotNegative
 from cavbench.detection import PatchOracle, Predictions
+from cavbench.detection.mount import Shape
 
 if TYPE_CHECKING:
     from cavbench.attacks.detection.transformations import Transformations
 
 
 @dataclass(frozen=True, kw_only=True)
-class Appear(EOT):
+class Appear(ShapedEOT):
     """A plate that is taken for a stop sign (appearing attack, Zhao et al. 2019, arXiv 1812.10217).
 
     `eot` the other way round, under `threat.shape=plate`: the highest score of a stop sign on the plate is maximised.
 
     Args:
         loss: what is maximised: the mean of the score, or of its log-odds (default log_odds).
-        tv: weight of the total variation (default 0.05).
         window: side in pixels of the square window around the plate (default 160).
 
     The other parameters are those of `eot`.
@@ -36,15 +36,8 @@ class Appear(EOT):
         >>> of_pale_colours = Appear(nps=0.1)
     """
 
+    shape: ClassVar[Shape] = "plate"
     towards: ClassVar[float] = -1.0
-
-    loss: Loss = "log_odds"
-    tv: NotNegative = 0.05
-    window: Count = 160
-
-    @property
-    def forges(self) -> tuple[str, ...]:
-        return ("shape=plate",)
 
     def _scores(
         self, oracle: PatchOracle, views: Views, transform: Transformations, predictions: Predictions

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
-from cavbench.attacks.detection.eot import EOT, Loss
-from cavbench.core.ranges import Count, NotNegative
+from cavbench.attacks.detection.shaped import ShapedEOT
+from cavbench.detection.mount import Shape
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProjectedLight(EOT):
+class ProjectedLight(ShapedEOT):
     """Light on the sign, as of a projector (SLAP, Lovisotto et al. 2021, arXiv 2007.04137): it adds, and takes nothing away.
 
     `eot` with other defaults, under `threat.shape=light`. The budget bounds the added light as a share of the light on the sign.
 
-    Args:
-        loss: what is minimised: the mean of the score, or of its log-odds (default log_odds).
-        tv: weight of the total variation (default 0.05).
-        window: side in pixels of the square window around the sign (default 160).
-
-    The other parameters are those of `eot`.
+    The parameters are those of `eot`.
 
     Queries: restarts * steps * batch images.
 
@@ -28,10 +24,4 @@ class ProjectedLight(EOT):
         >>> coarse = ProjectedLight(texels=25)
     """
 
-    loss: Loss = "log_odds"
-    tv: NotNegative = 0.05
-    window: Count = 160
-
-    @property
-    def forges(self) -> tuple[str, ...]:
-        return ("shape=light",)
+    shape: ClassVar[Shape] = "light"

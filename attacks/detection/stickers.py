@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
-from cavbench.attacks.detection.eot import EOT, Loss
-from cavbench.core.ranges import Count, NotNegative
+from cavbench.attacks.detection.shaped import ShapedEOT
+from cavbench.core.ranges import NotNegative
+from cavbench.detection.mount import Shape
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stickers(EOT):
+class Stickers(ShapedEOT):
     """Robust physical perturbations (Eykholt et al. 2018, arXiv 1707.08945): stickers above and below the word.
 
     `eot` with other defaults, under `threat.shape=stickers`: four squares that together cover as much as the one of the same
     budget. As there, the non-printability score is a part of the loss.
 
     Args:
-        loss: what is minimised: the mean of the score, or of its log-odds (default log_odds).
-        tv: weight of the total variation (default 0.05).
         nps: weight of the non-printability score (default 0.1).
-        window: side in pixels of the square window around the sign (default 160).
 
     The other parameters are those of `eot`.
 
@@ -30,11 +29,6 @@ class Stickers(EOT):
         >>> any_colour = Stickers(nps=0)
     """
 
-    loss: Loss = "log_odds"
-    tv: NotNegative = 0.05
-    nps: NotNegative = 0.1
-    window: Count = 160
+    shape: ClassVar[Shape] = "stickers"
 
-    @property
-    def forges(self) -> tuple[str, ...]:
-        return ("shape=stickers",)
+    nps: NotNegative = 0.1
