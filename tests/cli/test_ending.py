@@ -75,18 +75,23 @@ class Kept:
 """
 
 
-@pytest.mark.parametrize("what", LATE)
-def test_a_command_ends_whatever_a_plugin_left(what: str, tmp_path: Path) -> None:
-    code, said = LATE[what]
-    install(tmp_path, "cavbench-late", {"cavbench.attacks": {"slow_end": "late:main"}}, {"late": HEAD + code}, "2.0")
-    start = time.monotonic()
-    found = subprocess.run(
+def ended(folder: Path, code: str) -> subprocess.CompletedProcess[str]:
+    """A command that ends after it has called the code's `main`, which a plug-in of the package cavbench-late has."""
+    install(folder, "cavbench-late", {"cavbench.attacks": {"slow_end": "late:main"}}, {"late": HEAD + code}, "2.0")
+    return subprocess.run(
         [sys.executable, "-c", COMMAND],
-        env={"PYTHONPATH": import_path(tmp_path), "PATH": "/usr/bin:/bin"},
+        env={"PYTHONPATH": import_path(folder), "PATH": "/usr/bin:/bin"},
         capture_output=True,
         text=True,
         timeout=60,
     )
+
+
+@pytest.mark.parametrize("what", LATE)
+def test_a_command_ends_whatever_a_plugin_left(what: str, tmp_path: Path) -> None:
+    code, said = LATE[what]
+    start = time.monotonic()
+    found = ended(tmp_path, code)
     assert time.monotonic() - start < 20
     assert found.returncode == 3
     assert found.stdout.startswith("all is said\n")
@@ -106,15 +111,7 @@ def test_a_command_ends_the_processes_that_a_plugin_left(tmp_path: Path) -> None
         "subprocess.Popen(['sleep', '96'], start_new_session=True)",
         "os.fork() or (os.setsid(), os.execlp('sleep', 'sleep', '96'))",
     )
-    code = HEAD + "import os, subprocess\ndef main():\n" + "".join(f"    {one}\n" for one in started)
-    install(tmp_path, "cavbench-late", {"cavbench.attacks": {"slow_end": "late:main"}}, {"late": code}, "2.0")
-    found = subprocess.run(
-        [sys.executable, "-c", COMMAND],
-        env={"PYTHONPATH": import_path(tmp_path), "PATH": "/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    found = ended(tmp_path, "import os, subprocess\ndef main():\n" + "".join(f"    {one}\n" for one in started))
     assert found.returncode == 3
     assert found.stderr == "warning: the command ended processes that one of cavbench-late 2.0 left: sleep\n"
 
