@@ -18,7 +18,7 @@ from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.reading import read_tracks
 from cavbench.leaderboard.ranking.faults import FaultRow, Faults, is_fault, of, under_faults
 from cavbench.leaderboard.ranking.flags import Flag, Subject, flags
-from cavbench.leaderboard.ranking.remarks import row_remarks
+from cavbench.leaderboard.ranking.remarks import fault_remarks, row_remarks
 from cavbench.leaderboard.ranking.worst import Panel, Worst, margin
 from cavbench.statistics import doubts
 from cavbench.statistics.doubts import Remark
@@ -76,7 +76,7 @@ class Row:
     @property
     def remarks(self) -> list[Remark]:
         """What a reader must know of its score besides the flags."""
-        return row_remarks(self.worst)
+        return [*row_remarks(self.worst), *fault_remarks(self.faults, self.worst)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ class FaultRow:
     Args:
         name: defence and victim.
         faults: number of faults.
+        runs, cells, scenarios: of each fault: training seeds, cells, and scenarios a cell.
         clean, mean, worst: scores without a fault, over all faults, and under the worst.
         crashed, worst_crashed: crash rate over all faults, and under the worst of them.
         idm: score of IDM on the same scenarios; NaN where it was not driven.
@@ -35,6 +36,9 @@ class FaultRow:
 
     name: str
     faults: int
+    runs: int
+    cells: int
+    scenarios: int
     clean: float
     mean: float
     worst: float
@@ -56,6 +60,9 @@ class FaultRow:
         return cls(
             name=victim if defense == "none" else f"{defense} + {victim}",
             faults=len(found),
+            runs=len(first.own.runs),
+            cells=len(first.cells),
+            scenarios=len(first.own.seeds),
             clean=float(first.clean.column(metric).mean()) if first.clean else np.nan,
             mean=float(np.mean(scores)),
             worst=min(scores),

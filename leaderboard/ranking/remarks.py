@@ -7,6 +7,7 @@ from itertools import groupby
 
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.naming import Varying, component, defended, varying
+from cavbench.leaderboard.ranking.faults import FaultRow
 from cavbench.leaderboard.ranking.worst import Panel, Worst
 from cavbench.statistics import doubts
 from cavbench.statistics.doubts import OF_VICTIM, Remark
@@ -86,6 +87,17 @@ def _raced(panel: Panel) -> Iterator[Remark]:
             f"{dropped} of {every} attacks were dropped from a race after {len(panel.pilot.seeds)} scenarios a cell; the score "
             f"may be too high by up to {panel.hidden:.3f} for it, which its lower bound allows for",
         )
+
+
+def fault_remarks(faults: FaultRow | None, worst: Worst) -> Iterator[Remark]:
+    """A remark where faults were driven on fewer runs, cells or scenarios than the score of the row is of."""
+    if faults is None:
+        return
+    own, wanted = (faults.runs, faults.cells, faults.scenarios), (len(worst.runs), *worst.shape)
+    if any(few < many for few, many in zip(own, wanted, strict=True)):
+        nouns = (worst.most.track.run, "cell", "scenario")
+        driven = " x ".join(f"{count} {noun}{'s' * (count != 1)}" for count, noun in zip(own, nouns, strict=True))
+        yield Remark("few_faults", "", f"its columns of faults are of {driven} for each fault, fewer than its score")
 
 
 def _attack(episodes: Episodes) -> bool:

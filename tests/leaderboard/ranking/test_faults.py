@@ -53,6 +53,20 @@ def test_faults_are_columns_beside_the_attacks_and_rank_nothing(out: Path) -> No
     assert listed["faults_mean"].value(by_victim["ppo"], lambda one, kind: "") is None
 
 
+def test_faults_on_less_than_the_row_are_remarked_on(out: Path) -> None:
+    (board,), _ = read_boards(reading.read_all(out))
+    row = next(row for row in board.rows if row.faults)
+    assert row.faults is not None
+    assert (row.faults.runs, row.faults.cells, row.faults.scenarios) == (1, 1, 2)
+    assert "few_faults" not in {remark.name for remark in row.remarks}
+    fewer = replace(row, faults=replace(row.faults, scenarios=1))
+    (said,) = [remark.text for remark in fewer.remarks if remark.name == "few_faults"]
+    assert (
+        said
+        == "its columns of faults are of 1 training seed x 1 cell x 1 scenario for each fault, fewer than its score"
+    )
+
+
 def test_a_leaderboard_without_faults_has_no_column_of_them(out: Path) -> None:
     records = {name: table.filter(_is_no_fault(table)) for name, table in reading.read_all(out).items()}
     (board,), _ = read_boards(records)
