@@ -95,14 +95,17 @@ def strip(points: Mapping[str, Interval | None], width: int) -> Text:
 
 
 def size(comparisons: Sequence[Comparison]) -> str:
-    """How much was driven: "standard-v2: 18 cells of 20 scenarios, 3 training seeds"."""
+    """How much was driven: "standard-v2: 18 cells of 20 scenarios, 3 training seeds"; after a race "10 to 20 scenarios"."""
     track = comparisons[0].track
-    if len({one.own.shape[1:] for one in comparisons}) > 1:
+    counts = {one.own.shape[1] for one in comparisons}
+    if len(counts) > 1:
         return "several grids"
-    _, cells, episodes = comparisons[0].own.shape
+    episodes = sorted({one.own.shape[2] for one in comparisons})
     grids = sorted({grid for one in comparisons for grid in one.own.table["grid"].unique().to_pylist()})
     runs = max(len(one.own.runs) for one in comparisons)
-    return f"{' and '.join(grids)}: {counted(cells, 'cell')} of {counted(episodes, *track.episode)}, {counted(runs, track.run)}"
+    least = f"{episodes[0]} to " if len(episodes) > 1 else ""
+    driven = f"{counted(counts.pop(), 'cell')} of {least}{counted(episodes[-1], *track.episode)}"
+    return f"{' and '.join(grids)}: {driven}, {counted(runs, track.run)}"
 
 
 def counted(number: int, one: str, several: str = "") -> str:

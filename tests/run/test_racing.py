@@ -22,6 +22,7 @@ from cavbench.leaderboard.page.document import document
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.ranking.worst import Panel
 from cavbench.leaderboard.terminal.ranking import print_boards
+from cavbench.leaderboard.terminal.text import size
 from cavbench.records import reading
 from cavbench.run import runner, stops
 from cavbench.run.config import plan_of
@@ -115,6 +116,7 @@ def test_the_report_knows_a_race_from_its_records_and_makes_the_interval_wider(t
     print_boards(boards, console)
     assert isinstance(console.file, StringIO)
     assert "toy" in console.file.getvalue()
+    assert size(comparisons).endswith(": 2 cells of 10 to 30 scenarios, 2 training seeds")
     assert [remark.name for remark in row.remarks if remark.name == "raced"] == ["raced"]
 
 
