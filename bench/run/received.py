@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from cavbench import bounded
@@ -23,6 +24,7 @@ from cavbench.core.track import Track, track
 from cavbench.errors import UserError, short
 from cavbench.files import scratch
 from cavbench.records import validity
+from cavbench.records.pages import unpacked
 from cavbench.records.schema import schema
 from cavbench.records.store import FOLDER
 from cavbench.run.claims import invalid_floats
@@ -33,8 +35,8 @@ MOST_FILES, MOST_BYTES = 20_000, 2**32
 """Most files and bytes of a submission."""
 SHORT = 2**20
 """Most bytes of `CARD.md`, and of a file of records besides its rows."""
-ROW = 2**16
-"""Most bytes of a row, as a file of records states its size."""
+ROW = 2**14
+"""Most bytes of a row, unpacked: ten times the longest of the published ones."""
 KEYS = ("format", "pair", "track", "packages", "training_seeds", "commands", "environment", "files")
 
 
@@ -220,28 +222,47 @@ def _records(path: Path, own: Track, name: str) -> pa.Table:
     """The records of a file: columns, types and values as `bench run` writes them, of at most `MOST_EPISODES` rows."""
     wanted = schema(own)
     try:
-        with pq.ParquetFile(path) as file:
-            found, footer = file.schema_arrow, file.metadata
-            if why := _unlike(found, wanted):
-                raise UserError(f"{name} {why}: it is of another version of cavbench, or was not written by it")
-            if not 0 < footer.num_rows <= MOST_EPISODES:
-                raise UserError(f"{name} has {footer.num_rows} rows; a unit has 1 to {MOST_EPISODES} (seed)")
-            size = sum(footer.row_group(number).total_byte_size for number in range(footer.num_row_groups))
-            if not 0 <= size <= SHORT + ROW * footer.num_rows:
-                raise UserError(f"{name} is refused: its {footer.num_rows} rows unpack to {bounded.spelled(size)}")
-            records = file.read(use_threads=False)
-        records.validate(full=True)
+        records = _read(path.read_bytes(), wanted, name).cast(wanted)
     except UserError:
         raise
     # Whatever a damaged file does to the reader.
     except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
         raise UserError(f"{name} cannot be read: it is truncated or not Parquet ({type(error).__name__})") from None
-    records = records.cast(wanted)
     if problem := validity.complaint(records, own):
         raise UserError(f"{name} is invalid: {problem[1]}")
     if column := invalid_floats(records):
         raise UserError(f"{name} is invalid: {column} has a NaN")
     return records
+
+
+def _read(content: bytes, wanted: pa.Schema, name: str) -> pa.Table:
+    """The rows of a file, its texts as dictionaries: a few bytes can be a long text in every row."""
+    with pq.ParquetFile(pa.BufferReader(content)) as file:
+        found, footer = file.schema_arrow, file.metadata
+    if why := _unlike(found, wanted):
+        raise UserError(f"{name} {why}: it is of another version of cavbench, or was not written by it")
+    if not 0 < footer.num_rows <= MOST_EPISODES:
+        raise UserError(f"{name} has {footer.num_rows} rows; a unit has 1 to {MOST_EPISODES} (seed)")
+    most = SHORT + ROW * footer.num_rows
+    _check_size(unpacked(content, footer), most, footer.num_rows, name)
+    texts = [column.name for column in wanted if pa.types.is_string(column.type)]
+    with pq.ParquetFile(pa.BufferReader(content), read_dictionary=texts) as file:
+        records = file.read(use_threads=False)
+    records.validate(full=True)
+    _check_size(sum(_length(records[column]) for column in texts), most, footer.num_rows, name)
+    return records
+
+
+def _check_size(size: int, most: int, rows: int, name: str) -> None:
+    if size > most:
+        raise UserError(
+            f"{name} is refused: its {rows} rows unpack to {bounded.spelled(size)}, at most {bounded.spelled(most)} are allowed"
+        )
+
+
+def _length(texts: pa.ChunkedArray) -> int:
+    """The bytes of a column of dictionaries as plain texts."""
+    return sum(pc.sum(pc.binary_length(one.dictionary).take(one.indices)).as_py() or 0 for one in texts.chunks)
 
 
 def _unlike(found: pa.Schema, wanted: pa.Schema) -> str:

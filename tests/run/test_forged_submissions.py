@@ -267,6 +267,11 @@ def bomb(folder: Path) -> None:
     pq.write_table(pa.concat_tables([records] * 5_000).combine_chunks(), first(folder), compression="zstd")
 
 
+def of_one_text(records: pa.Table) -> pa.Table:
+    """A text that is in the file once, and a megabyte in every row."""
+    return replaced(records, "victim_params", "a" * 10**6, 4)
+
+
 def many(folder: Path) -> None:
     for number in range(101):
         (folder / "episodes" / f"{number:064x}.parquet").touch()
@@ -336,6 +341,7 @@ FORGERIES: dict[str, tuple[bool, Callable[[Path], object], str]] = {
     "an audit": (REHASHED, schema_changed(of_an_audit), "grid"),
     "a victim that reads a file": (REHASHED, schema_changed(of_a_file), "victim_params"),
     "a date in the future": (REHASHED, schema_changed(in_the_future), "created_at"),
+    "a text in every row": (REHASHED, schema_changed(of_one_text), "its 4 rows unpack to 4.0 MB, at most 1.1 MB are allowed"),
     "a bomb": (REHASHED, bomb, "has 20000 rows"),
     "a unit under another name": (
         REHASHED, lambda folder: first(folder).rename(folder / "episodes" / f"{'0' * 64}.parquet"), "a wrong unit",
