@@ -25,7 +25,7 @@ from cavbench.isolation.framework import Snapshot
 from cavbench.isolation.settings import RECURSION, Settings
 
 HARM_S = 120
-"""Seconds that the import of a module, or reading a file, may take."""
+"""Seconds that the import of a module, or reading a file, may take, besides those that it waits for a core."""
 STUCK_S = 15.0
 """Seconds without work after which a copy is taken for stuck, and made once more."""
 END_S = 5.0
@@ -133,7 +133,7 @@ def _tried(act: Callable[[], object], seconds: float, stays: bool, stuck: float)
     with os.fdopen(read, "rb", buffering=0) as pipe:
         deadline = time.monotonic() + seconds
         said = _reported(pipe, child, deadline, stuck)
-        late = time.monotonic() >= deadline
+        late = time.monotonic() >= deadline + _delay(child)
         reported = bool(said and said.startswith(SURVIVED))
         left = _left(said, pipe) if said and reported and stays else ""
     started = tree.identities(child)
@@ -189,14 +189,25 @@ def _copied() -> int:
 
 
 def _reported(pipe: FileIO, child: int, deadline: float, stuck: float) -> bytes | None:
-    """What the copy writes until it ends or reports; None at the deadline, or if it does nothing for `stuck` seconds."""
+    """What the copy writes until it ends or reports; None at the deadline, or if it does nothing for `stuck` seconds.
+
+    The deadline moves while the copy waits for a core: on a busy machine it may get a tenth of one.
+    """
     work, since = _work(child), time.monotonic()
-    while (now := time.monotonic()) < min(deadline, since + stuck):
-        if (said := _said(pipe, min(deadline, since + stuck, now + 1) - now)) is not None:
+    while (now := time.monotonic()) < (end := min(deadline + _delay(child), since + stuck)):
+        if (said := _said(pipe, min(end, now + 1) - now)) is not None:
             return said
         if (done := _work(child)) != work:
             work, since = done, time.monotonic()
     return None
+
+
+def _delay(process: int) -> float:
+    """Seconds that the first thread of a process was ready and had no core (schedstats of the kernel); 0 if nothing says."""
+    try:
+        return int(Path(f"/proc/{process}/schedstat").read_text().split()[1]) / 1e9
+    except (OSError, IndexError, ValueError):
+        return 0.0
 
 
 def _work(process: int) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -96,3 +97,25 @@ def test_an_act_that_works_without_end_is_tried_once(tmp_path: Path, monkeypatch
     monkeypatch.setattr("cavbench.isolation.foreign.STUCK_S", 2)
     assert harm(act, 6) == "does not end within 6 s"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the kernel does not say how long a process waited")
+def test_the_time_that_a_copy_waits_for_a_core_is_not_its_own() -> None:
+    cores = os.sched_getaffinity(0)
+
+    def work() -> None:
+        end = time.process_time() + 1.5
+        while time.process_time() < end:
+            pass
+
+    os.sched_setaffinity(0, {min(cores)})
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        begin = time.monotonic()
+        assert harm(work, 2) == ""
+        assert time.monotonic() - begin > 2
+    finally:
+        os.sched_setaffinity(0, cores)
+        for other in others:
+            other.kill()
+            other.wait()
