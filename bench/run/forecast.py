@@ -16,7 +16,7 @@ from cavbench.run.cost import longest, preparing_s, rates, shares
 from cavbench.run.task import Task
 
 EARLY = 0.02
-"""Share of a batch from which on its time says something of it."""
+"""Share of a batch, or of parts that are alike, from which on its time says something of the others."""
 REST = 0.1
 """Share of the steps to come that a batch still drives when it is past its usual end."""
 
@@ -80,10 +80,10 @@ class Forecast:
     ) -> None:
         self.workers, self.now = workers, now
         self.parts: dict[str, Part] = {}
+        self.spent: dict[Hashable, list[float]] = {}
         self.expect(tasks, recorded)
         self.running: dict[str, Batch] = {}
         self.ended: dict[str, Part] = {}
-        self.spent: dict[Hashable, list[float]] = {}
 
     def expect(self, tasks: Sequence[Task], recorded: Collection[str] = ()) -> None:
         """These tasks are still to be done, and no others; arguments as of the class."""
@@ -92,6 +92,10 @@ class Forecast:
             _key(task): Part(task.pair, next(costs) if task.step == "drive" else preparing_s(task.unit))
             for task in tasks
         }
+        self.costs = {alike: expected for alike, (_, expected) in self.spent.items()}
+        for part in self.parts.values():
+            for alike in _alike(part.pair):
+                self.costs[alike] = self.costs.get(alike, 0.0) + part.cost
 
     def working(self, tasks: Sequence[Task]) -> None:
         """These are under way, each with all its units, and no others."""
@@ -170,7 +174,8 @@ class Forecast:
         """How many times as long as expected parts like those of a pair take."""
         for key in _alike(pair):
             seconds, expected = self.spent.get(key, (0.0, 0.0))
-            if expected:
+            # A thousandth of a second that took a tenth says nothing of an hour.
+            if expected > EARLY * self.costs.get(key, 0.0):
                 return seconds / expected
         # Nothing is done yet: what is under way says the same.
         known = [pace for batch in self.running.values() if (pace := self._pace(batch))]

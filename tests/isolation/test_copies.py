@@ -99,7 +99,9 @@ def test_an_act_that_works_without_end_is_tried_once(tmp_path: Path, monkeypatch
     assert len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the kernel does not say how long a process waited")
+@pytest.mark.skipif(
+    not Path("/proc/self/schedstat").exists(), reason="the kernel does not say how long a process waited"
+)
 def test_the_time_that_a_copy_waits_for_a_core_is_not_its_own() -> None:
     cores = os.sched_getaffinity(0)
 

@@ -170,6 +170,17 @@ def test_after_a_tenth_of_the_work_the_time_left_is_right_within_a_quarter(slowe
     assert forecast.left == 0
 
 
+def test_a_patch_that_was_to_cost_next_to_nothing_says_nothing_of_its_episodes() -> None:
+    grid = ("lanes=3", "density=1", "weather=clear", "seeds=0", "episodes=2")
+    drives = tasks_of("attack=grey_patch", "victim=yolov5", *grid, "reference=false")
+    (plain,) = [task.unit for task in drives if task.pair.attack.name == "grey_patch"]
+    crafts = Task(step="prepare", unit=plain)
+    forecast = Forecast([crafts, *drives], 1)
+    planned = forecast.left
+    forecast.finished(crafts, 0.5)
+    assert forecast.left == pytest.approx(planned, rel=0.1)
+
+
 def test_units_of_one_task_may_be_driven_together_or_one_after_the_other() -> None:
     tasks = [task for task in tasks_of("attack=pgd", *SHORT, "reference=false") if task.pair.attack.name == "pgd"][:2]
     batch = Task(unit=tasks[0].unit, others=[tasks[1].unit])
