@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 AVOIDABLE, AVOIDABLE_IDM, ROOM = COLUMNS = ("avoidable", "avoidable_idm", "room")
-"""Names of the measurements of a crash; NaN in an episode without a crash, and where no car was driven."""
+"""Names of the measurements of a crash; NaN in an episode without a crash, and where the traffic drives as usual."""
 TAKEOVER_S = 5.0
 """Another driver takes the wheel so many seconds before the crash."""
 AFTERWARDS_S = 2.0
@@ -24,17 +24,18 @@ class Deeds:
     Args:
         seeds: the scenario seed of each episode [B].
         actions: the victim's action of each decision, [B] or [B, 2].
-        orders: the orders of each decision, float64 [B, N, 3] (`cavbench.driving.traffic.Orders`).
+        orders: the orders of each decision, float64 [B, N, 3] (`cavbench.driving.traffic.Orders`); [B, 0, 3] where no car is
+            driven.
     """
 
     seeds: NDArray[np.int64]
     actions: list[NDArray[np.generic]] = field(default_factory=list)
     orders: list[NDArray[np.float64]] = field(default_factory=list)
 
-    def append(self, action: Tensor, orders: Tensor) -> None:
+    def append(self, action: Tensor, orders: Tensor | None) -> None:
         """Add a decision."""
         self.actions.append(action.detach().numpy().copy())
-        self.orders.append(orders.numpy().copy())
+        self.orders.append(np.zeros((len(action), 0, 3)) if orders is None else orders.numpy().copy())
 
 
 Judge = Callable[[Deeds, NDArray[np.int64], NDArray[np.bool_]], Mapping[str, NDArray[np.float64]]]

@@ -24,6 +24,7 @@ from cavbench.driving.features import DrivingFacts
 from cavbench.driving.meter import Columns, Meter
 from cavbench.driving.policy import Policy, State, rows_of
 from cavbench.driving.probes import Probe
+from cavbench.driving.surroundings import USUAL
 from cavbench.driving.threat import ObservationThreat
 from cavbench.driving.traffic import View
 from cavbench.driving.victim import CountedPolicy
@@ -90,7 +91,7 @@ def rollout(
         dynamics: the world's rules of motion, for attacks with that access; None if the world does not offer them.
         entropy: seed of the steps that are probed, which a victim must not be able to foresee; no measurement depends on it.
         trace: collects every step of its episodes.
-        judge: says who is to blame for crashes among cars that the attack drives.
+        judge: says who is to blame for crashes, where the attack drives cars or the traffic does not drive as usual.
 
     Returns:
         One column [B] for each measurement; `cavbench.driving.track` has the names and units.
@@ -130,6 +131,7 @@ def rollout(
         td = env.reset(TensorDict({"seed": episodes}, batch_size=env.batch_size))
         state = subject.initial(torch.cat([opaque([seed], salt) for seed, salt in zip(seeds, salts, strict=True)]))
         deeds = Deeds(episodes.numpy())
+        otherwise = attack is not None and (attack.drives or threat.dynamics != USUAL)
         meter = Meter(subject, facts, td["info", "x"].squeeze(-1), forges=bool(sets.present(threat)))
         probe = Probe(len(seeds), subject, entropy, rehearsed=attack is not None and attack.access == "dynamics")
         _check_actions(subject, td["observation"], state, facts)
@@ -150,6 +152,7 @@ def rollout(
             executed = attacker.execute(action)
             if shown.orders is not None:
                 td["orders"] = shown.orders
+            if otherwise:
                 deeds.append(executed, shown.orders)
             td = env.step(td.set("action", executed))["next"]
             meter.step(truth, shown, action, running, state, td)
@@ -164,7 +167,7 @@ def rollout(
         raise NotJointError
     measured = meter.columns()
     judged = unknown(len(seeds))
-    if judge is not None and deeds.orders:
+    if judge is not None and otherwise:
         judged |= judge(deeds, measured["steps"].astype(np.int64), measured["crashed"].astype(np.bool_))
     reach = threat.reach(td["observation"].shape[-2], facts.features, facts.max_steps)
     shift = np.full(len(seeds), reach / policy.noise if policy.noise else np.nan)

@@ -152,7 +152,7 @@ BLAME: tuple[pa.Field, ...] = (
         "avoidable",
         FLOAT,
         "whether the planner with perfect information, at the wheel from 5 s before the crash, avoids it among the same driven "
-        "cars; null without a crash among driven cars",
+        "cars; null without a crash, and where the traffic drives as usual",
         "share, 0 to 1",
         nullable=True,
     ),
@@ -193,6 +193,7 @@ class DrivingTrack(Track):
         Measure(column="return", heading="return\nof {max_steps}"),
         Measure(column="crashed", heading="\ncrashed", unit="share"),
         Measure(column="offroad", heading="off\nroad", unit="share", tables="overview", spare=4),
+        Measure(column="avoidable", heading="avoid-\nable", unit="share", of_attack=True, spare=1),
         Measure(column="min_ttc_s", heading="min\nTTC s", how="median", digits=1, tables="overview", spare=6),
         Measure(column="changed", heading="success\n/ step", how="step mean", unit="share", of_attack=True, spare=2),
         Measure(column="queries", heading="queries\n/ step", how="step mean", of_attack=True),
@@ -201,7 +202,7 @@ class DrivingTrack(Track):
     legend: ClassVar[str] = (
         "safe progress: 0 if the car crashes or leaves the road, otherwise its mean progress. success: share of steps in which "
         "the attack changed the decision. TTC: time to collision with the car ahead. best blind: the best policy that "
-        "ignores its input."
+        "ignores its input. avoidable: share of the crashes that a planner with perfect information avoids in the same traffic."
     )
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
         BEST_BLIND: Baseline(title="best blind policy", heading="best\nblind", spare=0),
@@ -287,6 +288,7 @@ class DrivingTrack(Track):
             f"{(column(name) * steps).sum() / max(float(steps.sum()), 1.0):.2f}" for name in ("linf_m", "linf_mps")
         )
         yield "moved", f"{metres} m and {speed} m/s: largest deviation per step, on average"
+        yield from _blame(*(column(name).ravel() for name in ("avoidable", "avoidable_idm", "safe_progress")))
 
     def identity(self, pair: Pair) -> Mapping[str, object]:
         return {"action_type": _parts(pair)[0].action_type}
@@ -338,6 +340,22 @@ class DrivingTrack(Track):
         from cavbench.driving.recording.film import EpisodeFilm
 
         return EpisodeFilm(Episode.of(trace, _parts(job.pair)[1].facts_at(job.cell), meta))
+
+
+def _blame(
+    avoidable: NDArray[np.float64], by_idm: NDArray[np.float64], scores: NDArray[np.float64]
+) -> Iterator[tuple[str, str]]:
+    """How many crashes of E episodes could have been avoided, and the score without the others; [E] each, NaN without one."""
+    judged = np.isfinite(avoidable)
+    if not judged.any():
+        return
+    counted = avoidable != 0
+    score = f"{scores[counted].mean():.2f}" if counted.any() else "none"
+    yield (
+        "blame",
+        f"{np.nansum(avoidable):.0f} of {judged.sum()} crashes could have been avoided ({np.nansum(by_idm):.0f} by IDM); "
+        f"score without the other crashes: {score}",
+    )
 
 
 def _parts(pair: Pair) -> tuple[DrivingVictim, DrivingWorld]:

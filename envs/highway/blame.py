@@ -50,8 +50,10 @@ def blame(
     held = max(1, round(HELD_S * config.policy_frequency))
     # The planner chooses in every `held`-th decision.
     takeover = np.maximum(ends - round(TAKEOVER_S * config.policy_frequency), 0) // held * held
-    moment, found[ROOM][rows] = _again(own, deeds, rows, ends, takeover)
     orders = np.stack([orders[rows] for orders in deeds.orders], 1)
+    if not orders.shape[2]:
+        orders = np.zeros((*orders.shape[:2], config.vehicles + 1, 3))
+    moment, found[ROOM][rows] = _again(own, deeds, rows, orders, ends, takeover)
     # Nobody gives orders after the crash.
     orders[np.arange(orders.shape[1]) >= ends[:, None]] = 0.0
     length = ends - takeover + round(AFTERWARDS_S * config.policy_frequency)
@@ -62,7 +64,7 @@ def blame(
 
 
 def _again(
-    config: HighwayConfig, deeds: Deeds, rows: Integers, ends: Integers, takeover: Integers
+    config: HighwayConfig, deeds: Deeds, rows: Integers, orders: NDArray[np.float64], ends: Integers, takeover: Integers
 ) -> tuple[Moment, NDArray[np.float64]]:
     """Drive the episodes again as they were: the states at `takeover`, and the room at the last manoeuvre of a driven car.
 
@@ -77,7 +79,7 @@ def _again(
         for copy, now in zip(kept, (engine.vehicles, engine.order, engine.episodes), strict=True):
             copy[due] = now[due]
         before = engine.vehicles.copy()
-        engine.order_cars(deeds.orders[step][rows])
+        engine.order_cars(orders[:, step])
         room = np.where(step < ends, _room(before, engine.vehicles, room), room)
         engine.step(deeds.actions[step][rows])
     return kept, room

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
+from cavbench.core.pair import choose
+from cavbench.driving import Control
 from cavbench.driving.blame import AVOIDABLE, AVOIDABLE_IDM, ROOM, Deeds
+from cavbench.driving.rollout import rollout
 from cavbench.driving.sets import Traffic
+from cavbench.driving.surroundings import Surroundings
+from cavbench.driving.threat import ObservationThreat
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.blame import blame
 from cavbench.envs.highway.config import HighwayConfig
@@ -72,3 +79,32 @@ def test_a_crash_that_nobody_can_avoid_is_not_avoidable(monkeypatch: pytest.Monk
     deeds, decisions, crashed = driven(FASTER, after=30)
     found = blame(CONFIG, deeds, decisions, crashed)
     assert found[AVOIDABLE][crashed].mean() < 0.5
+
+
+@pytest.mark.parametrize("reaction", [0.0, 1.5])
+def test_crashes_are_judged_where_the_traffic_drives_otherwise_and_only_there(reaction: float) -> None:
+    world, victim, attack = (
+        choose(kind, name, **params).component
+        for kind, name, params in (
+            ("world", "highway", {}),
+            ("victim", "blind", {"policy": "faster"}),
+            ("attack", "noise", {}),
+        )
+    )
+    around = Surroundings(reaction=reaction)
+    cells, facts = CONFIG.cells[:4], world.facts_at(CONFIG.cells[0])
+    control = Control(action_type="discrete", driver="agent", surroundings=around)
+    found = rollout(
+        world.build(cells, control),
+        victim.load(0, facts),
+        attack,
+        ObservationThreat(budget=0.0, dynamics=around),
+        [500, 501, 502, 503],
+        facts=facts,
+        attack_seed=0,
+        judge=partial(world.blame, cells, control),
+    )
+    crashed = found["crashed"].astype(bool)
+    assert crashed.all()
+    assert np.isfinite(found[AVOIDABLE]).all() == np.isfinite(found[AVOIDABLE_IDM]).all() == (reaction > 0)
+    assert np.isnan(found[ROOM]).all(), "no car was driven"

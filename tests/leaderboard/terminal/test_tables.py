@@ -55,6 +55,23 @@ def one_pair(**changes: object) -> pa.Table:
     return pa.concat_tables([drive(), drive(**attacked), baseline_drivers()])  # type: ignore[arg-type]
 
 
+def test_the_share_of_avoidable_crashes_is_a_column_and_who_is_to_blame_a_line() -> None:
+    records = one_pair()
+    attacked = pc.equal(records["attack"], "zo").to_numpy()
+    crashed = records["crashed"].to_numpy() & attacked
+    avoided = crashed & (np.cumsum(crashed) % 4 > 0)
+    judged = {"avoidable": np.where(crashed, avoided, np.nan), "avoidable_idm": np.where(crashed, 0.0, np.nan)}
+    for name, values in judged.items():
+        column = pa.array(values, pa.float64(), from_pandas=True)
+        records = records.set_column(records.schema.get_field_index(name), SCHEMA.field(name), column)
+    assert re.search(r"zo .* 75 % ", overview(records, 160))
+    score = records["safe_progress"].to_numpy()[attacked & ~(crashed & ~avoided)].mean()
+    said = f"{avoided.sum()} of {crashed.sum()} crashes could have been avoided (0 by IDM)"
+    assert said in cells(records, 160)
+    assert f"score without the other crashes: {score:.2f}" in cells(records, 160)
+    assert "able" not in overview(one_pair(), 160)
+
+
 @pytest.mark.parametrize("width", [80, 100, 120, 140])
 def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut_off(width: int) -> None:
     text = printed(one_pair(), width)
