@@ -40,6 +40,9 @@ def race(plan: Any, units: Sequence[Unit], drive: Drive, rest: Drive, results: R
     """
     pilot, later = _parts(plan, units)
     finished = drive(pilot)
+    if not later:
+        # The pilot is all there is: nothing is dropped.
+        return [unit.fingerprint for unit in pilot]
     on: set[str] = set()
     for group in groups(plan):
         found = _scores(group, pilot, finished, results)

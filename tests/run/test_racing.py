@@ -76,6 +76,13 @@ def test_what_was_dropped_is_written_with_its_reason(driven: tuple[Plan, list[st
         assert "lowered the score more in all cells together" in str(stop)
 
 
+def test_a_grid_that_ends_with_the_pilot_drops_nothing(tmp_path: Path) -> None:
+    plan = raced(tmp_path)
+    plan = replace(plan, grid=replace(plan.grid, episodes=10))
+    assert len(runner.run(plan, Silent())) == 20
+    assert stops.read(plan.out, plan.racing) == []
+
+
 def test_the_same_command_drives_nothing_again_and_without_a_race_it_drives_what_is_left(
     driven: tuple[Plan, list[str]], tmp_path: Path
 ) -> None:
