@@ -11,10 +11,12 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from cavbench.attacks.detection.schedule import Schedule
 from cavbench.attacks.detection.views import Views
 from cavbench.core.contracts import Access, Progress
 from cavbench.core.ranges import Count, NotNegative, Positive, Share
 from cavbench.detection import PatchAttack, PatchOracle, Predictions, Scenes
+from cavbench.detection.boxes import overlap
 from cavbench.detection.evidence import log_odds
 from cavbench.detection.printing import non_printability
 from cavbench.detection.threat import HIDING, Texels
@@ -30,6 +32,8 @@ CUT = 0.4
 """Side of the square that `cutout` greys, as a share of the patch's side."""
 JUDGED = 0.2
 """Share of the steps, the last ones, whose mean loss says which start is the best."""
+COUNTED, SOFTNESS = 0.3, 0.05
+"""The overlap (IoU) from which on a box counts for the score of a frame, and the width of the soft threshold in the loss."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +73,12 @@ class EOT(PatchAttack):
         noise: standard deviation of Gaussian noise on the sRGB scale (default 0.02).
         cutout: probability that a random square of the patch is grey in a view, so that no part of the patch is needed alone
             (T-SEA, Huang et al. 2023, arXiv 2211.09773) (default 0).
+        moves: whether boxes may also be moved away: a score counts as far as its box overlaps the sign's by `COUNTED` and more,
+            which is what the score of a frame counts (default False).
+        patience: a start ends after so many steps without a lower loss, and the learning rate halves after half as many;
+            `steps` is then the most. 0: all steps, with a cosine schedule (default 0).
 
-    Queries: restarts * steps * batch images.
+    Queries: at most restarts * steps * batch images.
 
     Example:
         >>> from cavbench.attacks.detection.eot import EOT
@@ -101,6 +109,8 @@ class EOT(PatchAttack):
     hue: Annotated[float, Interval(ge=0, le=0.5)] = 0.05
     noise: NotNegative = 0.02
     cutout: Share = 0.0
+    moves: bool = False
+    patience: Annotated[int, Interval(ge=0)] = 0
 
     def craft(self, oracle: PatchOracle, scenes: Scenes, progress: Progress) -> Tensor:
         found = [
@@ -119,7 +129,7 @@ class EOT(PatchAttack):
 
         patch = torch.rand(1, 3, self.texels, self.texels, generator=oracle.generator).requires_grad_(True)
         adam = torch.optim.Adam([patch], lr=self.learning_rate)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.steps, self.learning_rate / 20)
+        schedule = Schedule(adam, self.steps, self.patience)
         views = Views(oracle, scenes, window=self.window, translation=self.translation)
         transform = Transformations(
             rotation=self.rotation,
@@ -131,7 +141,7 @@ class EOT(PatchAttack):
             hue=self.hue,
             noise=self.noise,
         )
-        losses = []
+        losses, ended = [], False
         for step in range(min(self.steps, oracle.remaining // self.batch)):
             views.draw(self.batch)
             shown = cut_out(patch, self.batch, self.cutout, oracle.generator) if self.cutout else patch
@@ -148,14 +158,16 @@ class EOT(PatchAttack):
             adam.zero_grad()
             loss.backward()
             adam.step()
-            schedule.step()
             losses.append(loss.item())
+            ended = schedule.step(losses[-1])
             with torch.no_grad():
                 patch.copy_(oracle.threat.confine(patch))
             if step % REPORT_EVERY == 0:
                 progress(step / self.steps, f"stop sign {found.item():.2f}")
-        last = losses[-max(1, round(JUDGED * self.steps)) :]
-        mean = sum(last) / len(last) if len(losses) == self.steps else torch.inf
+            if ended:
+                break
+        last = losses[-max(1, round(JUDGED * len(losses))) :]
+        mean = sum(last) / len(last) if len(losses) == self.steps or ended else torch.inf
         # A start whose loss is not a number is never the best one.
         return patch.detach()[0], torch.inf if mean != mean else mean
 
@@ -167,7 +179,11 @@ class EOT(PatchAttack):
         self, oracle: PatchOracle, views: Views, transform: Transformations, predictions: Predictions
     ) -> Tensor:
         """[N] what is attacked in each view: the highest score of a stop sign."""
-        return views.highest(predictions)
+        if not self.moves:
+            return views.highest(predictions)
+        sign = transform.carried(views.boxes).unsqueeze(1)
+        on_sign = ((overlap(predictions.boxes, sign) - COUNTED) / SOFTNESS).sigmoid()
+        return (predictions.scores_of(oracle.label) * on_sign).amax(-1)
 
     def _loss(self, scores: Tensor) -> Tensor:
         """The loss of scores [N] in [0, 1]."""

@@ -20,7 +20,7 @@ from cavbench.detection.boxes import confidence
 from cavbench.detection.victims.yolov3_tiny import YOLOv3TinyNetwork
 from cavbench.errors import UserError
 from tests.detection.drawn_street import DrawnStreet
-from tests.plugins.toy_camera import RedDetector, RedScenes
+from tests.plugins.toy_camera import SIGN, RedDetector, RedScenes
 
 SCENES = RedScenes(torch.linspace(30, 8, 5))
 
@@ -101,6 +101,37 @@ def test_it_reports_its_losses_without_changing_the_patch(monkeypatch: pytest.Mo
     assert torch.allclose(reported.losses["total_variation"], variation, atol=0.01)
     monkeypatch.setattr(PatchOracle, "report", lambda *_, **__: None)
     assert torch.equal(crafted(attack)[0], patch)
+
+
+class Dragged(RedDetector):
+    """The stop sign's score is always 0.9; its box is the farther to the right, the bluer the sign is."""
+
+    def predict(self, pictures: Tensor) -> Predictions:
+        blueness = pictures[:, 2, SIGN, SIGN].mean((1, 2))
+        shift = torch.tensor([1.0, 0.0, 1.0, 0.0]) * 24 * blueness[:, None]
+        boxes = (torch.tensor([8.0, 8.0, 24.0, 24.0]) + shift)[:, None]
+        classes = torch.tensor([0.0, 1.0]).expand(len(pictures), 1, 2)
+        return Predictions(boxes, torch.full_like(blueness[:, None], 0.9), classes)
+
+
+def test_a_box_may_be_moved_away() -> None:
+    plain = EOT(
+        texels=8, steps=60, batch=4, window=32, translation=0.0, rotation=0.0, scale=0.0, perspective=0.0, tv=0.0
+    )
+    moving = replace(plain, moves=True, loss="log_odds")
+    blue = [float(crafted(attack, detector=Dragged(), scenes=SCENES)[0][2].mean()) for attack in (plain, moving)]
+    assert blue[0] < 0.6
+    assert blue[1] > 0.9
+
+
+def test_a_search_ends_on_a_plateau_and_goes_on_while_the_loss_falls() -> None:
+    flat = EOT(texels=8, steps=200, batch=2, window=32, patience=10, tv=0.0)
+    _, oracle = crafted(flat, detector=Dragged(), scenes=SCENES)
+    assert oracle.spent < 60
+    falling = EOT(texels=8, steps=200, batch=4, window=32, patience=10, learning_rate=0.01)
+    patch, oracle = crafted(falling)
+    assert 4 * 30 < oracle.spent < 4 * 200
+    assert red(patch) <= red(crafted(replace(falling, patience=0, steps=30))[0])
 
 
 class TwoColours(RedDetector):
