@@ -29,13 +29,22 @@ class ClairvoyantPlanner:
         engine: the engine, with discrete actions.
         orders: [B, T, N, 3] the orders to cars that an attacker drives, of each decision of the episode, if they are known;
             otherwise the cars are taken to go on as they were ordered last.
+        horizon_s: seconds of a plan.
     """
 
-    def __init__(self, engine: HighwayEngine, orders: NDArray[np.float64] | None = None) -> None:
+    def __init__(
+        self, engine: HighwayEngine, orders: NDArray[np.float64] | None = None, horizon_s: float = HORIZON_S
+    ) -> None:
         hz = engine.config.policy_frequency
         self.engine, self.orders = engine, orders
-        self.length, self.held = round(HORIZON_S * hz), max(1, round(HELD_S * hz))
-        self.library = _library(self.length, max(1, round(SEGMENT_S * hz)))
+        self.length, self.held = round(horizon_s * hz), max(1, round(HELD_S * hz))
+        segment = max(1, round(SEGMENT_S * hz))
+        self.library = _library(self.length, segment)
+        self.simple = [np.full(self.length, action) for action in (FASTER, IDLE, SLOWER)]
+        if horizon_s > HORIZON_S:
+            # Nobody finds by chance the one lane that a way needs, many lanes away.
+            at = np.arange(self.length) % segment == 0
+            self.simple += [np.where(at, side, IDLE) for side in (LANE_LEFT, LANE_RIGHT)]
         self.plan = np.full((engine.config.batch, self.length), IDLE, dtype=np.int64)
 
     def actions(self) -> NDArray[np.int64]:
@@ -56,8 +65,8 @@ class ClairvoyantPlanner:
         rest = np.roll(self.plan[rows], -self.held, axis=1)
         rest[:, -self.held :] = IDLE
         tried[:, 0] = np.where(begun, rest, IDLE)
-        for place, action in enumerate((FASTER, IDLE, SLOWER), start=1):
-            tried[:, place] = action
+        for place, plan in enumerate(self.simple, start=1):
+            tried[:, place] = plan
         self.plan[rows] = tried[np.arange(len(rows)), self.worth(rows, tried).argmax(1)]
 
     def worth(self, rows: NDArray[np.int64], tried: NDArray[np.int64]) -> NDArray[np.floating]:

@@ -6,9 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.compiled import entry_point
-from cavbench.envs.highway.clairvoyant import FAILURE, ClairvoyantPlanner
+from cavbench.envs.highway.clairvoyant import FAILURE, HORIZON_S, ClairvoyantPlanner
+from cavbench.envs.roads.config import TaskKind
 from cavbench.envs.roads.engine import PARTS, RoadsEngine, drive
 from cavbench.envs.roads.state import Integers
+
+FAR_S = {TaskKind.EXIT: 10.0}
+"""Seconds of a plan where it takes longer to get into the right lane than `HORIZON_S`."""
 
 
 @entry_point
@@ -54,7 +58,7 @@ class RoadsPlanner(ClairvoyantPlanner):
     """
 
     def __init__(self, engine: RoadsEngine) -> None:
-        super().__init__(engine)  # type: ignore[arg-type]
+        super().__init__(engine, horizon_s=FAR_S.get(engine.config.task, HORIZON_S))  # type: ignore[arg-type]
         self.roads = engine
         # Within a plan every decision counts, and only a crash or the roadside ends it.
         self.parameters = engine.parameters.copy()
