@@ -37,7 +37,7 @@ class Row:
         left_out: attacks that were driven on other scenarios, or on a part of them.
         flags: each with its measurement, fired or not.
         group: rank group, from 1; rows of a group cannot be told from its first. Flagged rows follow the others. 0 for a row
-            without a rank, whose victim sees nothing without an attack.
+            without a rank: its victim sees nothing without an attack (`hopeless`), or it has one patch (`one_patch`).
         faults: its scores under faults, which rank nothing; None where they were not driven.
     """
 
@@ -65,6 +65,11 @@ class Row:
     def flagged(self) -> bool:
         """Whether any flag has fired."""
         return any(flag.fired for flag in self.flags)
+
+    @property
+    def one_patch(self) -> bool:
+        """Whether its attacks were crafted once, on a track whose attacks are crafted: another patch may take more or less."""
+        return self.worst.most.track.artefact is not None and len(self.worst.scores) == 1
 
     @property
     def hopeless(self) -> bool:
@@ -194,18 +199,21 @@ def _within(one: Comparison, key: Key) -> bool:
 
 def ranked(rows: Iterable[Row]) -> Iterator[Row]:
     """Best first, flagged ones last, in groups whose rows are not significantly below the first; then those without a rank."""
-    found = list(rows)
-    hopeless = [row for row in found if row.hopeless]
-    ordered = sorted(
-        (row for row in found if row not in hopeless),
-        key=lambda row: (row.flagged, -round(row.worst.score.estimate, 9), row.attacks[0].ranked_as),
-    )
+    ordered = sorted(rows, key=lambda row: (row.hopeless, row.one_patch, row.flagged, *_order(row)))
     group, leader = 0, None
     for row in ordered:
+        if row.hopeless or row.one_patch:
+            yield row
+            continue
         if leader is None or row.flagged != leader.flagged or _below(row.worst, leader.worst):
             group, leader = group + 1, row
         yield replace(row, group=group)
-    yield from sorted(hopeless, key=lambda row: row.attacks[0].ranked_as)
+
+
+def _order(row: Row) -> tuple[float, object]:
+    """By the score, and rows that do nothing by their names."""
+    name = row.attacks[0].ranked_as
+    return (0.0 if row.hopeless else -round(row.worst.score.estimate, 9)), name
 
 
 def _below(row: Worst, leader: Worst) -> bool:

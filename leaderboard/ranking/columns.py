@@ -81,7 +81,8 @@ def _names() -> Iterator[Column]:
         name="rank",
         title="Rank",
         short="\nrank",
-        meaning="rank group, from 1; flagged rows rank below all others; empty for a victim that sees nothing without an attack",
+        meaning="rank group, from 1; flagged rows rank below all others; empty for a victim that sees nothing without an attack, "
+        "and for a row with one patch",
         value=lambda row, called: row.group or None,
         kind="count",
         digits=0,

@@ -23,6 +23,7 @@ from cavbench.leaderboard.terminal.text import (
     BASELINE,
     CLEAN,
     MISSING,
+    counted,
     estimate,
     number,
     of_frames,
@@ -106,7 +107,9 @@ def print_boards(boards: Sequence[Board], console: Console) -> None:
 
 
 def _without_rank(board: Board) -> Iterator[str]:
-    """Why rows have no rank, a line each."""
+    """Why rows have no rank: a line for each that does nothing, and one for all with one patch."""
+    if alone := sum(row.one_patch and not row.hopeless for row in board.rows):
+        yield f"{counted(alone, 'row')} of one patch without a rank: another patch may take more or less"
     for row in board.rows:
         if row.hopeless:
             yield from (f"{_name(row, board)}: {one.text}" for one in row.remarks if one.name == "hopeless")

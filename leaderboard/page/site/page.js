@@ -277,6 +277,9 @@ function render() {
   at("scope").textContent = `${threatText(board.threat)}. ${left} of ${total} cells; ${metric}, mean with its 95 % interval.` + (left === total ? "" : " Ranks and flags refer to all cells.") +
     (rows.some(({ row, score }) => score.low == null && row.values.score.low != null) ? " No interval was computed for these cells together." : "") +
     (rows.some((one) => one.row.flagged) ? " Below the double line, a flag (⚑) casts doubt on each row: it ranks below all rows without one, whatever its score." : "") +
+    (rows.some((one) => one.row.values.rank == null)
+      ? " A row without a rank has one patch, or its victim sees nothing without an attack."
+      : "") +
     " Rows of one rank are not told apart from its first." +
     (rows.length ? "" : " No row was driven in the selected cells.");
 

@@ -47,6 +47,15 @@ def test_a_ranking_of_seventeen_rows_has_no_sentences_about_each_row(published: 
     assert "`bench report flags`" in text
 
 
+def test_a_row_of_one_patch_has_no_rank(published: dict[str, pa.Table]) -> None:
+    detection = {"detection": published["detection"]}
+    rows = [row for board in read_boards(detection)[0] for row in board.rows]
+    assert {row.one_patch for row in rows} == {True, False}
+    assert all((row.group == 0) == (len(row.worst.scores) == 1) for row in rows)
+    said = " ".join(printed(leaderboard_report, detection, 120).split())
+    assert "rows of one patch without a rank: another patch may take more or less" in said
+
+
 def test_why_rows_are_flagged_is_told_on_request() -> None:
     common = {"cells": CLEAR[:3], "episodes": 6, "runs": (0,)}
     records = [
