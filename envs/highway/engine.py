@@ -288,9 +288,9 @@ def check_seeds(seeds: Integers) -> None:
         raise ValueError(f"scenario seeds must be at least 0, got {seeds.min()}")
 
 
-def physical_controls(action: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[B, 2] m/s2 and rad: ContinuousAction.get_action, in the action's own precision, as highway-env computes it."""
+def physical_controls(action: NDArray[np.floating], limit: float = np.pi / 4) -> NDArray[np.float64]:
+    """[B, 2] m/s2 and rad, the latter at most `limit`: ContinuousAction.get_action, in the action's own precision as there."""
     clipped = np.clip(action, -1, 1)
     acceleration = -5 + (clipped[:, 0] + 1) * (5.0 - -5) / 2
-    steering = -np.pi / 4 + (clipped[:, 1] + 1) * (np.pi / 4 - -np.pi / 4) / 2
+    steering = -limit + (clipped[:, 1] + 1) * (limit - -limit) / 2
     return np.stack([acceleration, steering], axis=1).astype(np.float64)

@@ -32,6 +32,7 @@ def put_body(road: Road, body: Body, kind: int, x: float, y: float, heading: flo
     body.impact_x = body.impact_y = 0.0
     body.impact = body.crashed = False
     body.changes_lanes, body.yielding = True, False
+    body.slides, body.lateral_speed, body.yaw_rate = False, 0.0, 0.0
     body.route, body.route_place = -1, 0
 
 

@@ -95,6 +95,8 @@ class RoadsConfig:
         clipped: whether these four are clipped.
         relative: whether the other rows are relative to the ego.
         obstacles: whether obstacles are observed.
+        slides: whether the tyres of an ego with continuous actions slip.
+        steering_limit: largest steering angle of continuous actions in rad.
         observed_vehicles: number of rows in an observation, including the ego; at least 2.
         offroad_terminal: whether leaving the road ends the episode.
         odometer: whether `x` is the distance driven, because no direction is the forward one.
@@ -134,6 +136,8 @@ class RoadsConfig:
     obstacles: bool = True
     observed_vehicles: int = 5
     offroad_terminal: bool = False
+    slides: bool = False
+    steering_limit: float = math.pi / 4
     odometer: bool = False
     shoulder: float = 0.0
 
@@ -205,6 +209,7 @@ def parameters(config: RoadsConfig) -> NDArray[np.void]:
         "action_repeat",
         "duration",
         "offroad_terminal",
+        "slides",
         "progress",
         "lane_weight",
         "reference_speed",

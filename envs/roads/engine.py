@@ -350,7 +350,9 @@ class RoadsEngine:
     def _controls(self, action: NDArray[np.floating]) -> Floats:
         """[B, 3] acceleration in m/s2, steering in rad, and the size of the action; one column [B, 1] is steering alone."""
         both = action if action.shape[1] == 2 else np.concatenate([np.zeros_like(action), action], 1)
-        return np.concatenate([physical_controls(both), np.linalg.norm(action, axis=1)[:, None]], 1)
+        return np.concatenate(
+            [physical_controls(both, self.config.steering_limit), np.linalg.norm(action, axis=1)[:, None]], 1
+        )
 
     def step(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None = None) -> None:
         """Execute one action in each episode; finished and paused episodes do not change and have reward 0.

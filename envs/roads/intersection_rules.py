@@ -95,7 +95,7 @@ def spawn(
     episode.ego = episode.cars
     ego = bodies[episode.ego]
     put_body(road, ego, parameters.ego, x, y, heading_at(lane, 60.0), lane.speed_limit)
-    ego.route = ego.lane * 4 + episode.goal
+    ego.route, ego.slides = ego.lane * 4 + episode.goal, parameters.slides
     episode.cars += 1
     episode.bodies = episode.cars
     number = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -57,6 +58,17 @@ def _intersection(*, connected: bool) -> RoadsConfig:
         high=(100.0, 100.0, 20.0, 20.0),
         relative=False,
         observed_vehicles=15,
+    )
+
+
+def _sliding_intersection() -> RoadsConfig:
+    return replace(
+        _intersection(connected=False),
+        action_type="continuous",
+        slides=True,
+        steering_limit=math.pi / 3,
+        features=("presence", "x", "y", "vx", "vy", "long_off", "lat_off", "ang_off"),
+        observed_vehicles=5,
     )
 
 
@@ -126,6 +138,7 @@ ORIGINALS: dict[str, Callable[[], RoadsConfig]] = {
     "roundabout-v0": lambda: _roundabout(connected=False),
     "roundabout-v1": lambda: _roundabout(connected=True),
     "intersection-v0": lambda: _intersection(connected=False),
+    "intersection-v1": _sliding_intersection,
     "intersection-v2": lambda: _intersection(connected=True),
     "exit-v0": lambda: _exit(connected=False),
     "exit-v1": lambda: _exit(connected=True),

@@ -8,6 +8,8 @@ import numpy as np
 
 from cavbench.compiled import inner
 from cavbench.envs.roads.lanes import heading_at, position
+from cavbench.envs.roads.motion import move
+from cavbench.envs.roads.sliding import slide
 from cavbench.envs.roads.state import Bodies, Body, Floats, Kind, Road
 
 CONTINUOUS, IDM = int(Kind.CONTINUOUS), int(Kind.IDM)
@@ -33,6 +35,22 @@ def predict(road: Road, body: Body, seconds: float) -> tuple[float, float, float
             number = route_lane(road, body, place)
     x, y = position(road.lanes[number], along, 0.0)
     return x, y, heading_at(road.lanes[number], along)
+
+
+@inner
+def predict_steered(road: Road, body: Bodies, predicted: Floats) -> None:
+    """Vehicle.predict_trajectory_constant_speed: [11, 3] places and headings of a car that keeps steering as it does.
+
+    `body` is an array of the car alone, which is changed.
+    """
+    car = body[0]
+    car.acceleration = 0.0
+    for time in range(TIMES):
+        if car.slides:
+            slide(road, car, STEP)
+        else:
+            move(road, car, STEP)
+        predicted[time, 0], predicted[time, 1], predicted[time, 2] = car.x, car.y, car.heading
 
 
 @inner
@@ -97,6 +115,9 @@ def enforce_rules(road: Road, bodies: Bodies, cars: int) -> None:
             body.yielding = False
     predicted = np.empty((cars, TIMES, 3))
     for number in range(cars):
+        if bodies[number].kind == CONTINUOUS:
+            predict_steered(road, bodies[number : number + 1].copy(), predicted[number])
+            continue
         for time in range(TIMES):
             predicted[number, time] = predict(road, bodies[number], STEP + time * STEP)
     for number in range(cars):

@@ -6,6 +6,7 @@ from cavbench.compiled import inner
 from cavbench.envs.roads.collision import find_collisions
 from cavbench.envs.roads.motion import move
 from cavbench.envs.roads.regulation import enforce_rules
+from cavbench.envs.roads.sliding import slide
 from cavbench.envs.roads.state import Bodies, Episode, Floats, Kind, Parameters, Road
 from cavbench.envs.roads.traffic import act
 
@@ -25,5 +26,8 @@ def advance(road: Road, bodies: Bodies, episode: Episode, frames: int, parameter
         if parameters.regulation > 0 and episode.frames % parameters.regulation == 0:
             enforce_rules(road, bodies, episode.cars)
         for number in range(episode.cars):
-            move(road, bodies[number], parameters.dt)
+            if bodies[number].slides:
+                slide(road, bodies[number], parameters.dt)
+            else:
+                move(road, bodies[number], parameters.dt)
         find_collisions(bodies, episode.cars, parameters.dt, corners)

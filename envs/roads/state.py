@@ -89,6 +89,9 @@ class Body:
     crashed: bool
     changes_lanes: bool  # whether MOBIL is on
     yielding: bool  # whether it waits at a crossing
+    slides: bool  # whether its tyres slip
+    lateral_speed: float  # m/s to the right, of a car that slides
+    yaw_rate: float  # rad/s, of a car that slides
 
 
 class Episode:
@@ -136,6 +139,7 @@ class Bodies(Protocol):
     def __getitem__(self, number: int) -> Body: ...
     @overload
     def __getitem__(self, number: slice) -> Bodies: ...
+    def copy(self) -> Bodies: ...
     def __setitem__(self, number: slice, bodies: Bodies) -> None: ...
 
 
@@ -201,6 +205,7 @@ class Parameters(Protocol):
     lane_weight: float
     reference_speed: float  # m/s
     offroad_terminal: bool
+    slides: bool
     odometer: bool
     shoulder: float  # m
     columns: int  # of an observation
