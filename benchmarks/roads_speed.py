@@ -1,16 +1,19 @@
 """Measures how much faster than highway-env the engine of road networks is, per CPU second of one thread:
 
-    python benchmarks/roads_speed.py [TASK ...] [--seconds 3] [--batch 64]
+    python benchmarks/roads_speed.py [TASK ...] [--seconds 3] [--batch 64] [--envpool PYTHON]
 
-Whole episodes with random actions, resets included; of a racetrack's steering a twentieth. Compilation is not counted. Give the
-tasks of an intersection a run of their own: making one changes the traffic of all later tasks of the process.
+Whole episodes with random actions, resets included; of a racetrack's steering a twentieth. Compilation is not counted. With
+`--envpool` EnvPool is measured too, by a Python that has it (`envpool_speed.py`). Give the tasks of an intersection a run of their
+own: making one changes the traffic of all later tasks of the process.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import subprocess
 import time
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -25,7 +28,7 @@ from cavbench.envs.roads.engine import RoadsEngine
 from cavbench.envs.roads.originals import ORIGINALS, original
 
 STEERING = 0.05
-GOAL = 1000
+GOAL, PEER_GOAL = 1000, 3
 
 
 def reference_rate(task: str, seconds: float) -> float:
@@ -70,18 +73,29 @@ def engine_rate(task: str, seconds: float, batch: int) -> float:
     return steps / (time.process_time() - start)
 
 
+def peer_rate(python: str, task: str, seconds: float, batch: int) -> float:
+    """EnvPool's steps per CPU second; NaN for a task that it does not have."""
+    command = [python, Path(__file__).with_name("envpool_speed.py"), task, str(seconds), str(batch)]
+    found = subprocess.run(command, capture_output=True, text=True)
+    return float("nan") if found.returncode else float(found.stdout.splitlines()[-1])
+
+
 def main() -> None:
     """Measure the tasks that the command line names."""
     parser = argparse.ArgumentParser(description="Speed of the engine of road networks against highway-env.")
     parser.add_argument("tasks", nargs="*", default=list(ORIGINALS), metavar="TASK")
     parser.add_argument("--seconds", type=float, default=3.0)
     parser.add_argument("--batch", type=int, default=64)
+    parser.add_argument("--envpool", metavar="PYTHON", help="a Python that has EnvPool")
     options = parser.parse_args()
     console = Console()
     for task in options.tasks:
         theirs = reference_rate(task, options.seconds)
         ours = engine_rate(task, options.seconds, options.batch)
         console.print(f"{task}: {theirs:.0f} and {ours:.0f} steps a CPU second, {ours / theirs:.0f} x (goal {GOAL} x)")
+        if options.envpool:
+            peer = peer_rate(options.envpool, task, options.seconds, options.batch)
+            console.print(f"  EnvPool: {peer:.0f}, {ours / peer:.1f} x (goal {PEER_GOAL} x)")
 
 
 if __name__ == "__main__":

@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from cavbench.compiled import inner
 from cavbench.envs.highway.dynamics import not_zero
-from cavbench.envs.roads.lanes import local_coordinates, position
+from cavbench.envs.roads.lanes import SINE, STRAIGHT, local_coordinates, position
 from cavbench.envs.roads.state import Bodies, Body, Episode, Parameters, Road
 from cavbench.envs.roads.traffic import lane_distance
 
 HALF, CELL, CELLS = 18.0, 3.0, 12
 """Half the side of the occupancy grid in m, the side of a cell, and the number of cells on a side."""
+FAR = 27.0
+"""What is farther from the ego than this in m is outside the grid, whatever the ego's heading: its corners are at 25.5 m."""
 SEEN = 100.0
 """Lanes are drawn up to this distance in m along them."""
 SPEEDS = LANES = 3
@@ -25,7 +27,7 @@ MARGIN = 5.0
 @inner
 def mark(ego: Body, x: float, y: float, layer: NDArray[np.float32]) -> None:
     """Set the cell [12, 12] at a place relative to the ego in m, in the world's axes."""
-    cos, sin = math.cos(ego.heading), math.sin(ego.heading)
+    cos, sin = ego.cos_heading, ego.sin_heading
     row = math.floor((cos * x + sin * y + HALF) / CELL)
     column = math.floor((-sin * x + cos * y + HALF) / CELL)
     if 0 <= row < CELLS and 0 <= column < CELLS:
@@ -41,12 +43,18 @@ def occupancy(road: Road, bodies: Bodies, episode: Episode, grid: NDArray[np.flo
         mark(ego, bodies[number].x - ego.x, bodies[number].y - ego.y, grid[:CELLS])
     for number in range(road.lane_count):
         lane = road.lanes[number]
-        along, _ = local_coordinates(lane, ego.x, ego.y)
+        along, across = local_coordinates(lane, ego.x, ego.y)
+        if lane.kind != SINE and abs(across) > FAR:
+            continue
         # numpy's arange: the step is the difference of the first two numbers.
-        first = along - SEEN
+        first, before = along - SEEN, -1.0
         step = (first + CELL) - first
         for place in range(math.ceil(((along + SEEN) - first) / CELL)):
             point = min(max(first + place * step, 0.0), lane.length)
+            # Many points are the same end of the lane, and most others are outside the grid.
+            if point == before or (lane.kind == STRAIGHT and abs(point - along) > FAR):
+                continue
+            before = point
             x, y = position(lane, point, 0.0)
             mark(ego, x - ego.x, y - ego.y, grid[CELLS:])
 
@@ -75,27 +83,30 @@ def is_connected(road: Road, ego: Body, other: Body) -> bool:
 
 
 @inner
-def collide_at(
-    road: Road, ego: Body, other: Body, index: int, parameters: Parameters, grid: NDArray[np.float64]
-) -> None:
-    """compute_ttc_grid for one speed of the ego and one other car; `grid` is [speeds, lanes, T]."""
+def collide_with(road: Road, ego: Body, other: Body, parameters: Parameters, grid: NDArray[np.float64]) -> None:
+    """compute_ttc_grid for one other car; `grid` is [speeds, lanes, T]."""
+    if not is_connected(road, ego, other):
+        return
     lane, own = road.lanes[other.lane], road.lanes[ego.lane]
-    speed = parameters.target_speeds[index]
     projected = other.speed * (other.cos_heading * ego.cos_heading + other.sin_heading * ego.sin_heading)
     apart = lane_distance(road, ego, other)
     lanes = road.edges[own.edge].lanes
     same = road.edges[lane.edge].lanes == lanes
-    for point in range(3):
-        shift = 0.0 if point == 0 else (-MARGIN if point == 1 else MARGIN)
-        cost = 1.0 if point == 0 else 0.5
-        time = (apart + shift) / not_zero(speed - projected)
-        if time < 0 or not is_connected(road, ego, other):
+    for index in range(parameters.speeds):
+        speed = parameters.target_speeds[index]
+        if speed == other.speed:
             continue
-        for rounded in (int(time / parameters.period), math.ceil(time / parameters.period)):
-            if 0 <= rounded < grid.shape[2]:
-                for number in range(lanes):
-                    if number == lane.number or not same:
-                        grid[index, number, rounded] = max(grid[index, number, rounded], cost)
+        for point in range(3):
+            shift = 0.0 if point == 0 else (-MARGIN if point == 1 else MARGIN)
+            cost = 1.0 if point == 0 else 0.5
+            time = (apart + shift) / not_zero(speed - projected)
+            if time < 0:
+                continue
+            for rounded in (int(time / parameters.period), math.ceil(time / parameters.period)):
+                if 0 <= rounded < grid.shape[2]:
+                    for number in range(lanes):
+                        if number == lane.number or not same:
+                            grid[index, number, rounded] = max(grid[index, number, rounded], cost)
 
 
 @inner
@@ -114,10 +125,9 @@ def times_to_collision(
     ego = bodies[episode.ego]
     lanes, own = road.edges[road.lanes[ego.lane].edge].lanes, road.lanes[ego.lane].number
     grid[:] = 0.0
-    for index in range(parameters.speeds):
-        for number in range(episode.cars):
-            if number != episode.ego and parameters.target_speeds[index] != bodies[number].speed:
-                collide_at(road, ego, bodies[number], index, parameters, grid)
+    for number in range(episode.cars):
+        if number != episode.ego:
+            collide_with(road, ego, bodies[number], parameters, grid)
     for row in range(SPEEDS):
         speed = min(max(ego.speed_index - 1 + row, 0), parameters.speeds - 1)
         for column in range(LANES):
