@@ -2,9 +2,9 @@
 
     python benchmarks/roads_speed.py [TASK ...] [--seconds 3] [--batch 64] [--envpool PYTHON]
 
-Whole episodes with random actions, resets included; of a racetrack's steering a twentieth. Compilation is not counted. With
-`--envpool` EnvPool is measured too, by a Python that has it (`envpool_speed.py`). Give the tasks of an intersection a run of their
-own: making one changes the traffic of all later tasks of the process.
+Whole episodes with random actions, resets included; of a racetrack's steering a twentieth. Compilation is not counted.
+With `--envpool` EnvPool is measured too, by a Python that has it (`envpool_speed.py`). Give the tasks of an intersection a run of
+their own: making one changes the traffic of all later tasks of the process.
 """
 
 from __future__ import annotations
