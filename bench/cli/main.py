@@ -192,7 +192,7 @@ def audit(words: Words = None, as_json: AsJson = False) -> None:
 
 
 @app.command(cls=RunHelp)
-def certify(words: Words = None) -> None:
+def certify(words: Words = None, as_json: AsJson = False) -> None:
     """Prove which decisions no attack can change, and a lower bound of the score under every attack.
 
     The options are those of bench run; leaves=NUMBER limits the search for the bound, leaves=0 leaves it out.
@@ -201,7 +201,7 @@ def certify(words: Words = None) -> None:
     from cavbench.cli import certify as cli_certify
 
     plan, leaves = cli_certify.asked(words or [], start)
-    cli_certify.certify(plan, leaves, Console())
+    cli_certify.certify(plan, leaves, Console(stderr=as_json), as_json=as_json)
 
 
 TrainWords = Annotated[
