@@ -29,7 +29,8 @@ def _words_before() -> list[str]:
 def _fitting(incomplete: str) -> list[str]:
     key, equals, value = incomplete.partition("=")
     if not equals:
-        return [f"{known}=" for known in known_keys() if known.startswith(key)]
+        known = [*known_keys(), *(_of_sets() if key.startswith("threat.") else ())]
+        return [f"{each}=" for each in known if each.startswith(key)]
     before, comma, last = value.rpartition(",")
     return [f"{key}={before}{comma}{known}" for known in _values(key) if known.startswith(last)]
 
@@ -43,6 +44,17 @@ def known_keys() -> list[str]:
     axes = dict.fromkeys(axis for grid in registry.all_grids() for axis in grid.axes)
     threat = [f"threat.{name}" for name in ("norm", "budget", "access", "queries", "share")]
     return [*registry.KINDS, *axes, *threat, *(name for name, _, _ in settings(RunOptions))]
+
+
+def _of_sets() -> Iterator[str]:
+    """`threat.presence.hidden` and its like, of all tracks; reading them takes a moment."""
+    from dataclasses import fields
+
+    from cavbench.core.track import tracks
+
+    for track in tracks():
+        for name, kind in track.sets.items():
+            yield from (f"threat.{name}.{item.name}" for item in fields(kind))
 
 
 def _values(key: str) -> Iterator[str]:

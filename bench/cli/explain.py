@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.text import Text
 
 from cavbench.core import registry, suites
-from cavbench.core.parameters import Parameter
+from cavbench.core.parameters import Parameter, description, parameters
 from cavbench.core.registry import GROUPS, KINDS, Kind
 from cavbench.core.track import Measure, tracks
 from cavbench.errors import UserError
@@ -109,11 +109,28 @@ def _spellings(heading: str) -> set[str]:
 def _parameters(kind: Kind, owner: str) -> dict[str, Parameter]:
     """The parameters of a component; none of an adapter with choices."""
     from cavbench.core.outline import outline
-    from cavbench.core.parameters import parameters
 
     if (known := outline(kind, owner)) is not None:
         return parameters(known)
     return {} if registry.offers(kind, owner) else parameters(registry.load(kind, owner))
+
+
+def _of_a_set(name: str) -> list[Text]:
+    """`presence`, all fields of a set of the threat models; or `presence.hidden`, one of them."""
+    own, _, wanted = name.partition(".")
+    kinds = [track.sets[own] for track in tracks() if own in track.sets]
+    found = []
+    for kind in kinds:
+        said = (
+            [] if wanted else [Text.assemble((f"threat.{own}", "bold"), f"  {description(kind).replace(chr(10), ' ')}")]
+        )
+        for field, one in parameters(kind).items():
+            if wanted in ("", field):
+                said.append(
+                    Text.assemble((f"threat.{own}.{field}", "bold"), f"  {one.meaning} Default {one.default_text}.")
+                )
+        found += said
+    return found
 
 
 def _of_a_parameter(term: str) -> list[Text]:
@@ -134,5 +151,5 @@ def _of_a_parameter(term: str) -> list[Text]:
                     )
                 )
     if kind == "threat" and name:
-        found += _of_the_glossary(name)
+        found += [*_of_the_glossary(name), *_of_a_set(name)]
     return found

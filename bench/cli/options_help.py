@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -54,6 +55,7 @@ class RunHelp(TyperCommand):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from cavbench.core import registry, suites
+        from cavbench.core.track import tracks
         from cavbench.run.options import RunOptions
 
         super().format_help(ctx, formatter)
@@ -61,6 +63,15 @@ class RunHelp(TyperCommand):
         rows = [(kind, default, meaning) for kind, (default, meaning) in COMPONENTS.items()]
         rows += [("KIND.PARAMETER", "", "A parameter of a component: bench list NAME.")]
         rows += [(f"threat.{name}", default, meaning) for name, (default, meaning) in THREAT.items()]
+        rows += [
+            (
+                f"threat.{name}.…",
+                "none",
+                f"{inspect.cleandoc(kind.__doc__ or '').splitlines()[0]} bench help threat.{name}",
+            )
+            for track in tracks()
+            for name, kind in track.sets.items()
+        ]
         rows += settings(RunOptions)
         _print(console, "Every KEY=VALUE, with its default", rows)
         worlds = {grid.world: grid for grid in registry.all_grids()}

@@ -182,6 +182,8 @@ class Track(ABC):
     """Those of `probes` that older records do not have."""
     norms: ClassVar[tuple[str, ...]] = ()
     """The norms of its threat models; records with another one are refused. Empty: any name."""
+    sets: ClassVar[Mapping[str, type[Any]]] = {}
+    """The sets of its threat models beside the perturbation of values (`cavbench.core.sets`), by name."""
     facts: ClassVar[Mapping[str, object]] = {}
     """Facts of its worlds (`world_facts`), with values of their types: records with facts of other types are refused."""
     metric: ClassVar[str]

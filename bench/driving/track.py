@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from cavbench.core import sets
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Baseline, Certified, Contrast, Driven, Job, Measure, Track
+from cavbench.driving.sets import Actuator, Held, Latency, Presence, Traffic
+from cavbench.driving.surroundings import Surroundings
 from cavbench.errors import UserError
 from cavbench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, field
 from cavbench.scenarios import Cell
@@ -186,6 +188,14 @@ class DrivingTrack(Track):
     probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS, *ALARMS, *FORGED, *BLAME)
     later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*ALARMS, *FORGED, *BLAME))
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
+    sets: ClassVar[Mapping[str, type[Any]]] = {
+        "presence": Presence,
+        "latency": Latency,
+        "held": Held,
+        "actuator": Actuator,
+        "traffic": Traffic,
+        "dynamics": Surroundings,
+    }
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"
     failure: ClassVar[str] = "crashed"

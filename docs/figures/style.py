@@ -62,6 +62,9 @@ STYLE = {
 LONG_NUMBER = re.compile(r"(?<=[\s\"])-?\d+\.\d{2,}(?=[\s\"])")
 """A coordinate in an SVG file. One decimal is enough: a tenth of a point."""
 
+UNUSED = re.compile(r'(?s)<metadata>.*?</metadata>\n|(?<=<g) id="[a-z0-9_.]+"(?=>)')
+"""What says who made an SVG file, and names of groups to which nothing refers."""
+
 SAME_COMMAND = re.compile(r"(?:[LM] [-\d. ]+(?:\nL [-\d. ]+)+|Q [-\d. ]+(?:\nQ [-\d. ]+)+)")
 """Lines of a path in an SVG file, one after the other, or curves: the letter is needed once."""
 
@@ -85,7 +88,8 @@ def save(made: Figure, path: Path) -> None:
         drawn = io.StringIO()
         made.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
         text = LONG_NUMBER.sub(lambda number: f"{float(number[0]):.1f}", drawn.getvalue())
-        path.write_text(SAME_COMMAND.sub(_joined, re.sub(r"\s*\n\s*", "\n", text)))
+        text = UNUSED.sub("", re.sub(r"\s*\n\s*", "\n", text))
+        path.write_text(SAME_COMMAND.sub(_joined, text))
         return
     drawn = io.BytesIO()
     made.savefig(drawn, format="png", dpi=PNG_DPI)

@@ -15,8 +15,11 @@ import pytest
 from rich.console import Console
 
 import cavbench
+from cavbench.cli.completion import completed
 from cavbench.cli.explain import heading_of, print_term
 from cavbench.cli.options_help import THREAT, settings
+from cavbench.core import sets
+from cavbench.core.pair import choose
 from cavbench.core.registry import GROUPS, KINDS, entries
 from cavbench.core.track import tracks
 from cavbench.detection.threat import PatchThreat
@@ -64,6 +67,8 @@ def test_one_kind_is_listed(bench: Bench) -> None:
         ("min TTC", "smallest time to collision"),
         ("safe_progress", "column of driving records"),
         ("threat.budget", "size of the perturbation set"),
+        ("threat.presence", "threat.presence.hidden real cars that may be hidden at once"),
+        ("threat.traffic.headway", "room at the beginning of a manoeuvre"),
         ("attack.restarts", "attack.restarts of pgd"),
         ("zo", "ZO-SignSGD"),
         ("run", "Score attacks on defended victims"),
@@ -101,6 +106,7 @@ def test_an_unknown_term_is_one_line(bench: Bench) -> None:
         ("bench run attack = pg", 4, {"pgd"}),
         ("bench run weather=clear,f", 2, {"weather=clear,fog"}),
         ("bench aud", 1, {"audit"}),
+        ("bench run threat.held.", 2, {"threat.held.share=", "threat.held.longest="}),
     ],
 )
 def test_the_shell_completes_options(words: str, place: int, found: set[str]) -> None:
@@ -109,6 +115,14 @@ def test_the_shell_completes_options(words: str, place: int, found: set[str]) ->
         [sys.executable, "-c", COMMAND], env=os.environ | asked, capture_output=True, text=True, check=False
     )
     assert set(said.stdout.split()) == found, said.stderr
+
+
+def test_help_and_completion_know_the_sets_that_the_threat_models_have() -> None:
+    for one in tracks():
+        model = choose("victim", one.victim).component.threat
+        assert one.sets == sets.of(model)
+    every = {f"threat.{name}.{item.name}=" for one in tracks() for name in one.sets for item in fields(one.sets[name])}
+    assert every <= set(completed("threat."))
 
 
 def test_every_column_of_the_tables_is_explained() -> None:
