@@ -20,6 +20,7 @@ from cavbench.driving.sets import Actuator
 from cavbench.driving.threat import ObservationThreat, PerturbationSet, bounds
 from cavbench.errors import UserError
 
+NO_ACTUATOR = Actuator()
 COINS = 0x5DEECE66D
 """The run's coins have another seed than the attack's random numbers."""
 
@@ -137,7 +138,7 @@ class Forging:
             UserError: if the attack's action is none of the world.
         """
         actuator, forgery = self.threat.actuator, self.answer
-        if actuator == Actuator():
+        if actuator == NO_ACTUATOR:
             return action
         if actuator.delay:
             self.actions = [action.clone(), *self.actions[: actuator.delay]]
