@@ -1,13 +1,12 @@
 """B episodes on SUMO's motorway: the ego is moved, and everything is measured, by the code of `highway`; SUMO moves the traffic.
 
-A step: the ego acts and moves by itself. SUMO is told where the ego then is, and moves all others, which see it where it was. Then
-collisions, progress and observation are computed from where all bodies are.
+A step: the ego acts and moves by itself. SUMO is told where the ego then is, and moves all others, which see it where it was.
+Then collisions, progress and observation are computed from where all bodies are.
 """
 
 from __future__ import annotations
 
 import math
-
 
 import numpy as np
 from numpy.typing import NDArray

@@ -75,7 +75,10 @@ def _edges(lanes: Sequence[int]) -> Iterator[str]:
         y = _ramp_y(count) + LANE_WIDTH / 2
         points = ((RAMP_LENGTH, y - RAMP_ASIDE), (RAMP_STRAIGHT, y), (0.0, y))
         shape = " ".join(f"{MERGE - before:g},{across:g}" for before, across in points)
-        yield f'<edge id="{edge(RAMP, row)}" from="ramp_{row}" to="{ends[1]}" numLanes="1" priority="1" shape="{shape}" {common}/>'
+        yield (
+            f'<edge id="{edge(RAMP, row)}" from="ramp_{row}" to="{ends[1]}" '
+            f'numLanes="1" priority="1" shape="{shape}" {common}/>'
+        )
 
 
 def _connections(lanes: Sequence[int]) -> Iterator[str]:

@@ -101,5 +101,7 @@ def _keep(content: bytes, key: str, ending: str) -> Path:
         with whole(path) as file:
             file.write(content)
     except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror or error}; set XDG_CACHE_HOME to another folder") from None
+        raise UserError(
+            f"{path} cannot be written: {error.strerror or error}; set XDG_CACHE_HOME to another folder"
+        ) from None
     return path

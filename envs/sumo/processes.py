@@ -8,6 +8,7 @@ import sys
 import tempfile
 import weakref
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,8 @@ class Process:
 
     def _why(self) -> str:
         """What SUMO said before it ended."""
-        self.process.wait(PATIENCE_S)
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(PATIENCE_S)
         self.complaints.seek(0)
         said = network.complaint(self.complaints.read().decode(errors="replace"))
         return f"SUMO has ended: {said}; if its network is damaged, delete {self.network}"
@@ -82,10 +84,9 @@ def _end(process: subprocess.Popen[bytes], complaints: Any) -> None:
     """End a simulation: it ends when there are no more commands."""
     for stream in (process.stdin, process.stdout):
         if stream is not None:
-            try:
+            # What was not sent cannot be: the process has ended.
+            with suppress(OSError):
                 stream.close()
-            except OSError:
-                pass
     try:
         process.wait(PATIENCE_S)
     except subprocess.TimeoutExpired:

@@ -49,7 +49,7 @@ def arguments(network: str, cars: str) -> list[str]:
         "--step-method.ballistic": "true",
         "--lateral-resolution": "0.8",
         "--time-to-teleport": "-1",
-        # Collisions are our own: SUMO's are gaps that are too small, and it does not look beside a car that is moved from outside.
+        # Collisions are our own: SUMO's are small gaps, and it does not look beside a car that is moved from outside.
         "--collision.action": "none",
         "--default.speeddev": "0",
         "--xml-validation": "never",
@@ -178,8 +178,13 @@ def main() -> None:
     import libsumo
 
     network, cars, *sizes = sys.argv[1:]
-    libsumo.start(arguments(network, cars))
-    serve(Simulation(libsumo, *map(int, sizes)), sys.stdin.buffer, answers)
+    try:
+        libsumo.start(arguments(network, cars))
+        serve(Simulation(libsumo, *map(int, sizes)), sys.stdin.buffer, answers)
+    except libsumo.TraCIException as error:
+        print(f"Error: {error}", file=sys.stderr, flush=True)  # noqa: T201
+        # An end of Python may wait for SUMO, which has none after an error.
+        os._exit(1)
     libsumo.close()
 
 
