@@ -102,7 +102,10 @@ def test_an_angle_is_clockwise_from_north_and_y_grows_to_the_left() -> None:
 
 
 def test_times_are_whole_milliseconds() -> None:
-    program = "begin({'--step-length': str(1 / 15)})\nfor _ in range(450): libsumo.simulationStep()\nprint(libsumo.simulation.getTime())"
+    program = """
+begin({"--step-length": str(1 / 15)})
+for _ in range(450): libsumo.simulationStep()
+print(libsumo.simulation.getTime())"""
     assert shown(program) == 30.15
     facts = SumoWorld().facts
     assert facts.max_steps / facts.decision_hz == pytest.approx(30.15)
