@@ -63,7 +63,7 @@ def drawn(axes: Axes, engine: SumoEngine) -> None:
     axes.add_patch(Rectangle((0, -2), LENGTH, bottom + 2, color=GREY, lw=0))
     begin, bend, end = MERGE - RAMP_LENGTH, MERGE - RAMP_STRAIGHT, MERGE + MERGE_LENGTH
     edge = np.array([[begin, bottom + RAMP_ASIDE], [bend, bottom], [end, bottom]])
-    axes.fill(*np.concatenate([edge, edge[::-1] + [0, 4]]).T, color=GREY, lw=0)
+    axes.fill(*np.concatenate([edge, edge[::-1] + np.array([0, 4])]).T, color=GREY, lw=0)
     for lane in range(1, LANES):
         axes.axhline(4 * lane - 2, color="white", lw=0.8)
     axes.plot([bend, MERGE], [bottom, bottom], color="white", lw=1.6)

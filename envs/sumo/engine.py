@@ -133,8 +133,9 @@ def place_chosen(
     """The start of the episodes `chosen` [R], from SUMO's columns [B, N, 4]."""
     for number in chosen:
         cars, episode = vehicles[number], episodes[number]
-        cars[0].heading = 0.0
         cars[0].crashed = False
+        # No push of a collision is pending.
+        cars[0].impact_pair = -1
         from_sumo(places[number, 0], cars[0], episode.lanes)
         take_places(cars, order[number], episode, places[number], parameters)
 

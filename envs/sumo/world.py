@@ -12,6 +12,7 @@ from cavbench.driving.kinematics import CarFollowing
 from cavbench.envs.highway.config import ACTIONS, KINEMATICS, STANDARD_FEATURES, STANDARD_TARGET_SPEEDS, HighwayConfig
 from cavbench.envs.sumo.axes import SUMO, SUMO_V1
 from cavbench.envs.sumo.cars import ACCELERATION, BRAKING, PERIOD_MS, STANDING_GAP, TIME_GAP
+from cavbench.envs.sumo.motorway import LENGTH, START
 from cavbench.envs.sumo.network import LIBRARIES, check_installed
 from cavbench.scenarios import Axes, Cell
 
@@ -26,6 +27,8 @@ FOLLOWING = CarFollowing(
     free_share=0.5,
 )
 MOST_PROCESSES = 64
+MOST_STEPS = int((LENGTH - START) / (KINEMATICS["top_speed"] * PERIOD_MS / 1000))
+"""Decisions in which no ego comes to the end of the motorway."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +72,8 @@ class SumoWorld(DrivingWorld):
         object.__setattr__(self, "target_speeds", tuple(float(speed) for speed in self.target_speeds))
         if not 1 <= self.processes <= MOST_PROCESSES:
             raise ValueError(f"processes must be between 1 and {MOST_PROCESSES}, got {self.processes}")
+        if self.max_steps > MOST_STEPS:
+            raise ValueError(f"max_steps must be at most {MOST_STEPS}, where the motorway ends, got {self.max_steps}")
         self.configuration((self.home,))
 
     @property

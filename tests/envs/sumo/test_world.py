@@ -34,6 +34,7 @@ def test_it_keeps_the_rules_of_every_world() -> None:
         ({"target_speeds": (30.0, 20.0)}, "increasing speeds"),
         ({"vehicles": 0}, "vehicles must be between 1 and 1000"),
         ({"max_steps": 0}, "max_steps must be"),
+        ({"max_steps": 900}, "max_steps must be at most 820, where the motorway ends"),
     ],
 )
 def test_a_wrong_parameter_is_one_line(options: dict[str, object], message: str) -> None:
