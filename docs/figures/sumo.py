@@ -18,14 +18,16 @@ from docs.figures import style
 from docs.figures.roads import GREY, cars
 
 LANES, SEED = 3, SUMO_V1.first_seed
-MOMENTS = (0, 120, 210)
+MOMENTS = (120, 210)
+SHOWN = (340, 800)
+"""m along the road; the ego is always there."""
 BODY = {"length": 5.0, "width": 2.0}
 
 
 def sumo() -> Figure:
     """The first 14 s of a scenario that SUMO's IDM drives, and the end of one in which the ego steers into a car beside it."""
     cell = SumoWorld().axes.cell(lanes=LANES, density=2.0)
-    made = style.figure(6.2, f"sumo: lanes {LANES}, density 2")
+    made = style.figure(4.6, f"sumo: lanes {LANES}, density 2")
     every = made.subplots(len(MOMENTS) + 1, 1)
     engine = SumoEngine(SumoWorld().configuration((cell,), Control(driver="idm")))
     engine.reset(np.array([0]), np.array([SEED]))
@@ -33,7 +35,7 @@ def sumo() -> Figure:
         while engine.episodes["steps"][0] < moment:
             engine.step(np.array([1]))
         drawn(axes, engine)
-        axes.set(xlim=(280, 800), ylim=(24, -4), yticks=[], aspect=3)
+        axes.set(xlim=SHOWN, ylim=(24, -4), yticks=[], aspect=3)
         axes.set_title(f"{moment * PERIOD_MS / 1000:.0f} s", fontsize=10)
     engine.processes.close()
     crash(every[-1], cell)
@@ -68,7 +70,8 @@ def drawn(axes: Axes, engine: SumoEngine) -> None:
         axes.axhline(4 * lane - 2, color="white", lw=0.8)
     axes.plot([bend, MERGE], [bottom, bottom], color="white", lw=1.6)
     axes.plot([MERGE, end], [bottom, bottom], color="white", lw=0.8, ls=(0, (6, 4)))
-    bodies = [{name: float(car[name]) for name in FIELDS} | BODY for car in engine.vehicles[0]]
+    shown = [car for car in engine.vehicles[0] if SHOWN[0] < car["x"] < SHOWN[1]]
+    bodies = [{name: round(float(car[name]), 3) for name in FIELDS} | BODY for car in shown]
     cars(axes, bodies)  # type: ignore[arg-type]
 
 
