@@ -74,6 +74,7 @@ FIGURES = {
     "world_two_way.svg": "roads:two_way",
     "world_racetrack.svg": "roads:racetrack",
     "world_u_turn.svg": "roads:u_turn",
+    "world_sumo.svg": "sumo:sumo",
     "world_camera.png": "camera:world",
     "world_crossing.png": "crossing:world",
     "world_places.png": "camera:places",

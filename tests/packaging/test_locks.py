@@ -41,7 +41,7 @@ def lock(name: str) -> dict[str, str]:
     return found
 
 
-UNLOCKED = {"log"}
+UNLOCKED = {"log", "sumo"}
 """Extras that neither `make run` nor `make test` installs (docs/trust.md)."""
 PROJECT = tomllib.loads((TREE / "pyproject.toml").read_text())["project"]
 
