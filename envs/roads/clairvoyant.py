@@ -9,6 +9,7 @@ from cavbench.compiled import entry_point
 from cavbench.envs.highway.clairvoyant import FAILURE, HORIZON_S, ClairvoyantPlanner
 from cavbench.envs.roads.config import TaskKind
 from cavbench.envs.roads.engine import PARTS, RoadsEngine, drive
+from cavbench.envs.roads.recordings import Recordings
 from cavbench.envs.roads.state import Integers
 
 FAR_S = {TaskKind.EXIT: 10.0}
@@ -25,6 +26,7 @@ def roll_batch(
     parameters: NDArray[np.void],
     failed: Integers,
     progress: NDArray[np.float32],
+    recordings: Recordings,
 ) -> None:
     """Simulate plans [R, P, T] from the states of R episodes: decisions before a failure, and the progress made [R, P]."""
     given = parameters[0]
@@ -39,7 +41,8 @@ def roll_batch(
             episode[:] = episodes[row : row + 1]
             now, total, step = episode[0], 0.0, 0
             while step < actions.shape[2]:
-                drive(road, copy, now, given.actions[actions[row, plan, step]], control, given, corners, parts)
+                action = given.actions[actions[row, plan, step]]
+                drive(road, copy, now, action, control, given, corners, parts, recordings)
                 if now.crashed or now.offroad:
                     break
                 total += now.progress
@@ -77,5 +80,6 @@ class RoadsPlanner(ClairvoyantPlanner):
             self.parameters,
             failed,
             progress,
+            engine.recordings,
         )
         return progress - np.where(failed < self.length, FAILURE - failed, 0.0)
