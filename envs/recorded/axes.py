@@ -25,7 +25,7 @@ RECORDED = Axes(
         Axis(
             name="traffic",
             kind="str",
-            meaning="replay: as recorded; mixed: until the ego matters to a car, which then follows IDM; reactive: all follow IDM",
+            meaning="replay: as recorded; mixed: a car follows IDM as soon as the ego matters to it; reactive: all do",
             choices=("replay", "mixed", "reactive"),
             default="mixed",
         ),

@@ -40,12 +40,17 @@ def read(path: Path, name: str = "") -> Recording:
     name = name or str(path)
     root = markup.read(path, name=name)
     try:
-        return _recording(root, name)
+        return recording(root, name)
     except ValueError as error:
         raise UserError(f"{name} cannot be driven: {error}") from None
 
 
-def _recording(root: Element, name: str) -> Recording:
+def recording(root: Element, name: str) -> Recording:
+    """The scene in a document, by a name for errors.
+
+    Raises:
+        ValueError: in one line, as of `read`.
+    """
     if root.tag != "commonRoad":
         raise ValueError(f"it is a file of <{short(root.tag)}>, not of <commonRoad>")
     version = root.attribute("commonRoadVersion")

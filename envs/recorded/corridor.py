@@ -1,7 +1,7 @@
 """The road of a scene, straightened: parallel lanes along x, and every road user in their coordinates.
 
-Places are measured along and across a reference line, the smoothed centre of a lane beside the start of the planning problem. In a
-bend of radius R, a length at y m from the line is off by a share of y / R. So a road that bends too much is refused.
+Places are measured along and across a reference line, the smoothed centre of a lane beside the start of the planning problem. In
+a bend of radius R, a length at y m from the line is off by a share of y / R. So a road that bends too much is refused.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ STEP_M = 1.0
 SMOOTHED_M, BEYOND_M = 40.0, 120.0
 """The reference line is smoothed over so many m, and goes on straight for so many m at both ends."""
 LEAST_RADIUS_M = 150.0
-LEAST_LENGTH_M = 80.0
+LEAST_LENGTH_M, MOST_LENGTH_M = 80.0, 5_000.0
 STRAIGHT_ON = math.pi / 6
 """A piece of a lane that turns by more leaves the road."""
 COVERED = 0.97
@@ -25,6 +25,8 @@ COVERED = 0.97
 UNEVEN_M = 0.6
 """Lanes count as evenly spaced up to this distance of a centre from its place."""
 WIDTHS = (2.0, 6.0)
+MOST_PRODUCTS = 4_000_000
+"""Distances that are computed at a time; it limits the memory."""
 MOST_LANES = 12
 
 
@@ -61,8 +63,8 @@ class Corridor:
 def corridor(recording: Recording) -> Corridor:
     """The road on which the first planning problem starts, or without one, most road users.
 
-    Each lane beside the start is tried as the reference line. The one along which most metres of lanes run counts, so that no exit
-    and no lane that ends decides.
+    Each lane beside the start is tried as the reference line. The one along which most metres of lanes run counts, so that no
+    exit and no lane that ends decides.
 
     Raises:
         ValueError: in one line, if the scene has no such road.
@@ -195,9 +197,15 @@ def _line(points: Floats) -> Floats:
     for end in (points, points[::-1]):
         far = end[np.hypot(*(end - end[0]).T) >= 20.0]
         outwards = end[0] - (far[0] if len(far) else end[-1])
+        if not np.hypot(*outwards) > 0:
+            raise ValueError("its road ends where it begins")
         ends.append(end[0] + outwards / np.hypot(*outwards) * (BEYOND_M + SMOOTHED_M))
     whole = np.concatenate([ends[:1], points, ends[1:]])
     place = np.append(0.0, np.hypot(*np.diff(whole, axis=0).T).cumsum())
+    if place[-1] > MOST_LENGTH_M:
+        raise ValueError(
+            f"its road goes on for {place[-1] / 1000:.1f} km, at most {MOST_LENGTH_M / 1000:g} km are driven"
+        )
     count = round(place[-1] / STEP_M)
     at = np.linspace(0, place[-1], count + 1)
     dense = np.stack([np.interp(at, place, column) for column in whole.T], 1)
@@ -228,8 +236,9 @@ def _projected(line: Floats, places: Floats) -> tuple[Floats, Floats, Floats]:
     directions, numbers = _directions(line), np.arange(len(line), dtype=np.float64)
     middle = line.mean(0)
     off, points = places[:, :2] - middle, line - middle
+    parts = len(off) * len(line) // MOST_PRODUCTS + 1
     # The nearest point of the line has the smallest |c|^2 - 2 p c; that is one product of matrices.
-    near = [((points**2).sum(1) - 2 * part @ points.T).argmin(1) for part in np.array_split(off, len(off) // 4096 + 1)]
+    near = [((points**2).sum(1) - 2 * part @ points.T).argmin(1) for part in np.array_split(off, parts)]
     along = np.concatenate(near).astype(np.float64)
     for _ in range(3):
         x, y, turned = (np.interp(along, numbers, column) for column in (*line.T, directions))

@@ -28,7 +28,7 @@ ASIDE_M = 60.0
 """Road users that never come so near to the lanes are left out."""
 MARGIN_M = 0.3
 """Cars up to so far beside a lane are on it: real lanes are narrow, and real cars are not in their middle."""
-STARTS_A_SECOND = 5
+STARTS_A_SECOND, MOST_STARTS = 5, 5_000
 FREE_PERCENTILE = 95
 """Of the recorded speeds: at which speed the rule-based driver wants to go."""
 
@@ -153,15 +153,11 @@ def _starts(
         last = np.minimum(off[np.searchsorted(off, at)] - 1, at + wanted)
         way = states[np.maximum(last, at), 0] - states[at, 0]
         fits = (first + at <= latest) & (last - at >= least) & (way >= LEAST_M)
-        fits &= (
-            np.array(
-                [np.abs(states[a : b + 1, 3] - states[a, 3]).max(initial=0) for a, b in zip(at, last, strict=True)]
-            )
-            >= change
-        )
+        fits &= _changes(states[:, 3], at, last) >= change
         pace = way / (np.maximum(last - at, 1) / hz)
         made.append(np.array(list(zip([number] * fits.sum(), first + at[fits], pace[fits], strict=True)), START))
     starts = np.concatenate([np.zeros(0, START), *made])
+    starts = starts[np.random.default_rng(0).permutation(len(starts))[:MOST_STARTS]]
     starts = starts[_are_free(starts, tracks, frames)]
     if not len(starts):
         raise ValueError(
@@ -169,6 +165,12 @@ def _starts(
             f"{LEAST_M:g} m and changes its speed by {change:g} m/s (world.change), {seconds:g} s before the recording ends"
         )
     return _dealt(starts)
+
+
+def _changes(speeds: Floats, first: NDArray[np.int64], last: NDArray[np.int64]) -> Floats:
+    """The largest difference of speeds from that in a first frame, up to a last one; 0 for frames that do not follow."""
+    pairs = zip(first, last, strict=True)
+    return np.array([np.abs(speeds[begin : end + 1] - speeds[begin]).max(initial=0) for begin, end in pairs])
 
 
 def _are_free(starts: NDArray[np.void], tracks: list[Track], frames: list[tuple[int, Floats]]) -> NDArray[np.bool_]:
@@ -185,9 +187,7 @@ def _are_free(starts: NDArray[np.void], tracks: list[Track], frames: list[tuple[
 
 
 def _dealt(starts: NDArray[np.void]) -> NDArray[np.void]:
-    """Starts in a mixed order, always the same: first one of each car, then a second one of each."""
-    generator = np.random.default_rng(0)
-    starts = starts[generator.permutation(len(starts))]
+    """Starts in another order: first one of each car, then a second one of each."""
     seen: dict[int, int] = {}
     rounds = []
     for track in starts["track"].tolist():

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 from annotated_types import Interval
 
 from cavbench import bounded
-from cavbench.driving import DrivingFacts, Kinematics
+from cavbench.driving import ActionType, Control, DrivingFacts, Dynamics, Kinematics
 from cavbench.driving.kinematics import CarFollowing
 from cavbench.envs.highway.config import KINEMATICS
 from cavbench.envs.recorded.axes import OWN, OWN_V1, RECORDED, RECORDED_V1, SCENES
@@ -133,6 +133,13 @@ class RecordedWorld(RoadsWorld):
         if not path.is_file():
             raise UserError(f"the scene {name} of world recorded is not here: `bench fetch ngsim` brings it")
         return path, part.sha256
+
+    def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics:
+        """See `cavbench.driving.DrivingWorld.dynamics`. Nothing of a recording is told."""
+        # Imported here because it loads torch and numba, which `bench list` must not load.
+        from cavbench.envs.roads.foresight import RoadsDynamics
+
+        return RoadsDynamics(self.config(cells, Control(action_type=action_type)))
 
     def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
         # It is called before anything is driven, so a scene that is missing or unfit is named then.

@@ -316,6 +316,26 @@ def start_batch(
         report(road, cars, episode, given, numbers, flags, number)
 
 
+@entry_point
+def look_batch(
+    roads: NDArray[np.void],
+    bodies: NDArray[np.void],
+    episodes: NDArray[np.void],
+    parameters: NDArray[np.void],
+    observation: NDArray[np.float32],
+    numbers: NDArray[np.float32],
+    flags: NDArray[np.bool_],
+) -> None:
+    """Write the observation and the record of every episode. See `RoadsEngine.look`."""
+    rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
+    given = parameters[0]
+    grid = np.zeros((given.speeds, MOST_SIDE_LANES, max(given.horizon, 1)))
+    for number in range(episodes.size):
+        episode, cars = episodes[number], bodies[number]
+        look(roads[episode.network], cars, episode, given, rows, work, grid, observation[number])
+        report(roads[episode.network], cars, episode, given, numbers, flags, number)
+
+
 class RoadsEngine:
     """B episodes of `config`, in numpy. The engine owns the outputs and overwrites them in the next call.
 
@@ -377,7 +397,12 @@ class RoadsEngine:
             self.recordings,
         )
 
-    def _controls(self, action: NDArray[np.floating]) -> Floats:
+    def look(self) -> None:
+        """Write the current observation and record of every episode, without a step."""
+        look_batch(self.roads, self.bodies, self.episodes, self.parameters, self.observation, self.numbers, self.flags)
+
+    @staticmethod
+    def controls(action: NDArray[np.floating]) -> Floats:
         """[B, 3] acceleration in m/s2, steering in rad, and the size of the action; one column [B, 1] is steering alone."""
         both = action if action.shape[1] == 2 else np.concatenate([np.zeros_like(action), action], 1)
         return np.concatenate(
@@ -402,7 +427,7 @@ class RoadsEngine:
             if actions.min() < 0 or actions.max() > last:
                 raise ValueError(f"actions must be between 0 and {last}, got {actions.tolist()}")
         elif self.config.ego == Kind.CONTINUOUS:
-            controls = self._controls(np.asarray(action))
+            controls = self.controls(np.asarray(action))
         step_batch(
             self.roads,
             self.bodies,

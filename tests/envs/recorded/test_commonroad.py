@@ -8,9 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from cavbench.envs.recorded import commonroad
+from cavbench.envs.recorded.corridor import corridor
 from cavbench.errors import UserError
+from cavbench.formats import markup
 from tests.envs.recorded.scenes import Car, Road, platoon, scene, wave, with_static
 
 LANE = 'lanelet id="1"'
@@ -155,6 +159,26 @@ def test_a_file_that_cannot_be_replayed_is_refused_in_one_line(tmp_path: Path, c
     assert "scene.xml" in line
     assert "\n" not in line
     assert len(line) < 300
+
+
+PLAIN = scene(cars=CARS)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    place=st.integers(0, len(PLAIN) - 1),
+    length=st.integers(0, 400),
+    text=st.text(st.sampled_from("0123456789.-eN<>/&x "), max_size=6),
+)
+def test_a_damaged_file_is_a_scene_or_one_line(place: int, length: int, text: str) -> None:
+    damaged = PLAIN[:place] + text + PLAIN[place + length :]
+    said = ""
+    try:
+        corridor(commonroad.recording(markup.parsed(damaged.encode()), "scene"))
+    except ValueError as error:
+        said = str(error)
+    assert "\n" not in said
+    assert len(said) < 300
 
 
 @pytest.mark.parametrize("limit", ["MOST_LANELETS", "MOST_TRACKS", "MOST_STATES", "MOST_POINTS"])

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cavbench.envs.recorded.commonroad import _recording
+from cavbench.envs.recorded.commonroad import recording
 from cavbench.envs.recorded.corridor import Corridor, corridor
 from cavbench.envs.recorded.scene import Recording
 from cavbench.formats import markup
@@ -20,7 +20,7 @@ CAR = [Car(number=50, lane=1, along=wave(40, 12, steps=5))]
 
 
 def recorded(road: Road, cars: Sequence[Car] = CAR, **options: object) -> Recording:
-    return _recording(markup.parsed(scene(road, cars, **options).encode()), "scene")  # type: ignore[arg-type]
+    return recording(markup.parsed(scene(road, cars, **options).encode()), "scene")  # type: ignore[arg-type]
 
 
 def straightened(road: Road, **options: object) -> Corridor:
@@ -92,6 +92,11 @@ def test_a_road_that_bends_too_much_is_refused() -> None:
 def test_a_road_that_is_too_short_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 80 m"):
         straightened(Road(length=60.0), cars=[])
+
+
+def test_a_road_of_a_thousand_kilometres_is_refused_before_it_is_measured() -> None:
+    with pytest.raises(ValueError, match="at most 5 km"):
+        straightened(Road(length=1e6), cars=[])
 
 
 def test_lanes_that_are_too_narrow_are_refused() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from cavbench.envs.recorded.commonroad import _recording
+from cavbench.envs.recorded.commonroad import recording
 from cavbench.envs.recorded.frames import Stage, stage
 from cavbench.formats import markup
 from tests.envs.recorded.scenes import Car, Road, platoon, scene, wave, with_static
@@ -16,8 +16,7 @@ ROAD = Road()
 
 
 def staged(cars: Sequence[Car] | None = None, *, hz: int = 15, seconds: float = 6.0, change: float = 3.0) -> Stage:
-    recording = _recording(markup.parsed(scene(ROAD, cars).encode()), "scene")
-    return stage(recording, hz, seconds, change)
+    return stage(recording(markup.parsed(scene(ROAD, cars).encode()), "scene"), hz, seconds, change)
 
 
 @pytest.mark.parametrize("hz", [10, 15, 30, 7])
@@ -87,7 +86,7 @@ def test_a_scene_without_road_users_is_refused() -> None:
 
 def test_a_parked_car_is_there_all_the_time() -> None:
     text = with_static(scene(ROAD, platoon()), ROAD, 150, 2)
-    found = stage(_recording(markup.parsed(text.encode()), "scene"), 15, 6.0, 3.0)
+    found = stage(recording(markup.parsed(text.encode()), "scene"), 15, 6.0, 3.0)
     assert found.recordings.tracks["stands"].sum() == 1
     parked = int(np.flatnonzero(found.recordings.tracks["stands"])[0])
     assert parked not in found.recordings.starts["track"]

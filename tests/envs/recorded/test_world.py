@@ -200,21 +200,11 @@ def test_it_keeps_the_rules_of_bench_check(path: Path) -> None:
     assert broken("world", "recorded", path=str(path)) == {}
 
 
-@pytest.mark.parametrize("words", [("victim=planner",), ("victim=dqn", "seeds=0", "defense=tracker+shield")])
-def test_a_run_drives_drivers_and_filters_that_need_lanes(
-    bench: Bench, path: Path, tmp_path: Path, words: tuple[str, ...]
-) -> None:
+def test_a_run_attacks_a_driver_behind_filters_that_need_lanes(bench: Bench, path: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     said = bench(
-        "run",
-        "world=recorded",
-        f"world.path={path}",
-        "attack=none",
-        "episodes=2",
-        "weather=clear",
-        "traffic=mixed",
-        f"out={out}",
-        *words,
+        *("run", "world=recorded", f"world.path={path}", "episodes=1", "weather=clear", "traffic=mixed", f"out={out}"),
+        *("victim=dqn", "seeds=0", "defense=tracker+shield", "attack=rehearse", "threat.access=dynamics"),
     )
     assert said.code == 0, said.err
     records = pq.read_table(out / "episodes").to_pylist()
