@@ -401,8 +401,7 @@ class RoadsEngine:
         """Write the current observation and record of every episode, without a step."""
         look_batch(self.roads, self.bodies, self.episodes, self.parameters, self.observation, self.numbers, self.flags)
 
-    @staticmethod
-    def controls(action: NDArray[np.floating]) -> Floats:
+    def controls(self, action: NDArray[np.floating]) -> Floats:
         """[B, 3] acceleration in m/s2, steering in rad, and the size of the action; one column [B, 1] is steering alone."""
         both = action if action.shape[1] == 2 else np.concatenate([np.zeros_like(action), action], 1)
         return np.concatenate(

@@ -77,7 +77,7 @@ class RoadsDynamics(Dynamics):
         self.parameters = parameters(self.config)
         self.action_type, self.period = config.action_type, 1 / config.policy_frequency
         self.actions = len(ACTIONS) if config.action_type == "discrete" else 0
-        engine = RoadsEngine(self.config)
+        self._engine = engine = RoadsEngine(self.config)
         self.roads, self._networks = engine.roads, engine.episodes["network"].copy()
         # An observation does not say how far the end of the road is.
         self.roads["end"] = np.inf
@@ -130,7 +130,7 @@ class RoadsDynamics(Dynamics):
         if self.actions:
             actions = np.ascontiguousarray(given, dtype=np.int64)
         else:
-            controls = RoadsEngine.controls(given.reshape(-1, 2)).reshape(*shape, 3)
+            controls = self._engine.controls(given.reshape(-1, 2)).reshape(*shape, 3)
         failed, progress = np.zeros(shape[:2], np.int64), np.zeros(shape[:2], np.float32)
         crashed, generators = np.zeros(shape[:2], np.bool_), np.zeros((len(episodes), WORDS), np.uint64)
         roll_batch(
